@@ -1,4 +1,4 @@
-"""What a run holds: records, codes and places as the engine declares them (cpp/data.hpp), and how they are made."""
+"""Records, codes and indices of a run as the engine declares them (cpp/data.hpp), and functions that create them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 else:
     globals().update((name, value) for name, value in vars(BUILD).items() if not name.startswith("_"))
 
-# Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
+# Dead band in units of the rounding error of the terms of an invariant; compensated runs use the smaller one.
 BAND, BAND_COMPENSATED, BAND_MULTISTEP = 4.0, 1.0, 1 / 64
 
 
 def bare_schedule(span: Span, first: float) -> Schedule:
-    """One that saves nothing; `first` is the length of the first step."""
+    """Return a schedule that saves nothing; `first` is the length of the first step."""
     none = np.zeros(0)
     clock = np.array([span.t0, span.t0, 0.0, first])
     return Schedule(span, 0, none, np.zeros(3, np.int64), clock, none, none, none, none, none)
@@ -35,7 +35,7 @@ _none = np.zeros(0)
 
 
 def no_columns(values: int) -> Columns:
-    """Return the record of a run with this number of invariants that carries no derivatives."""
+    """Return the record of a run with this number of invariants and without derivatives."""
     return Columns(kept=np.zeros((values, 0)), size=0, seen=0, half=0, symplectic=False)
 
 

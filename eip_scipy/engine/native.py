@@ -1,4 +1,4 @@
-"""The step in C++: the build of it that this processor takes, and a user's functions as it takes them."""
+"""The engine in C++: the build for this processor, and the forms in which it accepts a user's functions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
     "library_function",
 ]
 
-# Names one of the builds, _native or _native_v3, in place of the best one that the processor takes.
+# Names one of the builds, _native or _native_v3, to use instead of the best one for the processor.
 VARIABLE = "EIP_SCIPY_ENGINE"
 AGAIN = "python -m pip install --no-build-isolation --no-deps --editable ."
 
@@ -36,8 +36,8 @@ AGAIN = "python -m pip install --no-build-isolation --no-deps --editable ."
 class Call(NamedTuple):
     """A user's function in Python: ``fun(t, y[, f][, out], *args)``.
 
-    Its value is taken as it is where it is an array of that shape (a float for ``()``), of the state's type or, where
-    it is `real`, of floats; else ``convert(value, t)`` makes such an array of it, or raises.
+    Its value is used directly if it is an array of the right shape (a float for ``()``) and type: that of the state, or
+    float if it is `real`. Otherwise ``convert(value, t)`` converts it to such an array, or raises an error.
     """
 
     fun: Callable[..., Any]
@@ -50,7 +50,7 @@ class Call(NamedTuple):
 
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: bool) -> Call:
-    """A `Call` with as many further arguments as there are."""
+    """Return a `Call` with the given further arguments."""
     if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
     return Call(fun, args, shape, convert, **kind)
@@ -62,12 +62,12 @@ class Rates(NamedTuple):
     Attributes
     ----------
     items : tuple of (int, int)
-        Of each balance its place among the functions of the invariants, and the number of its values.
+        For each balance its index among the functions of the invariants, and the number of its values.
     functions : tuple
-        Of each balance its rate, as a `Call` or by its address. None: the rate of the gradient along the flow, and of
-        the explicit dependence on time.
+        For each balance its rate, as a `Call` or as an address. None: the rate follows from the gradient along the flow
+        and from the explicit dependence on time.
     low, high, shift : float
-        The interval within which derivatives in time are taken, and by what shifts.
+        Interval within which derivatives in time are computed, and the shift of the differences.
     """
 
     items: tuple[tuple[int, int], ...] = ()
@@ -78,7 +78,7 @@ class Rates(NamedTuple):
 
 
 class PythonFunctions(NamedTuple):
-    """A run's functions in Python; `second_order`: `rhs` gives the accelerations of (q, v)."""
+    """The functions of a run in Python; `second_order`: `rhs` returns the accelerations of (q, v)."""
 
     rhs: Call
     inv: tuple[Call, ...]
@@ -91,12 +91,12 @@ class PythonFunctions(NamedTuple):
 
 
 class NativeFunctions(NamedTuple):
-    """A run's functions by their addresses, with the signatures in cpp/system.hpp; `owner` keeps them alive.
+    """The addresses of the functions of a run, with the signatures in cpp/system.hpp; `owner` keeps them alive.
 
-    A function of the library's stands for itself. Of each invariant, gradient and event the address, and how many
-    floats it fills. `python`: the functions in Python,
-    of which the events are called; there are none by address then. None for a gradient: by differences, with shifts in
-    units of the size of a component and of its floor, `floors` (n,).
+    A function of the library is given as an object. For each invariant, gradient and event there is the address and the
+    number of floats that it fills. None for a gradient: it is computed by differences, with shifts in units of the size
+    of a component and of its floor, `floors` (n,). `python` contains the functions in Python if events are called from
+    Python; then no events are given as addresses.
     """
 
     rhs: Any
@@ -114,7 +114,7 @@ class NativeFunctions(NamedTuple):
 
 
 class OctetFunctions(NamedTuple):
-    """The same functions for eight members of an ensemble: for each number of their arrays there are eight."""
+    """The functions for eight members of an ensemble: each number in their arrays is replaced by eight."""
 
     rhs: Any
     inv: tuple[tuple[Any, int], ...]
@@ -124,14 +124,14 @@ class OctetFunctions(NamedTuple):
 
 
 class Hooks(NamedTuple):
-    """Parts of a step in Python, in place of the engine's own.
+    """Parts of a step in Python, which replace those of the engine.
 
     ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. If it `drives`, it is
     ``one_step(t, y, again)`` of a solver that controls its own error: it fills work.K too, and returns the end of its
-    step and the length of the next one, or None where no step is short enough; `again`: in place of the last one, and
-    shorter. ``project(t_old, t, last, y_new)`` projects work.y_hat and returns the engine's code. `joint` are
-    `JointInvariants`, which come before that. ``agree(here)``: whether the raw result is finite on all processes that
-    have a part of the state, as it is `here`.
+    step and the length of the next one, or None if no step is short enough; `again`: repeat the last step with a
+    shorter one. ``project(t_old, t, last, y_new)`` projects work.y_hat and returns the code of the engine. `joint` are
+    `JointInvariants`, which are used first. ``agree(here)`` returns True if the raw result is finite on all processes
+    that have a part of the state; `here` says whether it is on this process.
     """
 
     one_step: Callable[..., Any] | None = None
@@ -148,13 +148,14 @@ def _build(name: str) -> Any:
     except ModuleNotFoundError:
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
         raise ImportError(
-            f"eip_scipy's engine is not built for Python {version} here ({Path(__file__).parent} has no {name}). In a "
-            "clone of the sources: python -m pip install -e . ; else leave the clone's folder, or install the package."
+            f"the engine of eip_scipy is not built for Python {version} here ({Path(__file__).parent} has no {name}). "
+            "In a clone of the sources, run python -m pip install -e . ; otherwise leave the folder of the clone, or "
+            "install the package."
         ) from None
 
 
 def _best() -> Any:
-    """The build that was asked for, or the best one that the processor takes."""
+    """Return the requested build, or the best one for the processor."""
     if name := os.environ.get(VARIABLE):
         return _build(name)
     plain = _build("_native")
@@ -162,7 +163,7 @@ def _best() -> Any:
 
 
 def _require_current(build: Any) -> None:
-    """In a clone: the build is that of the sources beside it."""
+    """Raise ImportError in a clone whose sources have changed since the engine was built."""
     folder = Path(__file__).parent / "cpp"
     files = sorted(folder.rglob("*.?pp"))
     if files and hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest() != build.SOURCES:
@@ -178,9 +179,9 @@ Engine = BUILD.Engine
 FailedCallError = BUILD.FailedCallError
 LibraryFunction = BUILD.LibraryFunction
 library: dict[str, LibraryFunction] = BUILD.LIBRARY
-"""The functions of the library's own problems that are in C++, by name."""
+"""The functions of the ready problems in C++, by name."""
 
 
 def library_function(name: str, own: Sequence[float] = ()) -> Any:
-    """The function of that name, as it comes back from a pickle, with its `own` parameters, if it has any."""
+    """Return the function of that name, with its `own` parameters if it has any; used by pickles."""
     return library[name].bound(own) if own else library[name]

@@ -1,8 +1,8 @@
-"""What the corrections of a run say about it: whether the projection hides a failure.
+"""Detection of runs whose projection hides a failure, from their corrections.
 
-A projection moves a state by what the step's errors explain. Where it moves it by far more, the quantity is no
-invariant of the system, or its gradient is wrong, or the step is far too long; the projected run looks perfect all the
-same. The step notes the figures (`note` in cpp/trust.hpp), a row for each invariant; what they mean is decided here.
+The errors of the steps explain the corrections of a correct run. If corrections are much larger, the quantity is not an
+invariant of the system, its gradient is wrong, or the step is much too long; the projected run looks perfect
+nevertheless. The step records figures (`note` in cpp/trust.hpp), a row for each invariant; this module interprets them.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ __all__ = ["ProjectionWarning", "Trust"]
 
 # At loose tolerances steps may miss more: DISTANT is FAR_IN_TOLERANCES relative tolerances then, up to MOST_FAR.
 FAR_IN_TOLERANCES, MOST_FAR = 7.5, 0.075
-# What no healthy run shows (docs/explanation/trust.md has the figures). One change of so many local errors (the
-# estimates of pairs of methods vanish by chance, which makes thousands), LARGE ones in such a share of the projections,
-# changes that are together so many times the errors; one defect that is TOO_FAR times what DISTANT means, DISTANT ones
-# in such a share of them.
+# Bounds that no correct run exceeds (measured in docs/explanation/trust.md): the size of one correction in local errors
+# (it can be thousands, because estimates of pairs of methods vanish by chance), the fraction of projections with LARGE
+# corrections, the sum of corrections relative to the errors, the size of one invariant error relative to DISTANT, and
+# the fraction of projections with DISTANT errors.
 BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
 TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
-# Rates of change along the flow are rounding up to this share of their terms.
+# Rates of change along the flow are rounding errors up to this fraction of their terms.
 ROUNDING_OF_RATES, ROUNDING_OF_DIFFERENCES = 1e-11, 1e-7
-# So many changes make a share or a sum, where more than one is LARGE.
+# Smallest number of projections for which fractions and sums are judged, if more than one correction is LARGE.
 ENOUGH = 5
-MOST_REASONS = 3  # in a message
+MOST_REASONS = 3  # largest number of reasons in a message
 PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
 
 class ProjectionWarning(RuntimeWarning):
-    """The projection hides a failure: its corrections are not those of the step's errors.
+    """Warning that the projection hides a failure: the errors of the steps do not explain its corrections.
 
-    Issued once a run by `solve_ivp` with an EIP method, `integrate`, `ensemble` and `project`; the same text is in
-    ``message``, and ``trusted`` is False. What it means and what to do: the page "When a run is not trusted".
+    It is issued once per run by `solve_ivp` with an EIP method, `integrate`, `ensemble` and `project`; ``message``
+    contains the same text, and ``trusted`` is False. The page "When a run is not trusted" explains what to do.
     """
 
 
@@ -72,13 +72,13 @@ class Trust:
     Attributes
     ----------
     names : tuple of str
-        Of the l invariants.
+        Names of the l invariants.
     figures : ndarray, shape (l, N_FIGURES)
-        What the step notes.
+        Figures recorded by the step.
     doubts : list of str
-        What checks of the invariants found, in sentences.
+        Findings of the checks of the invariants, as sentences.
     failed : bool
-        Whether a step failed.
+        True if a step failed.
     """
 
     def __init__(self, names: Sequence[str], figures: np.ndarray) -> None:
@@ -88,22 +88,22 @@ class Trust:
 
     @property
     def trusted(self) -> bool:
-        """Whether no step failed, no check found anything and all corrections are those of the steps' errors."""
+        """True if no step failed, no check found anything and the errors of the steps explain all corrections."""
         return not (self.failed or self.doubts or self.sick.any())
 
     @property
     def sick(self) -> np.ndarray:
-        """Which invariants' corrections or defects no healthy run has, (l,)."""
+        """Return which invariants have corrections or errors that no correct run has, (l,)."""
         return sick(self.figures)
 
     @property
     def beyond_doubt(self) -> bool:
-        """Whether what was noted so far will not be outweighed by what is to come."""
+        """Return True if later projections cannot make the run reliable again."""
         return bool(_extreme(self.figures).any())
 
     @property
     def worst(self) -> tuple[str, float, float] | None:
-        """Invariant, time and size in local errors of the largest correction; None where none was measured."""
+        """Return invariant, time and size in local errors of the largest correction; None if none was measured."""
         if not np.any(self.figures[:, JUDGED] > 0):
             return None
         k = int(np.argmax(self.figures[:, NU]))
@@ -145,7 +145,7 @@ class Trust:
 
     @property
     def message(self) -> str:
-        """Why the run is not to be trusted; "" where nothing speaks against it."""
+        """Reason why the run is not to be trusted; "" if there is none."""
         reasons = self.reasons + self.doubts
         if not reasons:
             return ""
@@ -202,7 +202,7 @@ def _severity(figures: np.ndarray) -> np.ndarray:
 
 
 def _reason(name: str, row: np.ndarray) -> str:
-    """What is wrong with one invariant's corrections."""
+    """Return what is wrong with the corrections of one invariant."""
     parts = []
     if _may_leak(row) and row[NU] > LARGE:
         parts.append(

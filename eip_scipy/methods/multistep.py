@@ -1,4 +1,4 @@
-"""Summed multistep methods for q'' = a(t, q) with a fixed step: Gauss-Jackson's, of any order."""
+"""Gauss-Jackson methods of any order: summed multistep methods for q'' = a(t, q) with a fixed step."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .orders import Ordered
 __all__ = ["GaussJackson", "Weights", "damping_limit", "interpolation_weights", "stability_limit", "weights"]
 
 LEAST_ORDER, LARGEST_ORDER = 4, 16
-# Of the errors' shape: the difference of this order, which is still far above rounding at small steps.
+# Order of the difference that has the shape of the errors and is still far above rounding at small steps.
 ESTIMATE = 8
-# Of a mode in a step, at most, where the method is called stable.
+# Largest growth of a mode in a step with which the method is called stable.
 GROWTH = 1e-4
-# Moments that the rounded weights are to have, over times in units of which a step is so much.
+# Number of moments that the rounded weights must have, and the length of a step in their unit of time.
 MOMENTS, STEP = 4, 1 / 16
 
 Series = list[Fraction]
@@ -28,37 +28,38 @@ Series = list[Fraction]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GaussJackson(Ordered):
-    """Gauss-Jackson's method of a given order, in summed form: one evaluation a step.
+    """Gauss-Jackson method of a given order in summed form, with one evaluation per step.
 
     With the accelerations a_n at steps' ends, s_n = a_n + a_(n-1) + ... and S_n = s_n + s_(n-1) + ..., positions and
     velocities are
 
         q_(n+1) = h^2 (S_n + sum_j P_j a_(n-j)),    v_n = h (s_n + sum_j V_j a_(n-j)),    j < order,
 
-    so that rounding is that of two sums, which are kept as pairs of floats. The position is predicted, the acceleration
-    evaluated there, and both sums take it (PEC).
+    so that rounding errors are those of two sums, which are stored as pairs of floats. The position is predicted, the
+    acceleration is evaluated there, and added to both sums (PEC).
 
     Parameters
     ----------
     order : int
-        From 4 to 16: the number of accelerations in a formula.
+        Order from 4 to 16, which is the number of accelerations in a formula.
     corrected : bool, optional
-        Move each acceleration by the Jacobian times what the corrector would change of the position, where a run has
-        a Jacobian: nearly the stability of a second evaluation for the price of none.
+        If True and a run has a Jacobian, each acceleration is changed by the Jacobian times the change of the position
+        by the corrector: this is nearly as stable as a second evaluation, without its cost.
     name : str, optional
+        Name of the method.
     velocities : bool, optional
-        Whether the accelerations depend on velocities, which are then predicted too. A run finds out by itself.
+        True if the accelerations depend on velocities, which are then predicted too. A run determines this itself.
 
     Raises
     ------
     ValueError
-        For another order.
+        If the order is not allowed.
 
     Notes
     -----
     x = 1 - E^-1 is the backward difference and L = -log(1 - x) / x; the predicted position is the series of
     L^-2 / (1 - x), the position i steps back that of L^-2 (1 - x)^i, the velocity there that of L^-1 (1 - x)^i, after
-    the leading terms, which the sums carry. All coefficients are fractions, rounded once.
+    the leading terms, which are contained in the sums. All coefficients are fractions, rounded once.
 
     References
     ----------
@@ -97,18 +98,18 @@ class GaussJackson(Ordered):
 
     @property
     def fixed_steps_only(self) -> bool:
-        """The estimate has the errors' shape, but no size that could control a step."""
+        """True, because the estimate has the shape of the errors, but no size that could control a step."""
         return True
 
     @property
     def middle(self) -> int:
-        """How many steps before the newest the history is centred."""
+        """Number of steps from the centre of the history to its newest node."""
         return self.order // 2
 
 
 @cache
 def _inverse_powers(power: int, terms: int) -> Series:
-    """L^-power."""
+    """Return the series of L^-power."""
     L = [Fraction(1, k + 1) for k in range(terms)]
     inverse = [Fraction(1)]
     for k in range(1, terms):
@@ -124,7 +125,7 @@ def _product(a: Series, b: Series, terms: int) -> Series:
 
 
 def _shifted(series: Series, back: int) -> Series:
-    """The series times (1 - x)^back; back = -1 is one step ahead."""
+    """Return the series times (1 - x)^back; back = -1 is one step ahead."""
     terms = len(series)
     if back < 0:
         return _product(series, [Fraction(1)] * terms, terms)
@@ -133,7 +134,7 @@ def _shifted(series: Series, back: int) -> Series:
 
 
 def _ordinates(series: Series) -> Series:
-    """Coefficients of a_n, a_(n-1), ... for a sum over backward differences of a_n."""
+    """Return the coefficients of a_n, a_(n-1), ... for a sum over backward differences of a_n."""
     return [
         (-1) ** j * sum((series[k] * comb(k, j) for k in range(j, len(series))), Fraction(0))
         for j in range(len(series))
@@ -141,27 +142,27 @@ def _ordinates(series: Series) -> Series:
 
 
 def position_series(back: int, terms: int) -> Series:
-    """Of the position `back` steps before the newest, after its two leading terms, which are 1 and -1 - back."""
+    """Return the series of the position `back` steps before the newest, after its leading terms 1 and -1 - back."""
     return _shifted(_inverse_powers(2, terms + 2), back)[2:]
 
 
 def velocity_series(back: int, terms: int) -> Series:
-    """Of the velocity, after its leading term 1."""
+    """Return the series of the velocity after its leading term 1."""
     return _shifted(_inverse_powers(1, terms + 1), back)[1:]
 
 
 def position_weights(back: int, order: int) -> Series:
-    """Weights of a_n, a_(n-1), ... in the position."""
+    """Return the weights of a_n, a_(n-1), ... in the position."""
     return _ordinates(position_series(back, order))
 
 
 def velocity_weights(back: int, order: int) -> Series:
-    """Weights of a_n, a_(n-1), ... in the velocity."""
+    """Return the weights of a_n, a_(n-1), ... in the velocity."""
     return _ordinates(velocity_series(back, order))
 
 
 def correction_weights(order: int) -> Series:
-    """Weights of a_(n+1), a_n, ..., order + 1 of them, in the corrected less the predicted position at n + 1."""
+    """Return the order + 1 weights of a_(n+1), a_n, ... in the corrected minus the predicted position at n + 1."""
     corrected = [*position_weights(0, order), Fraction(0)]
     predicted = [Fraction(0), *position_weights(-1, order)]
     return [c - p for c, p in zip(corrected, predicted, strict=True)]
@@ -170,8 +171,9 @@ def correction_weights(order: int) -> Series:
 class Weights(NamedTuple):
     """The weights of a method as floats, from the oldest node to the newest.
 
-    Of the predicted position and velocity, (order,); of the state so many nodes before the newest one, (order, order);
-    of the corrector less the predictor, of differences that have the errors' shape and of the highest, (order + 1,).
+    The weights of the predicted position and velocity are (order,), those of the state at each number of nodes before
+    the newest one (order, order), those of the corrector minus the predictor, of the differences with the shape of the
+    errors, and of the highest difference (order + 1,).
     """
 
     predict_q: np.ndarray
@@ -187,7 +189,7 @@ class Weights(NamedTuple):
 
 @cache
 def weights(order: int) -> Weights:
-    """Those of the method of this order; the velocity's error is the change of the position's."""
+    """Return the error weights of the method of this order; those of the velocity are differences of the others."""
     back = range(order)
     estimate = min(ESTIMATE, order - 2)
 
@@ -208,10 +210,10 @@ def weights(order: int) -> Weights:
 
 
 def _balanced(exact: Series) -> np.ndarray:
-    """Weights rounded up or down, each so that all together miss their first moments least.
+    """Round each weight up or down so that the errors of the first moments of all weights are smallest.
 
-    The largest, some hundred, lose 1e-14 each, in the same way in every step: a force along the motion, by which
-    Mercury would drift 2e-9 AU off in 1000 years.
+    Rounding changes the largest weights, about one hundred, by 1e-14 each, in the same way in every step. That acts as
+    a force along the motion, by which Mercury would drift by 2e-9 AU in 1000 years.
     """
     nearest = np.array([float(weight) for weight in exact])
     missed = np.array([float(weight - Fraction(rounded)) for weight, rounded in zip(exact, nearest, strict=True)])
@@ -230,7 +232,7 @@ def _oldest_first(values: Series) -> np.ndarray:
 
 @cache
 def interpolation_weights(order: int) -> np.ndarray:
-    """Lagrange polynomials [back, node, power] in theta, from the node `back` steps before the newest on.
+    """Return the Lagrange polynomials [back, node, power] in theta, from the node `back` steps before the newest on.
 
     Node j is j steps before the newest one; theta = 1 is one step later than the node at theta = 0.
     """
@@ -251,9 +253,9 @@ def interpolation_weights(order: int) -> np.ndarray:
 
 @cache
 def damping_limit(order: int) -> float:
-    """The largest h c at which the method is stable for q'' = -c v and for q'' = i c v, friction and rotation.
+    """Return the largest h c for which the method is stable for q'' = -c v (friction) and q'' = i c v (rotation).
 
-    Velocities are predicted, as those of Adams and Bashforth.
+    Velocities are predicted as by the methods of Adams and Bashforth.
     """
     P = np.array([float(c) for c in velocity_weights(-1, order)])
     # a_(n+1) = -c v^p_(n+1), whose first difference is that of h (s_n + sum_j P_j a_(n-j)).
@@ -274,10 +276,10 @@ def damping_limit(order: int) -> float:
 
 @cache
 def stability_limit(order: int, corrected: bool) -> float:
-    """The largest h omega at which the method is stable for q'' = -omega^2 q.
+    """Return the largest h omega for which the method is stable for q'' = -omega^2 q.
 
-    From the roots of its characteristic polynomial: none may grow by more than GROWTH a step, the two that stand for
-    the solution neither.
+    It follows from the roots of the characteristic polynomial: none may grow by more than GROWTH in a step, including
+    the two roots of the solution.
     """
     P = np.array([float(c) for c in position_weights(-1, order)])
     D = np.array([float(c) for c in correction_weights(order)]) if corrected else np.zeros(order + 1)

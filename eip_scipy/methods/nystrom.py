@@ -1,6 +1,7 @@
 """Explicit Runge-Kutta-Nystrom tableaux for q'' = a(t, q).
 
-Those that a user makes are checked against the order conditions then; those of the package by its tests.
+User-defined tableaux are checked against the order conditions when they are created; those of the package are checked
+by its tests.
 """
 
 from __future__ import annotations
@@ -20,16 +21,17 @@ from .runge_kutta import FLOAT_TOLERANCE, Number, _low_parts, _stage_matrix, _ve
 
 __all__ = ["RKN86", "RKN1210", "NystromTableau"]
 
-# Order conditions are summed in integers of 2**-256, 77 digits: fractions would collect the denominators of all stages.
+# Order conditions are summed in integers of 2**-256 (77 digits), because fractions would accumulate the denominators of
+# all stages.
 FIXED_BITS = 256
 # The published fractions of RKN1210 miss the conditions by 2e-54; floats by 1e-16 times the size of the coefficients.
 TOLERANCE = 1e-50
-# Beyond seven moments the corrections grow above what rounding lost, and a step no longer sees the moments.
+# With more than seven moments the corrections would exceed the rounding errors, and a step would not resolve them.
 MOMENTS = 7
 
 
 class NystromTree(NamedTuple):
-    """A special Nystrom tree below its root, an acceleration: velocities at its leaves, and further trees."""
+    """A special Nystrom tree below its root, which is an acceleration: velocities at its leaves, and further trees."""
 
     leaves: int
     subtrees: tuple[NystromTree, ...]
@@ -37,13 +39,13 @@ class NystromTree(NamedTuple):
 
 @cache
 def nystrom_trees(order: int) -> tuple[NystromTree, ...]:
-    """All special Nystrom trees with `order` vertices (Hairer, Norsett & Wanner I, section II.14)."""
+    """Return all special Nystrom trees with `order` vertices (Hairer, Norsett & Wanner I, section II.14)."""
     forests = _forests(order - 1, order - 1)
     return tuple(NystromTree(order - 1 - sum(1 + _size(sub) for sub in forest), forest) for forest in forests)
 
 
 def _forests(vertices: int, largest: int) -> Iterator[tuple[NystromTree, ...]]:
-    """Multisets of trees, each on a vertex that joins it to the root, with at most `vertices` vertices in all."""
+    """Return multisets of trees, each on a vertex that joins it to the root, at most `vertices` vertices in total."""
     if largest < 2:
         yield ()
         return
@@ -60,7 +62,7 @@ def _size(tree: NystromTree) -> int:
 
 @cache
 def _density(tree: NystromTree) -> int:
-    """1 / density is the velocity's share of the tree in the exact solution."""
+    """Return the density: 1 / density is the weight of the tree in the velocity of the exact solution."""
     product = _size(tree)
     for sub in tree.subtrees:
         product *= (1 + _size(sub)) * _density(sub)
@@ -68,7 +70,7 @@ def _density(tree: NystromTree) -> int:
 
 
 def _fixed(values: np.ndarray) -> np.ndarray:
-    """Numbers as integers in units of 2**-FIXED_BITS."""
+    """Return numbers as integers in units of 2**-FIXED_BITS."""
     integers = np.empty(values.shape, dtype=object)
     for place, value in np.ndenumerate(values):
         exact = Fraction(value)
@@ -77,7 +79,7 @@ def _fixed(values: np.ndarray) -> np.ndarray:
 
 
 class Weights(NamedTuple):
-    """A row of weights and what it is to be: the position's gain a factor h by the velocity, and a vertex."""
+    """A row of weights and its order; a position has an additional factor h from the velocity, and a vertex."""
 
     label: str
     values: np.ndarray
@@ -86,7 +88,7 @@ class Weights(NamedTuple):
 
 
 def nystrom_residuals(A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> Iterator[tuple[Weights, int, float]]:
-    """Residuals of all conditions up to each row's order, with the number of vertices of their trees.
+    """Yield the residuals of all conditions up to the order of each row, with the number of vertices of their trees.
 
     sum_i b'_i phi_i(tree) - 1 / density(tree) up to `order` vertices for a velocity, and
     sum_i b_i phi_i(tree) - 1 / ((vertices + 1) density(tree)) up to one vertex less for a position.
@@ -135,11 +137,11 @@ class NystromTableau(Ordered):
     order : int
         Order of the step, checked against every order condition: to 1e-50 for rational entries, to 1e-12 for floats.
     b_hat, b_prime_hat : sequence, length s, optional
-        Weights of the embedded estimate; both or none. (The papers put the hat on the step, not on the estimate.)
+        Weights of the embedded estimate; both or none. (In the papers the hat denotes the step, not the estimate.)
     error_estimator_order : int, optional
-        Order of the estimate, checked likewise; needed with `b_hat`.
+        Order of the estimate, checked in the same way; required with `b_hat`.
     reference : str
-        Where the coefficients come from, down to the table.
+        Source of the coefficients, including the table.
 
     Attributes
     ----------
@@ -147,22 +149,23 @@ class NystromTableau(Ordered):
         (s, s), (s,), (s,), (s,).
     b_hat, b_prime_hat : ndarray of float64, shape (s,), or None
     e, e_prime : ndarray of float64, shape (s,)
-        Weights of the error estimate, ``b - b_hat`` and ``b_prime - b_prime_hat``; zero without one.
+        Weights of the error estimate, ``b - b_hat`` and ``b_prime - b_prime_hat``; zero without an estimate.
     b_low, b_prime_low : ndarray of float64, shape (s,)
-        What rounding `b` and `b_prime` to double lost, for compensated summation, corrected as follows. The step runs
-        with rounded nodes, for which even exact weights miss the quadrature conditions by 1e-17, with the same sign in
-        each step; so the low parts make the first moments exact for the rounded nodes: up to seven, no more than
-        `order` asks for and no more than there are distinct nodes with weights. Weights of zero stay zero.
+        Rounding errors of `b` and `b_prime` in double precision, for compensated summation, corrected as follows. The
+        step uses rounded nodes, with which even exact weights violate the quadrature conditions by 1e-17, with the same
+        sign in each step; therefore the low parts make the first moments exact for the rounded nodes: at most seven, at
+        most `order`, and at most the number of distinct nodes with weights. Weights of zero stay zero.
     exact : mapping from str to ndarray of object
         A, b, b_prime, c and, if given, b_hat and b_prime_hat, as fractions (floats where floats were given).
     n_stages : int
+        Number of stages.
     fsal : bool
-        Whether the last stage serves the error estimate only, and is the first one of the next step.
+        True if the last stage is only used by the error estimate, and is the first stage of the next step.
 
     Raises
     ------
     ValueError
-        When the tableau is not explicit, its first stage is not at the start of the step, shapes disagree, or an order
+        If the tableau is not explicit, its first stage is not at the start of the step, shapes disagree, or an order
         condition fails.
     """
 
@@ -264,13 +267,13 @@ def _row(name: str, label: str, values: Sequence[Number], s: int) -> np.ndarray:
 
 
 def _is_fsal(exact: Mapping[str, np.ndarray]) -> bool:
-    """Return whether the last stage is at the new position and time, and the step does not use it."""
+    """Return True if the last stage is at the new position and time, and the step does not use it."""
     unused = exact["c"][-1] == 1 and exact["b"][-1] == 0 and exact["b_prime"][-1] == 0
     return bool(unused and np.array_equal(exact["A"][-1], exact["b"]))
 
 
 def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:
-    """Weights less those of the estimate, rounded once."""
+    """Return the weights minus those of the estimate, rounded once."""
     if f"{key}_hat" not in exact:
         return np.zeros(len(exact[key]))
     pairs = zip(exact[key], exact[f"{key}_hat"], strict=True)
@@ -278,17 +281,17 @@ def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _velocity_moments(order: int) -> list[Fraction]:
-    """The sums of b'_i c_i^k for k = 0, 1, ..."""
+    """Return the exact sums of b'_i c_i^k for k = 0, 1, ..."""
     return [Fraction(1, k + 1) for k in range(min(order, MOMENTS))]
 
 
 def _position_moments(order: int) -> list[Fraction]:
-    """The sums of b_i c_i^k for k = 0, 1, ...: one less, since the position gains an order from the velocity."""
+    """Return the exact sums of b_i c_i^k for k = 0, 1, ...: one less, because the position gains an order."""
     return [Fraction(1, (k + 1) * (k + 2)) for k in range(min(order - 1, MOMENTS))]
 
 
 def _low_parts_of_used(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
-    """Low parts of the weights that are not zero; the others stay zero."""
+    """Return the low parts of the weights that are not zero; the others stay zero."""
     used = np.array([x != 0 for x in b])
     low = np.zeros(len(b))
     low[used] = _low_parts(b[used], c[used], moments)
@@ -296,7 +299,7 @@ def _low_parts_of_used(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]
 
 
 class _Published(NystromTableau):
-    """One of the package's own, which the tests check: at each import the 800 trees of RKN1210 would take 60 ms."""
+    """A tableau of this package, checked by the tests: the 800 trees of RKN1210 would take 60 ms per import."""
 
     @staticmethod
     def _check_order(name: str, A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> None:
@@ -357,9 +360,9 @@ RKN86 = _Published(
     reference="Dormand, El-Mikkawy & Prince, IMA J. Numer. Anal. 7 (1987) 423, table 1, RKN8(6)9FM; "
     "corrigendum: IMA J. Numer. Anal. 11 (1991) 297",
 )
-# The paper offers these numbers on request only. Some of the longest integers end early in the copies there are: with
-# ...125 for the last digits of the numerator of A[13, 5] the conditions on that row hold exactly. As they stand, all
-# order conditions hold to 2e-54.
+# The paper offers these numbers on request only. Some of the longest integers are truncated in the available copies:
+# with ...125 as the last digits of the numerator of A[13, 5] the conditions on that row hold exactly. All order
+# conditions hold to 2e-54.
 RKN1210 = _Published(
     "RKN1210",
     [

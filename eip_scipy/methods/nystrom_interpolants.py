@@ -13,28 +13,29 @@ from .nystrom import NystromTableau, NystromTree, _density, nystrom_trees
 
 __all__ = ["LEAST_ORDER", "Interpolant", "interpolant"]
 
-# Methods of lower order have the quintic through positions, velocities and accelerations at both ends.
+# Methods of lower order use the quintic through positions, velocities and accelerations at both ends.
 LEAST_ORDER = 6
-# Stages of a group that comes before the others, and how often the group is enlarged.
+# Number of stages in a group that precedes the others, and how often groups are added.
 GROUP, MOST_GROUPS = 6, 3
-# Newton iterations for a node, and the bits that they keep.
+# Number of Newton iterations for a node, and their precision in bits.
 ITERATIONS, BITS = 12, 120
-# A condition counts as dependent on others below the first number, beside its own size, and as met below the second.
+# A condition is dependent on others if its residual relative to its size is below the first number, and met if it is
+# below the second.
 DEPENDENT, MET = 1e-10, 1e-11
 
 Array = np.ndarray
 
 
 class Interpolant(NamedTuple):
-    """Further stages of a step and what the accelerations at some of them give.
+    """Further stages of a step, and the polynomial through the accelerations at some of them.
 
-    The rows of accelerations are those of the method's stages, that at the end of the step, and those of the further
-    stages, in this order.
+    The rows of accelerations are those of the stages of the method, the one at the end of the step, and those of the
+    further stages, in this order.
 
     Attributes
     ----------
     A : ndarray, shape (further, rows)
-        Weights of a further stage's position over the rows before its own.
+        Weights of the position of a further stage over the preceding rows.
     c : ndarray, shape (further,)
         Nodes of the further stages.
     legendre : ndarray, shape (k, rows)
@@ -78,7 +79,7 @@ def interpolant(tableau: NystromTableau) -> Interpolant:
 
 
 def _extended(A: Array, c: Array, nodes: Array, weights: Array) -> tuple[Array, Array]:
-    """Stages followed by others at `nodes`, with the weights (nodes, stages)."""
+    """Return the stages followed by others at `nodes`, with the weights (nodes, stages)."""
     known = c.size
     longer = np.zeros((known + nodes.size, known + nodes.size))
     longer[:known, :known], longer[known:, :known] = A, weights

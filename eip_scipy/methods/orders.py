@@ -1,4 +1,4 @@
-"""What every method has: an order, and perhaps an embedded error estimate of another one."""
+"""Base class of methods: an order, and optionally an embedded error estimate of another order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["AT_REST", "AtRest", "Ordered", "named_constant"]
 
 
 def named_constant(value: Any, names: Mapping[str, Any]) -> str | None:
-    """Return the name under which a module has an object, for pickles: it comes back as the same object."""
+    """Return the name of an object in its module, so that it is pickled by name."""
     return next((name for name, own in names.items() if own is value), None)
 
 
@@ -18,24 +18,24 @@ class Ordered:
 
     order: int
     error_estimator_order: int | None
-    # Whether the equations are q'' = a(t, q), and the state is (q, v).
+    # True if the equations are q'' = a(t, q), and the state is (q, v).
     of_second_order: ClassVar[bool] = False
-    # Whether steps use what earlier ones left. Such a method starts once and carries its rounding, and its history is
-    # what is projected.
+    # True if steps use results of earlier steps. Such a method starts once and uses compensated sums, and its history
+    # is projected.
     has_history: ClassVar[bool] = False
-    # Whether the steps are made by a user's Python function, without calls of the right-hand side.
+    # True if the steps are made by a user's Python function, without calls of the right-hand side.
     in_python: ClassVar[bool] = False
     # True if a solver of SciPy makes the steps, and controls their error and their length.
     drives: ClassVar[bool] = False
 
     @property
     def has_estimate(self) -> bool:
-        """Whether there is an error estimate."""
+        """True if there is an error estimate."""
         return self.error_estimator_order is not None
 
     @property
     def fixed_steps_only(self) -> bool:
-        """Whether the estimate, or its lack, leaves no way to control the step."""
+        """True if the step cannot be controlled, because there is no suitable error estimate."""
         return not self.has_estimate
 
     @property
@@ -47,7 +47,7 @@ class Ordered:
 
 
 class AtRest(Ordered):
-    """No method: a state is projected where it is."""
+    """Stand-in for a method if a single state is projected."""
 
     name = "project"
     order = 0

@@ -1,6 +1,7 @@
 """Explicit Runge-Kutta tableaux as exact fractions.
 
-Those that a user makes are checked against the order conditions then; those of the package by its tests.
+User-defined tableaux are checked against the order conditions when they are created; those of the package are checked
+by its tests.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from .orders import Ordered, named_constant
 
 __all__ = ["DOP853", "RK1", "RK2", "RK3", "RK4", "RK5", "RK23", "RK45", "Tableau"]
 
-# What passes for rounding in tableaux of floats.
+# Bound on rounding errors in tableaux of floats.
 FLOAT_TOLERANCE = 1e-12
 
 Number = int | float | str | Fraction
@@ -28,12 +29,12 @@ Tree = tuple["Tree", ...]
 
 @cache
 def rooted_trees(order: int) -> tuple[Tree, ...]:
-    """All rooted trees with `order` vertices, each a sorted tuple of its subtrees."""
+    """Return all rooted trees with `order` vertices, each a sorted tuple of its subtrees."""
     return tuple(_forests(order - 1, order - 1))
 
 
 def _forests(total: int, largest: int) -> Iterator[Tree]:
-    """Multisets of trees with `total` vertices in all, none above `largest` vertices."""
+    """Return multisets of trees with `total` vertices, each tree with at most `largest` vertices."""
     if total == 0:
         yield ()
         return
@@ -57,7 +58,7 @@ def _density(tree: Tree) -> int:
 
 
 def _stage_weights(tree: Tree, A: np.ndarray) -> np.ndarray:
-    """The factor of b_i in the elementary weight of `tree` (Hairer, Norsett & Wanner I, eq. II.2.15)."""
+    """Return the factor of b_i in the elementary weight of `tree` (Hairer, Norsett & Wanner I, eq. II.2.15)."""
     phi = np.full(A.shape[0], A.dtype.type(1) if A.dtype != object else Fraction(1), dtype=A.dtype)
     for sub in tree:
         phi = phi * A.dot(_stage_weights(sub, A))
@@ -65,7 +66,7 @@ def _stage_weights(tree: Tree, A: np.ndarray) -> np.ndarray:
 
 
 def order_residuals(A: np.ndarray, b: np.ndarray, order: int) -> Iterator[tuple[Tree, Number]]:
-    """Residual of every order condition up to `order`: sum_i b_i phi_i(tree) - 1 / density(tree)."""
+    """Yield the residual of every order condition up to `order`: sum_i b_i phi_i(tree) - 1 / density(tree)."""
     for vertices in range(1, order + 1):
         for tree in rooted_trees(vertices):
             yield tree, b.dot(_stage_weights(tree, A)) - Fraction(1, _density(tree))
@@ -99,35 +100,37 @@ class Tableau(Ordered):
     b_hat : sequence, length s or s + 1, optional
         Weights of the embedded estimate; entry s belongs to f at the new point.
     error_estimator_order : int, optional
-        Order of `b_hat`, checked likewise; needed with `b_hat`.
+        Order of `b_hat`, checked in the same way; required with `b_hat`.
     c : sequence, length s, optional
-        Nodes; default, and required to equal, the row sums of `A`.
+        Nodes, which must equal the row sums of `A` (default).
     e_low : sequence, length s + 1, optional
-        Weights of a second, cruder error e3 beside ``e = b - b_hat`` (e5): the estimate is then
-        ``h e5 |e5| / hypot(e5, e3 / 10)``, as in DOP853, and `b_hat` two orders below `error_estimator_order`.
+        Weights of a second, less accurate error e3 in addition to ``e = b - b_hat`` (e5): the estimate is then
+        ``h e5 |e5| / hypot(e5, e3 / 10)``, as in DOP853, and `b_hat` is two orders below `error_estimator_order`.
     P : sequence of sequences, shape (s + 1, q), optional
         Dense output: y(t + theta h) = y + h sum_j theta^(j + 1) (K^T P)_j, the last row for f at the new point.
     reference : str
-        Where the coefficients come from, down to the equation or table.
+        Source of the coefficients, including the equation or table.
 
     Attributes
     ----------
     A, b, c : ndarray of float64
         (s, s), (s,), (s,).
     e, e_low : ndarray of float64, shape (s + 1,)
-        Weights of the error estimate, ``b - b_hat``, and of its second part; zero without one.
+        Weights of the error estimate, ``b - b_hat``, and of its second part; zero without an estimate.
     P : ndarray of float64, shape (s + 1, q), or None
+        Dense output.
     b_low : ndarray of float64, shape (s,)
-        What rounding `b` to double lost, for compensated summation, corrected so that the first quadrature moments are
-        exact for the rounded nodes.
+        Rounding errors of `b` in double precision, for compensated summation, corrected so that the first quadrature
+        moments are exact for the rounded nodes.
     n_stages : int
+        Number of stages.
     fsal : bool
-        Whether the estimate takes f at the new point: `b_hat` has s + 1 entries.
+        True if the estimate uses f at the new point, that is, `b_hat` has s + 1 entries.
 
     Raises
     ------
     ValueError
-        When the tableau is not explicit, shapes disagree, or an order condition fails.
+        If the tableau is not explicit, shapes disagree, or an order condition fails.
     """
 
     name: str
@@ -172,7 +175,7 @@ class Tableau(Ordered):
         if b_hat is None and error_estimator_order is not None:
             raise ValueError(f"{name}: error_estimator_order was given without b_hat.")
         if b_hat is not None:
-            # Of a pair of orders 5 and 3 the combined estimate is of order 2 * 5 - 3 = 7.
+            # The combined estimate of a pair of orders 5 and 3 has the order 2 * 5 - 3 = 7.
             fewer = 0 if e_low is None else 2
             weights_hat = self._check_embedded(name, exact_A, exact_b, b_hat, error_estimator_order, fewer)
         e = np.zeros(s + 1)
@@ -233,7 +236,7 @@ class Tableau(Ordered):
 
     @property
     def paired(self) -> bool:
-        """Whether the estimate has two parts."""
+        """True if the estimate has two parts."""
         return bool(np.any(self.e_low))
 
     def __repr__(self) -> str:
@@ -267,11 +270,11 @@ def _check_nodes(name: str, c: np.ndarray, row_sums: np.ndarray) -> None:
 
 
 def _low_parts(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
-    """What rounding `b` lost, and the smallest corrections that make sum b c^k = moments[k] for `c` rounded.
+    """Return the rounding errors of `b`, with the smallest corrections so that sum b c^k = moments[k] for rounded `c`.
 
-    Rounded weights and nodes miss the quadrature moments by about 1e-17, a systematic error that compensated long runs
-    would otherwise accumulate. Nodes that only rounding tells apart count as one: there are no more moments to be met
-    than nodes, and a correction that makes use of the difference of two such nodes would be large.
+    Rounded weights and nodes violate the quadrature moments by about 1e-17, a systematic error that long compensated
+    runs would otherwise accumulate. Nodes that differ only by rounding count as one: the number of moments is at most
+    the number of nodes, and a correction that uses the difference of two such nodes would be large.
     """
     high = [Fraction(float(x)) for x in b]
     lost = [float(Fraction(x) - y) for x, y in zip(b, high, strict=True)]
@@ -286,10 +289,11 @@ def _low_parts(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.
 
 
 def _least_corrections(nodes: Sequence[Fraction], missing: Sequence[Fraction]) -> list[Fraction]:
-    """The smallest x, in the Euclidean norm, with sum_i x_i c_i^k = missing[k], exactly.
+    """Return the smallest x, in the Euclidean norm, with sum_i x_i c_i^k = missing[k], exactly.
 
-    They are a polynomial in the nodes, x_i = sum_k a_k c_i^k, whose coefficients solve V V^T a = missing with the
-    Vandermonde matrix V: in whole numbers, with nodes in units of their last bit, by Bareiss's elimination.
+    It is a polynomial in the nodes, x_i = sum_k a_k c_i^k, whose coefficients solve V V^T a = missing with the
+    Vandermonde matrix V. The system is solved in integers, with nodes in units of their last bit, by Bareiss's
+    elimination.
     """
     unit = max((x.denominator for x in nodes), default=1)  # nodes are doubles, so that all denominators divide it
     places = [int(x * unit) for x in nodes]
@@ -308,7 +312,7 @@ def _least_corrections(nodes: Sequence[Fraction], missing: Sequence[Fraction]) -
 
 
 class _Published(Tableau):
-    """One of the package's own, which the tests check: at each import it would take 40 ms."""
+    """A tableau of this package, checked by the tests, because a check would take 40 ms per import."""
 
     @staticmethod
     def _check_order(name: str, label: str, A: np.ndarray, b: np.ndarray, order: int) -> None:
@@ -343,7 +347,7 @@ RK4 = _Published(
     order=4,
     b_hat=["1/6", "1/3", "1/3", 0, "1/6"],
     error_estimator_order=3,
-    reference=f"{_PAPER} (the classical method); estimate: f at the new point in place of the fourth stage",
+    reference=f"{_PAPER} (the classical method); estimate: f at the new point instead of the fourth stage",
 )
 RK5 = _Published(
     "RK5",
@@ -400,7 +404,7 @@ RK45 = _Published(
 
 
 def _dop853() -> Tableau:
-    """The coefficients that SciPy's public class carries, so that there is one copy of these 150 numbers."""
+    """Return the coefficients from SciPy's public class, so that these 150 numbers are not copied."""
     import scipy.integrate
 
     source = scipy.integrate.DOP853
