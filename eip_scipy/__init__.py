@@ -100,7 +100,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "solve_ivp": "run.solve_ivp",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
-# In a clone the integrations lie beside the package; an installed package has them inside.
+# In a clone the integrations are next to the package; an installed package contains them.
 if not _Path(__file__).with_name("integrations").exists():
     __path__.append(str(_Path(__file__).parents[1]))
 

@@ -1,4 +1,4 @@
-"""What all solver classes have in common, and what becomes one: a tableau, or a one-step method of your own."""
+"""Base class of the solvers, and functions that make one from a tableau or a user-defined one-step method."""
 
 from .core.one_step import OneStepMethod
 from .core.solvers import EIPSolver, eip_method

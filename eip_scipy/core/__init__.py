@@ -1,1 +1,1 @@
-"""Invariants, options, methods and results: what one step needs, whoever takes it."""
+"""Invariants, options, methods and results: everything that one step needs."""

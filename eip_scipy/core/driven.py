@@ -48,7 +48,7 @@ MOST_ORDER = 5  # of BDF
 
 
 class Jacobian(NamedTuple):
-    """What SciPy's implicit solvers take as `jac` and `jac_sparsity`."""
+    """The arguments `jac` and `jac_sparsity` of SciPy's implicit solvers."""
 
     jac: Any = None
     jac_sparsity: Any = None

@@ -26,7 +26,7 @@ inside = partial(njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class _NumPy(python_types.ModuleType):
-    """NumPy, but for some functions."""
+    """NumPy with some functions replaced."""
 
     def __init__(self, others: dict[str, Any]) -> None:
         super().__init__("numpy")
@@ -44,7 +44,7 @@ def for_duals(fun: Any, dual: Dual) -> Any:
 
 
 def _replaced(item: Any, others: dict[int, Any]) -> Any:
-    """What stands for a variable from outside a function in its copy; `others` knows what has been replaced."""
+    """Return the replacement of a global or closure variable in a copied function; `others` contains earlier ones."""
     if id(item) in others or not is_jitted(item):
         return others.get(id(item), item)
     source = item.py_func
@@ -66,7 +66,7 @@ def _names(code: python_types.CodeType) -> set[str]:
 
 
 def _of_floats(dtype: Any) -> bool:
-    """Whether an argument dtype, as Numba types it, asks for floats, or is missing."""
+    """Return True if a dtype argument, as typed by Numba, means floats or is missing."""
     if isinstance(dtype, types.NumberClass):
         return isinstance(dtype.dtype, types.Float)
     return not (isinstance(dtype, types.Function) and dtype.typing_key is not float)

@@ -1,6 +1,6 @@
 """Dual numbers for Numba: a value and its derivatives along several directions, carried through a function at once.
 
-A `Dual` computes as a float does and follows the chain rule beside it. Numba compiles the source that it compiles for
+A `Dual` computes as a float does and also applies the chain rule. Numba compiles the source that it compiles for
 floats for arrays of duals too, branches included: duals compare by their values. Loaded only where an invariant is
 jitted and has no gradient.
 
@@ -44,7 +44,7 @@ class Dual(types.Type):
         return Conversion.safe if isinstance(other, PLAIN) else None
 
     def unify(self, typingctx: Any, other: Any) -> Any:
-        """What is a dual in one branch, and a number in another, is a dual."""
+        """Return the type of a variable that is a dual in one branch and a number in another: a dual."""
         return self if isinstance(other, PLAIN) or other == self else None
 
 
@@ -192,12 +192,12 @@ def stack_array(typingctx, kind, size):
 
 
 def _is_dual(*kinds: Any) -> bool:
-    """Whether these are scalars, and one of them a dual."""
+    """Return True if all are scalars and one of them is a dual."""
     return any(isinstance(k, Dual) for k in kinds) and all(isinstance(k, Dual | PLAIN) for k in kinds)
 
 
 def _define(emit: Callable[..., Any], *functions: Any, compares: bool = False) -> None:
-    """What every function has much of, emitted as it stands: what is written in Python takes Numba longer to compile.
+    """Define frequent operations directly in LLVM, because Numba takes longer to compile those written in Python.
 
     ``emit(builder, *values)`` gives the value and the derivatives in each argument; of a comparison, the value alone.
     """
@@ -318,7 +318,7 @@ def _define_binary(function: Any, slope: Callable[..., Any], other: Callable[...
 
 
 def _define_flat(function: Any, arguments: int, *names: Any) -> None:
-    """What has no derivative, or 0 almost everywhere: the plain function of the values."""
+    """Define a function whose derivative is 0 almost everywhere or undefined: it is applied to the values."""
 
     def typed(x, y):
         return (lambda x, y: function(value_of(x), value_of(y))) if _is_dual(x, y) else None

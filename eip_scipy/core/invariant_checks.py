@@ -25,7 +25,7 @@ Derivative = Callable[[float, Array], Array]
 CHECK_STEPS = (6e-6, 6e-8, 6e-10)
 CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
 INVARIANCE_TOLERANCE = 1e-8
-# The same for the rate of a balance, whose error of 1e-3 is 1e-9 of the terms if the rate is 1e-6 of them; right ones
+# Bound for the rate of a balance, whose error of 1e-3 is 1e-9 of the terms if the rate is 1e-6 of them; right ones
 # differ by 1e-16, those of gradients by differences by 1e-12.
 RATE_TOLERANCE, RATE_TOLERANCE_OF_DIFFERENCES = 1e-11, 1e-9
 # Single precision leaves this share of the terms of a rate.
@@ -59,7 +59,7 @@ MISSING = "Add that constraint to the invariants, and start on it"
 
 
 class Complaint(NamedTuple):
-    """What a check found.
+    """Result of a check.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
         if not wrong.any():
             return
     wrong &= ~(_rounding(known, at, at.directions) > np.abs(difference - along))
-    # Where the slopes to both sides differ there is a kink, and no gradient of a function could be right.
+    # Different slopes on both sides mean a kink, where no gradient of a function can be correct.
     kink = np.abs(ends[0] + ends[1] - 2 * at.here) / step > np.abs(along) * 0.01 + noise
     wrong &= ~(np.array(known.computed) & kink)
     way = int(wrong.any(axis=1).argmax())
@@ -291,7 +291,7 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
     if found is None:
         return
     wrong = found.wrong
-    # Of small rates only: single precision does not explain large ones. Differences of values do not see small rates.
+    # Only for small rates: single precision does not explain large ones, and differences do not resolve small rates.
     small = wrong & (np.abs(found.rate) <= SINGLE_TOLERANCE * found.terms)
     if (small.any() or _large_and_single([at.f]).any()) and (what := _in_single_precision(known, at, rhs)):
         names = [name for name, hidden in zip(known.names, small | ~wrong, strict=True) if hidden]

@@ -262,7 +262,7 @@ def _apart(fun: Any, grad: Any, args: Sequence[Any]) -> tuple[Any, Any, Sequence
 
 
 def _lacks_gradient(item: Invariant) -> bool:
-    """Whether an invariant is jitted, as a compiled run takes it, but for its gradient."""
+    """Return True if an invariant is jitted, so that a compiled run can use it, except for its gradient."""
     return item.gradient is None and not item.args and is_jitted(item.function) and not jit_is_off()
 
 
@@ -299,7 +299,7 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
 
 
 def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
-    """What a gradient returned at t, of the expected shape, and real where the state is."""
+    """Return the value of a gradient at t, checked for the expected shape, and real if the state is."""
     what = f"gradient of invariant {label!r}"
     refuse_units(**{f"{what} returned": value})
     try:

@@ -31,7 +31,7 @@ class NotCompilableError(TypeError):
 
 
 def is_jitted(fun: Any) -> bool:
-    """Whether a function is Numba's."""
+    """Return True if a function is a Numba function."""
     if "numba" not in sys.modules:
         return False
     from numba import extending
@@ -40,7 +40,7 @@ def is_jitted(fun: Any) -> bool:
 
 
 def jit_is_off() -> bool:
-    """Whether Numba is told to leave functions as they are (NUMBA_DISABLE_JIT)."""
+    """Return True if Numba's compilation is disabled (NUMBA_DISABLE_JIT)."""
     if "numba" not in sys.modules:
         return False
     from numba import config
@@ -65,7 +65,7 @@ def jitted(fun: Any) -> Any:
 
 
 def is_compiled(fun: Any) -> bool:
-    """Whether Numba's functions may call it: one of them, or one of the library's."""
+    """Return True if Numba functions can call it: a Numba function, or one of the library."""
     return is_jitted(fun) or isinstance(fun, LibraryFunction)
 
 

@@ -29,7 +29,7 @@ __all__ = [
 def rhs_by_duals(
     fun: Any, form: str, n: int, parameters: tuple[int, ...], columns: int, has_params: bool, scalars: str
 ) -> Any:
-    """The right-hand side in place of a state with columns, by dual numbers: exact but for rounding.
+    """Return the in-place right-hand side of a state with columns, by dual numbers: exact up to rounding.
 
     Raises
     ------
@@ -193,7 +193,8 @@ def wide_gradient(
 ) -> Any:
     """The gradient in place over a state with columns, on which the invariant does not depend.
 
-    `shape`: that of the invariant's value. `takes_f`, `in_place`: how `grad` is called; the result takes f likewise.
+    `shape` is that of the invariant's value. `takes_f` and `in_place` say how `grad` is called; the result takes f in the
+    same way.
     """
     (n, first, second), state = layout, _state_of(layout)
     places, sizes = np.array(parameters, np.int64), (*shape, n)

@@ -27,7 +27,7 @@ SAYING = ("No implementation", "Cannot", "Unknown")
 
 @lru_cache(maxsize=256)
 def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
-    """The gradient ``grad(t, y, out[, params])`` of a jitted invariant, by dual numbers: exact but for rounding.
+    """Return the gradient ``grad(t, y, out[, params])`` of a jitted invariant, by dual numbers: exact up to rounding.
 
     With `scalars`, the types of some numbers, it is ``grad(t, y, out, *numbers)``.
 
@@ -53,7 +53,7 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
 
 @lru_cache(maxsize=256)
 def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
-    """The rate ``rate(t, y, f[, params])`` of a jitted balance: its derivative along (1, f), exact but for rounding.
+    """Return the rate ``rate(t, y, f[, params])`` of a jitted balance: its derivative along (1, f), up to rounding.
 
     With `scalars`, the types of some numbers, it is ``rate(t, y, f, *numbers)``.
 

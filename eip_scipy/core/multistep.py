@@ -23,7 +23,7 @@ ROWS = 4  # of the history's window, in orders of the method
 ALIGNMENT = 64
 # Bodies whose frequency is above this share of what is stable without the Jacobian are corrected by it.
 CORRECTED_SHARE = 0.8
-# The largest differences of a history that is smooth, beside the accelerations; for low orders, in units of those that
+# The largest differences of a smooth history, relative to the accelerations; for low orders, in units of those that
 # the largest stable step has.
 SMOOTH, SMOOTH_LOW = 1e-2, 30.0
 ROUNDS = 12  # of the power iterations
@@ -137,7 +137,7 @@ def _largest_damping(system: SecondOrder) -> float:
 
 
 def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
-    """What the accelerations change by along a change d of a part of the state."""
+    """Return the change of the accelerations along a change d of a part of the state."""
     t, y, f, _ = system.start
     half, length = y.size // 2, DIFFERENCE * (float(np.linalg.norm(y[part])) or 1.0)
     moved = y.copy()

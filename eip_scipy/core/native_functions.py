@@ -24,7 +24,7 @@ NO_DUALS = "only jitted functions of real states get one compiled"
 
 
 class Kind(NamedTuple):
-    """What a function takes and gives.
+    """Signature of a function.
 
     `shape` of its value, () for a number; `size` of the state it gets; `p` of its params, -1 where it takes none; the
     type of the state's numbers; whether the value is real, the function takes f, fills an argument `out`, or is a
@@ -50,7 +50,7 @@ class Native(NamedTuple):
 
     @property
     def entry(self) -> Any:
-        """What the engine takes: a function of the library's itself, the address of any other."""
+        """The form for the engine: a function of the library itself, the address of any other function."""
         if self.function is None or isinstance(self.function, LibraryFunction):
             return self.function
         return self.function.address
@@ -59,7 +59,7 @@ class Native(NamedTuple):
 def native_functions(
     fun: Callable[..., Any], form: str, params: Packed | None, invariants: InvariantSet, y0: np.ndarray
 ) -> NativeFunctions:
-    """The addresses of a run's functions, but for its events.
+    """Return the addresses of the functions of a run, without its events.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def function_alone(
 def with_events(
     functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
-    """The same with the addresses of the events.
+    """Return the functions with the addresses of the events.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def with_events(
 def with_jacobian(
     functions: NativeFunctions, jacobian: Callable[..., Any], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
-    """The same with the address of the accelerations' Jacobian times a vector, ``jacobian(t, q, dq, out[, params])``.
+    """Return the functions with the address of the Jacobian times a vector, ``jacobian(t, q, dq, out[, params])``.
 
     Raises
     ------

@@ -31,7 +31,7 @@ def register() -> None:
 
 @cache
 def _jitted(function: Any) -> Any:
-    """It as a Numba function, on copies of its arguments, which need be neither contiguous nor checked before."""
+    """Return a library function as a Numba function that copies its arguments, which may be of any layout."""
     if function.own or function.numbers < 0:
         raise TypeError(f"{function.__name__} cannot be called by jitted functions.")
     value = njit(_value_of(function))

@@ -19,7 +19,7 @@ from .native_functions import Kind
 __all__ = ["Compiled", "compiled"]
 
 
-# Of the names of C functions.
+# Counter for the names of C functions.
 _serial = count()
 # Called from compiled code alone. Inlined, for that an array is nobody's and needs no counting of references shows only
 # there.
@@ -44,11 +44,11 @@ class Compiled(NamedTuple):
 
     @property
     def address(self) -> int:
-        """Of the C function."""
+        """Address of the C function."""
         return self.pointer.address
 
     def failure(self, t: float, y: bytes, f: bytes, params: np.ndarray) -> RuntimeError:
-        """What it raises is raised here, in a second call; returned is the error that it raises nothing."""
+        """Raise the exception of the function in a second call; return an error if it raises nothing then."""
         kind = self.kind
         state = np.frombuffer(y, kind.dtype)[: kind.size].copy()
         slope = np.frombuffer(f or bytes(len(y)), kind.dtype).copy()
@@ -99,7 +99,7 @@ def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
 
 
 def _c_function(compiled: Any, kind: Kind) -> Pointer:
-    """What has been compiled for (t, y, f, out, params), as a C function that returns 0, or -1 after an exception.
+    """Wrap a function compiled for (t, y, f, out, params) as a C function that returns 0, or -1 after an exception.
 
     Written in LLVM's own language: Numba's `cfunc` would take twice as long to compile, and each call of it be two.
     """

@@ -18,7 +18,7 @@ NUMBERS = (float, np.float64, int, complex, np.complex128)
 
 @runtime_checkable
 class OneStepMethod(Protocol):
-    """A one-step method: what `eip_method` takes besides a tableau.
+    """A one-step method, which `eip_method` accepts instead of a tableau.
 
     Any object with these members will do; nothing is inherited.
 
@@ -77,7 +77,7 @@ class OneStep(Ordered):
     TypeError
         When the object is no `OneStepMethod`.
     ValueError
-        When an order is no integer >= 1.
+        If an order is not an integer >= 1.
 
     Notes
     -----
@@ -136,18 +136,18 @@ def _integer(name: str, what: str, value: Any, least: int = 1) -> int:
 
 
 def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
-    """What a user's function returned at t as an array (n,), or an error that says what `came`.
+    """Return the value of a user's function at t as an array (n,), or raise an error that describes `came`.
 
     Raises
     ------
     TypeError
-        For None, values that are no numbers, and numbers with a unit.
+        If the value is None, is not numeric, or has a unit.
     ValueError
         For a wrong shape, or complex values where the state is real.
     """
     if value is None:
         raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
-    # Of a list the first item tells: a look at all of them, at every stage, would take longer than the function.
+    # Only the first item of a list is checked: checking all of them at every stage would take longer than the function.
     if not (type(value) in (list, tuple) and value and type(value[0]) in NUMBERS):
         refuse_units(**{came.removesuffix(":"): value})
     try:

@@ -22,7 +22,7 @@ SCALARS = {"values", "g", "band", "before", "defect", "max_defect", "max_correct
 
 
 class SolverOfParts(EIPSolver):
-    """What stands before a method: every process calls it with its part of the state.
+    """Wrapper of a method that every process calls with its part of the state.
 
     The right-hand side fills a part of the derivative; an invariant returns the same number everywhere and the
     gradient's part. For fixed steps in the Euclidean metric.
@@ -126,7 +126,7 @@ class _Coordinates:
         if begins:
             _orthonormal_rows(w.G.view(float), self._basis)
         part = np.empty((size, size + 1))
-        # By loops of NumPy's own: threads of BLAS on each of the ranks would compete.
+        # NumPy loops instead of BLAS, whose threads on each of the ranks would compete.
         np.einsum("ij,kj->ik", w.G.view(float), self._basis, out=part[:, :-1])
         np.einsum("ij,j->i", np.abs(w.G.view(float)), np.abs(w.y_hat.view(float)), out=part[:, -1])
         parts = self._gathered(part)

@@ -21,7 +21,7 @@ TYPES = {  # as LowLevelCallable writes them, without spaces and const
     VALUE: "int(double,double*,double*,double*)",
     GRADIENT: "int(double,double*,double*,double*,double*)",
 }
-# Of the C functions as Python calls them; the GIL is released, as in a run whose functions are all native.
+# Prototype with which Python calls C functions; the GIL is released, as in a run with native functions only.
 PROTOTYPES = {
     kind: ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[ctypes.c_void_p] * types.count("*"))
     for kind, types in TYPES.items()
@@ -91,7 +91,7 @@ class PointerFunction:
         self.takes_f, self.shape = takes_f, shape
         both = isinstance(pointer, CFunctions)
         self.address = _checked_address(pointer.one if both else pointer, name, kind)
-        # Of the function of eight members; 0 where there is none.
+        # Address of the function of eight members; 0 if there is none.
         self.octet_address = _checked_address(pointer.eight, f"{name} for eight members", kind) if both else 0
         self._function = PROTOTYPES[kind](self.address)
 
@@ -113,7 +113,7 @@ class PointerFunction:
         numbers = reals(rest[0]) if len(rest) == 1 else _as_params(tuple(rest))
         if numbers is None:
             raise TypeError(
-                f"{self.name} is a C function by pointer: besides t and y it takes numbers or one array of floats, as "
+                f"{self.name} is a C function pointer: its arguments after t and y are numbers or one array of floats, "
                 f"its params; it got {', '.join(map(shown, rest))}."
             )
         given += [out, np.ascontiguousarray(numbers)]
@@ -130,14 +130,14 @@ class PointerFunction:
         raise self.unpicklable()
 
     def unpicklable(self) -> TypeError:
-        """What an attempt to pickle it is."""
+        """Return the error for an attempt to pickle it."""
         return TypeError(
             f"{self.name} is a C function by pointer, which cannot be pickled: its address means nothing in another "
             "process. Ensembles on Dask and on processes, and all else that pickles, need functions in Python or Numba."
         )
 
     def failure(self, t: float, status: int) -> RuntimeError:
-        """What a negative status is to a run."""
+        """Return the error for a negative status."""
         return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; below 0 it ends the run.")
 
 
@@ -146,7 +146,7 @@ def _as_params(rest: tuple[Any, ...]) -> np.ndarray | None:
 
 
 def is_pointer(fun: Any) -> bool:
-    """Whether a function is a C function by pointer.
+    """Return True if a function is a C function pointer.
 
     SciPy and cffi are not loaded to find out: where they are not loaded, none is theirs.
     """
@@ -165,7 +165,7 @@ def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
 
 
 def address_hint(fun: Any) -> str:
-    """What is to be said besides of an integer where a function belongs."""
+    """Return an additional hint for an integer given instead of a function."""
     if isinstance(fun, bool) or not isinstance(fun, (int, np.integer)):
         return ""
     return "; an address says nothing of its signature: give a ctypes or cffi pointer, or a scipy.LowLevelCallable"

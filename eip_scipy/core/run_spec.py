@@ -93,7 +93,7 @@ class RunSpec:
         tau : float, optional
             Length of the first step, by default that of `stepping`.
         check_start : bool
-            False: the invariants have been checked, and their cost told, at the start of another run like this.
+            False: the invariants have been checked, and their cost reported, at the start of a similar run.
         """
         t0 = self.stepping.span.t0
         method, f0 = self.examined(y0, f0)
@@ -178,7 +178,9 @@ class RunSpec:
             run.start = Start(t0, moved, self.rhs(t0, moved), tau)
         violation = run.invariants.start_violation(*run.start[:3])
         if violation:
-            raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
+            raise ValueError(
+                f"{violation}; correct y0 or the target, or pass project_initial=True to project y0 first."
+            )
         if run.options.watched and invariants_too and np.isfinite(run.start.f).all():
             run.trust.doubts += run.invariants.check(*run.start)
 

@@ -26,7 +26,7 @@ __all__ = ["Counted", "Run", "Start"]
 
 
 class Start(NamedTuple):
-    """Where a run starts: time, state, derivative there, and the scale of time, which is the step or the first one."""
+    """Start of a run: time, state, derivative, and the scale of time, which is the step or the first step."""
 
     t: float
     y: np.ndarray

@@ -603,12 +603,12 @@ def _jacobian(method: Any, options: dict[str, Any]) -> Any:
 
 
 def _never(value: Any, t: float) -> np.ndarray:
-    """Of a function in place, whose value nobody looks at."""
+    """Stand-in for the conversion of the value of an in-place function."""
     raise AssertionError
 
 
 def _without_effect(names: Iterable[str]) -> str:
-    """What SciPy's own solvers warn of, in their words: filters made for theirs hold here too."""
+    """Return SciPy's warning about unknown options in its own words, so that existing warning filters apply."""
     listed = ", ".join(f"`{name}`" for name in names)
     hints = ((name, nearest(name, OPTIONS).removeprefix("; ")) for name in names)
     meant = "".join(f" `{name}`: {hint}" for name, hint in hints if hint)
@@ -774,7 +774,7 @@ class EIPGJ14(EIPSolver):
     """EIP method on the multistep method of Gauss and Jackson of order 14, its accelerations corrected by the Jacobian.
 
     As `EIPGJ12`, with longer steps: after each evaluation the accelerations are moved by the Jacobian times what the
-    corrector would change of the positions, for the bodies that need it. `nbody` and the scenes made of it bring the
+    corrector would change of the positions, for the bodies that need it. `nbody` and the problems made of it have the
     Jacobian of the central body; for others give ``jacobian=fun(t, q, dq, out[, params])``, to `integrate` or
     solve_ivp. Without one the step is stable only where it is very short.
     """

@@ -18,7 +18,7 @@ def as_derivative(value: Any, n: int, dtype: np.dtype, t: float, name: str = "fu
 
 
 def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
-    """y0 as a new float64 or complex128 array (n,), with SciPy's messages for what is no state."""
+    """Return y0 as a new float64 or complex128 array (n,), with SciPy's error messages."""
     y = states(name, y0)
     if y.ndim != 1:
         raise ValueError(f"`{name}` must be 1-dimensional.")

@@ -1,4 +1,4 @@
-"""What the families of methods do differently in a run; nothing else asks which family a method belongs to.
+"""Differences between the families of methods in a run; no other module depends on the family of a method.
 
 Each function is written once for a family: Runge-Kutta tableaux, Nyström tableaux, Gauss-Jackson methods, one-step
 methods of a user, and solvers of SciPy. Facts that need no more than a flag are attributes of

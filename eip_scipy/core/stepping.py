@@ -137,8 +137,8 @@ class StepOptions:
         Raises
         ------
         ValueError
-            For options with wrong values, for `h` beside those of adaptive steps, and without `h` where the method
-            `name` has no error estimate.
+            If an option has a wrong value, `h` is combined with options of adaptive steps, or `h` is missing and the
+            method `name` has no error estimate.
         """
         h = self.h
         if h is None and method.fixed_steps_only:
@@ -259,7 +259,7 @@ def _slack(h: float, t0: float, t_bound: float) -> float:
 def fixed_steps(h: float, t0: float, t_bound: float) -> int:
     """Number of steps of length h from t0 to t_bound, UNBOUNDED for an endless interval.
 
-    T/h rounded where it is a whole number but for round-off, else the next larger one; the last step is then shorter.
+    T/h is rounded if it is an integer up to round-off, else the next larger integer; the last step is then shorter.
     An interval that is not empty takes one step at least, however much longer h is.
     """
     ratio = abs(t_bound - t0) / h

@@ -92,7 +92,7 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
         if is_time(item):
             raise TypeError(f"{name}: {shown(item)} is a moment; expected {_expected(powers, known)}.")
         if powers != (0, 1) and not has_unit(item) and np.any(item):
-            raise TypeError(f"{name}: {shown(item)} has no unit, and others beside it have one; give it one too.")
+            raise TypeError(f"{name}: {shown(item)} has no unit, but others have one; give it one too.")
         return _converted(name, item, powers, known)
 
     return _each(name, value, convert)
@@ -124,7 +124,7 @@ def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch 
 
 
 def is_time(value: Any) -> bool:
-    """Whether a value is a time of astropy, a moment and not a duration."""
+    """Return True if a value is a time of astropy, not a duration."""
     return hasattr(value, "jd1") and hasattr(value, "jd2") and hasattr(value, "mjd")
 
 
@@ -139,7 +139,7 @@ def as_epoch(name: str, value: Any) -> Epoch:
     Raises
     ------
     TypeError
-        For a number with a unit, a date of Python's, or what is no number.
+        If it has a unit, is a date of Python, or is not a number.
     ValueError
         For more than one moment, and for what is not finite.
     """

@@ -227,7 +227,7 @@ def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tu
         return wide
 
     def members(blocks: Any) -> Any:
-        # What is done with blocks of one size goes over all of a state.
+        # Blocks of one size cover the whole state.
         return blocks._replace(member=places[blocks.member.astype(np.intp)].astype(INDEX), size=0)
 
     frame = options.frame
@@ -239,7 +239,7 @@ def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tu
         rtol=spread(options.rtol), atol=spread(options.atol), groups=members(options.groups),
         kinds=members(options.kinds), columns=kept, joint=None,
         metric=GIVEN if options.metric == EUCLIDEAN and columns.parameters else options.metric,
-        # Likewise what is done with a frame of bodies.
+        # A frame of bodies is extended in the same way.
         frame=frame._replace(bodies=np.zeros((2, 0, 0)), place=places[frame.place.astype(np.intp)].astype(INDEX)),
     )  # fmt: skip
     return options, spread(1.0 if sigma is None else sigma)

@@ -1,4 +1,4 @@
-"""What a charged particle's states say: guiding centre, gyroradius, gyrophase, magnetic moment, banana tips."""
+"""Analysis of the states of a charged particle: guiding centre, gyroradius, gyrophase, magnetic moment, banana tips."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FEWEST_PER_GYRATION = 4
 
 
 class Tips(NamedTuple):
-    """Where a trapped particle turns back.
+    """Points at which a trapped particle turns back.
 
     Attributes
     ----------

@@ -117,7 +117,7 @@ def test_what_is_not_allowed_is_refused(text):
         ("x^2", r"'x\^2' has \^; powers are written \*\*"),
         ("lambda*x", "lambda is a word of Python's; call it otherwise"),
         ("x.real", "'x.real' is not allowed. Allowed are numbers, names, pi"),
-        ("gamma(x)", "'gamma' is no function known here"),
+        ("gamma(x)", "'gamma' is not a known function"),
         ("sin(x, y)", "not as sin is called, with 1 argument"),
         ("9**9**9", r"'9\*\*9' is an exponent beyond 1000"),
     ],

@@ -1,1 +1,1 @@
-"""Point masses: their equations and forces, the solar system, hard scenes."""
+"""Point masses: their equations and forces, the solar system, hard problems."""

@@ -38,7 +38,7 @@ class Bodies(NamedTuple):
 
     @property
     def forces(self) -> tuple[str, ...]:
-        """What they feel besides Newton's gravitation."""
+        """Forces in addition to Newton's gravitation."""
         further = np.asarray(self.problem.params, dtype=float)[self.gm.size :]
         if not further.size:
             return ()
@@ -80,7 +80,7 @@ def body_names(names: Sequence[str], n: int) -> tuple[str, ...]:
     Raises
     ------
     TypeError, ValueError
-        When they are no strings, not n, or two are the same.
+        If they are not strings, their number is not n, or two are equal.
     """
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise TypeError(f"bodies must be a sequence of names, got {shown(names)}.")
@@ -133,7 +133,7 @@ def _gravitational(gm: Any, known: tuple[Unit, Unit]) -> Any:
     """G m of values that are G m or masses."""
     if isinstance(gm, tuple | list) or type(gm) is np.ndarray:
         return np.array([_gravitational(value, known) for value in gm])
-    if not _is_mass(gm):  # a plain 0 beside others is a test particle
+    if not _is_mass(gm):  # a plain 0 among others is a test particle
         return in_unit("gm", gm, (3, -2), known)
     length, time = known
     return gm.to_value("kg") * (G_SI * time.si**2 / length.si**3)

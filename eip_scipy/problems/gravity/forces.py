@@ -99,7 +99,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
     ValueError
         For an unknown name, or two kinds of relativity at once.
     TypeError
-        For what is no name and no sequence.
+        If it is neither a name nor a sequence.
     """
     if not isinstance(forces, Iterable):
         raise TypeError(f"forces must be a name or a sequence of names, got {forces!r}; () is Newton alone.")
@@ -193,7 +193,7 @@ def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> t
 
 
 def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
-    """Whether v^2/c^2 times the relative size of what is added to Newton is lost in round-off."""
+    """Return True if v^2/c^2 times the relative size of the additional force is lost in round-off."""
     n = y0.size // 6
     newton = np.empty_like(y0)
     library["gravity.rhs"](0.0, y0, newton, params[:n])

@@ -57,7 +57,7 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf)
         to_centre = distance[:, centre].copy()
         distance[here, bodies] = to_centre[bodies == centre] = np.inf
         mass = gm[bodies]
-        with np.errstate(divide="ignore"):  # two bodies at one place are told where the accelerations are
+        with np.errstate(divide="ignore"):  # two bodies at the same place are reported with the accelerations
             nearer = (gm + mass[:, None]) / distance**3 > ((gm[centre] + mass) / to_centre**3)[:, None]
         others = max(others, float(pairs[nearer].max(initial=0.0)))
     return about, others

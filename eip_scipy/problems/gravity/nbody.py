@@ -61,7 +61,7 @@ def nbody(
     h : float, optional
         A number or a duration.
     forces : str or sequence of str, optional
-        What is added to Newton's gravitation, all of it from the first body (the Sun) but for "eih":
+        Forces in addition to Newton's gravitation, all from the first body (the Sun) except "eih":
 
         "1pn"
             First post-Newtonian terms of the Sun's field in harmonic coordinates, in positions and velocities relative

@@ -52,7 +52,7 @@ class OrbitalElements:
     theta : ndarray
         True longitude, Omega + omega + f; Omega - omega - f of a retrograde orbit.
     l : ndarray
-        Mean longitude, likewise with M.
+        Mean longitude, defined with M in the same way.
     n : ndarray
         Mean motion; negative for a hyperbola, as in REBOUND.
     P : ndarray
@@ -252,7 +252,7 @@ def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.nda
     """The angle in the plane of the orbit from the ascending node to q; 0 where there is no node or no q."""
     hx, hy, hz = momentum
     along = hx * q[1] - hy * q[0] + 0.0
-    # Of h x node, which is (-hx hz, -hy hz, hx^2 + hy^2), times q, over h.
+    # Product of h x node, (-hx hz, -hy hz, hx^2 + hy^2), with q, divided by h.
     with np.errstate(divide="ignore", invalid="ignore"):
         across = np.where(h > 0, (level**2 * q[2] - hz * (hx * q[0] + hy * q[1])) / h, 0.0)
     return np.arctan2(across, along)

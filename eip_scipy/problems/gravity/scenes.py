@@ -1,4 +1,4 @@
-"""Hard scenes of celestial mechanics: close encounters, chaos, choreography; each with a reference state at its end.
+"""Hard problems of celestial mechanics: close encounters, chaos, choreography; each has a reference state at its end.
 
 The starts are here; the reference states are data (``data/scene_references.json``), made in 160-bit arithmetic by
 ``eip-scipy study scene-reference``.

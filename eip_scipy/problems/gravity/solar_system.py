@@ -19,7 +19,7 @@ __all__ = ["solar_system"]
 UNITS = ("AU, yr", "SI")
 
 C_KM_S = 299792.458
-# Of DE440: comments of the kernel. The Sun's pole: IAU Working Group on Cartographic Coordinates (2015), ICRF.
+# DE440: comments of the kernel. The Sun's pole: IAU Working Group on Cartographic Coordinates (2015), ICRF.
 J2_SUN, SUN_RADIUS_KM, EARTH_OVER_MOON = 2.1961391516529825e-07, 696000.0, 81.300568221497215
 POLE_RA_DEG, POLE_DEC_DEG = 286.13, 63.87
 MOON_ORBIT_KM = 384399.0
@@ -103,7 +103,7 @@ def _reference(references: dict[float, np.ndarray], length: float, time: float, 
 
 
 def _starts_as_references(data: SolarSystemData) -> bool:
-    """Whether these are the masses and states that the stored states start from; a name tells nothing of the epoch."""
+    """Return True if these are the masses and states of the stored states; a name does not determine the epoch."""
     start = load("de440")
     return np.array_equal(data.gm, start.gm) and np.array_equal(data.y0, start.y0)
 

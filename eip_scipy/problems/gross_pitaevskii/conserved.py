@@ -1,4 +1,4 @@
-"""Mass and energy of the Gross-Pitaevskii equation as a step asks for them, f = -i H psi at hand: no transforms."""
+"""Mass and energy of the Gross-Pitaevskii equation in a step, where f = -i H psi is known: no transforms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ JOINT = ("mass", "energy")
 
 
 class _Known:
-    """A state where f is known: its energy, and that of states 1e-12 or so beside it, by the expansion there."""
+    """A state with known f: its energy, and that of states at a distance of about 1e-12, by an expansion."""
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
         self._gpe, self._norm = gpe, gpe.largest_frequency()
@@ -46,8 +46,8 @@ class _Known:
 class Energy:
     """The energy as an invariant: value, and gradient 2 w i f.
 
-    A step asks for the gradient at its raw result, for the energy there, and for that of the projected state beside it.
-    Neither takes a transform.
+    A step needs the gradient at its raw result, the energy there, and that of the projected state close to it. Neither
+    needs a transform.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ ALIKE = 1e-9  # radii and values of a potential that count as equal
 
 
 def at_rest(problem: FieldProblem) -> FieldProblem:
-    """The same motion seen from the frame at rest, in which the equation has no rotation: fewer transforms.
+    """Return the problem in the frame at rest, in which the equation has no rotation and needs fewer transforms.
 
     Where the potential is round about the z axis, ``rotated(gpe, y, gpe.Omega * t)`` is the solution in the rotating
     frame if y is that at rest. The invariants are the mass and the energy at rest; the energy in the rotating frame is
@@ -90,7 +90,7 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
 
 
 def check_radial(gpe: GrossPitaevskii) -> None:
-    """Whether the potential has one value at all points of the grid that are equally far from the z axis.
+    """Return True if the potential is equal at all grid points with the same distance from the z axis.
 
     Raises
     ------

@@ -15,7 +15,7 @@ __all__ = ["Grid", "Multiplier", "SpectralSum"]
 
 MOST_AXES = 3
 STRIP = 64  # columns of a field of two dimensions that are transformed together along x
-SLAB = 2**19  # bytes of a field that stay in a processor's cache, with others beside them
+SLAB = 2**19  # bytes of a field that stay in a processor's cache together with others
 
 
 class Grid:

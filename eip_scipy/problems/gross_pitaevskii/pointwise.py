@@ -2,7 +2,7 @@
 
 Fields are contiguous complex arrays with any number of axes, or float views of them (Re, Im, Re, Im ...); what is
 written is the argument `out`, else the first one. Sums are those of blocks of a few hundred points: the same bits on
-every machine, and the error of a sum over so many numbers, not of one over all. Other threads run meanwhile where a
+every machine, and the error of a sum over this number of terms, not of one over all. Other threads run meanwhile if a
 field is large.
 """
 

@@ -1,4 +1,4 @@
-"""Scenes of the Gross-Pitaevskii equation: closed forms of the NLS equation, and the paper's experiment IV."""
+"""Problems for the Gross-Pitaevskii equation: closed forms of the NLS equation, and the paper's experiment IV."""
 
 from __future__ import annotations
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are used: scipy.signal, with statistics behind it, would take .9 s here
+import scipy  # its parts load when they are used: scipy.signal, with statistics behind it, would take 0.9 s here
 
 from .equation import GrossPitaevskii
 from .vortices import core_size
 
 __all__ = ["Surface", "density_surface"]
 
-DEEP = 2.0  # where the density with the cores filled in is so many times that of the surface, it is inside
+DEEP = 2.0  # a point is inside if the density with filled cores exceeds that of the surface by this factor
 SMOOTH = 2.0  # points, for an edge without teeth
 
 

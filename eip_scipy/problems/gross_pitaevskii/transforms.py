@@ -23,7 +23,7 @@ class Transforms:
     """
 
     name = ""
-    # Whether transforms along x are faster of some columns at a time, copied together, than of a whole field.
+    # Return True if transforms along x are faster for some copied columns at a time than for a whole field.
     gains_by_strips = False
 
     def __init__(self, threads: int) -> None:

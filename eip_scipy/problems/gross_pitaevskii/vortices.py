@@ -110,7 +110,7 @@ def _least_of_corners(a: np.ndarray) -> np.ndarray:
 
 
 def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: float) -> tuple[float, float]:
-    """Where the plane through the four corners' values vanishes, seen in the rotation about the plaquette's middle."""
+    """Return the zero of the plane through the values at the four corners, in the frame of the plaquette's centre."""
     u = np.array([[-0.5], [0.5]])
     middle = x + 0.5 * dx, y + 0.5 * dy
     c = corners * np.exp(-1j * Omega * (middle[0] * dy * u.T - middle[1] * dx * u))

@@ -73,7 +73,7 @@ def find_invariants(
     Notes
     -----
     Invariants that hold on a manifold only (of unit quaternions, say) are none at random points, and not found. A
-    quantity whose rate is below 1e-12 of its terms cannot be told from an invariant.
+    quantity whose rate is below 1e-12 of its terms cannot be distinguished from an invariant.
 
     Examples
     --------

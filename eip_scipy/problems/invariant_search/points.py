@@ -31,7 +31,7 @@ class Sample(NamedTuple):
 
 
 class Surroundings:
-    """Where invariants are looked for.
+    """Region and points for the search of invariants.
 
     `scale` are the sizes of the components, `tau` a time in which the state moves by its own size, `trajectory` states
     that follow y0.
@@ -56,7 +56,7 @@ class Surroundings:
         return found
 
     def term_gradients(self, y: Array) -> Array:
-        """Of each term, a row; NaN where it cannot be computed."""
+        """Values with a row for each term; NaN if it cannot be computed."""
         try:
             return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
         except (ArithmeticError, ValueError) as error:
@@ -95,7 +95,7 @@ class Surroundings:
             points, slopes, gradients = [], [], []
             for k in range(4 * wanted):
                 y = self.y0 + spread * self.scale * self.rng.standard_normal(self.y0.size)
-                # What depends on time is to be kept at all times.
+                # A quantity that depends on time must be conserved at all times.
                 t = self.t + self.tau * self.rng.random() * (k % 2)
                 f, g = self._slope(t, y), self.term_gradients(y)
                 if np.isfinite(f).all() and np.isfinite(g).all():
@@ -105,7 +105,7 @@ class Surroundings:
                 if len(points) == wanted:
                     return _rates(np.array(points), np.array(slopes), np.array(gradients), basis)
         raise ValueError(
-            f"find_invariants: fun or a term is finite at less than a quarter of the points around y0, even within "
+            f"find_invariants: fun or a term is finite at fewer than 25 % of the points around y0, even within "
             f"{SPREADS[-1]} of its components' sizes."
         ) from self.failure
 

@@ -20,7 +20,7 @@ LONGEST_NAME = 200
 
 
 class Term(NamedTuple):
-    """A function of the state that is no monomial."""
+    """A function of the state that is not a monomial."""
 
     fun: Callable[..., float]
     grad: Callable[..., np.ndarray]

@@ -18,7 +18,7 @@ __all__ = ["Search"]
 Array = np.ndarray
 
 FRESH = 60
-# Of a rate computed in floats, to the sum of its products, in units of rtol: 1e-12 where rtol is 1e-9.
+# Bound of a computed rate relative to the sum of its products, in units of rtol: 1e-12 for rtol = 1e-9.
 ROUND_OFF = 1e-3
 FAIR_PIVOT, INDEPENDENT = 1e-2, 1e-6
 NEGLIGIBLE = (1e-6, 1e-8, 1e-10, 0.0)  # coefficients that are left out, if the rest is still kept
@@ -39,7 +39,7 @@ class Search:
         variables = range(around.y0.size)
         self.basis = [item for d in range(1, degree + 1) for item in combinations_with_replacement(variables, d)]
         self.column = {item: k for k, item in enumerate(self.basis)}
-        # What turns a coefficient of z into one of y.
+        # Factor that converts a coefficient of z into one of y.
         of_monomials = [1 / np.prod(around.scale[list(item)]) for item in self.basis]
         self.units = np.array([*of_monomials, *(1.0 for _ in self.terms)])
         self.sample = around.sample(self._width + self._width // 4 + 30, self.basis)
@@ -83,7 +83,7 @@ class Search:
 
     def _null_space(self, columns: Any) -> Array:
         """Rows that span it: singular vectors from the smallest on, as long as they are kept at the fresh points."""
-        # What does not move at all is kept; beside columns of that size no rounding is small.
+        # A component that does not move is conserved; relative to such columns no rounding error is small.
         still, _, rows = self._singular(columns)
         found = [self._spread(np.ones(1), [k]) for k in still]
         for row in rows[::-1]:
@@ -119,7 +119,7 @@ class Search:
         return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
-        """Whether the rate is 0 at the fresh points: relative to the products in it, and to the terms of dI/dy . f."""
+        """Return True if the rate is 0 at new points, relative to its products and to the terms of dI/dy . f."""
         rate = np.abs(self.fresh.rates @ row)
         if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
             return False
@@ -198,7 +198,7 @@ class Search:
         return -len(set(self.basis[k])), -len(self.basis[k]), k
 
     def _nice(self, row: Array) -> Array | None:
-        """The same with few terms and simple coefficients, as far as that is kept; None if it is not kept at all."""
+        """Return a version with few terms and simple coefficients if it is conserved; None if nothing is conserved."""
         for bound in NEGLIGIBLE:
             null = self._null_space(np.flatnonzero(np.abs(row) > bound * np.max(np.abs(row))))
             if not len(null):
@@ -228,7 +228,7 @@ class Search:
         return raw * np.sign(raw[np.flatnonzero(raw)[0]]) / self.units
 
     def _is_new(self, row: Array) -> bool:
-        """Whether its gradient is independent of the others', at some point."""
+        """Return True if its gradient is independent of the gradients of the others at some point."""
         points = self.fresh.points[:10]
         own, sizes = self._gradients(row, points), self._gradients(row, points, np.abs)
         others = [self._gradients(item, points) for item in self.accepted]
@@ -253,7 +253,7 @@ class Search:
             parts += list((coefficients * np.array([self.around.term_values(y) for y in states])).T)
         values, sizes = sum(parts), sum(map(np.abs, parts))
         bound = DRIFT * np.fmax.accumulate(sizes)
-        # Where a logarithm's argument is nearly 0 the trajectory's own errors decide, and from there on.
+        # If the argument of a logarithm is nearly 0, errors of the trajectory dominate from there on.
         errors = RELATIVE * np.abs(points) + ABSOLUTE
         sure = ((np.abs(self._gradients(row, points)) * errors).sum(axis=1) <= bound) & np.isfinite(values)
         end = sure.size if sure.all() else int(np.argmin(sure))

@@ -31,7 +31,7 @@ class FieldFunctions(NamedTuple):
 
 
 class ParticleEquations(NamedTuple):
-    """What a problem needs; the invariants are None where the field does not give them."""
+    """Functions of a problem; the invariants are None if the field does not have them."""
 
     rhs: Callable[..., None]
     energy: Callable[..., float] | None
@@ -160,7 +160,7 @@ def canonical_momentum(t, y, params):
 
 
 def canonical_momentum_gradient(t, y, out, params):
-    """Of L."""
+    """Gradient of L."""
     out[0] = y[4]
     out[1] = -y[3]
     out[2] = 0.0
@@ -242,7 +242,7 @@ def kinetic_energy_gradient(t, y, out, params):
 
 @jitable
 def velocity_energy_gradient(E, t, y, out, m, q):
-    """Of H: (-q E, m v)."""
+    """Gradient of H: (-q E, m v)."""
     e = E(t, y[0], y[1], y[2])
     out[0] = -q * e[0]
     out[1] = -q * e[1]
@@ -261,7 +261,7 @@ def velocity_momentum(A, t, y, m, q):
 
 @jitable
 def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
-    """Of L."""
+    """Gradient of L."""
     a = A(t, y[0], y[1], y[2])
     d = jacobian(t, y[0], y[1], y[2])
     out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
@@ -272,7 +272,7 @@ def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
     out[5] = 0.0
 
 
-# What a field does not give, from what it gives.
+# Missing functions of a field, computed from those that it has.
 
 
 def at_any_time(fun: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""Charged particles in electromagnetic fields: the paper's Experiment III, and fields of one's own."""
+"""Charged particles in electromagnetic fields: the paper's Experiment III, and user-defined fields."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def charged_particle(
     Raises
     ------
     TypeError
-        When `field` is no ParticleField.
+        If `field` is not a ParticleField.
     ValueError
         For an unknown form, a canonical form without A, a start or functions of the field that are not finite, a mass
         that is not positive, a charge of 0, functions that contradict each other at the start, or a magnetic field with
@@ -207,7 +207,7 @@ def _variational(
 
 @lru_cache(maxsize=32)
 def _equations(field: ParticleField, form: str) -> ParticleEquations:
-    """The same functions for the same field: they are compiled once in a process."""
+    """Return the functions of a field, which are compiled once in a process."""
     return compose(field.functions, form)
 
 

@@ -1,4 +1,4 @@
-"""Fields for charged particles: those of the paper's Experiment III, and the record for fields of one's own."""
+"""Fields for charged particles: those of the paper's Experiment III, and the record for user-defined fields."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TINY = 1e-300
 # Divergence of B in its largest derivative: beyond this a field is none, from AGREEMENT on it may be one from a table.
 NO_FIELD = 0.1
 FINER = (1.0, 0.25, 0.0625)  # steps of the differences, in the usual one
-# Where else than at the start, in steps: a field may be right at one point by symmetry.
+# Further points, in steps from the start: a field may be correct at one point by symmetry.
 NEAR = ((0.0, 0.0, 0.0), (2.9, -1.7, 1.3), (-2.3, 2.1, 2.7), (1.1, 3.1, -2.2))
 
 
@@ -105,7 +105,7 @@ class ParticleField:
 
     @property
     def _step(self) -> float:
-        """Of the differences: a power of two, so that it is added and subtracted nearly without rounding."""
+        """Shift of the differences: a power of two, so that adding and subtracting it causes almost no rounding."""
         return float(2.0 ** round(log2(DIFFERENCE_STEP * self.length)))
 
     @cached_property
@@ -159,8 +159,8 @@ class ParticleField:
         Raises
         ------
         ValueError
-            When a function does not return so many finite real numbers; when the jacobian is not that of A, B not
-            curl A or E not -grad phi there; or when B has a divergence there or nearby.
+            If a function does not return the right number of finite real numbers, the jacobian is not that of A, B is
+            not curl A or E is not -grad phi there, or B has a divergence there or nearby.
 
         Warns
         -----

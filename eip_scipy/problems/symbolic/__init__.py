@@ -39,11 +39,12 @@ def hamiltonian(
     ----------
     H : str or sympy.Expr
         The Hamiltonian. Text is read as Python's arithmetic of numbers, names, pi and functions such as sqrt and cos,
-        by a reader that runs nothing of it; every name is yours, E, I, S, N, beta and gamma too, but for t, the time.
-        A name that you declare, as a coordinate, momentum or parameter, is yours before all else: then pi is no number.
+        by a parser that does not execute it. All names except t, the time, are free, including E, I, S, N, beta and
+        gamma. Declared names of coordinates, momenta or parameters have precedence over everything else: then pi is
+        not a number.
     q, p : str or sequence, optional
         Names of coordinates and momenta, ``"q1 q2"``, a list of them, or SymPy symbols. The state is (q, p). Default:
-        the names in `H` that are no parameters, x with px, q1 with p1, theta with p_theta and so on; the result's repr
+        the names in `H` that are not parameters, x with px, q1 with p1, theta with p_theta and so on; the result's repr
         shows the pairs.
     params : mapping, optional
         Values of the constants by their names. ``problem.params`` holds them in this order, and so do the rows that

@@ -1,4 +1,4 @@
-"""Whether a quantity is kept: its rate along the equations, {I, H} where they are Hamilton's."""
+"""Test whether a quantity is conserved: its rate along the equations, {I, H} for Hamilton's equations."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def read_inputs(
     Raises
     ------
     ValueError, TypeError
-        For what is no input.
+        If it is not an input.
     """
     if not isinstance(given, Mapping):
         raise TypeError(

@@ -1,4 +1,4 @@
-"""Whether a quantity is kept where constraints hold, and perhaps only there."""
+"""Test whether a quantity is conserved if constraints hold, and possibly only then."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 __all__ = ["paired"]
 
-# Whose momenta may stand alone in H: a coordinate that H does not depend on is cyclic, but it is there.
+# Coordinates whose momenta may occur alone in H: a coordinate that H does not depend on is cyclic.
 KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
 
 
@@ -36,7 +36,7 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
-    """What is wrong with names that are left without a partner, or with no names."""
+    """Return what is wrong with names without a partner, or if there are no names."""
     rule = "Names are paired as x with px, q1 with p1, theta with p_theta; others by hamiltonian(H, 'a b', 'pa pb')."
     if not left:
         return f"hamiltonian: H contains neither coordinates nor momenta. {rule}"
@@ -51,7 +51,7 @@ def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
 
 
 def _coordinate(momentum: str, free: set[str]) -> str | None:
-    """Of which coordinate a name is the momentum, if of one."""
+    """Return the coordinate of which a name is the momentum, or None."""
     if not momentum.startswith("p") or momentum == "p":
         return None
     rest = momentum[1:].removeprefix("_")

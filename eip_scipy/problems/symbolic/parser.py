@@ -56,7 +56,7 @@ def as_names(what: str, names: Any) -> tuple[str, ...]:
     Raises
     ------
     ValueError
-        For what is no name, and for one that stands twice.
+        If it is not a name, or occurs twice.
     """
     items = names.replace(",", " ").split() if isinstance(names, str) else _items(what, names)
     found = tuple(_name(what, item) for item in items)
@@ -105,14 +105,12 @@ def _name(what: str, item: Any) -> str:
     if not isinstance(item, str):
         raise TypeError(f"{what}: expected names, as 'x y' or ['x', 'y'], got {_cut(item)} among them.")
     if not item.isidentifier() or keyword.iskeyword(item):
-        raise ValueError(
-            f"{what}: {_cut(item)} is no name; one is made of letters, digits and _, and no word of Python's."
-        )
+        raise ValueError(f"{what}: {_cut(item)} is not a name; use letters, digits and _, and no keyword of Python.")
     return str(ast.parse(item, mode="eval").body.id)  # type: ignore[attr-defined]  # as Python spells it in expressions
 
 
 def _is_float(number: sympy.Expr) -> bool:
-    """Whether it is real, and a float holds it."""
+    """Return True if it is real and a float can represent it."""
     value = number if isinstance(number, sympy.Rational) else sympy.N(number)
     return bool(value == 0 or ((value.is_Float or value.is_Rational) and 1 / LARGEST < abs(value) < LARGEST))
 
@@ -160,7 +158,7 @@ class Reader:
                 warnings.simplefilter("ignore", (SyntaxWarning, DeprecationWarning))  # of odd numbers: "1or 2"
                 tree = ast.parse(self.text, mode="eval")
         except SyntaxError as error:
-            raise ValueError(f"{self.what}: {_cut(self.text)} is no expression: {self._mistake(error)}") from None
+            raise ValueError(f"{self.what}: {_cut(self.text)} is not an expression: {self._mistake(error)}") from None
         except (RecursionError, MemoryError):
             raise ValueError(
                 f"{self.what}: {_cut(self.text)} is too long or nests too deep for Python's parser; put parts of long "
@@ -195,7 +193,7 @@ class Reader:
             raise self._refuse(node, str(error)) from None
         # At every level: what is built from numbers that floats hold stays small enough to be computed at once.
         if found.is_number and not _is_float(found):
-            raise self._refuse(node, "is no number that a float holds")
+            raise self._refuse(node, "is not a number that a float can represent")
         return found
 
     def _converted(self, node: ast.expr, depth: int) -> sympy.Expr:
@@ -237,10 +235,10 @@ class Reader:
     def _number(self, node: ast.Constant) -> sympy.Expr:
         value: Any = node.value
         if type(value) not in (int, float):
-            raise self._refuse(node, "is no real number")
+            raise self._refuse(node, "is not a real number")
         if abs(value) > LARGEST:
             raise self._refuse(node, "is too large")
-        # What the user wrote, .1 as 1/10: sums of constants are exact, and so is what cancels.
+        # Decimals as the user wrote them, 0.1 as 1/10: sums of constants and cancellations are exact.
         return sympy.Rational(repr(value)) if isinstance(value, float) else sympy.Integer(value)
 
     def _power(self, node: ast.BinOp, depth: int) -> sympy.Expr:
@@ -259,7 +257,7 @@ class Reader:
         if name in self.declared:
             raise self._refuse(node, f"calls {name}, a component or parameter here; rename that to call {name}")
         if name not in FUNCTIONS:
-            raise self._refuse(node.func, "is no function known here")
+            raise self._refuse(node.func, "is not a known function")
         function, count = FUNCTIONS[name]
         if node.keywords or len(node.args) != count:
             raise self._refuse(node, f"is not as {name} is called, with {count} argument{'s' * (count > 1)}")

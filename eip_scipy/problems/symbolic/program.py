@@ -62,7 +62,7 @@ class Arguments:
 
     @property
     def places(self) -> dict[str, tuple[str, int | None]]:
-        """Of each name the array and the place in it; the time is a number."""
+        """Array and index of each name; the time is a number."""
         places = {name: (array, k) for array, names in self.arrays.items() for k, name in enumerate(names)}
         return {**places, "t": ("t", None)}
 

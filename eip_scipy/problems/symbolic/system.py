@@ -50,7 +50,7 @@ class System(NamedTuple):
 
     @property
     def accelerations(self) -> tuple[Any, ...] | None:
-        """Those of q'' = a(t, q), where the equations are of that kind for the state (q, q')."""
+        """Accelerations of q'' = a(t, q) if the equations have that form for the state (q, q')."""
         variables, half = self.variables, len(self.components) // 2
         velocities = variables[half:]
         found = self.rates[half:]
@@ -98,7 +98,7 @@ class SymbolicProblem(Problem):
         return dict(zip(self.system.parameters, values, strict=True))
 
     def second_order(self) -> SymbolicProblem:
-        """The same problem in (q, v) with v = q', as Nystrom methods take it, where H is p W p / 2 + V(t, q).
+        """Return the problem in (q, v) with v = q', as Nystrom methods need it, if H is p W p / 2 + V(t, q).
 
         Returns
         -------
@@ -108,7 +108,7 @@ class SymbolicProblem(Problem):
         Raises
         ------
         ValueError
-            Where q' is no constant matrix W times p, or p' depends on p.
+            If q' is not a constant matrix W times p, or p' depends on p.
         """
         names, rates = self.system.components, self.system.rates
         half, W = len(self.pairs), self._kinetic()
@@ -135,7 +135,7 @@ class SymbolicProblem(Problem):
 
     @property
     def has_second_order(self) -> bool:
-        """Whether `second_order` gives one."""
+        """True if `second_order` returns a problem."""
         return self._kinetic() is not None
 
     def _kinetic(self) -> Any:

@@ -115,7 +115,7 @@ class KortewegDeVries:
         out[:] = self.field(self.nonlinear(modes) - 1j * self.frequencies * modes)
 
     def fun(self, t: float, u: np.ndarray) -> np.ndarray:
-        """The same as a new array: what `solve_ivp` takes."""
+        """Return the right-hand side as a new array, as `solve_ivp` needs it."""
         out = np.empty_like(u)
         self.rhs(t, u, out)
         return out

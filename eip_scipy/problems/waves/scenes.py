@@ -147,7 +147,7 @@ def korteweg_de_vries_solitons(
         point that starts at the mean of the places and moves with the mean of the speeds.
     t_end : float
     h : float, optional
-        Default: a third of `KortewegDeVries.largest_step`.
+        Default: 1/3 of `KortewegDeVries.largest_step`.
 
     Returns
     -------

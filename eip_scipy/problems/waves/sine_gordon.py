@@ -85,7 +85,7 @@ class SineGordon:
             out[n:] -= self.damping * y[n:]
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
-        """The same as a new array: what `solve_ivp` takes."""
+        """Return the right-hand side as a new array, as `solve_ivp` needs it."""
         out = np.empty_like(y)
         self.rhs(t, y, out)
         return out
@@ -117,7 +117,7 @@ class SineGordon:
         return f - lost, lost
 
     def _energy_gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
-        """By f = (p, a): (-w a, w p)."""
+        """Gradient from f = (p, a): (-w a, w p)."""
         n, cell = self.grid.size, self.grid.cell
         np.multiply(f[n:], -cell, out=out[:n])
         np.multiply(y[n:], cell, out=out[n:])
