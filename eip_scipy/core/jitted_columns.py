@@ -193,8 +193,8 @@ def wide_gradient(
 ) -> Any:
     """The gradient in place over a state with columns, on which the invariant does not depend.
 
-    `shape` is that of the invariant's value. `takes_f` and `in_place` say how `grad` is called; the result takes f in the
-    same way.
+    `shape` is that of the invariant's value. `takes_f` and `in_place` say how `grad` is called; the result takes f as
+    `grad` does.
     """
     (n, first, second), state = layout, _state_of(layout)
     places, sizes = np.array(parameters, np.int64), (*shape, n)

@@ -92,7 +92,7 @@ def test_a_test_particle_is_a_plain_zero():
         ({"gm": [1, 2] * units.km}, units.UnitConversionError, "^gm: .* not in units of AU3 yr-2"),
         ({"position": np.eye(2, 3) * units.s}, units.UnitConversionError, "^position: .* not in units of m"),
         ({"velocity": np.eye(2, 3) * AU}, units.UnitConversionError, "^velocity: .* not in units of AU yr-1"),
-        ({"gm": [1 * units.Msun, 2]}, TypeError, "^gm: 2 has no unit, and others beside it have one"),
+        ({"gm": [1 * units.Msun, 2]}, TypeError, "^gm: 2 has no unit, but others have one"),
         ({"t_span": (0 * YR, 1 * AU)}, units.UnitConversionError, "^t_span: .* not in units of yr"),
         ({"t_span": (0 * YR, EPOCH)}, TypeError, "^t_span: .* is a date, and nbody does not say at which one t is 0"),
         ({"h": EPOCH}, TypeError, "^h: .* is a moment"),

@@ -151,7 +151,7 @@ def test_c_functions_get_numbers_as_params(tmp_path):
     expected = run(JITTED, events=None)
     np.testing.assert_array_equal(run(functions).y, expected.y)
     np.testing.assert_array_equal(run(functions, compiled=False).y, expected.y)
-    with pytest.raises(TypeError, match="fun is a C function by pointer: besides t and y it takes numbers"):
+    with pytest.raises(TypeError, match="fun is a C function pointer: its arguments after t and y are numbers"):
         run(functions, args=(K, "steel"))
 
 
