@@ -8,7 +8,6 @@ import os
 import shlex
 import sysconfig
 from concurrent.futures import Future, ThreadPoolExecutor
-from distutils.ccompiler import new_compiler
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -91,6 +90,8 @@ class Build(build_ext):
 
     def build_extensions(self) -> None:
         """Build all, the library of nanobind before them."""
+        from distutils.ccompiler import new_compiler  # that of setuptools, which has been imported by now
+
         if not COMPILER.own:
             self.compiler = new_compiler(compiler="unix")  # on Windows too
             self.compiler.set_executables(**COMPILER.executables)
