@@ -96,7 +96,7 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def sources(to: Path, cache: Path) -> Path:
-    """Write the sdist, and return the folder into which it is unpacked: the same one each time, as zig's cache asks."""
+    """Write the sdist, and return the folder with its files, where all wheels are built and share zig's cache."""
     folder = cache / "sources"
     shutil.rmtree(folder, ignore_errors=True)
     subprocess.run([sys.executable, "setup.py", "--quiet", "sdist", f"--dist-dir={to}"], check=True, cwd=ROOT)

@@ -14,13 +14,13 @@ FLAGS = ["-O2", "-ffp-contract=off", "-shared", "-fPIC"]
 
 
 def compiler():
-    """Return the words of its command. Skip the test if there is no compiler."""
+    """Return the words of its command, or skip the test if there is none."""
     command = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
     if shutil.which(command[0]):
         return command
     if find_spec("ziglang"):
         return [sys.executable, "-m", "ziglang", "cc"]
-    pytest.skip(f"there is no C compiler here, neither {command[0]} nor ziglang: python -m pip install ziglang")
+    pytest.skip(f"needs a C compiler, {command[0]} or ziglang: python -m pip install ziglang")
 
 
 def shared_library(path, *sources):
