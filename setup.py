@@ -167,8 +167,8 @@ def _longest_first(source: str) -> int:
 
 builds: dict[str, list[str]] = {"_native": EVERY}
 if TARGET.machine == "x86_64":
-    # The first build is for processors of 2012 and before, which call a function for a fused operation: of the
-    # optimizer the least, which saves 33 % of its compilation.
+    # The first build is for processors of 2012 and before, which call a function for a fused operation: it is compiled
+    # with few optimizations, which saves 33 % of its compilation time.
     builds = {"_native": [*EVERY, OLD], "_native_v3": V3}
 # For .ci: one of them, and further flags; or none, where the package is looked at and not run.
 if only := os.environ.get("EIP_SCIPY_BUILD"):

@@ -124,7 +124,7 @@ def _by_ida(problem: MechanicsProblem, ida: Any, tolerance: float) -> Outcome:
 
     def residual(t: float, y: np.ndarray, rates: np.ndarray, out: np.ndarray) -> None:
         calls.add()
-        state = np.ascontiguousarray(y[:n])
+        state = y[:n].copy()  # IDA's own array is read-only, for which functions would be compiled again
         fill(t, state, gradient, *item.args)
         out[:n] = rates[:n] - problem.fun(t, state)
         out[:nq] -= gradient[:on_positions, :nq].T @ y[n : n + on_positions]
