@@ -104,6 +104,7 @@ class Invariant:
 
     # These are attributes of balances, see `Balance`.
     is_balance = False
+    of_state: Any = None  # of a state with columns of derivatives behind it, see `variations.OfState`
     rate_function: Callable[..., Any] | None = None
     rate_uses_f = False
     # Components and weights (s, k) of the s directions along which all values are projected, or one such pair for every

@@ -17,8 +17,6 @@ __all__ = [
     "rearranged",
     "rhs_by_duals",
     "rhs_by_products",
-    "wide_gradient",
-    "wide_value",
 ]
 
 # A state with columns is (y, p, first column, second column, ...): the parameters p that derivatives are taken by stand
@@ -148,98 +146,9 @@ def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
     return njit(in_place)
 
 
-def _state_of(layout: tuple[int, int, int]) -> Any:
-    """Return a function that takes the state out of a wide one, see `variations.layout`."""
-    n, first, second = layout
-    if first == n:
-        return inside(lambda Y: Y[:n])
-
-    def state(Y):
-        y = np.empty(n)
-        y[:first] = Y[:first]
-        y[first:] = Y[second : second + n - first]
-        return y
-
-    return inside(state)
-
-
 @lru_cache(maxsize=256)
-def wide_value(fun: Any, layout: tuple[int, int, int], parameters: tuple[int, ...] = ()) -> Any:
-    """A function of the state in a wide one, with these parameters from behind it."""
-    state, n = _state_of(layout), layout[0]
-    if not parameters:
-        return njit(lambda t, Y, *extra: fun(t, state(Y), *extra))
-    places = np.array(parameters, np.int64)
-    return njit(lambda t, Y, params: fun(t, Y[:n], _from_state(Y, params, n, places)))
-
-
-@inside
-def _from_state(Y, params, n, places):
-    found = params.copy()
-    for j in range(places.size):
-        found[places[j]] = Y[n + j]
-    return found
-
-
-@lru_cache(maxsize=256)
-def wide_gradient(
-    grad: Any,
-    by_parameters: Any,
-    layout: tuple[int, int, int],
-    parameters: tuple[int, ...],
-    shape: tuple[int, ...],
-    takes_f: bool,
-    in_place: bool,
-) -> Any:
-    """The gradient in place over a state with columns, on which the invariant does not depend.
-
-    `shape` is that of the invariant's value. `takes_f` and `in_place` say how `grad` is called; the result takes f as
-    `grad` does.
-    """
-    (n, first, second), state = layout, _state_of(layout)
-    places, sizes = np.array(parameters, np.int64), (*shape, n)
-    if takes_f and in_place:
-        own = inside(lambda t, y, F, out, extra: grad(t, y, state(F), out, *extra))
-    elif takes_f:
-        own = inside(lambda t, y, F, out, extra: _put(grad(t, y, state(F), *extra), out))
-    elif in_place:
-        own = inside(lambda t, y, F, out, extra: grad(t, y, out, *extra))
-    else:
-        own = inside(lambda t, y, F, out, extra: _put(grad(t, y, *extra), out))
-
-    def row(t, Y, F, out, extra):  # of a number's gradient, where it lies
-        out[n:] = 0.0
-        own(t, Y[:n], F, out[:n], extra)
-
-    def rows(t, Y, F, out, extra):
-        found = np.empty(sizes)
-        own(t, state(Y), F, found, extra)
-        out[:] = 0.0
-        out[..., :first] = found[..., :first]
-        out[..., second : second + n - first] = found[..., first:]
-
-    def with_parameters(t, Y, F, out, extra):
-        arguments = (_from_state(Y, extra[0], n, places),)
-        rows(t, Y, F, out, arguments)
-        slopes = by_parameters(t, Y[:n], *arguments)
-        for j in range(places.size):
-            out[..., n + j] = slopes[..., places[j]]
-
-    rows = inside(rows)
-    filled = inside(with_parameters if parameters else row) if parameters or (not shape and first == n) else rows
-    if takes_f:
-        return njit(lambda t, Y, F, out, *extra: filled(t, Y, F, out, extra))
-    return njit(lambda t, Y, out, *extra: filled(t, Y, Y, out, extra))
-
-
-@inside
-def _put(values, out):
-    out[:] = values
-
-
-@lru_cache(maxsize=256)
-def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...]) -> Any:
-    """The derivatives (..., p) of a jitted invariant by its parameters.
+def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...], parameters: tuple[int, ...]) -> Any:
+    """The derivatives ``slopes(t, y, params) -> (..., k)`` of a jitted invariant by k of its p parameters.
 
     Raises
     ------
@@ -248,11 +157,13 @@ def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...]) -> Any:
     """
     swapped = njit(lambda t, params, y: fun(t, y, params))
     grad = gradient_by_duals(swapped, p, shape, True)
-    sizes = (*shape, p)
+    sizes, chosen, places = (*shape, p), (*shape, len(parameters)), np.array(parameters, np.int64)
 
     def slopes(t, y, params):
-        out = np.empty(sizes)
-        grad(t, params, out, y)
+        found, out = np.empty(sizes), np.empty(chosen)
+        grad(t, params, found, y)
+        for j in range(places.size):
+            out[..., j] = found[..., places[j]]
         return out
 
     return njit(slopes)

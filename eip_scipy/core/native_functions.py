@@ -83,27 +83,38 @@ def native_functions(
     kind = number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place"))
     values = None if params is None else params.values
     rhs = function_alone(fun, kind, "acceleration" if second_order else "fun", values, second_order=second_order)
-    inv, grad = list[Native](), list[Native]()
-    for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
+    inv, grad, slopes = list[Native](), list[Native](), list[Native]()
+    for k, (wide, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
+        item, value = _of_state(wide, number)
         name = f"invariant {label!r}"
         if item.args:
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
         shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
-        inv.append(_native(item.function, number._replace(shape=shape), name))
+        inv.append(_native(item.function, value._replace(shape=shape), name))
         if item.gradient is None and isinstance(item.function, PointerFunction):
             grad.append(Native(None, inv[-1].floats * n * (2 if y0.dtype.kind == "c" else 1)))
             continue
         if item.gradient is None:
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
-        rows = number._replace(shape=(*shape, n), real=False, takes_f=item.uses_f)
+        rows = value._replace(shape=(*shape, value.size), real=False, takes_f=item.uses_f)
         rows = rows._replace(in_place=item.in_place, gradient=True)
         grad.append(_native(item.gradient, rows, f"gradient of {name}"))
+        if wide.of_state is not None and wide.of_state.by_parameters is not None:
+            columns = value._replace(shape=(*shape, wide.of_state.parameters))
+            slopes.append(_native(wide.of_state.by_parameters, columns, f"derivatives by parameters of {name}"))
     return rhs._replace(
         inv=_addresses(inv),
         grad=_addresses(grad),
+        by_parameters=_addresses(slopes),
         floors=invariants.floors,
-        owner=rhs.owner | {"inv": inv, "grad": grad},
+        owner=rhs.owner | {"inv": inv, "grad": grad, "by_parameters": slopes},
     )
+
+
+def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
+    """Return what a function of a state with columns of derivatives is of the state alone; others are what they are."""
+    alone = getattr(fun, "of_state", None)
+    return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
 
 
 def function_alone(
@@ -139,7 +150,10 @@ def with_events(
         As by `native_functions`.
     """
     number = _number(params, y0)
-    event = [_native(function, number, f"event {k}") for k, function in enumerate(events)]
+    event = list[Native]()
+    for k, function in enumerate(events):
+        own, kind = _of_state(function, number)
+        event.append(_native(own, kind, f"event {k}"))
     return functions._replace(event=_addresses(event), owner=functions.owner | {"event": event})
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import OdeSolution
@@ -20,7 +20,7 @@ from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import filled, reals, require_arguments, shown
 from .invariants import Invariant
 from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
-from .pointers import PointerFunction
+from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import as_derivative
 
 __all__ = [
@@ -42,6 +42,18 @@ AGREES = 1e-6
 WRONG = 1e-3
 SHIFT = 332  # binary digits of a complex step, relative to its direction
 LEAST = 1e-3  # size of a parameter that is 0, for differences
+
+
+class OfState(NamedTuple):
+    """An invariant or event of a wide state as a function of the `n` components of the state, as the engine calls it.
+
+    `by_parameters`: of an invariant, its derivatives by the `parameters` that are behind the state, if there are any.
+    """
+
+    n: int
+    function: Any
+    by_parameters: Callable[..., Any] | None = None
+    parameters: int = 0
 
 
 @dataclass(frozen=True)
@@ -306,7 +318,7 @@ class Variations:
                 "orbit; omit the balances in this run."
             )
         rhs, source = products
-        compiled = is_compiled(rhs) and not jit_is_off() and not in_python
+        compiled = _has_address(rhs) and not in_python
         items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
         return cls(columns, rhs, items, tuple(invariants), source)
 
@@ -331,25 +343,20 @@ class Variations:
 
     def _event(self, fun: Callable[..., Any]) -> Callable[..., Any]:
         columns = self.columns
-        if is_jitted(fun) and not jit_is_off() and is_compiled(self.rhs):
-            from .jitted_columns import wide_value
 
-            wide = wide_value(fun, layout(columns))
-        else:
+        def wide(t: float, Y: Array, *extra: Any) -> Any:
+            return fun(t, columns.own(Y), *extra)
 
-            def wide(t: float, Y: Array, *extra: Any) -> Any:
-                return fun(t, columns.own(Y), *extra)
-
+        wide.of_state = OfState(columns.n, fun)  # type: ignore[attr-defined]
         for name in ("terminal", "direction"):
             if hasattr(fun, name):
                 setattr(wide, name, getattr(fun, name))
         return wide
 
 
-def layout(columns: Columns) -> tuple[int, int, int]:
-    """Return where compiled functions find a state: n, the length of its first part, the place of the second."""
-    first = columns.half or columns.n
-    return columns.n, first, first * (1 + columns.count)
+def _has_address(fun: Any) -> bool:
+    """Return whether the engine may call a function by its address."""
+    return isinstance(fun, LibraryFunction) or (is_jitted(fun) and not jit_is_off())
 
 
 def right_hand_side(
@@ -368,6 +375,7 @@ def right_hand_side(
         raise ValueError("variations: derivatives by parameters need them as params=[...], one array of numbers.")
     if own is not None and jvp is None:
         return _rearranged(own(columns.parameters), columns.order[:, : columns.n]), "problem"
+    jvp = by_pointer(jvp, "jvp", GRADIENT, takes_f=True, shape=(columns.n,))
     rhs, source = _of_columns_in_order(columns, fun, form, t0, y0, extra, jvp)
     return _rearranged(rhs, columns.order), source
 
@@ -538,7 +546,8 @@ def _difference(
 class _WideInvariant:
     """An invariant as a function of the wide state, with its gradient, as Python calls them.
 
-    `shape`: that of its value. `parameters`: those that it depends on and derivatives are taken by.
+    `shape`: that of its value. `parameters`: those that it depends on and derivatives are taken by; `slopes`: the
+    function of the derivatives by these, differences by default.
     """
 
     def __init__(
@@ -550,9 +559,11 @@ class _WideInvariant:
         t0: float,
         y0: Array,
         extra: tuple,
+        slopes: Callable[..., Array] | None = None,
     ) -> None:
         self.item, self.columns, self.shape, self.places = item, columns, shape, list(parameters)
         gradient: Any = item.gradient
+        self.slopes = self._differences if slopes is None else slopes
         self.args, self.in_place, self.uses_f = item.args, item.in_place, item.uses_f
         if gradient is None:
             floors = typical_sizes(y0, np.zeros_like(y0), 0.0)
@@ -581,7 +592,7 @@ class _WideInvariant:
         else:
             out[..., places] = self.own_gradient(*first, *self.args, *extra)
         if self.places:
-            out[..., n : n + len(self.places)] = self._by_parameters(t, own(Y), extra[0])
+            out[..., n : n + len(self.places)] = self.slopes(t, own(Y), extra[0])
         return out
 
     def _arguments(self, Y: Array, extra: tuple) -> tuple:
@@ -592,7 +603,7 @@ class _WideInvariant:
         params[self.places] = Y[n : n + len(self.places)]
         return (params,)
 
-    def _by_parameters(self, t: float, y: Array, params: Array) -> Array:
+    def _differences(self, t: float, y: Array, params: Array) -> Array:
         """Return the derivatives by parameters, by differences of order 6."""
         slopes = difference_gradient(
             lambda p: np.asarray(self.item.function(t, y.copy(), p)), params, np.abs(params) + LEAST
@@ -604,38 +615,33 @@ def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple,
     """Return an invariant as a function of the wide state, with a gradient."""
     shape = np.shape(item.function(t0, y0.copy(), *item.args, *extra))
     parameters = columns.parameters if extra and not item.args else ()
-    if compiled and is_compiled(item.function) and not item.args and scalars(extra) is not None:
-        try:
-            return _jitted(item, columns, shape, parameters, extra)
-        except NotCompilableError:  # Python then calls it
-            pass
-    wide, found = _WideInvariant(item, columns, shape, parameters, t0, y0, extra), copy(item)
+    found = copy(item)
+    if compiled and not item.args and scalars(extra) is not None:
+        found.of_state = _of_state(item, columns.n, shape, parameters, extra)
+    own, slopes = (item, None) if found.of_state is None else (found.of_state.function, found.of_state.by_parameters)
+    wide = _WideInvariant(own, columns, shape, parameters, t0, y0, extra, slopes)
     found.function, found.gradient, found.args = wide.value, wide.gradient, ()
     found.in_place, found.uses_f = False, wide.uses_f
     return found
 
 
-def _jitted(
-    item: Invariant, columns: Columns, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
-) -> Invariant:
-    """Return the same with compiled functions.
+def _of_state(
+    item: Invariant, n: int, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
+) -> OfState | None:
+    """Return the invariant as the engine calls it, with a gradient; None if not all of its functions have addresses."""
+    own, slopes = copy(item), None
+    if not _has_address(own.function) or (parameters and not is_jitted(own.function)):
+        return None
+    try:
+        if own.gradient is None and is_jitted(own.function):
+            from .jitted_gradients import gradient_by_duals
 
-    Raises
-    ------
-    NotCompilableError
-        When one of them cannot be compiled.
-    """
-    from .jitted_columns import parameter_gradient, wide_gradient, wide_value
-    from .jitted_gradients import gradient_by_duals
+            own.gradient = gradient_by_duals(own.function, n, shape, bool(extra), scalars(extra) or "")
+            own.in_place = True
+        if parameters:
+            from .jitted_columns import parameter_gradient
 
-    gradient, in_place, found = item.gradient, item.in_place, copy(item)
-    if gradient is None:
-        gradient = gradient_by_duals(item.function, columns.n, shape, bool(extra), scalars(extra) or "")
-        in_place = True
-    if not is_compiled(gradient) or (parameters and not is_jitted(item.function)):
-        raise NotCompilableError("one of its functions is not compiled")
-    by = parameter_gradient(item.function, extra[0].size, shape) if parameters else None
-    found.function = wide_value(item.function, layout(columns), parameters)
-    found.gradient = wide_gradient(gradient, by, layout(columns), parameters, shape, item.uses_f, in_place)
-    found.in_place = True
-    return found
+            slopes = parameter_gradient(own.function, extra[0].size, shape, parameters)
+    except NotCompilableError:  # Python then calls it
+        return None
+    return OfState(n, own, slopes, len(parameters)) if _has_address(own.gradient) else None

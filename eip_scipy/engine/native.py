@@ -96,7 +96,8 @@ class NativeFunctions(NamedTuple):
     A function of the library is given as an object. For each invariant, gradient and event there is the address and the
     number of floats that it fills. None for a gradient: it is computed by differences, with shifts in units of the size
     of a component and of its floor, `floors` (n,). `python` contains the functions in Python if events are called from
-    Python; then no events are given as addresses.
+    Python; then no events are given as addresses. `by_parameters` are the derivatives of each invariant with respect to
+    the parameters behind the state, in runs with such columns of derivatives.
     """
 
     rhs: Any
@@ -110,6 +111,7 @@ class NativeFunctions(NamedTuple):
     jacobian: Any = None
     floors: np.ndarray | None = None
     rates: Rates = Rates()
+    by_parameters: tuple[tuple[Any, int], ...] = ()
     native: bool = True
 
 

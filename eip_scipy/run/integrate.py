@@ -134,7 +134,8 @@ def integrate(
         dual numbers if the functions are jitted, from `jvp`, or else from complex steps. See
         :doc:`/how-to/tangent-maps`.
     jvp : callable, optional
-        ``jvp(t, y, dy[, params]) -> (n,)``: the Jacobian of `fun` times dy, for `variations`.
+        ``jvp(t, y, dy[, params]) -> (n,)``: the Jacobian of `fun` times dy, for `variations`. Or a C function by
+        pointer, ``int jvp(double t, const double *y, const double *dy, double *out, const double *params)``.
     symplectic : bool, optional
         If True, a state-transition matrix is kept symplectic, for states (q, p) of a Hamiltonian system. Default: True
         if the problem is known to be such a system.

@@ -228,7 +228,8 @@ class System:
 
         in_python = isinstance(functions, PythonFunctions)
         found = {self.name: kind(self.fun, in_python)}
-        for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
+        for wide, label in zip(run.invariants.items, run.invariants.labels, strict=True):
+            item = wide if wide.of_state is None else wide.of_state.function
             found[label] = kind(item.function, in_python)
             differences = item.gradient is None and not in_python
             found[f"gradient of {label}"] = "differences" if differences else kind(item.gradient, in_python)

@@ -146,8 +146,8 @@ class IntegrationResult(WithColumns):
     h : float or None
         Step size; None for adaptive steps.
     variations : ndarray, shape (m, n, k)
-        Columns of derivatives at the saved times, if they were requested. Between two steps they are interpolated, not
-        projected. See `stm` and `sensitivities`.
+        Columns of derivatives at the saved times, if they were requested. Between two steps they are interpolated
+        and projected, as the states are. See `stm` and `sensitivities`.
     columns : dict
         Description of these columns: "state", True if the state-transition matrix is included; "parameters", the number
         of derivatives with respect to parameters, and their "names"; "symplectic", True if the matrix was kept

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba import njit
 
 from eip_scipy import EIPDOP853, Invariant, ensemble, hamiltonian, integrate, load, solve_ivp
 from eip_scipy.checkpoint import CheckpointError
@@ -176,6 +177,18 @@ def test_dense_output_is_that_of_the_states(every):
     np.testing.assert_allclose(run.sol(t), plain.sol(t), rtol=0, atol=1e-15)
     if every == 1:
         np.testing.assert_allclose(energy(0, run.sol(t)), energy(0, np.array(START)), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("rows", [{"every": 4, "save_every": 1}, {"t_eval": [0.13, 1.42, 2.9]}])
+@pytest.mark.parametrize("jit", [pytest.param(True, marks=pytest.mark.needs_jit), False])
+def test_rows_without_a_projection_of_their_own_are_projected(rows, jit):
+    fun, kept = (njit(pendulum), njit(energy)) if jit else (pendulum, energy)
+    options = {"params": [1.0], "method": EIPDOP853, "h": 0.4, "invariants": [kept], **rows}
+    run = integrate(fun, SPAN, START, variations="state", **options)
+    assert run.compiled == jit
+    q, p = run.y
+    gradients = np.column_stack([np.sin(q), p])[:, None] @ run.stm
+    np.testing.assert_allclose(gradients, np.tile([np.sin(START[0]), START[1]], (q.size, 1, 1)), rtol=0, atol=2e-15)
 
 
 @pytest.mark.parametrize("rows", [{}, {"save_every": 10}, {"t_eval": [1.0, 2.5]}])

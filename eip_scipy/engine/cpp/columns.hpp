@@ -43,7 +43,7 @@ inline void change_in_place(const Columns &columns, const W &w, double *column, 
 template <class W>
 inline void weigh_packed_rows(const Options &o, const W &w, const double *sigma) {
     const Columns &columns = o.columns;
-    pack_rows(columns, w.G, w.l, w.m);
+    if (columns.half > 0) pack_rows(columns, w.G, w.l, w.m);
     for (int64_t i = 0; i < w.l; ++i) {
         double *row = w.Q + i * w.m;
         copy(w.gradient(i), row, columns.size);
@@ -53,26 +53,38 @@ inline void weigh_packed_rows(const Options &o, const W &w, const double *sigma)
     }
 }
 
-// The columns M (count, size) moved onto G M = kept, each by the least correction in the weights sigma of the state. The
-// rows of G and of its factorisation are packed.
+// Of each invariant the correction of a column by which G M = kept is missed by one, into w.B: the least one in the weights
+// sigma of the state. The rows of G and of its factorisation are packed.
 template <class W>
-inline void project_each(const Options &o, const W &w, double *M, int64_t rank, const Matrix &rows, double *sigma) {
-    const Columns &columns = o.columns;
+inline void find_corrections(const Options &o, const W &w, int64_t rank, const Matrix &rows, const double *sigma) {
+    const int64_t n = o.columns.size;
+    for (int64_t i = 0; i < w.l; ++i) {
+        double *correction = w.B + i * w.m;
+        fill(w.g, 0.0, w.l);
+        w.g[i] = 1.0;
+        least_norm(w.g, w.inverse_norms, corner(w.R, w.l, w), w.pivots, rank, w.mu);
+        fill(correction, 0.0, n);
+        for (int64_t k = 0; k < rank; ++k) {
+            const double *row = rows.row(w.pivots[k]), factor = w.mu[w.pivots[k]];
+            for (int64_t j = 0; j < n; ++j) correction[j] += factor * row[j];
+        }
+        for (int64_t j = 0; j < n; ++j) correction[j] *= sigma[j];
+        if (o.frame.rows == 0) continue;
+        change_in_place(o.columns, w, correction, [&](double *whole) { remove_sparse(o.frame, 0, w.products, whole); });
+    }
+}
+
+// The columns M (count, size) moved onto G M = kept by these corrections.
+template <class W>
+inline void project_each(const Columns &columns, const W &w, double *M) {
     const int64_t n = columns.size;
-    double *move = sigma + n;
     for (int64_t c = 0; c < columns.count; ++c) {
         double *column = M + c * n;
         for (int64_t i = 0; i < w.l; ++i) w.g[i] = dot(w.gradient(i), column, n) - columns.kept[i * columns.count + c];
-        least_norm(w.g, w.inverse_norms, corner(w.R, w.l, w), w.pivots, rank, w.mu);
-        fill(move, 0.0, n);
-        for (int64_t k = 0; k < rank; ++k) {
-            const double *row = rows.row(w.pivots[k]), factor = w.mu[w.pivots[k]];
-            for (int64_t j = 0; j < n; ++j) move[j] += factor * row[j];
+        for (int64_t i = 0; i < w.l; ++i) {
+            const double *correction = w.B + i * w.m, missed = w.g[i];
+            for (int64_t j = 0; j < n; ++j) column[j] += missed * correction[j];
         }
-        for (int64_t j = 0; j < n; ++j) move[j] *= sigma[j];
-        if (o.frame.rows > 0)
-            change_in_place(columns, w, move, [&](double *whole) { remove_sparse(o.frame, 0, w.products, whole); });
-        for (int64_t j = 0; j < n; ++j) column[j] += move[j];
     }
 }
 
@@ -106,7 +118,7 @@ inline void restore_symplectic(int64_t n, double *M, double *E, double *row) {
 }
 
 // The columns of a state that has been projected, y_new. The errors of the step are not needed any more: their buffers, of
-// size (1 + count) numbers each, hold the columns one after the other, the matrix E, or the state's weights and one correction.
+// size (1 + count) numbers each, hold the columns one after the other, the matrix E, or the state's weights.
 template <class AnyRun>
 [[gnu::noinline]] inline void project_columns(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
@@ -127,7 +139,10 @@ template <class AnyRun>
     const Matrix rows{w.Q, w.l, n, w.m};
     const int64_t rank = factor(rows, w.inverse_norms, corner(w.R, w.l, w), w.pivots);
     ++w.counters[NLU];
-    if (rank > 0) project_each(o, w, M, rank, rows, scratch);
+    if (rank > 0) {
+        find_corrections(o, w, rank, rows, scratch);
+        project_each(columns, w, M);
+    }
     if (columns.symplectic) restore_symplectic(n, M, scratch, w.move);
     for (int64_t c = 0; in_halves && c < columns.count; ++c) put_column(columns, c, M + c * n, step.y_new);
 }

@@ -1,8 +1,8 @@
 // A whole step: the raw one, the projection, and the control of its length, which is SciPy's.
 #pragma once
 
-#include "columns.hpp"
 #include "multistep.hpp"
+#include "state_alone.hpp"
 
 namespace eip {
 
@@ -23,6 +23,9 @@ inline void make_stages(const AnyRun &run, const Step &step) {
     run.work.counters[NFEV] += run.method.stages - 1;
 }
 
+// Return whether the derivative at y_hat serves the projection only, and another one follows.
+inline bool is_for_projection(const Options &o, const Step &step) { return step.project && !o.reuse_f; }
+
 // Computations after the stages: f at y_hat in w.last(), the local error in w.err and its norm in w.norm where they are needed.
 // Return whether the step's local errors are to be compared with what it changes in each block.
 template <class AnyRun>
@@ -34,7 +37,14 @@ inline bool look_back(const AnyRun &run, const Step &step) {
     w.counters[HAVE_F] = (estimate && m.fsal) || (step.project && o.uses_f);
     w.counters[HAVE_ERROR] = estimate;
     if (w.counters[HAVE_F]) {
-        run.system.rhs(w, step.t_new, w.y_hat, w.last());
+        if constexpr (IS_SINGLE<AnyRun>) {
+            if (is_for_projection(o, step))
+                run.system.rhs(w, step.t_new, w.y_hat, w.last());
+            else
+                run.system.rhs_of_whole(w, step.t_new, w.y_hat, w.last());
+        } else {
+            run.system.rhs(w, step.t_new, w.y_hat, w.last());
+        }
         ++w.counters[NFEV];
     }
     if (estimate) estimate_error(run, step);
@@ -46,13 +56,29 @@ inline bool look_back(const AnyRun &run, const Step &step) {
     return sampled && is_sampled_for_resolution(w);
 }
 
+// The same, and that comparison.
+template <class AnyRun>
+inline void look_back_and_compare(const AnyRun &run, const Step &step) {
+    if (look_back(run, step) && !run.options.adaptive) [[unlikely]]
+        note_roughness(step, run.options, run.work);
+}
+
+// The same of a run with columns of derivatives, which nothing of this depends on.
+[[gnu::noinline]] inline void look_back_at_state(const Run &run, const Step &step) {
+    of_state_alone(run, [&](const auto &alone) { look_back_and_compare(alone, step); });
+    int64_t &have = run.work.counters[HAVE_F];
+    if (have && run.system.takes_state && is_for_projection(run.options, step)) have = OF_STATE;
+}
+
 template <class AnyRun>
 inline Code raw_step(const AnyRun &run, const Step &step) {
     make_stages(run, step);
     const bool finite = all_finite(run.work.y_hat, run.work.m);
     if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
-    if (look_back(run, step) && !run.options.adaptive) [[unlikely]]
-        note_roughness(step, run.options, run.work);
+    if (has_state_alone(run)) [[unlikely]]
+        look_back_at_state(of_any_length(run), step);
+    else
+        look_back_and_compare(run, step);
     return OK;
 }
 
@@ -101,17 +127,9 @@ inline void close_step(const AnyRun &run, const Step &step, Code status) {
         else if (o.metric == BY_ERROR || o.every == AUTO || o.adaptive)
             quadrature(w.err, w.err_sum, w.err_sum, w.m);
     }
-    const bool wanted = !w.counters[HAVE_F] || (step.project && status == OK && !o.reuse_f);
+    const bool have = w.counters[HAVE_F] && w.counters[HAVE_F] != OF_STATE;
+    const bool wanted = !have || (step.project && status == OK && !o.reuse_f);
     close_derivative(run, step.t_new, step.y_new, wanted);
-}
-
-// The columns of derivatives behind a state that has been projected. Batches of members have none.
-template <class AnyRun>
-inline void project_any_columns(const AnyRun &, const Step &, Code) {}
-template <class W>
-inline void project_any_columns(const RunOf<W, System> &run, const Step &step, Code status) {
-    if (run.options.columns.count > 0 && status == OK) [[unlikely]]
-        project_columns(of_any_length(run), step);
 }
 
 // The rest of a step whose raw result is accepted; OK or FAILED_PROJECTION.
@@ -119,12 +137,11 @@ template <class AnyRun>
 inline Code finish_step(const AnyRun &run, const Step &step) {
     Code status = OK;
     if (step.project) {
-        status = project_any(run, step);
+        status = project_whole(run, step);
         if (status == FAILED_PROJECTION) {
             ++run.work.counters[REJECTED];
             return status;
         }
-        project_any_columns(run, step, status);
     } else {
         copy(run.work.y_hat, step.y_new, run.work.m);
     }

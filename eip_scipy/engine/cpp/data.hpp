@@ -22,9 +22,10 @@ constexpr int64_t AUTO = 0;  // the option `every`
 
 // Places of the numbers that the step counts and leaves for the next one. From HAVE_ERROR on: whether an estimate of the
 // step's error is available, projections begun without one, steps since the last projection, what stood out in them, and
-// whether the last row of K holds f at the raw result.
+// whether the last row of K holds f at the raw result. HAVE_F may be OF_STATE, see state_alone.hpp.
 EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED,
          HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, N_COUNTERS);
+constexpr int64_t OF_STATE = 2;
 // Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
 EIP_ENUM(Clock, TIME, TIME_NEW, LENGTH, NEXT_LENGTH);
 EIP_ENUM(Place, STEP, ROW, PENDING);
@@ -263,6 +264,8 @@ struct Columns {
     int64_t cut() const { return half > 0 ? half : size; }
     int64_t first(int64_t c) const { return (c + 1) * cut(); }
     int64_t second(int64_t c) const { return (1 + count) * cut() + (c + 1) * (size - cut()); }
+    // The length of the state with all of its columns.
+    int64_t wide() const { return (1 + count) * size; }
 };
 
 template <class Visit>
@@ -337,11 +340,13 @@ struct WorkOf {
     double *norm, *suspect;
     int64_t *pivots, *counters;
     Inner inner;
+    int64_t behind = 0;  // of a part of a state: floats of the whole one that are behind its m
 
-    int64_t suspect_size() const { return N_SUSPECT + 2 * m; }
+    int64_t whole() const { return m + behind; }
+    int64_t suspect_size() const { return N_SUSPECT + 2 * whole(); }
     Reason suspected() const { return static_cast<Reason>(suspect[REASON]); }
-    Value *row(int64_t i) const { return K + i * m; }  // f of stage i
-    Value *last() const { return K + stages * m; }     // f at the raw result, or at the end of the step
+    Value *row(int64_t i) const { return K + i * whole(); }  // f of stage i
+    Value *last() const { return K + stages * whole(); }     // f at the raw result, or at the end of the step
     Value *gradient(int64_t i) const { return G + i * m; }
     Value *rate(int64_t i) const { return rates + i * balances; }  // of the balances at stage i
     Value *figures(int64_t i) const { return trust + i * N_FIGURES; }

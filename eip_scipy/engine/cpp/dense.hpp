@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "multistep.hpp"
+#include "state_alone.hpp"
 
 namespace eip {
 
@@ -386,6 +387,15 @@ inline bool project_sample(const Run &run, double t, double *out) {
     return true;
 }
 
+// Fit the columns of derivatives to the state in front of them, which meets its targets.
+inline void fit_columns(const DenseRun &dense, double t, double *y) {
+    const Columns &columns = dense.dense.options.columns;
+    if (columns.count == 0 || dense.work.l == 0) [[likely]]
+        return;
+    const Step at_rest{t, t, 0.0, y, y, true, false};
+    project_columns_behind(dense.run, at_rest);
+}
+
 // The state y at t, where the balances have these values, which no projection has made, as it is handed out: a copy projected onto the targets, or y itself if it
 // misses them by rounding only, or if no state nearby meets them. With the error metric each block moves in proportion to
 // its size. The copy depends on nothing but the state, so that it is the same as the end of one step and as the start of the
@@ -408,7 +418,7 @@ inline void hand_out(const Run &run, const DenseRun &dense, double t, const doub
         const double size = std::max(std::max(std::abs(w.values[i]), std::abs(w.target[i])), d.options.scales[i]);
         meets &= std::abs(w.values[i] - w.target[i]) <= SHOWN_ROUNDINGS * EPS * size;
     }
-    if (meets) return;
+    if (meets) return fit_columns(dense, t, out);
     if (d.by_travel)
         weigh_blocks(w.sigma, d.options.blocks, w,
                      [&](int64_t b) { return block_norm(y, nullptr, b, d.options.blocks, w); });
@@ -419,7 +429,8 @@ inline void hand_out(const Run &run, const DenseRun &dense, double t, const doub
         fill(w.sigma, 1.0, w.m);
         met = try_to_project();
     }
-    if (!met) copy(y, out, w.m);
+    if (!met) return copy(y, out, w.m);
+    fit_columns(dense, t, out);
 }
 
 // The interpolant of the balances, of the kind that the state has, with their rates in the place of its derivatives.
@@ -559,7 +570,7 @@ inline void interpolate(const DenseRun &dense, double *floats, double t, double 
     }
     copy(piece.sigma, w.sigma, w.m);
     copy(out, w.y_hat, w.m);
-    if (project_sample(dense.run, t, out)) return;
+    if (project_sample(dense.run, t, out)) return fit_columns(dense, t, out);
     evaluate(d, piece, theta, out, w);
     if (theta != share) return;
     if (d.missed[0] == 0.0) d.missed[1] = t;

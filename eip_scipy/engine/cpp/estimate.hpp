@@ -85,12 +85,12 @@ inline void estimate_error(const AnyRun &run, const Step &step) {
         weighted_sum(step.h, {m.e_v, w.K + half, m.n_e_v, w.m}, w.err + half, half);
         if (o.adaptive) w.norm[0] = norm_of_error(step.y, o, w);
     } else if (m.paired) {
-        weighted_sum(step.h, {m.e, w.K, m.n_e, w.m}, w.err, w.m);
-        weighted_sum(step.h, {m.e_low, w.K, m.n_e, w.m}, w.err_low, w.m);
+        weighted_sum(step.h, {m.e, w.K, m.n_e, w.whole()}, w.err, w.m);
+        weighted_sum(step.h, {m.e_low, w.K, m.n_e, w.whole()}, w.err_low, w.m);
         const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.n;
         w.norm[0] = paired_error_norm(w.err, w.err_low, step.y, w.y_hat, o, seen);
     } else {
-        weighted_sum(step.h, {m.e, w.K, m.n_e, w.m}, w.err, w.m);
+        weighted_sum(step.h, {m.e, w.K, m.n_e, w.whole()}, w.err, w.m);
         w.norm[0] = o.adaptive ? norm_of_error(step.y, o, w) : 0.0;
     }
 }

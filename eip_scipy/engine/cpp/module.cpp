@@ -94,7 +94,8 @@ class Engine {
         require(data_.work.balances == 0 || data_.options.balances.stages == data_.work.stages,
                 "engine: the balances do not fit the stages");
         read_balances(functions, data_.work, system);
-        if (native) read_pointers(functions, data_.work, python.is_none() ? events : 0, kept_, system);
+        if (native)
+            read_pointers(functions, data_.work, data_.options.columns, python.is_none() ? events : 0, kept_, system);
         if (!python.is_none()) {
             functions_ = std::make_unique<PythonFunctions>(python, buffers.owner(), data_.work, type_, kept_);
             system.python = functions_.get();

@@ -425,7 +425,22 @@ void read_balances(nb::handle functions, const Work &w, System &system) {
     system.scratch_G.resize(w.l * w.m);
 }
 
-void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list &kept, System &system) {
+// The functions of the invariants of a state with columns of derivatives behind it, which take the state alone.
+static void read_functions_of_state(nb::handle functions, const Work &w, const Columns &columns, System &system) {
+    const int64_t n = columns.seen, by = columns.size - n, p = system.n_params;
+    require(columns.wide() == w.m && n <= columns.size, "engine: the columns do not fit the state");
+    system.columns = &columns;
+    system.inv_pointers = pointers_of<Native<ValuePointer>>(functions, "inv", w.l, n, p);
+    system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * n, n, p);
+    system.by_parameters = pointers_of<Native<ValuePointer>>(functions, "by_parameters", w.l * by, n, p);
+    const LibraryFunction *rhs;
+    system.takes_state = nb::try_cast(nb::object(functions.attr("rhs")), rhs) && rhs->fits(columns.size, p);
+    for (auto *own : {&system.state, &system.slope_of_state}) own->resize(n);
+    system.scratch_G.resize(w.l * by);
+}
+
+void read_pointers(nb::handle functions, const Work &w, const Columns &columns, int64_t events, nb::list &kept,
+                   System &system) {
     system.by_pointer = true;
     system.second_order = truth(functions, "second_order");
     const nb::object params = functions.attr("params");
@@ -433,14 +448,19 @@ void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list
     system.params = static_cast<double *>(memory(params, "params", NPY_DOUBLE, {system.n_params}, kept));
     const int64_t size = system.second_order ? w.m / 2 : w.m, p = system.n_params;
     system.rhs_pointer = pointer_of<Native<ValuePointer>>(functions.attr("rhs"), "rhs", size, size, p);
-    system.inv_pointers = pointers_of<Native<ValuePointer>>(functions, "inv", w.l, w.m, p);
-    system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * w.m, w.m, p, true);
-    read_shifts(functions, w, kept, system);
+    if (columns.count > 0) {
+        read_functions_of_state(functions, w, columns, system);
+    } else {
+        system.inv_pointers = pointers_of<Native<ValuePointer>>(functions, "inv", w.l, w.m, p);
+        system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * w.m, w.m, p, true);
+        read_shifts(functions, w, kept, system);
+    }
     const nb::object rates = nb::object(functions.attr("rates")).attr("functions");
     for (size_t b = 0; b < system.balances.size(); ++b)
         if (Balance &balance = system.balances[b]; balance.is_given)
             balance.rate = pointer_of<Native<GradientPointer>>(rates[b], "rates", balance.floats, w.m, p);
-    system.event_pointers = pointers_of<Native<ValuePointer>>(functions, "event", events, w.m, p);
+    const int64_t seen = columns.count > 0 ? columns.seen : w.m;
+    system.event_pointers = pointers_of<Native<ValuePointer>>(functions, "event", events, seen, p);
     const nb::object jacobian = functions.attr("jacobian");
     if (!jacobian.is_none())
         system.jacobian_pointer = pointer_of<Native<GradientPointer>>(jacobian, "jacobian", w.m / 2, w.m / 2, p);

@@ -68,8 +68,9 @@ Members members_of(nb::handle members, const Data &run, const Schedule &schedule
 OctetSystem octet_system_of(nb::handle functions, const Data &run);
 // The balances among the invariants; their rates by pointer are read with the other functions.
 void read_balances(nb::handle functions, const Work &w, System &system);
-// Functions by pointer.
-void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list &kept, System &system);
+// Functions by pointer; `columns` must live as long as the system.
+void read_pointers(nb::handle functions, const Work &w, const Columns &columns, int64_t events, nb::list &kept,
+                   System &system);
 
 // Attributes of a record.
 double number(nb::handle record, const char *name);

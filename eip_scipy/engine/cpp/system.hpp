@@ -1,6 +1,7 @@
 // The user's functions as the step calls them, and what a step knows of its run.
 #pragma once
 
+#include <cstring>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -77,6 +78,11 @@ struct FailedCall {
     int status = 0;
 };
 
+// The length of a state, in the place of the buffers of a run.
+struct Length {
+    int64_t m;
+};
+
 // The functions of a run, by pointer or in Python: all of them, or of a run by pointer the events.
 struct System {
     static constexpr int MEMBERS = 1;
@@ -91,17 +97,33 @@ struct System {
     Times times;  // for derivatives in time
     double *params = nullptr;
     int64_t n_params = 0;
-    std::vector<double> scratch, scratch_f, scratch_G;
+    std::vector<double> scratch, scratch_f, scratch_G, state, slope_of_state;
     std::vector<double> pulls;  // those that come with accelerations
     bool rates_by_pulls = false;
     Shifts shifts;  // for gradients without a function
     FailedCall failed;
+    // With columns of derivatives behind the state, in runs by pointer: these, otherwise null. The functions of the invariants
+    // then take the state alone, as `rhs_pointer` also does if it `takes_state`. The derivatives of all invariants by the
+    // parameters behind the state, (l, parameters).
+    const Columns *columns = nullptr;
+    bool takes_state = false;
+    std::vector<Native<ValuePointer>> by_parameters;
 
     // The derivative at a state that is kept.
     template <class W>
     void rhs(const W &w, double t, const double *y, double *out) {
         if (!by_pointer) return python->rhs(t, y, out);
+        if (columns) [[unlikely]]
+            return rhs_with_columns(w.m, t, y, out);
         call_rhs(w, t, rhs_pointer.library ? y : copied(y, scratch, w.m), out);
+    }
+
+    // The same with the derivatives of all columns, also for the state alone, behind which they are.
+    template <class W>
+    void rhs_of_whole(const W &w, double t, const double *y, double *out) {
+        if (columns) [[unlikely]]
+            return rhs_with_columns(columns->wide(), t, y, out);
+        rhs(w, t, y, out);
     }
 
     // The derivative at a state that is made anew for each call.
@@ -122,22 +144,25 @@ struct System {
     template <class W>
     void inv(const W &w, double t, const double *y, double *values) {
         if (!by_pointer) return python->inv(t, y, values);
+        if (columns) [[unlikely]]
+            return call_each(Length{columns->seen}, inv_pointers, "inv", t, state_of(y, state), values);
         call_each(w, inv_pointers, "inv", t, y, values);
     }
 
     template <class W>
     void event(const W &w, double t, const double *y, double *values) {
         if (python) return python->event(t, y, values);
+        if (columns) [[unlikely]]
+            return call_each(Length{columns->seen}, event_pointers, "event", t, state_of(y, state), values);
         call_each(w, event_pointers, "event", t, y, values);
     }
 
     template <class W>
     void grad(const W &w, double t, const double *y, const double *f, double *G) {
         if (!by_pointer) return python->grad(t, y, f, G);
-        for (int64_t k = 0; k < std::ssize(grad_pointers); ++k) {
-            grad_by_pointer(w, k, t, y, f, G);
-            G += grad_pointers[k].floats;
-        }
+        if (columns) [[unlikely]]
+            return grad_with_columns(w.m, t, y, f, G);
+        each_gradient(w, t, y, f, G);
     }
 
     // The rates of all balances, where f is the derivative at y.
@@ -217,6 +242,54 @@ struct System {
     }
 
   private:
+    // Of the state alone, where m is its length and the function takes it, or of the state with its columns.
+    void rhs_with_columns(int64_t m, double t, const double *y, double *out) {
+        const int64_t wide = columns->wide(), length = takes_state && m == columns->size ? m : wide;
+        call_rhs(Length{length}, t, rhs_pointer.library ? y : copied(y, scratch, wide), out);
+    }
+
+    // The numbers of the state in one with columns behind it.
+    const double *state_of(const double *y, std::vector<double> &own) const {
+        const int64_t half = columns->half;
+        if (half == 0 || !y) return y;
+        copy(y, own.data(), half);
+        copy(y + columns->second(-1), own.data() + half, columns->seen - half);
+        return own.data();
+    }
+
+    // Rows of m numbers, m being the length of the state with its parameters or with its columns too: of the derivatives by the
+    // state, which the functions give one after the other, and by the parameters; 0 elsewhere.
+    [[gnu::noinline]] void grad_with_columns(int64_t m, double t, const double *y, const double *f, double *G) {
+        const int64_t n = columns->seen, p = columns->size - n, first = columns->half > 0 ? columns->half : n;
+        const double *at = state_of(y, state), *slope = state_of(f, slope_of_state);
+        each_gradient(Length{n}, t, at, slope, G);
+        if (p > 0) call_each(Length{n}, by_parameters, "by_parameters", t, at, scratch_G.data());
+        if (m == n) return;
+        for (int64_t i = rows_of_gradients(n) - 1; i >= 0; --i) {
+            double *row = G + i * m, *second = row + (columns->half > 0 ? columns->second(-1) : n);
+            std::memmove(second, G + i * n + first, (n - first) * sizeof(double));
+            std::memmove(row, G + i * n, first * sizeof(double));
+            if (p > 0) copy(scratch_G.data() + i * p, second, p);
+            double *behind = second + (n - first) + p;
+            fill(row + first, 0.0, second - (row + first));
+            fill(behind, 0.0, row + m - behind);
+        }
+    }
+
+    int64_t rows_of_gradients(int64_t n) const {
+        int64_t floats = 0;
+        for (const auto &grad : grad_pointers) floats += grad.floats;
+        return floats / n;
+    }
+
+    template <class W>
+    [[gnu::always_inline]] void each_gradient(const W &w, double t, const double *y, const double *f, double *G) {
+        for (int64_t k = 0; k < std::ssize(grad_pointers); ++k) {
+            grad_by_pointer(w, k, t, y, f, G);
+            G += grad_pointers[k].floats;
+        }
+    }
+
     template <class W>
     void rate_along_flow(const W &w, const Balance &balance, double t, const double *y, const double *f, double *out) {
         double *G = scratch_G.data();

@@ -171,8 +171,8 @@ inline Code judge(const double *before, const double *y_old, const double *y, co
     w.suspect[SUSPECT_FROM] = step.t;
     w.suspect[SUSPECT_TO] = step.t_new;
     w.suspect[SUSPECT_WAITED] = static_cast<double>(w.counters[WAITED]);
-    copy(step.y, w.suspect + N_SUSPECT, w.m);
-    copy(w.y_hat, w.suspect + N_SUSPECT + w.m, w.m);
+    copy(step.y, w.suspect + N_SUSPECT, w.whole());
+    copy(w.y_hat, w.suspect + N_SUSPECT + w.whole(), w.whole());
     ++w.counters[FOUND];
 }
 
@@ -180,7 +180,7 @@ inline Code judge(const double *before, const double *y_old, const double *y, co
 [[gnu::cold, gnu::noinline]] inline void keep_accepted(const Step &step, const Work &w) {
     if (w.suspect[SUSPECT_FROM] != step.t) return;
     w.suspect[SUSPECT_TO] = step.t_new;
-    copy(step.y_new, w.suspect + N_SUSPECT + w.m, w.m);
+    copy(step.y_new, w.suspect + N_SUSPECT + w.whole(), w.whole());
 }
 
 // Return whether some invariant changes along the flow at y_hat by more than was known before, relative to the terms of that

@@ -101,7 +101,7 @@ int64_t take_steps(const char *name, double constant, nb::object functions, cons
     System system;
     std::optional<PythonFunctions> in_python;
     if (truth(functions, "native")) {
-        read_pointers(functions, work, 0, kept, system);
+        read_pointers(functions, work, {}, 0, kept, system);
     } else {
         in_python.emplace(functions, buffers.owner(), work, NPY_DOUBLE, kept);
         system.python = &*in_python;
