@@ -1,13 +1,18 @@
 """Tangent maps against closed forms, complex steps and REBOUND; exponents, MEGNO, periodic orbits, fits."""
 
+import ctypes
+from functools import lru_cache
+
 import numpy as np
 import pytest
 import sympy
+from c_compiler import shared_library
 from numba import njit
 from scipy.optimize import least_squares
 
 from eip_scipy import EIPDOP853, EIPRK4, equations, hamiltonian, integrate
-from eip_scipy.problems import ForceConstants, nbody
+from eip_scipy.problems import ForceConstants, harmonic, nbody
+from eip_scipy.problems import kepler as kepler_problem
 from eip_scipy.tangent_maps import TrajectoryFit, lyapunov_spectrum, megno, periodic_orbit
 
 pytestmark = pytest.mark.needs_jit
@@ -163,7 +168,14 @@ SYSTEMS = {
         [0.8, 0.1],
     ),
 }
-SOURCES = ("SymPy", "dual numbers", "jvp", "jitted jvp", "complex step")
+SOURCES = ("SymPy", "dual numbers", "jvp", "jitted jvp", "jvp in C", "complex step")
+KINDS = {  # as a run names them
+    "SymPy": "problem",
+    "ready problems": "problem",
+    "jitted jvp": "jvp",
+    "jvp in C": "jvp",
+    "complex step": "complex steps",
+}
 SOME = ("forced Duffing",)  # the others take minutes to compile
 
 
@@ -199,14 +211,19 @@ def product_with_jacobian(name):
     ]
 
 
-def by_complex_steps(name, tableau, h, steps):
+@lru_cache(maxsize=2)
+def steps_of(name, h, steps):
     """Derivatives (n, n + p) of the state after some steps, by complex steps through the steps themselves."""
     rates, params, _, y0 = SYSTEMS[name]
-    f = written(name, "t, Y, P", rates.values())
-    A, b, c = (np.asarray(getattr(tableau, item)) for item in "Abc")
+    return through_steps(written(name, "t, Y, P", rates.values()), y0, list(params.values()), h, steps)
+
+
+def through_steps(f, y0, params, h, steps):
+    """The same of a function f(t, y, p) of complex arrays."""
+    A, b, c = (np.asarray(getattr(EIPDOP853.TABLEAU, item)) for item in "Abc")
     columns = []
     for k in range(len(y0) + len(params)):
-        y, p = np.array(y0, complex), np.array(list(params.values()), complex)
+        y, p = np.array(y0, complex), np.array(params, complex)
         (y if k < len(y0) else p)[k if k < len(y0) else k - len(y0)] += 1e-30j
         for step in range(steps):
             K = []
@@ -217,34 +234,106 @@ def by_complex_steps(name, tableau, h, steps):
     return np.array(columns).T
 
 
-def carried(name, source, keeps, **options):
+def in_c(name, folder):
+    """The product with the Jacobian as a C function by pointer."""
+    rates, params, *_ = SYSTEMS[name]
+    lines = [f"double {item} = Y[{k}], d{k} = dY[{k}];" for k, item in enumerate(rates)]
+    lines += [f"double {item} = P[{k}];" for k, item in enumerate(params)]
+    lines += [f"out[{k}] = {sympy.ccode(sympy.sympify(text))};" for k, text in enumerate(product_with_jacobian(name))]
+    arguments = "double t, const double *Y, const double *dY, double *out, const double *P"
+    source = folder / "product.c"
+    source.write_text(f"#include <math.h>\nint product({arguments}) {{\n{chr(10).join(lines)}\nreturn 0; }}\n")
+    product = ctypes.CDLL(str(shared_library(folder / "product.so", source))).product
+    product.argtypes = [ctypes.c_double, *[ctypes.POINTER(ctypes.c_double)] * 4]
+    return product
+
+
+def system(name, source, folder):
+    """What `integrate` takes: the problem or function, and its options; compiled once for the runs of a test."""
     rates, params, kept, y0 = SYSTEMS[name]
-    invariants = {f"I{k}": text for k, text in enumerate(kept)} if keeps else {}
-    span, places = (0, STEP * STEPS), list(params)
+    options = {"t_span": (0, STEP * STEPS), "y0": y0, "method": EIPDOP853}
     if source == "SymPy":
-        problem = equations(rates, params=params, invariants=invariants)
-        return integrate(problem, span, y0, variations=["state", *places], **options)
+        problem = equations(rates, params=params, invariants={f"I{k}": text for k, text in enumerate(kept)})
+        return problem, options | {"variations": ["state", *params]}
     f = written(name, "t, Y, P", rates.values())
-    items = [written(name, "t, Y, P", [text]) for text in kept] if keeps else []
-    wanted = ["state"] if "jvp" in source else ["state", *range(len(params))]
+    items = [written(name, "t, Y, P", [text]) for text in kept]
     if source in ("dual numbers", "jitted jvp"):
         f, items = njit(f), [njit(item) for item in items]
+    options |= {"params": list(params.values()), "invariants": items, "variations": ["state", *range(len(params))]}
     if "jvp" in source:
-        product = written(name, "t, Y, dY, P", product_with_jacobian(name))
-        options["jvp"] = njit(product) if "jitted" in source else product
-    return integrate(f, span, y0, params=list(params.values()), invariants=items, variations=wanted, **options)
+        product = in_c(name, folder) if "C" in source else written(name, "t, Y, dY, P", product_with_jacobian(name))
+        options |= {"variations": ["state"], "jvp": njit(product) if "jitted" in source else product}
+    return f, options
+
+
+@pytest.fixture(scope="module")
+def largest():
+    """Collect the largest errors by the source of the products, and print them at the end (``pytest -s``)."""
+    found = {}
+    yield found
+    print("\nsource            systems  plain run  projected run")
+    for source, errors in found.items():
+        plain, kept = np.max(errors, axis=0)
+        print(f"{source:<16} {len(errors):>8} {plain:>10.1e} {kept:>14.1e}")
+
+
+def require_derivatives(fun, options, right, source, largest):
+    """Compare the columns of a plain run with its steps, those of a projected run with the flow; `right`: both."""
+    size = np.abs(right[0]).max()
+    plain = integrate(fun, h=STEP, **options | {"invariants": ()})
+    kept = integrate(fun, h=STEP / 4, **options)
+    assert kept.columns["source"] == KINDS.get(source, source)
+    errors = [
+        np.abs(run.variations[-1] - exact[:, : run.variations.shape[-1]]).max() / size
+        for run, exact in zip((plain, kept), right, strict=True)
+    ]
+    largest.setdefault(source, []).append(errors)
+    assert errors[0] < 1e-12
+    assert errors[1] < 1e-10
 
 
 @pytest.mark.parametrize(("name", "source"), CASES)
-def test_sensitivities(name, source):
-    """Columns of a plain run are the derivatives of its steps; those of a projected run, of the flow."""
-    exact = by_complex_steps(name, EIPDOP853.TABLEAU, STEP, STEPS)
-    size = np.abs(exact).max()
-    plain = carried(name, source, False, method=EIPDOP853, h=STEP).variations[-1]
-    assert np.abs(plain - exact[:, : plain.shape[1]]).max() < 1e-12 * size
-    kept = carried(name, source, True, method=EIPDOP853, h=STEP / 4).variations[-1]
-    flow = by_complex_steps(name, EIPDOP853.TABLEAU, STEP / 4, 4 * STEPS)
-    assert np.abs(kept - flow[:, : kept.shape[1]]).max() < 1e-10 * size
+def test_sensitivities(name, source, largest, tmp_path):
+    fun, options = system(name, source, tmp_path)
+    right = steps_of(name, STEP, STEPS), steps_of(name, STEP / 4, 4 * STEPS)
+    require_derivatives(fun, options, right, source, largest)
+
+
+def newton(t, y, gm):
+    """Bodies in complex numbers."""
+    q, v = y.reshape(2, -1, 3)
+    way = q - q[:, None]
+    square = (way**2).sum(axis=2) + np.eye(gm.size)
+    return np.concatenate([v, ((gm * square**-1.5)[:, :, None] * way).sum(axis=1)]).ravel()
+
+
+def relativistic(t, y, p):
+    square = y[0] ** 2 + y[1] ** 2
+    return np.concatenate([y[2:], -(square**-1.5) * (1 + 1.5 * p[0] / square) * y[:2]])
+
+
+def bodies():
+    q, v = [[0, 0, 0], [1, 0, 0.1], [-0.3, 1.6, 0]], [[0, 0, 0], [0, 1.1, 0], [-0.9, -0.1, 0.2]]
+    return nbody([1.0, 0.1, 0.03], q, v, t_span=(0, 1))
+
+
+READY = {  # the problem, the parameters of its derivatives, and its equations for complex numbers
+    "kepler": (lambda: kepler_problem(0.3, relativistic=0.1), [0], relativistic),
+    "harmonic": (lambda: harmonic(1.7), [0], lambda t, y, p: p[0] * np.array([y[1], -y[0]])),
+    "nbody": (bodies, [], newton),
+}
+
+
+@pytest.mark.parametrize("name", READY)
+def test_sensitivities_of_ready_problems(name, largest):
+    make, parameters, f = READY[name]
+    problem = make()
+    columns = [*range(problem.y0.size), *(problem.y0.size + k for k in parameters)]
+    right = [
+        through_steps(f, problem.y0, problem.params, h, round(STEP * STEPS / h))[:, columns] for h in (STEP, STEP / 4)
+    ]
+    options = {"t_span": (0, STEP * STEPS), "method": EIPDOP853, "variations": ["state", *parameters]}
+    require_derivatives(problem, options, right, "ready problems", largest)
 
 
 # Exponents and MEGNO.
