@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from eip_scipy import EIPDOP853, EIPRK4, ProjectionWarning, hamiltonian, integrate
-from eip_scipy.problems import nbody
+from eip_scipy.problems import kepler, nbody, solar_system
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.tangent_maps import TrajectoryFit, megno, periodic_orbit
 
@@ -245,7 +245,9 @@ class TangentMaps(Measurement[Found]):
         blocks.append(table(heads, [(name, [f"{x:.7f}" for x in row]) for name, row in found.relativity.items()]))
         if found.rebound:
             blocks.append(self._compared(found))
-        blocks.append("Time of a run with all n columns, as a multiple of (n + 1) plain runs, by where J v comes from")
+        blocks.append(
+            "Time of a run with k columns, by default all, as a multiple of (k + 1) plain runs, by where J v comes from"
+        )
         blocks.append(table([["multiple", ""]], [(name, [f"{x:.2f}"]) for name, x in found.costs.items()]))
         fit = found.fit
         blocks.append(
@@ -491,6 +493,26 @@ def _costs(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]
             turns=5,
         )
         found[name] = times["wide"] / (5 * times["alone"])
+    return found | _costs_of_ready_problems()
+
+
+def _costs_of_ready_problems() -> dict[str, float]:
+    """Compare k columns of ready problems with k + 1 plain runs, with all of their invariants."""
+    bodies = solar_system()
+    n = bodies.y0.size
+    cases: dict[str, tuple[Any, float, Any, int]] = {
+        "kepler()": (kepler(), 200 * PERIOD, "state", 4),
+        "ten bodies, all columns": (bodies, 2.0, "state", n),
+        "ten bodies, one column": (bodies, 20.0, np.ones((n, 1)), 1),
+    }
+    found = {}
+    for name, (problem, end, asked, columns) in cases.items():
+
+        def seconds(problem: Any = problem, end: float = end, **options: Any) -> float:
+            return float(integrate(problem, (0, end), method=EIPDOP853, **options).wall_time)
+
+        times = least({"alone": seconds, "wide": partial(seconds, variations=asked)}, turns=5)
+        found[name] = times["wide"] / ((1 + columns) * times["alone"])
     return found
 
 
