@@ -70,8 +70,8 @@ class Step:
         return now
 
     def defects(self, t: float, y: Array) -> Array:
-        """I - target; 0 where that is the rounding of four of an invariant's terms."""
-        return np.where(self.shares(t, y) <= 4 * EPS, 0.0, self.values(t, y) - self.target)
+        """I - target, which is given; 0 where all of it is the rounding of four of the invariants' terms."""
+        return self.values(t, y) - self.target if (self.shares(t, y) > 4 * EPS).any() else np.zeros(len(self.target))
 
     def shares(self, t: float, y: Array) -> Array:
         """Return the distances from the targets in units of the invariants' terms."""

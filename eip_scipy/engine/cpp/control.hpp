@@ -10,6 +10,8 @@ constexpr double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 // A failed projection shrinks the step as CVODE does.
 constexpr double RETRY_FACTOR = 0.25;
 constexpr int MAX_RETRIES = 10;
+// A step that ends next to a singular position is made again, once, with this fraction of its length.
+constexpr double SHORTENED = 0.5;
 // every = AUTO: every few steps the step asks whether a projection is worth it, and the step after one that was.
 constexpr int64_t AUTO_SPACING = 5;
 
@@ -132,12 +134,14 @@ inline void close_step(const AnyRun &run, const Step &step, Code status) {
     close_derivative(run, step.t_new, step.y_new, wanted);
 }
 
-// The rest of a step whose raw result is accepted; OK or FAILED_PROJECTION.
+// The rest of a step whose raw result is accepted; OK, FAILED_PROJECTION or NEAR_SINGULAR.
 template <class AnyRun>
 inline Code finish_step(const AnyRun &run, const Step &step) {
     Code status = OK;
     if (step.project) {
         status = project_whole(run, step);
+        if (status == NEAR_SINGULAR) [[unlikely]]
+            return status;
         if (status == FAILED_PROJECTION) {
             ++run.work.counters[REJECTED];
             return status;
@@ -181,7 +185,8 @@ template <class AnyRun>
 
 // Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.last() = f at its end.
 //
-// A failed projection shortens the step, at most MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or
+// A failed projection shortens the step, at most MAX_RETRIES times in a row; the first end next to a singular position
+// does, too, because a step from elsewhere may cross it. Returns OK, NOT_FINITE, FAILED_PROJECTION or
 // TOO_SMALL; of a multistep method UNSTABLE too.
 template <class AnyRun>
 inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
@@ -196,7 +201,7 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         h_abs = span.max_step;
     else if (h_abs < least)
         h_abs = least;
-    bool rejected = false;
+    bool rejected = false, avoids_singular = adaptive;
     int retries = 0;
     Code status = std::isnan(h_abs) ? NOT_FINITE : TOO_SMALL;
     while (h_abs >= least) {
@@ -205,7 +210,8 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         clock[TIME_NEW] = last ? span.t_bound : t_new;
         clock[LENGTH] = adaptive ? clock[TIME_NEW] - t : span.between(k, k + 1);
         h_abs = std::abs(clock[LENGTH]);
-        const Step step{t, clock[TIME_NEW], clock[LENGTH], y, y_new, is_projected(run, k, last), last};
+        avoids_singular = avoids_singular && !last && SHORTENED * h_abs >= least;
+        const Step step{t, clock[TIME_NEW], clock[LENGTH], y, y_new, is_projected(run, k, last), last, avoids_singular};
         status = any_raw_step(run, step);
         const double norm = adaptive ? w.norm[0] : 0.0;
         if (status == OK && !std::isfinite(norm)) status = NOT_FINITE;
@@ -216,6 +222,11 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
                     norm == 0.0 ? MAX_FACTOR : std::min(MAX_FACTOR, SAFETY * std::pow(norm, run.method.exponent));
                 clock[NEXT_LENGTH] = h_abs * (rejected ? std::min(1.0, factor) : factor);
                 return OK;
+            }
+            if (status == NEAR_SINGULAR) {
+                avoids_singular = false;
+                h_abs *= SHORTENED;
+                continue;
             }
             if (retries == MAX_RETRIES) return status;
             ++retries;

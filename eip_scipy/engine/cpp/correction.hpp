@@ -156,10 +156,12 @@ inline int64_t first_move(const Options &o, const W &w, double *out, bool more) 
     double *rows = more ? nullptr : weighed_gradients(o, w);
     if (rows && solve_gram(rows_of(rows, w), w.g, R, w.mu)) {
         move_along(o, w, rows, out);
+        w.counters[TRIED_INDEPENDENT] = w.l;
         return w.l;
     }
     if (rows != w.Q) weigh_rows(o.frame, w, w.Q);
     const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
+    w.counters[TRIED_INDEPENDENT] = clearly_independent(R, w.pivots, rank);
     least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
     if (rank >= 0) move_along(o, w, w.Q, out);
     return rank;
@@ -359,7 +361,7 @@ inline Code stay(const AnyRun &run, const Step &step) {
 template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step);
 
-// Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION or POSTPONED.
+// Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION, POSTPONED or NEAR_SINGULAR.
 //
 // w.err holds the local error of y_hat where the metric wants it, w.last() f there where a gradient does. POSTPONED:
 // with every = AUTO, while the invariants know no more than round-off (y_new is then y_hat).
@@ -381,13 +383,17 @@ inline Code project_step(const AnyRun &run, const Step &step) {
     return project_evaluated(run, step);
 }
 
-// The rest of it, where the gradients at w.y_hat and the invariants' values are known.
+// The rest of it, where the gradients at w.y_hat and the invariants' values are known. NEAR_SINGULAR: the step avoids
+// singular positions, and at its end more gradients are nearly dependent than at its start. From there derivatives would be
+// those of a state off the manifold, divided by the distance from the singular position, and steps would become very short.
 template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
     if (!defects<double>(nullptr, w.y_hat, o, w, w.before) && o.balance_groups.count == 0) return stay(run, step);
     Moved moved = move(run, step);
+    if (step.avoids_singular && w.counters[TRIED_INDEPENDENT] < w.counters[INDEPENDENT]) [[unlikely]]
+        return NEAR_SINGULAR;
     Code status = correct(run, step, moved.rank);
     if (o.direction == NEW && o.iterations == 1 && !o.compensated && o.balance_groups.count == 0) {
         const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.m;
@@ -407,6 +413,7 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     if (status == OK) {
         take_note(step, origin(step, w), o, w);
         remember_errors(o, w);
+        w.counters[INDEPENDENT] = w.counters[TRIED_INDEPENDENT];
         w.max_correction[0] = std::max(w.max_correction[0], moved.correction);
     }
     return status;

@@ -14,17 +14,19 @@ namespace eip {
     constexpr const char *NAME##_NAMES = #__VA_ARGS__
 
 // Codes of a step; from PAUSE on those of the loops.
-EIP_ENUM(Code, OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE, PAUSE = 10, FULL, ENDED, DOUBTFUL);
+EIP_ENUM(Code, OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE, NEAR_SINGULAR, PAUSE = 10, FULL,
+         ENDED, DOUBTFUL);
 
 EIP_ENUM(Direction, NEW, OLD, MIDPOINT);
 EIP_ENUM(Metric, EUCLIDEAN, BY_ERROR, GIVEN);
 constexpr int64_t AUTO = 0;  // the option `every`
 
 // Places of the numbers that the step counts and leaves for the next one. From HAVE_ERROR on: whether an estimate of the
-// step's error is available, projections begun without one, steps since the last projection, what stood out in them, and
-// whether the last row of K holds f at the raw result. HAVE_F may be OF_STATE, see state_alone.hpp.
+// step's error is available, projections begun without one, steps since the last projection, what stood out in them,
+// whether the last row of K holds f at the raw result, and how many gradients of the last accepted projection, and of the
+// last one that was tried, are clearly independent. HAVE_F may be OF_STATE, see state_alone.hpp.
 EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED,
-         HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, N_COUNTERS);
+         HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, N_COUNTERS);
 constexpr int64_t OF_STATE = 2;
 // Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
 EIP_ENUM(Clock, TIME, TIME_NEW, LENGTH, NEXT_LENGTH);

@@ -10,6 +10,8 @@ namespace eip {
 constexpr double RANK_TOLERANCE = 1.4901161193847656e-08;  // sqrt(EPS)
 // Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the defects uncorrected.
 constexpr double REORTHOGONALISE = 0.05;
+// Rows of length 1 of which less than this is left without their components along others are nearly dependent.
+constexpr double NEARLY_DEPENDENT = 1e-4;
 
 // Rows of a matrix, `stride` values from one to the next.
 template <class Value>
@@ -70,6 +72,13 @@ using Matrix = MatrixOf<double>;
         scale_by(B.row(row), R(k, row), n);
     }
     return rows;
+}
+
+// Return how many of the first `rank` rows that `factor` chose are not nearly dependent.
+inline int64_t clearly_independent(const Matrix &R, const int64_t *pivots, int64_t rank) {
+    int64_t count = 0;
+    for (int64_t k = 0; k < rank; ++k) count += R(k, pivots[k]) * NEARLY_DEPENDENT < 1.0;
+    return count;
 }
 
 // Coefficients mu of the rows that `factor` left, of the least-norm x with row_i . x = -g_i; 0 beyond the rank.

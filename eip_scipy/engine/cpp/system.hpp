@@ -430,6 +430,7 @@ struct Step {
     const double *y;
     double *y_new;
     bool project, last;
+    bool avoids_singular = false;  // the step is given up if it ends next to a singular position
 };
 
 }  // namespace eip

@@ -22,7 +22,9 @@ constexpr double LEAST_RATE = 1e-8, LEAST_BALANCE_RATE = 1e-10, RATE_GROWTH = 2.
 constexpr double LEAST_ERROR = 3e-3, CLEAR_ERROR = 0.1, ERROR_GROWTH = 2.0, LEAST_CHANGE = 1e-2;
 
 // Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
-// whether anything is left to project. `terms`: sums of |G_k y_k|, else they are taken at `y`; then, where the step's
+// whether anything is left to project. Invariants with given targets are then corrected by all of their defects: where their
+// gradients are nearly dependent, what is left of them counts in units of the distance from the singular position, and
+// derivatives may hold on the targets only. `terms`: sums of |G_k y_k|, else they are taken at `y`; then, where the step's
 // errors are known, w.worth = sums of |G_k err_k| too.
 template <class Value, class W>
 inline Truth<Value> defects(const double *terms, const Value *y, const Options &o, const W &w, Value *raw) {
@@ -43,7 +45,7 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
         w.band[i] = band * size;
         raw[i] = w.values[i] - w.target[i];
         const Truth<Value> inside = (w.band[i] < ENDLESS) & (abs(raw[i]) <= w.band[i]);
-        w.g[i] = where(inside, 0.0, raw[i]);
+        w.g[i] = o.most_left[i] < ENDLESS ? raw[i] : where(inside, Value(0.0), raw[i]);
         outside = outside | !inside;
     }
     return outside;
