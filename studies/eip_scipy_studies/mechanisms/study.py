@@ -25,9 +25,12 @@ from .ways import BOTH, CONSTRAINTS, FACTORS, NEITHER, Outcome, Way, kept, ways
 
 __all__ = ["Mechanisms"]
 
-TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 LEVELS = (1e-2, 1e-4, 1e-6, 1e-8)  # errors whose costs are compared
 FINEST, AGREEMENT = 1e-13, 1e-8  # a run at this tolerance meets published states within this relative distance
+# Mechanisms whose errors are compared with those of runs without projection, at tolerances from this one on.
+LEAST_WEIGHED = 1e-9
+WEIGHED = ("andrews", "bricard", "wobbling disc", "steady disc", "knife edge")
 
 
 class Line(NamedTuple):
@@ -129,7 +132,12 @@ class Mechanisms(Study[Found]):
         }
 
     def checks(self, found: Found) -> Sequence[Check]:
-        return [*_four_bar_checks(found), *_published_checks(found), *_others(found.lines)]
+        return [
+            *_four_bar_checks(found),
+            *_published_checks(found),
+            *_weights_checks(found.lines),
+            *_others(found.lines),
+        ]
 
     def figures(self, found: Found) -> Figures:
         from ..plotting import CostPanel, cost_figure
@@ -183,6 +191,24 @@ def _published_checks(found: Found) -> Iterable[Check]:
     for name, distance in found.published.items():
         text = f"{name} at {FINEST:g}: within {distance:.1e} of the published last state (at most {AGREEMENT:g})"
         yield Check(text, distance <= AGREEMENT)
+
+
+def _weights_checks(lines: Sequence[Line]) -> Iterable[Check]:
+    """Yield errors relative to those of runs without projection, which the weights of corrections decide."""
+    by = {(line.mechanism, line.method, line.tolerance): line.error for line in lines}
+    for name in dict.fromkeys(line.mechanism for line in lines if line.mechanism in WEIGHED):
+        for what in (CONSTRAINTS, BOTH):
+            ratios = [
+                error / by[name, NEITHER, x]
+                for (which, method, x), error in by.items()
+                if (which, method) == (name, what) and x >= LEAST_WEIGHED
+            ]
+            mean, worst = float(np.exp(np.mean(np.log(ratios)))), max(ratios)
+            yield Check(
+                f"{name}, {what}: {mean:.2g} times DOP853's error in the mean (at most 1.2), {worst:.2g} times in one "
+                "run (at most 3)",
+                mean <= 1.2 and worst <= 3,
+            )
 
 
 def _others(lines: Iterable[Line]) -> Iterable[Check]:
