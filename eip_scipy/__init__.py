@@ -6,6 +6,7 @@ a function is to be compiled.
 
 from importlib import import_module as _import_module
 from pathlib import Path as _Path
+from sys import version_info as _python
 from typing import TYPE_CHECKING, Any
 
 from .core.moved import moved_names as _moved_names
@@ -100,6 +101,23 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "solve_ivp": "run.solve_ivp",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
+
+
+def _require_main_interpreter() -> None:
+    # NumPy would blame the installation. In subinterpreters of the older kind, such as those of mod_wsgi, NumPy only
+    # warns, and the engine's types would be shared with the main interpreter.
+    try:
+        interpreters = _import_module("_interpreters" if _python >= (3, 13) else "_xxsubinterpreters")
+    except ImportError:  # a Python without subinterpreters
+        return
+    if interpreters.get_current() != interpreters.get_main():
+        raise ImportError(
+            "eip_scipy was imported in a subinterpreter, but works only in the main interpreter of a process, as NumPy "
+            "does. Import it there, and use threads or processes (executor= of ensemble) for parallel runs."
+        )
+
+
+_require_main_interpreter()
 # In a clone the integrations are next to the package; an installed package contains them.
 if not _Path(__file__).with_name("integrations").exists():
     __path__.append(str(_Path(__file__).parents[1]))

@@ -61,6 +61,28 @@ def test_names_modules_and_version_come_by_name():
     assert python(code).split() == ["kepler", "read", eip_scipy.__version__, "EIPRK4", "__main__"]
 
 
+def test_a_subinterpreter_is_refused():
+    """Before NumPy is imported; the main interpreter is as it was."""
+    code = """
+import sys
+interpreters = __import__("_interpreters" if sys.version_info >= (3, 13) else "_xxsubinterpreters")
+run = interpreters.exec if sys.version_info >= (3, 13) else interpreters.run_string
+run(interpreters.create(), '''
+try:
+    import eip_scipy
+except ImportError as error:
+    print(error, flush=True)
+import sys
+print("numpy" in sys.modules, flush=True)
+''')
+from eip_scipy import Invariant
+print(Invariant.__name__)"""
+    *message, loaded, name = python(code)
+    assert " ".join(message[:6]) == "eip_scipy was imported in a subinterpreter,"
+    assert {"threads,", "processes"} <= {*message}
+    assert (loaded, name) == ("False", "Invariant")
+
+
 def test_no_folder_or_module_has_a_public_name():
     """Its import would put it in the place of the function, which comes by name only."""
     here = Path(eip_scipy.__file__).parent

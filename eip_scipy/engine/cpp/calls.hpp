@@ -5,16 +5,42 @@
 
 namespace eip {
 
+// The mode of the processor's floating-point unit, and the bits that have it take or leave subnormal numbers as zero.
+#if defined(__SSE2__)
+using Mode = unsigned;
+constexpr Mode FLUSHING = 0x8040u;  // FTZ and DAZ of MXCSR
+inline Mode read_mode() { return __builtin_ia32_stmxcsr(); }
+inline void write_mode(Mode mode) { __builtin_ia32_ldmxcsr(mode); }
+#elif defined(__aarch64__)
+using Mode = uint64_t;
+constexpr Mode FLUSHING = 0x1000001u;  // FZ and FIZ of FPCR
+inline Mode read_mode() {
+    Mode mode;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(mode));
+    return mode;
+}
+inline void write_mode(Mode mode) { __asm__ volatile("msr fpcr, %0" : : "r"(mode)); }
+#else
+using Mode = unsigned;
+constexpr Mode FLUSHING = 0u;
+inline Mode read_mode() { return 0u; }
+inline void write_mode(Mode) {}
+#endif
+
 // Subnormal numbers are numbers here, whatever another library left in the processor's mode.
 class [[maybe_unused]] FloatingPoint {
   public:
-#if defined(__SSE2__)
-    FloatingPoint() : mode_(__builtin_ia32_stmxcsr()) { __builtin_ia32_ldmxcsr(mode_ & ~0x8040u); }
-    ~FloatingPoint() { __builtin_ia32_ldmxcsr(mode_); }
+    FloatingPoint() : mode_(read_mode()) {
+        if (mode_ & FLUSHING) write_mode(mode_ & ~FLUSHING);
+    }
+    ~FloatingPoint() {
+        if (mode_ & FLUSHING) write_mode(mode_);
+    }
+    FloatingPoint(const FloatingPoint &) = delete;
+    FloatingPoint &operator=(const FloatingPoint &) = delete;
 
   private:
-    unsigned mode_;
-#endif
+    Mode mode_;
 };
 
 // The Python error of a call that was `Broken`, but where one is set already.

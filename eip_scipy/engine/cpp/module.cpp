@@ -5,8 +5,12 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <atomic>
 #include <string>
 #include <string_view>
+#if defined(__x86_64__)
+#include <cpuid.h>
+#endif
 
 #include "calls.hpp"
 #include "python_functions.hpp"
@@ -40,32 +44,37 @@ using State = StatesOf<double, 1>;
 using ConstState = StatesOf<const double, 1>;
 using Times = ArrayOf<const double, 1>;
 
-// True if the processor supports the other build, for x86-64-v3.
+// True if the processor supports the other build, for x86-64-v3, and the operating system saves its registers. CPUID is used
+// directly, because the library behind __builtin_cpu_supports is not available with each compiler and on each system.
 bool has_v3() {
 #if defined(__x86_64__)
-    __builtin_cpu_init();
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");
+    constexpr unsigned FIRST = bit_FMA | bit_OSXSAVE, SEVENTH = bit_AVX2 | bit_BMI2, KEPT = 6;  // XMM and YMM
+    unsigned a, b, c, d, low, high;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || (c & FIRST) != FIRST) return false;
+    __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+    return (low & KEPT) == KEPT && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & SEVENTH) == SEVENTH;
 #else
     return false;
 #endif
 }
 
 // The engine steps for one caller at a time, and interpolates for one: a function that does so with the run it belongs to
-// is refused.
+// is refused, and so is another thread.
 class Busy {
   public:
-    explicit Busy(bool &flag) : flag_(flag) {
-        if (flag)
-            refuse(PyExc_RuntimeError,
-                   "engine: a run cannot be stepped, nor its dense output evaluated, from its own functions");
-        flag = true;
+    explicit Busy(std::atomic<bool> &flag) : flag_(flag) {
+        if (flag.exchange(true, std::memory_order_acquire))
+            refuse(
+                PyExc_RuntimeError,
+                "engine: a run cannot be stepped, nor its dense output evaluated, from its own functions, nor by two "
+                "threads at once");
     }
-    ~Busy() { flag_ = false; }
+    ~Busy() { flag_.store(false, std::memory_order_release); }
     Busy(const Busy &) = delete;
     Busy &operator=(const Busy &) = delete;
 
   private:
-    bool &flag_;
+    std::atomic<bool> &flag_;
 };
 
 template <class Array>
@@ -120,7 +129,8 @@ class Engine {
 
     // Nothing is called from now on.
     void clear() {
-        busy_ = interpolating_ = true;
+        busy_ = true;
+        interpolating_ = true;
         eight_.reset();
         functions_.reset();
         hooks_.reset();
@@ -321,7 +331,7 @@ class Engine {
     std::unique_ptr<PythonFunctions> functions_;
     std::unique_ptr<PythonHooks> hooks_;
     int type_ = NPY_DOUBLE;
-    bool busy_ = false, interpolating_ = false;
+    std::atomic<bool> busy_ = false, interpolating_ = false;
     bool stepped_ = false;  // by `step`
 };
 
