@@ -26,7 +26,7 @@ def pendulum():
         return [(q[0] ** 2 + q[1] ** 2 - 1) / 2]
 
     return mechanism(
-        [1, 1], [0, -9.81], length, q0=[1, 0], u0=[0, 0], t_span=(0, 1), potential=lambda t, q: 9.81 * q[1]
+        [1, 1], [0, -9.81], length, q0=[1, 0], u0=[0, 0], t_span=(0, 0.4), potential=lambda t, q: 9.81 * q[1]
     )
 
 
@@ -40,6 +40,7 @@ def rows_of(folder):
         return list(csv.DictReader(stream))
 
 
+@pytest.mark.slow
 def test_it_compares_errors_calls_and_time(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "sksundae", None)
     monkeypatch.setitem(sys.modules, "sksundae.ida", None)
@@ -72,8 +73,9 @@ def test_ida_keeps_the_constraints_as_equations():
         outcome = found["IDA"](tolerance)
         assert abs(outcome.y[0] ** 2 + outcome.y[1] ** 2 - 1) < 10 * tolerance
         errors.append(np.abs(outcome.y - exact).max())
-        assert outcome.calls > 50
-    assert errors[2] < 1e-5 < 1e-2 > errors[0]
+        assert outcome.calls > 20
+    assert errors[2] < 1e-5
+    assert errors[0] < 1e-2
 
 
 def test_a_run_that_takes_too_long_has_no_error(monkeypatch, tmp_path):
