@@ -80,7 +80,8 @@ def mechanism(
     energy : callable, optional
         ``energy(t, q, u)``, the total energy.
     potential : callable, optional
-        ``potential(t, q)``, for the energy u M u / 2 + potential.
+        ``potential(t, q)``, for the energy u M u / 2 + potential. Without it and `energy`, the potential of
+        conservative forces is found by integration, where the functions can be written as expressions that allow it.
     power : callable, optional
         ``power(t, q, u)``, the rate of the energy, which is then kept as a `Balance`. By default it is computed.
     outputs : mapping, optional

@@ -18,7 +18,7 @@ __all__ = ["CONSTANT", "FEWEST", "Energy", "energy_of", "rates_of", "states_near
 
 # States next to the start at which rates are examined, and how far they are away, in units of the components' sizes.
 STATES, AWAY = 6, 0.2
-NEARER = (1.0, 0.1, 0.01)  # shares of that distance, of which the first is taken that gives a state
+NEARER = (1.0, 0.3, 0.1)  # shares of that distance, of which the first is taken that gives a state
 # A quantity is examined at this number of states at least.
 FEWEST = 3
 # An energy is constant if its rate is below this share of the rate's terms.
@@ -72,7 +72,8 @@ def energy_of(
         if rates.max() <= CONSTANT * terms.max() and terms.max() > 0 and item.power is None:
             kept = Invariant(item.value, item.gradient, args=args, in_place=True, name="energy")
             return kept, f"invariant, {item.description}"
-        slowness = rates.sum() / max(terms.sum(), np.finfo(float).tiny)
+        moving = terms > CONSTANT * terms.max()
+        slowness = float(np.median(rates[moving] / terms[moving])) if moving.any() else 0.0
         if slowness < least:
             slowest, least = item, slowness
     if slowest is None:
@@ -125,15 +126,23 @@ def states_near(
         duration = float(np.copysign(min(duration, abs(t_end - t)), t_end - t))
     found = [(t, y)]
     for time in t + duration * np.random.default_rng(20392).uniform(size=STATES):
-        direction = sizes * rng.standard_normal(y.size)
+        direction = rng.standard_normal(y.size)
+        origin = _nearest(y, constraints, time, sizes)
         for share in NEARER:
-            moved = y + share * direction
-            for item in constraints:
-                moved = nearest_start(moved, item, time, np.ones(y.size))
-            if np.isfinite(derivative(time, moved)).all() and all(_meets(item, time, moved) for item in constraints):
+            moved = _nearest(origin + share * sizes * direction, constraints, time, sizes)
+            # What is nearest is not farther away than the start; Newton's method may end beyond a singular position.
+            near = np.linalg.norm((moved - origin) / sizes) <= 2 * share * np.linalg.norm(direction) * (1 + CONSTANT)
+            meets = all(_meets(item, time, moved) for item in constraints)
+            if near and meets and np.isfinite(derivative(time, moved)).all():
                 found.append((time, moved))
                 break
     return found
+
+
+def _nearest(y: np.ndarray, constraints: Sequence[Invariant], t: float, sizes: np.ndarray) -> np.ndarray:
+    for item in constraints:
+        y = nearest_start(y, item, t, sizes)
+    return y
 
 
 def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> float:

@@ -201,8 +201,8 @@ def mechanics(
         it is called as it is, and may occur in forces only. Default: ``model.specifieds``, whose functions take
         (y, t), as PyDy has them.
     energy : sympy.Expr, optional
-        The total energy. Default: that of the bodies, to which the potential of constant loads is added if the energy
-        is constant with it; that of the Lagrangian.
+        The total energy. Default: that of the bodies, or of the Lagrangian, to which the potential of conservative
+        loads is added if the energy is constant with it.
     outputs : mapping, optional
         Expressions, which may contain derivatives of coordinates and speeds, of quantities that are computed at saved
         states, by name; see ``run.outputs``.

@@ -15,9 +15,10 @@ from ..multibody.motion import Sizes
 from ..multibody.outputs import Outputs
 from ..multibody.parts import Parts
 from .parser import symbol
+from .potentials import at_rest, potential_of
 from .program import Arguments, function
 
-__all__ = ["Constrained", "acceleration", "cyclic", "filling", "own_speed", "parts_of"]
+__all__ = ["Constrained", "acceleration", "conservative", "cyclic", "filling", "own_speed", "parts_of"]
 
 BRANCHES = (sympy.Piecewise, sympy.Abs, sympy.sign, sympy.Heaviside, sympy.Max, sympy.Min)
 
@@ -117,6 +118,21 @@ def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) 
         if along and not unsure:
             found.append(k)
     return found
+
+
+def conservative(system: Constrained, active: Sequence[Any], speeds_by_rate: Callable[[int], Sequence[Any]]) -> Any:
+    """Return the potential of those of the `active` forces (n,) on the speeds that are conservative, None without any.
+
+    Forces that depend on the time, on inputs, or on speeds have none.
+    """
+    speeds = [symbol(name) for name in system.speeds]
+    still = at_rest(active, speeds, {symbol("t"), *(symbol(name) for name, _ in system.inputs)})
+    columns = [speeds_by_rate(k) for k in range(len(system.coordinates))]
+    moved = [any(column and column[j] != 0 for column in columns) for j in range(len(speeds))]
+    if all(F == 0 for F in still) or any(F != 0 and not known for F, known in zip(still, moved, strict=True)):
+        return None
+    forces = [sympy.Add(*(a * F for a, F in zip(column, still, strict=True))) if column else 0 for column in columns]
+    return potential_of(list(map(sympy.sympify, forces)), [symbol(name) for name in system.coordinates])
 
 
 def acceleration(speed: str) -> sympy.Symbol:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from sympy.physics.mechanics import KanesMethod, Point, msubs
 
 from ...core.names import nearest
 from ..multibody.motion import plain
-from .constrained import Constrained, acceleration, cyclic, filling, own_speed
+from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed
 from .inputs import TIME, read_inputs
 from .parser import as_expression, symbol
 
@@ -61,6 +62,7 @@ class _Equations(NamedTuple):
     velocities: list[Any]
     energies: list[tuple[str, Any]]
     kinetic: Any  # or the Lagrangian
+    active: list[Any]  # generalised forces of loads, unless their potential is among the energies or there are none
     method: Any  # a KanesMethod, whose speeds may be any linear functions of the derivatives of coordinates
     independent: list[Any] | None
     by_speeds: dict[Any, Any]  # derivatives of coordinates
@@ -102,7 +104,7 @@ def read(
     found = _of_lagrange(method) if hasattr(method, "_L") else _of_kane(method)
     converted = _Conversion(found, inputs, start)
     system = _system(found, converted, parameters)
-    energies = tuple((label, converted(item)) for label, item in _energies(found, energy, converted))
+    energies = tuple(_energies(found, energy, system, converted))
     momenta = tuple(_momenta(found, system, converted))
     shown = tuple((name, converted.output(name, item, parameters)) for name, item in outputs.items())
     extra = [item for _, item in (*energies, *momenta, *shown)]
@@ -234,24 +236,34 @@ def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, 
     return system
 
 
-def _energies(found: _Equations, energy: Any, converted: _Conversion) -> list[tuple[str, Any]]:
-    """Return the quantities that may be the energy; those with inputs that are called are none."""
-    if energy is None:
-        return [(label, item) for label, item in found.energies if not converted.depends_on_call(converted(item))]
-    if converted.depends_on_call(converted(energy)):
-        raise ValueError(
-            "mechanics: energy depends on an input that is a function without an expression, and its derivatives are "
-            "needed; give the input as an expression of t and the state."
-        )
-    return [("energy=", energy)]
+def _energies(found: _Equations, energy: Any, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
+    """Yield the quantities that may be the energy; those with inputs that are called are none."""
+    if energy is not None:
+        if converted.depends_on_call(given := converted(energy)):
+            raise ValueError(
+                "mechanics: energy depends on an input that is a function without an expression, and its derivatives "
+                "are needed; give the input as an expression of t and the state."
+            )
+        yield "energy=", given
+        return
+    own = [(label, converted(item)) for label, item in found.energies]
+    own = [(label, item) for label, item in own if not converted.depends_on_call(item)]
+    yield from own
+    active = [converted(item) for item in found.active]
+    potential = conservative(system, active, partial(_by_rate, found, system, converted)) if own and active else None
+    if potential is not None:
+        label, first = own[0]
+        yield f"{label} and potential of the loads", first + potential
+
+
+def _by_rate(found: _Equations, system: Constrained, converted: _Conversion, k: int) -> list[Any]:
+    """Return the derivatives of the speeds by that of a coordinate, [] where they are not known."""
+    return own_speed(system, k) or (_speeds_by_rate(found.method, k, converted) if found.method else [])
 
 
 def _momenta(found: _Equations, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
     """Yield the names and expressions of momenta that may be constant."""
-
-    def speeds_by_rate(k: int) -> list[Any]:
-        return own_speed(system, k) or (_speeds_by_rate(found.method, k, converted) if found.method else [])
-
+    speeds_by_rate = partial(_by_rate, found, system, converted)
     places = cyclic(system, speeds_by_rate)
     slopes = [converted(sympy.diff(found.kinetic, u)) for u in found.speeds] if places else []
     for k in places:
@@ -300,7 +312,7 @@ def _of_kane(method: Any) -> _Equations:
     q, u = list(method.q), list(method.u)
     frame = method._inertial
     free = KanesMethod(frame, q_ind=q, u_ind=u, kd_eqs=[dq - value for dq, value in by_speeds.items()])
-    free.kanes_equations(bodies, loads)
+    active, _ = free.kanes_equations(bodies, loads)
     velocities = list(method._k_nh * sympy.Matrix(u) + method._f_nh) if method._k_nh else []
     dependent = {*method._qdep, *method._udep}
     kinetic = sympy.Add(*(body.kinetic_energy(frame) for body in bodies))
@@ -323,6 +335,7 @@ def _of_kane(method: Any) -> _Equations:
         velocities,
         energies,
         kinetic,
+        [] if of_loads is not None and all(_is_constant(item, frame) for item in loads or ()) else list(active),
         method,
         [item for item in (*q, *u) if item not in dependent] if dependent else None,
         dict(by_speeds),
@@ -346,9 +359,28 @@ def _of_lagrange(method: Any) -> _Equations:
         list(method.coneqs),
         [("of the Lagrangian", energy)],
         L,
+        _active_of_lagrange(method, speeds),
         None,
         None,
         {},
+    )
+
+
+def _active_of_lagrange(method: Any, speeds: Sequence[Any]) -> list[Any]:
+    """Return the generalised forces of a LagrangesMethod's loads, [] without any."""
+    frame, found = method.inertial, [sympy.Integer(0)] * len(speeds)
+    for place, vector in method.forcelist or ():
+        motion = place.vel(frame) if isinstance(place, Point) else place.ang_vel_in(frame)
+        found = [total + vector.dot(motion.diff(u, frame)) for total, u in zip(found, speeds, strict=True)]
+    return found if any(item != 0 for item in found) else []
+
+
+def _is_constant(load: Any, frame: Any) -> bool:
+    """Return whether a load is a force that is constant in the inertial frame."""
+    place, vector = load
+    components = [vector.dot(axis) for axis in frame]
+    return isinstance(place, Point) and not any(
+        item.atoms(AppliedUndef, sympy.Derivative) or item.has(TIME) for item in components
     )
 
 
@@ -356,11 +388,9 @@ def _potential_of_loads(loads: Iterable[Any], frame: Any, state: set[Any]) -> An
     """Return the potential of forces that are constant in the inertial frame; None where a position is not known."""
     total = sympy.Integer(0)
     for place, vector in loads:
-        if not isinstance(place, Point):
+        if not _is_constant((place, vector), frame):
             continue
         components = [vector.dot(axis) for axis in frame]
-        if any(item.atoms(AppliedUndef, sympy.Derivative) or item.has(TIME) for item in components):
-            continue
         origin = _fixed_point(place, frame)
         if origin is None:
             return None

@@ -12,7 +12,7 @@ import sympy
 from ..multibody.numerical import outputs_as_given
 from ..multibody.parts import Given, Parts
 from ..multibody.start import Names
-from .constrained import Constrained, cyclic, own_speed, parts_of
+from .constrained import Constrained, conservative, cyclic, own_speed, parts_of
 from .parser import symbol
 from .traced import NotTraceableError, traced
 
@@ -54,12 +54,14 @@ def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndar
     ).with_velocities()
     power = (expressions("power", "tqu") or (None,))[0]
     energies = []
+    M, column = sympy.Matrix(len(speeds), len(speeds), system.mass), sympy.Matrix(speeds)
+    kinetic = (column.T * M * column)[0] / 2
     if given.energy is not None:
         energies.append(("energy", expressions("energy", "tqu")[0], power))
     elif given.potential is not None:
-        M = sympy.Matrix(len(speeds), len(speeds), system.mass)
-        kinetic = (sympy.Matrix(speeds).T * M * sympy.Matrix(speeds))[0] / 2
         energies.append(("u M u / 2 + potential", kinetic + expressions("potential", "tq")[0], power))
+    elif (potential := conservative(system, system.forces, partial(own_speed, system))) is not None:
+        energies.append(("u M u / 2 + the potential of the forces", kinetic + potential, power))
     parts = parts_of(system, energies, tuple(_momenta(system)), _outputs(given, by_name))
     called = given.outputs and parts.outputs is None
     return parts._replace(outputs=outputs_as_given(given, q.size, u.size)) if called else parts

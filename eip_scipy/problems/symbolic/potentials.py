@@ -1,0 +1,111 @@
+"""Potentials of conservative forces, by integration along one coordinate after another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import sympy
+from sympy.integrals.manualintegrate import manualintegrate
+
+__all__ = ["at_rest", "potential_of"]
+
+# Operations of all forces together beyond which integration may take long.
+MOST_OPERATIONS = 1000
+# Factors of an integrand, and powers of its sines and cosines.
+MOST_FACTORS = 4
+KNOWN = (sympy.sin, sympy.cos, sympy.exp)
+# Points from which integrals are taken: the second one if forces are infinite at the first.
+BASES = (0, 1)
+
+
+def at_rest(forces: Sequence[Any], speeds: Sequence[Any], others: set[Any]) -> list[Any]:
+    """Return the terms of forces that are there at rest, without those that contain `others`, such as the time."""
+    still = [sympy.expand_mul(sympy.sympify(item).subs(dict.fromkeys(speeds, 0))) for item in forces]
+    return [sympy.Add(*(term for term in sympy.Add.make_args(F) if not term.free_symbols & others)) for F in still]
+
+
+def potential_of(forces: Sequence[Any], coordinates: Sequence[Any]) -> Any:
+    """Return V with forces = -dV/dq if the forces are conservative, None if no such expression is found.
+
+    V need not be right if they are not: whether it is shows in the energy that it is a part of.
+
+    Parameters
+    ----------
+    forces : sequence of sympy.Expr
+        The generalised forces of the coordinates, without speeds.
+    coordinates : sequence of sympy.Symbol
+    """
+    if sum(item.count_ops() for item in forces) > MOST_OPERATIONS:
+        return None
+    forces = [sympy.expand_mul(item) for item in forces]
+    lengths, forces = _of_lengths(forces, coordinates)
+    for base in BASES:
+        rest = _along_axes(forces, coordinates, base)
+        if rest is not None:
+            return lengths + rest
+    return None
+
+
+def _of_lengths(forces: Sequence[Any], coordinates: Sequence[Any]) -> tuple[Any, list[Any]]:
+    """Return the potential of terms along the gradient of a length, as springs and gravity have, and the other terms.
+
+    With S, the square of the length, the force is c S^p with c = a dS/dq / 2, where a is constant, and its potential
+    -a S^(p + 1) / (2 p + 2).
+    """
+    potential, forces = sympy.Integer(0), list(forces)
+    powers = set().union(*(item.atoms(sympy.Pow) for item in forces))
+    powers = {item for item in powers if item.exp.is_Rational and item.exp < 0 and item.exp != -1 and item.base.is_Add}
+    for inverse in sorted(powers, key=str):
+        slopes = [sympy.diff(inverse.base, q) / 2 for q in coordinates]
+        parts = [item.coeff(inverse) for item in forces]
+        pairs = [(part, slope) for part, slope in zip(parts, slopes, strict=True) if part != 0 and slope != 0]
+        if not pairs:
+            continue
+        factor = sympy.cancel(sympy.expand_trig(pairs[0][0]) / sympy.expand_trig(pairs[0][1]))
+        if not factor.free_symbols & set(coordinates):
+            potential -= factor * inverse.base ** (inverse.exp + 1) / (2 * inverse.exp + 2)
+            forces = [sympy.expand_mul(item - part * inverse) for item, part in zip(forces, parts, strict=True)]
+    return potential, forces
+
+
+def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) -> Any:
+    """Return the integral from the base along the last coordinate, then along the one before it, and so on."""
+    potential = sympy.Integer(0)
+    for k, (force, q) in enumerate(zip(forces, coordinates, strict=True)):
+        integrand = force.subs(dict.fromkeys(coordinates[:k], base))
+        terms = sympy.Add.make_args(sympy.expand(integrand))
+        if not all(_is_simple(term, q) for term in terms):
+            return None
+        integral = sympy.Add(*(manualintegrate(term, q) for term in terms))
+        if integral.has(sympy.Integral):
+            return None
+        potential -= integral - integral.subs(q, base)
+    is_finite = not potential.has(sympy.zoo, sympy.oo, -sympy.oo, sympy.nan, sympy.I)
+    return potential if is_finite else None
+
+
+def _is_simple(term: Any, q: Any) -> bool:
+    """Return whether a term is of a kind that is integrated quickly: others may take for ever.
+
+    It is a product of powers of q or of one polynomial of degree 2, or of sines, cosines and exponentials of linear
+    functions.
+    """
+    powers = [item.as_base_exp() for item in sympy.Mul.make_args(term) if item.has(q)]
+    if len(powers) > MOST_FACTORS:
+        return False
+    roots = [base for base, exponent in powers if base != q and not isinstance(base, sympy.Function | sympy.exp)]
+    waves = [(base, exponent) for base, exponent in powers if isinstance(base, sympy.sin | sympy.cos)]
+    others = [base for base, exponent in powers if base.has(q) and base != q and base not in roots]
+    if any(exponent.has(q) or not exponent.is_Rational for base, exponent in powers if base is not sympy.E):
+        return False
+    own = [exponent for base, exponent in powers if base == q] if others else []  # integrated by parts
+    if any(not (exponent.is_Integer and 0 < exponent <= MOST_FACTORS) for exponent in (*own, *(n for _, n in waves))):
+        return False
+    if any(not _degree(base.args[0], q) <= 1 or not isinstance(base, KNOWN) for base in others):
+        return False
+    return len(roots) <= 1 and all(_degree(base, q) <= 2 for base in roots) and not (roots and others)
+
+
+def _degree(expression: Any, q: Any) -> float:
+    return float(sympy.degree(expression, q)) if expression.is_polynomial(q) else float("inf")
