@@ -119,7 +119,7 @@ def test_inputs_are_expressions_or_functions(pushed, given):
     jitted = numba.extending.is_jitted(given)
     assert ("called as it is" in repr(problem)) is (given is late or jitted)
     assert numba.extending.is_jitted(problem.rhs) is (given is not late)
-    assert "not kept" in problem.energy_kept
+    assert problem.energy is None
     assert problem.momenta == ()
     state = np.array([np.sin(0.5), np.cos(0.5)])
     for one in (problem,) if jitted or given is not late else (problem, pickled(problem)):

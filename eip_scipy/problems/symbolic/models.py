@@ -237,7 +237,10 @@ def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, 
 
 
 def _energies(found: _Equations, energy: Any, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
-    """Yield the quantities that may be the energy; those with inputs that are called are none."""
+    """Yield the quantities that may be the energy.
+
+    There are none where inputs are called: their work may begin at a time that is not looked at.
+    """
     if energy is not None:
         if converted.depends_on_call(given := converted(energy)):
             raise ValueError(
@@ -246,8 +249,9 @@ def _energies(found: _Equations, energy: Any, system: Constrained, converted: _C
             )
         yield "energy=", given
         return
+    if converted.inputs.called:
+        return
     own = [(label, converted(item)) for label, item in found.energies]
-    own = [(label, item) for label, item in own if not converted.depends_on_call(item)]
     yield from own
     active = [converted(item) for item in found.active]
     potential = conservative(system, active, partial(_by_rate, found, system, converted)) if own and active else None
