@@ -28,6 +28,20 @@ inline void make_stages(const AnyRun &run, const Step &step) {
 // Return whether the derivative at y_hat serves the projection only, and another one follows.
 inline bool is_for_projection(const Options &o, const Step &step) { return step.project && !o.reuse_f; }
 
+// Computes f at y_hat in w.last() and, if one pass finds them all, values and gradients there if the step is to be projected.
+template <class AnyRun>
+inline void evaluate_raw(const AnyRun &run, const Step &step) {
+    const auto &w = run.work;
+    ++w.counters[NFEV];
+    if constexpr (IS_SINGLE<AnyRun>) {
+        auto &system = run.system;
+        system.all_at_raw = system.together && step.project && !system.columns;
+        if (system.all_at_raw) return system.together->all(w.y_hat, w.last(), w.values, w.G, system.params);
+        if (!is_for_projection(run.options, step)) return system.rhs_of_whole(w, step.t_new, w.y_hat, w.last());
+    }
+    run.system.rhs(w, step.t_new, w.y_hat, w.last());
+}
+
 // Computations after the stages: f at y_hat in w.last(), the local error in w.err and its norm in w.norm where they are needed.
 // Return whether the step's local errors are to be compared with what it changes in each block.
 template <class AnyRun>
@@ -38,17 +52,7 @@ inline bool look_back(const AnyRun &run, const Step &step) {
     const bool estimate = o.adaptive || ((o.metric == BY_ERROR || o.every == AUTO) && w.l > 0);
     w.counters[HAVE_F] = (estimate && m.fsal) || (step.project && o.uses_f);
     w.counters[HAVE_ERROR] = estimate;
-    if (w.counters[HAVE_F]) {
-        if constexpr (IS_SINGLE<AnyRun>) {
-            if (is_for_projection(o, step))
-                run.system.rhs(w, step.t_new, w.y_hat, w.last());
-            else
-                run.system.rhs_of_whole(w, step.t_new, w.y_hat, w.last());
-        } else {
-            run.system.rhs(w, step.t_new, w.y_hat, w.last());
-        }
-        ++w.counters[NFEV];
-    }
+    if (w.counters[HAVE_F]) evaluate_raw(run, step);
     if (estimate) estimate_error(run, step);
     if (!step.project) return false;
     const bool sampled = is_sampled(run);

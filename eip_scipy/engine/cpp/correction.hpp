@@ -27,13 +27,18 @@ inline MatrixOf<Value> corner(Value *a, int64_t size, const W &w) {
     return {a, size, size, w.l};
 }
 
-// w.values = I(y); compensated runs add what the carry is worth, by gradients G.
+// Add to w.values, in compensated runs, what the carry is worth by gradients G.
 template <class AnyRun, class Value>
-inline void evaluate_carried(const AnyRun &run, double t, const Value *y, const Value *carry, const Value *G) {
+inline void add_carried(const AnyRun &run, const Value *carry, const Value *G) {
     const auto &w = run.work;
-    run.system.inv(w, t, y, w.values);
     if (run.options.compensated)
         for (int64_t i = 0; i < w.l; ++i) w.values[i] += dot(G + i * w.m, carry, w.m);
+}
+// w.values = I(y) with the carry.
+template <class AnyRun, class Value>
+inline void evaluate_carried(const AnyRun &run, double t, const Value *y, const Value *carry, const Value *G) {
+    run.system.inv(run.work, t, y, run.work.values);
+    add_carried(run, carry, G);
 }
 // As above, by the carry and the current gradients.
 template <class AnyRun, class Value>
@@ -43,7 +48,7 @@ inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
 
 // Rows along which a correction goes: w.Q, or the gradients as they are where the weights are 1.
 template <class W>
-inline auto *weighed_gradients(const Options &o, const W &w) {
+[[gnu::always_inline]] inline auto *weighed_gradients(const Options &o, const W &w) {
     if (o.metric == EUCLIDEAN && o.frame.rows == 0) return w.G;
     weigh_rows(o.frame, w, w.Q);
     return w.Q;
@@ -51,7 +56,8 @@ inline auto *weighed_gradients(const Options &o, const W &w) {
 
 // w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction along rows Q, neutral to the frame; out = y_hat + move.
 template <class Value, class W>
-inline void move_along(const Options &o, const W &w, const Value *__restrict Q, Value *__restrict out) {
+[[gnu::always_inline]] inline void move_along(const Options &o, const W &w, const Value *__restrict Q,
+                                              Value *__restrict out) {
     const int64_t m = w.m;
     const Value *__restrict mu = w.mu, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
     Value *__restrict move = w.move;
@@ -149,7 +155,7 @@ inline auto *limits(const Options &o, const W &w) {
 
 // The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
 template <class W>
-inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
+[[gnu::always_inline]] inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
     if (o.balance_groups.count > 0) [[unlikely]]
         return move_in_groups(o, w, out);
     const Matrix R = corner(w.R, w.l, w);
@@ -369,7 +375,8 @@ template <class AnyRun>
 inline Code project_step(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
-    run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    const bool known = std::exchange(run.system.all_at_raw, false);
+    if (!known) run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     note_rates(run, step);
     if (o.every != 1 && (o.metric == BY_ERROR || o.every == AUTO || o.adaptive)) {
@@ -379,7 +386,10 @@ inline Code project_step(const AnyRun &run, const Step &step) {
             return POSTPONED;
         }
     }
-    evaluate_invariants(run, step.t_new, w.y_hat);
+    if (known)
+        add_carried(run, w.carry_hat, w.G);
+    else
+        evaluate_invariants(run, step.t_new, w.y_hat);
     return project_evaluated(run, step);
 }
 

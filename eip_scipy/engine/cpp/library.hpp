@@ -27,6 +27,14 @@ using LibraryPointer = void (*)(double t, const T *y, const T *f, T *out, const 
 // `accelerate_apart` of p bodies.
 using ApartPointer = void (*)(const double *y, double *out, double *pulls, const double *params, int64_t n, int64_t p);
 
+// A problem's functions at one state in one pass, in which they share their terms, with the bits of the functions one by one:
+// the derivative, and the values and the gradients of these invariants; the values alone.
+struct Together {
+    void (*all)(const double *y, double *f, double *values, double *G, const double *params);
+    void (*values)(const double *y, double *values, const double *params);
+    std::span<const LibraryPointer<double>> values_alone, gradients_alone;
+};
+
 // A function of `Given` as such a pointer.
 template <class T, void (*FUNCTION)(const Given<T> &)>
 void plain(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p) {
@@ -50,6 +58,7 @@ struct LibraryFunction {
     const char *sizes;                          // what fits
     ApartPointer apart = nullptr;               // null where there is none
     LibraryPointer<double> by_pulls = nullptr;  // of rates: from such pulls in the place of f
+    const Together *together = nullptr;         // of a derivative; null where there is none
     std::vector<double> own{};                  // parameters that replace those of the run; empty in the library itself
 
     bool is_gradient() const { return value == Value::GRADIENT || value == Value::GRADIENT_BY_F; }
@@ -73,9 +82,11 @@ struct LibraryCall {
     int64_t n_own = 0;
     ApartPointer apart = nullptr;
     LibraryPointer<T> by_pulls = nullptr;
+    const Together *together = nullptr;
 
     explicit operator bool() const { return pointer; }
-    void operator()(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p) const {
+    [[gnu::always_inline]] void operator()(double t, const T *y, const T *f, T *out, const T *params, int64_t n,
+                                           int64_t p) const {
         if (own) [[unlikely]]
             return pointer(t, y, f, out, own, n, n_own);
         pointer(t, y, f, out, params, n, p);

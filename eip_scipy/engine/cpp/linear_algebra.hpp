@@ -100,7 +100,7 @@ inline void least_norm(const double *g, const double *inverse_norms, const Matri
 // shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The diagonal of R then holds 1/D.
 // Two rows, the usual case, by Cramer's rule: one division to wait for.
 template <class Value>
-inline Truth<Value> gram_solution(const MatrixOf<Value> &R, const Value *g, Value *mu) {
+[[gnu::always_inline]] inline Truth<Value> gram_solution(const MatrixOf<Value> &R, const Value *g, Value *mu) {
     const int64_t rows = R.rows;
     constexpr double LEAST = REORTHOGONALISE * REORTHOGONALISE;
     Truth<Value> bad{};
@@ -140,7 +140,8 @@ inline Truth<Value> gram_solution(const MatrixOf<Value> &R, const Value *g, Valu
 }
 
 template <class Value>
-inline Truth<Value> solve_gram(const MatrixOf<Value> &B, const Value *g, const MatrixOf<Value> &R, Value *mu) {
+[[gnu::always_inline]] inline Truth<Value> solve_gram(const MatrixOf<Value> &B, const Value *g,
+                                                      const MatrixOf<Value> &R, Value *mu) {
     for (int64_t i = 0; i < B.rows; ++i)
         for (int64_t j = 0; j <= i; ++j) R(i, j) = dot(B.row(i), B.row(j), B.columns);
     return gram_solution(R, g, mu);

@@ -286,7 +286,7 @@ template <class AnyRun>
                                       double *y_new, const Saved &saved) {
     const auto &w = run.work;
     int64_t *place = s.place;
-    run.system.choose_rates();
+    run.system.choose();
     while (true) {
         if (place[PENDING] == 1) {
             s.clock[TIME] = s.clock[TIME_NEW];

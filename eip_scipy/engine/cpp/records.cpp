@@ -334,8 +334,12 @@ Members members_of(nb::handle members, const Data &run, const Schedule &schedule
 
 // A function of the library's for one state or for eight.
 static void take(const LibraryFunction &function, LibraryCall<double> &place) {
-    place = {function.one, function.own.empty() ? nullptr : function.own.data(), std::ssize(function.own),
-             function.apart, function.by_pulls};
+    place = {function.one,
+             function.own.empty() ? nullptr : function.own.data(),
+             std::ssize(function.own),
+             function.apart,
+             function.by_pulls,
+             function.together};
 }
 static void take(const LibraryFunction &function, LibraryCall<Octet> &place) {
     if (function.own.empty()) place = {function.eight};

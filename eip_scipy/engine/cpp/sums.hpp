@@ -67,7 +67,7 @@ inline double absolute(double x) { return __builtin_fabs(x); }
 // The sum of the terms of all i < n; term<Value>(i) is that of one float, or a vector of those from i on. The pointer says
 // what is added: floats, or vectors (values.hpp).
 template <class Term>
-inline double sum_of(const double *, int64_t n, const Term &term) {
+[[gnu::always_inline]] inline double sum_of(const double *, int64_t n, const Term &term) {
     const int64_t whole = n - n % LANES;
     double rest = 0.0;
     for (int64_t i = whole; i < n; ++i) rest += term.template operator()<double>(i);
@@ -79,13 +79,13 @@ inline double sum_of(const double *, int64_t n, const Term &term) {
 }
 
 template <class Value>
-inline Value dot(const Value *a, const Value *b, int64_t n) {
+[[gnu::always_inline]] inline Value dot(const Value *a, const Value *b, int64_t n) {
     return sum_of(a, n, [=]<class Part>(int64_t i) { return load_as<Part>(a + i) * load_as<Part>(b + i); });
 }
 
 // Sum of |a_i b_i|.
 template <class Value>
-inline Value abs_dot(const Value *a, const Value *b, int64_t n) {
+[[gnu::always_inline]] inline Value abs_dot(const Value *a, const Value *b, int64_t n) {
     return sum_of(a, n, [=]<class Part>(int64_t i) { return absolute(load_as<Part>(a + i) * load_as<Part>(b + i)); });
 }
 
@@ -144,6 +144,15 @@ struct Rows {
     int64_t count, stride;
 };
 
+// A vector, or a float that the compiler must not load together with its neighbours.
+template <typename Float>
+inline Float load_alone(const double *a) {
+    if constexpr (sizeof(Float) == sizeof(double))
+        return *const_cast<const volatile double *>(a);
+    else
+        return load_as<Float>(a);
+}
+
 // COUNT vectors, or floats, from i on of out = y + scale sum, or of scale sum where there is no y.
 template <typename Float, int COUNT, bool ADD>
 inline void combine_part(const double *y, double scale, const Rows &rows, double *out, int64_t i) {
@@ -153,7 +162,7 @@ inline void combine_part(const double *y, double scale, const Rows &rows, double
         const double weight = rows.weights[j];
         if (weight == 0.0) continue;
         const double *row = rows.first + j * rows.stride + i;
-        for (int k = 0; k < COUNT; ++k) total[k] += weight * load_as<Float>(row + k * LENGTH);
+        for (int k = 0; k < COUNT; ++k) total[k] += weight * load_alone<Float>(row + k * LENGTH);
     }
     for (int k = 0; k < COUNT; ++k) {
         Float value = scale * total[k];

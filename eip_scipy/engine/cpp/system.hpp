@@ -100,7 +100,9 @@ struct System {
     std::vector<double> scratch, scratch_f, scratch_G, state, slope_of_state;
     std::vector<double> pulls;  // those that come with accelerations
     bool rates_by_pulls = false;
-    Shifts shifts;  // for gradients without a function
+    const Together *together = nullptr;  // where these are all functions of a problem
+    bool all_at_raw = false;             // whether values and gradients are known at the raw result of the step
+    Shifts shifts;                       // for gradients without a function
     FailedCall failed;
     // With columns of derivatives behind the state, in runs by pointer: these, otherwise null. The functions of the invariants
     // then take the state alone, as `rhs_pointer` also does if it `takes_state`. The derivatives of all invariants by the
@@ -128,7 +130,7 @@ struct System {
 
     // The derivative at a state that is made anew for each call.
     template <class W>
-    void rhs_of_scratch(const W &w, double t, const double *y, double *out) {
+    [[gnu::always_inline]] void rhs_of_scratch(const W &w, double t, const double *y, double *out) {
         if (!by_pointer) return python->rhs(t, y, out);
         call_rhs(w, t, y, out);
     }
@@ -143,6 +145,7 @@ struct System {
 
     template <class W>
     void inv(const W &w, double t, const double *y, double *values) {
+        if (together) return together->values(y, values, params);
         if (!by_pointer) return python->inv(t, y, values);
         if (columns) [[unlikely]]
             return call_each(Length{columns->seen}, inv_pointers, "inv", t, state_of(y, state), values);
@@ -180,8 +183,25 @@ struct System {
         }
     }
 
-    // True if all rates are found from the pulls that come with the derivative: those of the same masses. Parameters may
-    // change from one run to the next.
+    // Chooses functions that share intermediate results. Parameters may change from one run to the next.
+    void choose() {
+        choose_rates();
+        choose_together();
+    }
+
+    // Sets `together` if these are the functions of a problem with one pass for all of them, in a run without columns.
+    void choose_together() {
+        const Together *known = rhs_pointer.library.together;
+        const auto same = [](const auto &functions, std::span<const LibraryPointer<double>> alone) {
+            return std::equal(functions.begin(), functions.end(), alone.begin(), alone.end(),
+                              [](const auto &a, auto b) { return a.library.pointer == b && !a.library.own; });
+        };
+        const bool all = by_pointer && known && !columns && same(inv_pointers, known->values_alone) &&
+                         same(grad_pointers, known->gradients_alone);
+        together = all ? known : nullptr;
+    }
+
+    // Sets `rates_by_pulls` if all rates are found from the pulls that come with the derivative: those of the same masses.
     void choose_rates() {
         const double *first = params, *end = params + n_params;
         rates_by_pulls = by_pointer && rhs_pointer.library.apart && !balances.empty() && n_params > 0;
@@ -332,7 +352,7 @@ struct System {
     }
 
     template <class W>
-    void call_rhs(const W &w, double t, const double *y, double *out) {
+    [[gnu::always_inline]] void call_rhs(const W &w, double t, const double *y, double *out) {
         if (!second_order) return call_rhs_pointer(w, t, y, out, w.m);
         copy(y + w.m / 2, out, w.m / 2);
         call_rhs_pointer(w, t, y, out + w.m / 2, w.m / 2);

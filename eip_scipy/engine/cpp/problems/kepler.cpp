@@ -6,17 +6,34 @@ namespace {
 
 using std::sqrt;
 
+template <class T>
+struct Distance {
+    T r2, r;
+
+    explicit Distance(const T *q) : r2(q[0] * q[0] + q[1] * q[1]), r(sqrt(r2)) {}
+};
+
 // The pull over r: r^-3 + 3/2 eps r^-5, by divisions that do not wait for each other.
 template <class T>
-[[gnu::always_inline]] inline T pull(const T *q, const T &eps) {
-    const T r2 = q[0] * q[0] + q[1] * q[1], w = 1.0 / (r2 * sqrt(r2));
-    return w + 1.5 * eps * w * (1.0 / r2);
+[[gnu::always_inline]] inline T pull(const Distance<T> &d, const T &eps) {
+    const T w = 1.0 / (d.r2 * d.r);
+    return w + 1.5 * eps * w * (1.0 / d.r2);
+}
+
+template <class T>
+[[gnu::always_inline]] inline T energy_of(const Distance<T> &d, const T *v, const T &eps) {
+    return 0.5 * (v[0] * v[0] + v[1] * v[1]) - 1.0 / d.r - 0.5 * eps / (d.r * d.r2);
+}
+
+template <class T>
+[[gnu::always_inline]] inline T momentum_of(const T *y) {
+    return y[0] * y[3] - y[1] * y[2];
 }
 
 template <class T>
 void kepler_rhs(const Given<T> &g) {
     const T *y = g.y;
-    const T w = pull(y, g.params[0]);
+    const T w = pull(Distance(y), g.params[0]);
     g.out[0] = y[2];
     g.out[1] = y[3];
     g.out[2] = -w * y[0];
@@ -25,7 +42,7 @@ void kepler_rhs(const Given<T> &g) {
 
 template <class T>
 void kepler_acc(const Given<T> &g) {
-    const T w = pull(g.y, g.params[0]);
+    const T w = pull(Distance(g.y), g.params[0]);
     g.out[0] = -w * g.y[0];
     g.out[1] = -w * g.y[1];
 }
@@ -62,9 +79,7 @@ void kepler_variational(const Given<double> &g) {
 
 template <class T>
 void kepler_energy(const Given<T> &g) {
-    const T *y = g.y;
-    const T r2 = y[0] * y[0] + y[1] * y[1], r = sqrt(r2);
-    g.out[0] = 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / r - 0.5 * g.params[0] / (r * r2);
+    g.out[0] = energy_of(Distance(g.y), g.y + 2, g.params[0]);
 }
 
 template <class T>
@@ -77,7 +92,7 @@ void kepler_energy_gradient(const Given<T> &g) {
 
 template <class T>
 void kepler_momentum(const Given<T> &g) {
-    g.out[0] = g.y[0] * g.y[3] - g.y[1] * g.y[2];
+    g.out[0] = momentum_of(g.y);
 }
 
 template <class T>
@@ -87,6 +102,28 @@ void kepler_momentum_gradient(const Given<T> &g) {
     g.out[2] = -g.y[1];
     g.out[3] = g.y[0];
 }
+
+void kepler_values(const double *y, double *values, const double *params) {
+    values[0] = energy_of(Distance(y), y + 2, params[0]);
+    values[1] = momentum_of(y);
+}
+
+void kepler_all(const double *y, double *f, double *values, double *G, const double *params) {
+    const Distance distance(y);
+    const double w = pull(distance, params[0]);
+    const double x = y[0], z = y[1], u = y[2], v = y[3], a = -w * x, b = -w * z;
+    values[0] = energy_of(distance, y + 2, params[0]);
+    values[1] = momentum_of(y);
+    f[0] = u, f[1] = v, f[2] = a, f[3] = b;
+    G[0] = -a, G[1] = -b, G[2] = u, G[3] = v;
+    G[4] = v, G[5] = -u, G[6] = -z, G[7] = x;
+}
+
+constexpr LibraryPointer<double> KEPLER_VALUES[] = {plain<double, kepler_energy<double>>,
+                                                    plain<double, kepler_momentum<double>>};
+constexpr LibraryPointer<double> KEPLER_GRADIENTS[] = {plain<double, kepler_energy_gradient<double>>,
+                                                       plain<double, kepler_momentum_gradient<double>>};
+constexpr Together KEPLER{kepler_all, kepler_values, KEPLER_VALUES, KEPLER_GRADIENTS};
 
 template <class T>
 void harmonic_rhs(const Given<T> &g) {
@@ -132,7 +169,7 @@ constexpr const char *FOUR = "a state of 4 numbers and 1 parameter", *TWO = "2 n
 #define EIP_VARIATIONAL(function, by_parameter, size, sizes) \
     Value::DERIVATIVE, 0, plain<double, function<by_parameter>>, nullptr, with_columns<size, by_parameter>, sizes
 const LibraryFunction functions[] = {
-    {"kepler.rhs", Value::DERIVATIVE, 0, EIP_BOTH(kepler_rhs), of_four, FOUR},
+    {"kepler.rhs", Value::DERIVATIVE, 0, EIP_BOTH(kepler_rhs), of_four, FOUR, nullptr, nullptr, &KEPLER},
     {"kepler.acc", Value::ACCELERATION, 0, EIP_BOTH(kepler_acc), of_two, TWO},
     {"kepler.jacobian", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_jacobian), of_two, TWO},
     {"kepler.variational", EIP_VARIATIONAL(kepler_variational, false, 4, FOURS)},
