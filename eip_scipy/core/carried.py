@@ -30,6 +30,8 @@ def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
 
 def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
     """Return what a function returned at t, real and of the expected shape."""
+    if isinstance(value, float) and not expected:
+        return np.array(float(value))
     refuse_units(**{f"{what} returned": value})
     try:
         found = np.asarray(value)

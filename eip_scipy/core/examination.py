@@ -108,7 +108,7 @@ class Examiner:
         one of them by an exception says nothing about the run.
         """
         known = copy.copy(self.invariants)
-        vars(known).update(inv=_guarded(known.inv), grad=_guarded(known.grad))
+        known.functions = _Guarded(known.functions)
         try:
             with np.errstate(all="ignore"):
                 return look(self, known, _guarded(rhs), *args)
@@ -118,6 +118,16 @@ class Examiner:
 
 class _RefusedError(Exception):
     """A user's function has refused a state that the run does not visit."""
+
+
+class _Guarded:
+    """Functions of invariants whose exceptions are those of a refused state."""
+
+    def __init__(self, functions: Any) -> None:
+        self._functions = functions
+
+    def __getattr__(self, name: str) -> Any:
+        return _guarded(getattr(self._functions, name))
 
 
 def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:

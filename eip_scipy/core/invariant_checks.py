@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..engine.data import EPS
+from ..engine.data import (
+    CHECK_NOISE,
+    CHECK_STEP,
+    CHECK_TOLERANCE,
+    EPS,
+    INVARIANCE_TOLERANCE,
+    TIME_ROOM,
+    TIME_SHARE,
+)
 from ..engine.trust import ROUNDING_OF_DIFFERENCES, ProjectionWarning
 from .conditional import is_kept_on_a_surface, on_targets
 from .gradients import DIFFERENCE_WEIGHTS, random_directions
@@ -16,15 +24,13 @@ from .gradients import DIFFERENCE_WEIGHTS, random_directions
 if TYPE_CHECKING:
     from .invariants import InvariantSet
 
-__all__ = ["Complaint", "complaints", "listed", "rates_by_values", "time_derivative"]
+__all__ = ["Complaint", "complaints", "listed", "time_derivative"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
 # Shorter ones have the last word where the first reaches too far.
-CHECK_STEPS = (6e-6, 6e-8, 6e-10)
-CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
-INVARIANCE_TOLERANCE = 1e-8
+CHECK_STEPS = (CHECK_STEP, 6e-8, 6e-10)
 # Bound for the rate of a balance, whose error of 1e-3 is 1e-9 of the terms if the rate is 1e-6 of them; right ones
 # differ by 1e-16, those of gradients by differences by 1e-12.
 RATE_TOLERANCE, RATE_TOLERANCE_OF_DIFFERENCES = 1e-11, 1e-9
@@ -43,13 +49,6 @@ RATE_ROUNDINGS = 100.0
 # Differences to one side of order 6: weights of 0, 1, ... 6 steps.
 ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
-# Short differences along the flow: their step, in the time in which the state moves by its size, and the share of the
-# rate's terms from which on those to both sides differ. What curvature makes them differ by is half as large at half
-# the step; what a kink does is not. Next to a kink of the slope, where terms may vanish, the differences to both
-# sides differ by more than the rate that is found.
-SHORT, KINK, KEPT_AT_HALF = 1e-6, 1e-4, 0.6
-# The rounding of a value, in units of its terms.
-ROUNDINGS = 4.0
 DOUBLE = (
     "Compute it in double precision: with JAX jax.config.update('jax_enable_x64', True), with PyTorch by tensors and "
     "parameters of torch.float64"
@@ -100,7 +99,13 @@ class _Samples(NamedTuple):
 
 
 def complaints(
-    known: InvariantSet, t: float, y: Array, f: Array, tau: float, rhs: Derivative | None
+    known: InvariantSet,
+    t: float,
+    y: Array,
+    f: Array,
+    tau: float,
+    rhs: Derivative | None,
+    evaluated: tuple[Array, Array] | None = None,
 ) -> Iterator[Complaint]:
     """Yield what is wrong with the precision of invariants, with gradients, or else with rates of change.
 
@@ -114,15 +119,21 @@ def complaints(
         The length of a step.
     rhs : callable or None
         ``rhs(t, y) -> (n,)``. With it, invariants that hold only together with others are looked at where all hold.
+    evaluated : (ndarray, ndarray), optional
+        The gradients (l, n) and the values (l,) there.
     """
     if known.size == 0 or y.size == 0:
+        return
+    G, here = (known.gradients(t, y, f), known.values(t, y)) if evaluated is None else evaluated
+    directions = random_directions(y.size, y.dtype.kind == "c")
+    interval = min(known.t_span), max(known.t_span)
+    if not known.balances.items and known.functions.is_in_order(t, y, f, G, here, tau, interval, directions):
         return
     # No further than the state moves while it changes by its own size: close to a singularity that is far less
     # than a step.
     moving, size = np.abs(f).max(), np.abs(y).max()
     span = np.abs(y) + (min(tau, size / moving) if size > 0 and moving > 0 else tau) * np.abs(f)
-    directions = random_directions(y.size, y.dtype.kind == "c") * span
-    G, here = known.gradients(t, y, f), known.values(t, y)
+    directions = directions * span
     ends = _values_at_ends(known, t, y, directions, CHECK_STEPS[0])
     at = _Samples(t, y, f, tau, span, directions, G, here, ends)
     for check in (_single_precision, _wrong_gradients):
@@ -386,36 +397,14 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     computed = np.array(known.computed, bool) & (known.by_values | ~carried)
     if (wrong & computed).any():
         # Gradients that are computed over a kink are wrong, and the rate with them.
-        by_values = rates_by_values(known, at.t, at.y, at.f, at.G) / unit
+        where = at.t, at.y, at.f, at.G, at.here
+        by_values = known.functions.rates_by_values(*where, known.target, known.scales) / unit
         near = np.abs(in_time + by_values - own) > ROUNDING_OF_DIFFERENCES * terms
         wrong &= near | ~computed
     if wrong.any():
         wrong &= ~(_rounding_of_rates(known, at, unit, rhs) > np.abs(rate))
     with np.errstate(over="ignore"):
         return _Rates(rate * unit, terms * unit, in_time, wrong)
-
-
-def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array, G: Array) -> Array:
-    """Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink.
-
-    Rates that are within the rounding of the values, which is larger than terms that nearly vanish, are 0.
-    """
-    moving, size = np.abs(f).max(initial=0.0), np.abs(y).max(initial=0.0)
-    if not (0 < moving < np.inf and 0 < size < np.inf):
-        return np.zeros(known.size)
-    step, here, terms = SHORT * size / moving, known.values(t, y), np.abs(G) @ np.abs(f)
-
-    def slopes(step: float) -> tuple[Array, Array]:
-        before, after = (known.values(t, y + side * f) for side in (-step, step))
-        return (here - before) / step, (after - here) / step
-
-    (back, forth), (half_back, half_forth) = slopes(step), slopes(0.5 * step)
-    jump, half_jump = np.abs(forth - back), np.abs(half_forth - half_back)
-    rates = 0.5 * (back + forth)
-    kink = (jump > KINK * terms) & ((half_jump > KEPT_AT_HALF * jump) | (np.abs(rates) <= jump))
-    rates[kink] = np.nan
-    rounding = ROUNDINGS * EPS * known.sizes_of_terms(y, G, here) / step
-    return np.where(np.abs(rates) <= rounding, 0.0, rates)
 
 
 def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Array, tau: float) -> tuple[Array, Array]:
@@ -434,7 +423,7 @@ def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Arr
         rounding = EPS * known.sizes_of_terms(y, G, here)
         hidden = 4 * rounding / abs(far - t)
     fixed = known.values(far, y) == here  # as almost always
-    step, centred = 0.01 * tau, min(before, after) >= 0.05 * tau
+    step, centred = TIME_SHARE * tau, min(before, after) >= TIME_ROOM * TIME_SHARE * tau
     step = 2.0 ** (round(math.log2(step)) if centred else math.floor(math.log2(min(step, room / 6))))
     if fixed.all() and (known.values(t + side * step, y) == here).all():
         return none, hidden

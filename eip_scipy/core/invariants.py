@@ -5,18 +5,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
+from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 
 from ..engine.data import EPS, Grouping
-from ..engine.native import Call, Rates, call
+from ..engine.native import BUILD, Call, LibraryFunction, Rates, call
 from .arguments import names, scalars
 from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
-from .invariant_checks import Complaint, complaints, listed, rates_by_values, time_derivative
+from .invariant_checks import Complaint, complaints, listed, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
@@ -299,6 +301,35 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
     return value.astype(float)
 
 
+def _first_gradient(
+    invariant: Invariant, gradient: Call, label: str, start: tuple[float, Array, Array], extra: tuple
+) -> Array:
+    """Return the gradient at the start, a time, a state and its derivative."""
+    t, y, f = start
+    what, states = f"gradient of invariant {label!r}", (y.copy(), f.copy()) if gradient.takes_f else (y.copy(),)
+
+    def call(*out: Array) -> Any:
+        return gradient.fun(t, *states, *out, *gradient.args)
+
+    try:
+        if not gradient.in_place:
+            return _gradient(call(), label, t, gradient.shape, y.dtype)
+        if not isinstance(gradient.fun, LibraryFunction):
+            return filled(call, gradient.shape, y.dtype, what, t)
+        out = np.empty(gradient.shape)
+        call(out)
+        return out
+    except TypeError:
+        given = ("t", "y", *(("f",) if gradient.takes_f else ()), *(("out",) if gradient.in_place else ()))
+        _require_arguments(invariant.gradient or invariant.function, what, given, invariant.args, extra)
+        raise
+
+
+def _for_each_value(of_items: list[bool], sizes: list[int]) -> list[bool]:
+    """Return what is known of each item for each of its values."""
+    return [known for known, size in zip(of_items, sizes, strict=True) for _ in range(size)]
+
+
 def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
     """Return the value of a gradient at t, checked for the expected shape, and real if the state is."""
     what = f"gradient of invariant {label!r}"
@@ -373,29 +404,26 @@ class InvariantSet:
         self.extra = extra
         # Why a jitted invariant has no compiled gradient, by its label.
         self.why_not: dict[str, str] = {}
-        self.floors = typical_sizes(y0, f0, tau)
+        self._start = y0, f0, tau
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
         functions = [bound(item.function, item.args + extra) for item in self.items]
         values = [
             _first_value(item, fun, label, t0, y0, extra)
             for item, fun, label in zip(self.items, functions, self.labels, strict=True)
         ]
-        self.scalar = [value.ndim == 0 for value in values]
-        if y0.dtype == FLOAT and any(_lacks_gradient(item) for item in self.items):
-            shapes = zip(self.items, self.labels, values, strict=True)
-            self.items = tuple(self._with_gradient(item, label, y0.size, v.shape) for item, label, v in shapes)
+        shapes = [value.shape for value in values]
+        self.scalar = [shape == () for shape in shapes]
+        if y0.dtype == FLOAT and any(map(_lacks_gradient, self.items)):
+            each = zip(self.items, self.labels, shapes, strict=True)
+            self.items = tuple(self._with_gradient(item, label, y0.size, shape) for item, label, shape in each)
         sizes = [value.size for value in values]
-        self.starts = [0, *np.cumsum(sizes, dtype=int).tolist()]
+        self.starts = list(accumulate(sizes, initial=0))
         self.size = self.starts[-1]
-        self.start_values = np.concatenate([np.atleast_1d(v) for v in values]) if values else np.zeros(0)
-        self.names = [
-            (label if scalar else f"{label}[{j}]") if not item.value_names else item.value_names[j]
-            for item, label, scalar, size in zip(self.items, self.labels, self.scalar, sizes, strict=True)
-            for j in range(size)
-        ]
+        self.start_values = np.concatenate([value.ravel() for value in values]) if values else np.zeros(0)
+        self.names = self._names(sizes)
         self._require_finite(self.start_values, "not finite at y0")
         self.scales = self._scales(sizes)
-        self.computed = np.repeat([item.gradient is None for item in given], sizes).tolist()
+        self.computed = _for_each_value([item.gradient is None for item in given], sizes)
         self.uses_f = any(item.uses_f for item in self.items)
         self.grads = [
             self._numerical_gradient(item, t0, y0) if item.gradient is None else item.gradient for item in self.items
@@ -405,30 +433,28 @@ class InvariantSet:
             self._tell_of_cost(given, y0.size)
         self.target = self._targets()
         given_targets = [item.target is not None and not item.is_measured for item in self.items]
-        self.given = np.repeat(np.array(given_targets, bool), sizes)
+        self.given = np.array(_for_each_value(given_targets, sizes), bool)
         self.shape, self.dtype = (self.size, y0.size), y0.dtype
-        self._bind(functions, values, y0)
-        self._gradients_at_start(t0, y0, f0)
-        self.balances = Carried(self.items, self.labels, self.starts, [value.shape for value in values], extra)
+        self.balances = Carried(self.items, self.labels, self.starts, shapes, extra)
         if y0.dtype == FLOAT:
             self.balances.compile_rates(y0.size)
+        self.calls = self._calls(shapes, y0)
+        self.functions: Any = BUILD.InvariantFunctions(*self.calls, y0.size, y0.dtype != FLOAT)
+        self.start_gradients = self._gradients_at_start(t0, y0, f0)
         self.balances.check(t0, y0, f0)
-        self.calls = self._calls(y0)
 
-    def _bind(self, functions: list[Callable[..., Any]], values: list[Array], y0: Array) -> None:
-        """Note functions and gradients with their places among all values, which `values` at the start show."""
-        places = [
-            start if scalar else slice(start, stop)
-            for start, stop, scalar in zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True)
+    def _names(self, sizes: list[int]) -> list[str]:
+        """Return the names of all values."""
+        return [
+            (label if scalar else f"{label}[{j}]") if not item.value_names else item.value_names[j]
+            for item, label, scalar, size in zip(self.items, self.labels, self.scalar, sizes, strict=True)
+            for j in range(size)
         ]
-        self._values = [
-            (fun, label, place, value.shape)
-            for fun, label, place, value in zip(functions, self.labels, places, values, strict=True)
-        ]
-        self._gradients = [
-            (*self._bound_gradient(k), label, place, value.shape + y0.shape)
-            for k, (label, place, value) in enumerate(zip(self.labels, places, values, strict=True))
-        ]
+
+    @cached_property
+    def floors(self) -> Array:
+        """Return the sizes (n,) that stand for those of smaller components, see `typical_sizes`."""
+        return typical_sizes(*self._start)
 
     @property
     def by_values(self) -> Array:
@@ -442,13 +468,14 @@ class InvariantSet:
     def _scales(self, sizes: list[int]) -> Array:
         scales = np.zeros(self.size)
         for k, (item, size) in enumerate(zip(self.items, sizes, strict=True)):
-            scale = np.atleast_1d(0.0 if item.scale is None else item.scale)
-            if scale.size not in (1, size):
+            if item.scale is None:
+                continue
+            if np.size(item.scale) not in (1, size):
                 raise ValueError(
-                    f"invariant {self.labels[k]!r}: scale has {scale.size} entries, its value {size}; give one number, "
-                    "or one for each."
+                    f"invariant {self.labels[k]!r}: scale has {np.size(item.scale)} entries, its value {size}; give "
+                    "one number, or one for each."
                 )
-            scales[self.starts[k] : self.starts[k + 1]] = scale
+            scales[self.starts[k] : self.starts[k + 1]] = item.scale
         return scales
 
     def _numerical_gradient(self, item: Invariant, t: float, y: Array) -> NumericalGradient:
@@ -531,11 +558,11 @@ class InvariantSet:
             self.why_not[label] = str(error)
         return item
 
-    def _calls(self, y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
-        """Values and gradients, as the engine calls them."""
+    def _calls(self, shapes: list[tuple[int, ...]], y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
+        """Values, of these shapes, and gradients, as the engine calls them."""
 
         def value(k: int) -> Call:
-            _, label, _, shape = self._values[k]
+            label, shape = self.labels[k], shapes[k]
 
             def convert(found: Any, t: float) -> Array:
                 return np.array(real_value(found, f"invariant {label!r}", t, shape), float, order="C")
@@ -543,17 +570,21 @@ class InvariantSet:
             return call(self.items[k].function, self.items[k].args + self.extra, shape, convert, real=True)
 
         def gradient(k: int) -> Call:
-            _, takes_f, in_place, label, _, shape = self._gradients[k]
+            item, label, shape = self.items[k], self.labels[k], shapes[k] + y0.shape
 
             def convert(found: Any, t: float) -> Array:
                 return np.array(_gradient(found, label, t, shape, y0.dtype), y0.dtype, order="C")
 
-            arguments = self._gradient_arguments(k)
-            return call(self.grads[k], arguments, shape, convert, takes_f=takes_f, in_place=in_place)
+            given = item.gradient is not None
+            arguments = item.args + self.extra if given else self.extra
+            takes_f = given and item.uses_f
+            return call(self.grads[k], arguments, shape, convert, takes_f=takes_f, in_place=item.in_place)
 
         return tuple(map(value, range(len(self.items)))), tuple(map(gradient, range(len(self.items))))
 
     def _require_finite(self, values: Array, what: str) -> None:
+        if np.isfinite(values).all():
+            return
         for name, value in zip(self.names, values, strict=True):
             if not np.isfinite(value):
                 raise ValueError(f"invariant {name!r} is {what}: it returned {value}.")
@@ -577,72 +608,25 @@ class InvariantSet:
         if not np.all(np.isfinite(part)):
             raise ValueError(f"invariant {self.labels[k]!r}: target must be finite, got {part}.")
 
-    def _gradients_at_start(self, t: float, y: Array, f: Array) -> None:
-        """Shapes and finiteness of every gradient, once."""
-        for item, (gradient, takes_f, in_place, label, _, expected) in zip(self.items, self._gradients, strict=True):
-            what = f"gradient of invariant {label!r}"
-
-            def call(*out: Array, gradient: Any = gradient, takes_f: bool = takes_f) -> Any:
-                return gradient(t, y.copy(), f.copy(), *out) if takes_f else gradient(t, y.copy(), *out)
-
-            try:
-                if in_place:
-                    G = filled(call, expected, y.dtype, what, t)
-                else:
-                    G = _gradient(call(), label, t, expected, y.dtype)
-            except TypeError:
-                first = ("t", "y", *(("f",) if takes_f else ()), *(("out",) if in_place else ()))
-                _require_arguments(item.gradient or item.function, what, first, item.args, self.extra)
-                raise
-            if not np.all(np.isfinite(G)):
-                raise ValueError(f"{what} is not finite at y0.")
-
-    def _bound_gradient(self, k: int) -> tuple[Callable[..., Any], bool, bool]:
-        """Gradient k as gradient(t, y), with f behind y if the second is true and `out` at the end if the third is."""
-        item = self.items[k]
-        takes_f = item.uses_f and item.gradient is not None
-        return bound(self.grads[k], self._gradient_arguments(k)), takes_f, item.in_place
-
-    def _gradient_arguments(self, k: int) -> tuple[Any, ...]:
-        item = self.items[k]
-        return self.extra if item.gradient is None else item.args + self.extra
-
-    def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
-        """Fill `values` (l,)."""
-        # A copy for each here and in grad: a user's function may keep or overwrite what it was given.
-        for fun, label, place, expected in self._values:
-            value = fun(t, y.copy())
-            if isinstance(value, float):
-                known = expected == ()
-            else:
-                known = type(value) is np.ndarray and value.dtype is FLOAT and value.shape == expected
-            values[place] = value if known else real_value(value, f"invariant {label!r}", t, expected)
-
-    def grad(self, t: float, y: Array, f: Array, G: Array, params: Any = None) -> None:
-        """Fill the gradients `G` (l, n)."""
-        dtype = y.dtype
-        for gradient, takes_f, in_place, label, place, expected in self._gradients:
-            if in_place:
-                out = G[place]
-                out.fill(np.nan)  # shows in the run where the gradient leaves a part of it as it was
-                gradient(t, y.copy(), f.copy(), out) if takes_f else gradient(t, y.copy(), out)
-                continue
-            row = gradient(t, y.copy(), f.copy()) if takes_f else gradient(t, y.copy())
-            if not (type(row) is np.ndarray and row.shape == expected and row.dtype is dtype):
-                row = _gradient(row, label, t, expected, dtype)
-            G[place] = row
+    def _gradients_at_start(self, t: float, y: Array, f: Array) -> Array:
+        """Return all gradients (l, n), after a check of their shapes and of what they fill."""
+        G = np.empty((self.size, *y.shape), y.dtype)
+        for k, (item, label) in enumerate(zip(self.items, self.labels, strict=True)):
+            rows = G[self.starts[k] : self.starts[k + 1]]
+            rows[:] = _first_gradient(item, self.calls[1][k], label, (t, y, f), self.extra)
+            if not np.isfinite(rows).all():
+                raise ValueError(f"gradient of invariant {label!r} is not finite at y0.")
+        return G
 
     def values(self, t: float, y: Array) -> Array:
         """All values (l,)."""
-        out = np.empty(self.size)
-        self.inv(t, y, out)
-        return out
+        found: Array = self.functions.values(t, y)
+        return found
 
     def gradients(self, t: float, y: Array, f: Array) -> Array:
         """All gradients (l, n)."""
-        out = np.zeros(self.shape, dtype=y.dtype)
-        self.grad(t, y, f, out)
-        return out
+        found: Array = self.functions.gradients(t, y, f)
+        return found
 
     def term_sizes(self, t: float, y: Array, f: Array) -> Array:
         """Size of the terms in each invariant: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
@@ -688,19 +672,17 @@ class InvariantSet:
 
         From those of balances their own rates are subtracted, which leaves NaN where none is given.
         """
-        G = self.gradients(t, y, f)
-        products = G.conj() * f
-        terms = np.abs(products).sum(axis=1)
-        rates = np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f, G)])
+        own = None
         if self.balances.items:
-            in_time, _ = time_derivative(self, t, y, G, self.values(t, y), self.tau)
-            rates = rates - (self.balances.known(t, y, f) - np.where(self.balances.mask, in_time, 0.0))
-        rates = np.abs(rates)
-        by_gradient, by_values = rates / np.where(terms > 0, terms, 1.0)
+            in_time, _ = time_derivative(self, t, y, self.gradients(t, y, f), self.values(t, y), self.tau)
+            own = self.balances.known(t, y, f) - np.where(self.balances.mask, in_time, 0.0)
+        by_gradient, by_values = self.functions.rate_shares(t, y, f, self.target, self.scales, own)
         return by_gradient, by_values
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
         """Return what is wrong with the start, where it misses given targets; the worst invariant comes first."""
+        if not self.given.any():
+            return None
         excess = np.nan_to_num(self._excess(t, y, f), nan=np.inf, posinf=np.inf)
         missed = [int(k) for k in np.argsort(-excess, kind="stable") if excess[k] > 1.0 and self.given[k]]
         if not missed:
@@ -710,8 +692,12 @@ class InvariantSet:
         text = f"the start violates invariant {self.names[missed[0]]!r} by {residual:.3g}"
         return text + (f", and also {listed(others)}" if others else "")
 
-    def check(self, t: float, y: Array, f: Array, tau: float) -> list[str]:
+    def check(
+        self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
+    ) -> list[str]:
         """Compare gradients with differences along two directions, and the invariance with the system.
+
+        `evaluated`: the gradients and the values there, which are evaluated if they are not given.
 
         Returns
         -------
@@ -730,7 +716,7 @@ class InvariantSet:
         ProjectionWarning
             When the rate of a balance is wrong.
         """
-        found = list(self.complaints(t, y, f, tau))
+        found = list(complaints(self, t, y, f, tau, self.rhs, evaluated))
         for complaint in found:
             if complaint.is_error:
                 raise ValueError(f"{complaint.text}. {complaint.advice}, or pass check=False to skip this check.")

@@ -122,7 +122,7 @@ class _Coordinates:
         """The gradients' coordinates (l, ranks * l); a basis is chosen at the raw result, where a projection begins."""
         w, size = self._run.work, self._options.scales.size
         begins, self._begins = self._begins, False
-        self._run.invariants.grad(t, self._at(c), w.K[-1] if begins else w.f_point, w.G)
+        w.G[:] = self._run.invariants.gradients(t, self._at(c), w.K[-1] if begins else w.f_point)
         if begins:
             _orthonormal_rows(w.G.view(float), self._basis)
         part = np.empty((size, size + 1))

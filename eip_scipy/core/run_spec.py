@@ -153,13 +153,16 @@ class RunSpec:
         options, sigma, identity = projection.settled(method, self.stepping, y, invariants)
         options = options._replace(kinds=kinds_of(options.groups, y, f))
         if columns is not None:
-            options, sigma = widened(options, sigma, columns, invariants.gradients(*start[:3]))
+            options, sigma = widened(options, sigma, columns, invariants.start_gradients)
         invariants.kinds = options.kinds
         arrays = steppers.arrays(method)
         carried, blocks = options.balances.place, options.groups.start.size - 1
         work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, blocks, carried.size)
-        work.level[:] = invariants.target[carried]
-        work.rates[[0, -1]] = np.nan  # not known yet
+        work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients
+        del invariants.start_gradients  # which may be large
+        if carried.size:
+            work.level[:] = invariants.target[carried]
+            work.rates[[0, -1]] = np.nan  # not known yet
         if sigma is not None:
             work.sigma[:] = sigma
         trust = Trust(invariants.names, work.trust)
@@ -170,7 +173,8 @@ class RunSpec:
 
     def _check(self, run: Run, invariants_too: bool) -> None:
         """Bring a run to its targets where that is asked for, and refuse a start that misses them."""
-        run.options = run.options._replace(scales=_scales(run))
+        if run.options.frame.products.size:
+            run.options = run.options._replace(scales=_scales(run))
         if self.projection.project_initial:
             t0, y0, _, tau = run.begin
             moved = projected_start(run, self.rhs)
@@ -182,7 +186,8 @@ class RunSpec:
                 f"{violation}; correct y0 or the target, or pass project_initial=True to project y0 first."
             )
         if run.options.watched and invariants_too and np.isfinite(run.start.f).all():
-            run.trust.doubts += run.invariants.check(*run.start)
+            known = (run.work.G, run.work.values) if run.start is run.begin else None
+            run.trust.doubts += run.invariants.check(*run.start, known)
 
 
 def _scales(run: Run) -> Array:
@@ -191,12 +196,13 @@ def _scales(run: Run) -> Array:
     Corrections do not touch these, and nothing but rounding is left of their gradients once the frame is taken out.
     At two states, for a gradient may lie in the frame by chance.
     """
-    (t0, y0, f0, tau), options, invariants = run.begin, run.options, run.invariants
-    if options.frame.products.size == 0:
-        return options.scales
-    away = FRAME_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
-    held = [spanned(options.frame, invariants.gradients(t0, y, f0).view(float)) for y in (y0, y0 + away)]
-    return np.where(np.all(held, axis=0), invariants.term_sizes(t0, y0, f0) / EPS, options.scales)
+    (t0, y0, f0, tau), frame, invariants, G = run.begin, run.options.frame, run.invariants, run.work.G
+    held = spanned(frame, G.view(float))
+    if not held.any():
+        return run.options.scales
+    away = y0 + FRAME_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
+    held &= spanned(frame, invariants.gradients(t0, away, f0).view(float))
+    return np.where(held, invariants.sizes_of_terms(y0, G, run.work.values) / EPS, run.options.scales)
 
 
 def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:

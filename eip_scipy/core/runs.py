@@ -105,7 +105,8 @@ class Run:
         engine, w = Engine(self.method, self.options, self.work, functions, schedule, _if_any(hooks)), self.work
         if self.options.watched and begins:
             t, f = schedule.span.t0, w.K[0]
-            w.values[:], w.G[:] = self.invariants.values(t, self.y0), self.invariants.gradients(t, self.y0, f)
+            if self.start is not self.begin:  # whose values and gradients there are already
+                w.values[:], w.G[:] = self.invariants.values(t, self.y0), self.invariants.gradients(t, self.y0, f)
             engine.start(self.y0, f, self.start.tau)
         return engine
 
@@ -163,14 +164,16 @@ class Run:
             self.looked = steps
             found = self.examiner.complaint(rhs, t, y)
         self.trust.doubts += [found] if found else []
-        return self._is_doubtful(ended) or found is not None
+        return found is not None or self._is_doubtful(ended)
 
     def _warn_of_fast_balances(self) -> None:
         """Warn once of balances that change too fast to be of help."""
-        found = slowness(self.work.slow)
         carried = self.invariants.balances
+        if not carried.items or self.warned_of_balances:
+            return
+        found = slowness(self.work.slow)
         fast = np.flatnonzero(found > carried.most_slowness)
-        if not fast.size or self.warned_of_balances:
+        if not fast.size:
             return
         self.warned_of_balances = True
         names, bound = [self.invariants.names[place] for place in carried.places[fast]], carried.most_slowness[fast[0]]
@@ -183,7 +186,7 @@ class Run:
 
     def _is_doubtful(self, ended: bool) -> bool:
         """Return whether the corrections contradict the run, or will do so at its end."""
-        return self.trust.beyond_doubt or (ended and bool(self.trust.sick.any()))
+        return bool(self.trust.sick.any()) if ended else self.trust.beyond_doubt
 
     @cached_property
     def examiner(self) -> Examiner:

@@ -377,6 +377,38 @@ class LibraryFunction:
     def __reduce__(self) -> tuple[Any, ...]: ...
 LIBRARY: dict[Any, Any] = ...
 
+class InvariantFunctions:
+    """The invariants of a run and their gradients, each as a `Call`."""
+
+    def __init__(self, values: tuple[Any, ...], gradients: tuple[Any, ...], n: int, is_complex: bool) -> None: ...
+
+    def values(self, t: float, y: numpy.typing.NDArray[numpy.inexact]) -> numpy.ndarray:
+        """Return all values (l,)."""
+
+    def gradients(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> numpy.ndarray:
+        """Return all gradients (l, n)."""
+
+    def is_in_order(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], tau: float, interval: tuple[float, float], directions: numpy.typing.NDArray[numpy.inexact]) -> bool:
+        """
+        Whether precision, gradients and invariance are beyond doubt at a state with these gradients and values.
+        """
+
+    def rates_by_values(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray:
+        """
+        Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink. Rates that are within the rounding of the values are 0.
+        """
+
+    def rate_shares(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], own: numpy.typing.NDArray[numpy.float64] | None = None) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """
+        Return rates of change along f by gradients and by values, without the rates `own`, in units of their terms; (l,) each.
+        """
+CHECK_STEP: float = 6e-06
+CHECK_TOLERANCE: float = 0.0001
+CHECK_NOISE: float = 6.0
+INVARIANCE_TOLERANCE: float = 1e-08
+TIME_SHARE: float = 0.01
+TIME_ROOM: float = 5.0
+
 class FailedCallError(Exception): ...
 
 class Span(NamedTuple):
@@ -618,6 +650,13 @@ class gradients:
     def checked_complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float, direction: numpy.typing.NDArray[numpy.float64], floors: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray | None:
         """
         Return the same, or None where it disagrees with a difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not analytic.
+        """
+
+class gravity:
+    @staticmethod
+    def frequencies(gm: numpy.typing.NDArray[numpy.float64], y: numpy.typing.NDArray[numpy.float64], duration: float) -> tuple[numpy.ndarray, float]:
+        """
+        Return the largest angular frequency of each body on its orbit about the heaviest one, and that of all other pairs.
         """
 
 class multibody:

@@ -54,6 +54,8 @@ TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
 ROUNDING_OF_RATES, ROUNDING_OF_DIFFERENCES = 1e-11, 1e-7
 # Smallest number of projections for which fractions and sums are judged, if more than one correction is LARGE.
 ENOUGH = 5
+# Figures that are 0 in most runs. If all of them are 0, no step of the run stands out.
+UNUSUAL = [SHARE, RAW, RAW_MANY, MANY]
 MOST_REASONS = 3  # largest number of reasons in a message
 PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
@@ -135,6 +137,8 @@ class Trust:
     def reasons(self) -> list[str]:
         """Return what is wrong with the corrections: a sentence for each of the worst three invariants, and a count."""
         found = np.flatnonzero(self.sick)
+        if not found.size:
+            return []
         worst = found[np.argsort(-_severity(self.figures[found]), kind="stable")]
         more = (
             [f"{found.size - MOST_REASONS} more invariants were corrected too much"]
@@ -158,8 +162,16 @@ class Trust:
 
 def sick(figures: np.ndarray) -> np.ndarray:
     """Return which rows of figures (..., N_FIGURES) no correct run has."""
+    if _are_calm(figures):
+        return np.zeros(figures.shape[:-1], bool)
     far = figures[..., RAW_MANY] > FAR_OFTEN * figures[..., NOTED]
     return _extreme(figures) | (_may_leak(figures) & _large_corrections(figures)) | far
+
+
+def _are_calm(figures: np.ndarray) -> bool:
+    """Return whether all figures by which rows are judged are those of correct runs, which is the usual case."""
+    together = figures[..., SUM] > TOGETHER * figures[..., EXPECTED]
+    return not (figures[..., UNUSUAL].any() or (figures[..., NU] > BEYOND_DOUBT).any() or together.any())
 
 
 def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:

@@ -433,9 +433,11 @@ NB_MODULE(EIP_MODULE, m) {
     eip::add_records(m);
     eip::add_engine(m);
     eip::add_library(m);
+    eip::add_examination(m);
     eip::add_condensates(m.def_submodule("condensates"));
     eip::add_fields(m.def_submodule("fields"));
     eip::add_comparators(m.def_submodule("comparators"));
     eip::add_gradients(m.def_submodule("gradients"));
+    eip::add_gravity(m.def_submodule("gravity"));
     eip::add_multibody(m.def_submodule("multibody"));
 }

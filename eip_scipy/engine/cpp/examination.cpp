@@ -1,0 +1,295 @@
+// The invariants of a run as Python calls them, all at once, and a first look at them (examination.hpp).
+#include "module.hpp"
+
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <bit>
+#include <cmath>
+
+#include "examination.hpp"
+#include "floats.hpp"
+#include "python_functions.hpp"
+
+namespace eip {
+namespace {
+
+using State = StatesOf<const double, 1>;
+using Rows = StatesOf<const double, 2>;
+using Numbers = ArrayOf<const double, 1>;
+using Buffer = std::vector<double>;
+
+// Whether numbers are of single precision and use more than half of its bits.
+class Single {
+  public:
+    void add(double value) {
+        exact_ = exact_ && static_cast<double>(static_cast<float>(value)) == value;
+        long_ = long_ || (std::bit_cast<uint64_t>(value) & ((uint64_t{1} << 40) - 1)) != 0;
+    }
+    explicit operator bool() const { return exact_ && long_; }
+
+  private:
+    bool exact_ = true, long_ = false;
+};
+
+class InvariantFunctions {
+  public:
+    InvariantFunctions(const nb::tuple &values, const nb::tuple &gradients, int64_t n, bool is_complex)
+        : type_(is_complex ? static_cast<int>(NPY_CDOUBLE) : static_cast<int>(NPY_DOUBLE)),
+          n_(n),
+          m_(is_complex ? 2 * n : n) {
+        for (const nb::handle call : values) l_ += inv_.emplace_back(call, type_, n, kept_).floats();
+        int64_t floats = 0;
+        for (const nb::handle call : gradients) floats += grad_.emplace_back(call, type_, n, kept_).floats();
+        require(floats == l_ * m_, "invariants: gradients of another number of values");
+    }
+
+    Array values(double t, State y) {
+        Array out = new_array({l_});
+        evaluate(t, checked(y), out.floats());
+        return out;
+    }
+
+    Array gradients(double t, State y, State f) {
+        Array out = new_array({l_, n_}, type_);
+        const double *state = checked(y), *slope = checked(f);
+        double *G = out.floats();
+        for (const PythonCall &call : grad_) {
+            call(t, state, slope, G, out);
+            G += call.floats();
+        }
+        return out;
+    }
+
+    // Whether nothing is wrong with the values' precision, with the gradients G and with the invariance at a state. Of a
+    // run of no duration nothing is known. NaN are not in order.
+    bool is_in_order(double t, State y, State f, Rows G, Numbers here, double tau, std::tuple<double, double> interval,
+                     Rows directions) {
+        const double *state = checked(y), *slope = checked(f), *gradients = checked_rows(G, l_), *values = known(here);
+        const double *ways = checked_rows(directions, 2);
+        return are_kept(slope, gradients) && are_fixed(t, state, values, tau, interval) &&
+               have_right_gradients(t, state, slope, gradients, values, tau, ways);
+    }
+
+    // The rates of change along f by short differences to both sides; NaN where these differ at a kink. Rates that are
+    // within the rounding of the values, which is larger than terms that nearly vanish, are 0.
+    Array rates_by_values(double t, State y, State f, Rows G, Numbers here, Numbers target, Numbers scales) {
+        const double *state = checked(y), *slope = checked(f), *gradients = checked_rows(G, l_), *values = known(here);
+        const double *targets = known(target), *least = known(scales);
+        Array out = new_array({l_});
+        double *rates = out.floats();
+        fill(rates, 0.0, l_);
+        const double moving = largest(slope), size = largest(state);
+        if (!(0.0 < moving && moving < ENDLESS && 0.0 < size && size < ENDLESS)) return out;
+        const double step = SHORT * size / moving;
+        const Slopes slopes = slopes_along(t, state, slope, values, step);
+        const Slopes half = slopes_along(t, state, slope, values, 0.5 * step);
+        for (int64_t i = 0; i < l_; ++i) {
+            const double jump = std::abs(slopes.forth[i] - slopes.back[i]);
+            const double half_jump = std::abs(half.forth[i] - half.back[i]);
+            const double *row = gradients + i * m_;
+            rates[i] = 0.5 * (slopes.back[i] + slopes.forth[i]);
+            if (jump > KINK * terms(row, slope) && (half_jump > KEPT_AT_HALF * jump || std::abs(rates[i]) <= jump))
+                rates[i] = NOT_A_NUMBER;
+            const double own =
+                std::max(std::max(std::abs(values[i]), std::abs(targets[i])), std::max(terms(row, state), least[i]));
+            if (std::abs(rates[i]) <= VALUE_ROUNDINGS * EPS * own / step) rates[i] = 0.0;
+        }
+        return out;
+    }
+
+    // The rates of change along f by gradients and by values, without what the values change by anyway, in units of
+    // the terms.
+    std::tuple<Array, Array> rate_shares(double t, State y, State f, Numbers target, Numbers scales,
+                                         std::optional<Numbers> own) {
+        const Array G = gradients(t, y, f), here = values(t, y);
+        Rows rows;
+        Numbers numbers;
+        rows.take(G.ptr()), numbers.take(here.ptr());
+        Array by_values = rates_by_values(t, y, f, rows, numbers, target, scales), by_gradient = new_array({l_});
+        for (int64_t i = 0; i < l_; ++i) {
+            const double *row = G.floats() + i * m_, expected = own ? known(*own)[i] : 0.0;
+            const double size = terms(row, f.data), unit = size > 0.0 ? size : 1.0;
+            by_gradient.floats()[i] = std::abs(dot(row, f.data, m_) - expected) / unit;
+            by_values.floats()[i] = std::abs(by_values.floats()[i] - expected) / unit;
+        }
+        return {by_gradient, by_values};
+    }
+
+    nb::handle kept() const { return kept_; }
+    void clear() {
+        inv_.clear();
+        grad_.clear();
+        kept_.reset();
+    }
+
+  private:
+    struct Slopes {
+        Buffer back, forth;
+    };
+
+    const double *checked(const State &y) const {
+        require(kept_.is_valid() && y.type == type_ && y.shape[0] == n_, "invariants: a state of another kind");
+        return y.data;
+    }
+    const double *checked_rows(const Rows &rows, int64_t count) const {
+        require(rows.type == type_ && rows.shape[0] == count && rows.shape[1] == n_,
+                "invariants: rows of another kind");
+        return rows.data;
+    }
+    const double *known(const Numbers &numbers) const {
+        require(numbers.shape[0] == l_, "invariants: another number of values");
+        return numbers.data;
+    }
+
+    void evaluate(double t, const double *y, double *out) const {
+        for (const PythonCall &call : inv_) {
+            call(t, y, nullptr, out, {});
+            out += call.floats();
+        }
+    }
+
+    double modulus(const double *a, int64_t k) const {
+        return type_ == NPY_CDOUBLE ? std::hypot(a[2 * k], a[2 * k + 1]) : std::abs(a[k]);
+    }
+    double largest(const double *a) const {
+        double top = 0.0;
+        for (int64_t k = 0; k < n_; ++k) {
+            const double size = modulus(a, k);
+            if (!(size <= top)) top = size;  // NaN too
+        }
+        return top;
+    }
+    // The sum of |G_k| |a_k|.
+    double terms(const double *G, const double *a) const {
+        double total = 0.0;
+        for (int64_t k = 0; k < n_; ++k) total += modulus(G, k) * modulus(a, k);
+        return total;
+    }
+
+    Buffer shifted(const double *y, double by, const double *way) const {
+        Buffer state(y, y + m_);
+        for (int64_t j = 0; j < m_; ++j) state[j] += by * way[j];
+        return state;
+    }
+
+    Slopes slopes_along(double t, const double *y, const double *f, const double *here, double step) const {
+        Slopes found{Buffer(l_), Buffer(l_)};
+        evaluate(t, shifted(y, -step, f).data(), found.back.data());
+        evaluate(t, shifted(y, step, f).data(), found.forth.data());
+        for (int64_t i = 0; i < l_; ++i) {
+            found.back[i] = (here[i] - found.back[i]) / step;
+            found.forth[i] = (found.forth[i] - here[i]) / step;
+        }
+        return found;
+    }
+
+    // Whether no invariant changes along a derivative of double precision.
+    bool are_kept(const double *f, const double *G) const {
+        for (int64_t j = 0; j < m_; ++j) {
+            Single single;
+            single.add(f[j]);
+            if (single) return false;
+        }
+        for (int64_t i = 0; i < l_; ++i) {
+            const double *row = G + i * m_;
+            if (!(std::abs(dot(row, f, m_)) <= INVARIANCE_TOLERANCE * abs_dot(row, f, m_))) return false;
+        }
+        return true;
+    }
+
+    bool have_values(double t, const double *y, const double *expected) const {
+        Buffer values(l_);
+        evaluate(t, y, values.data());
+        return std::equal(values.begin(), values.end(), expected);
+    }
+
+    // Whether the values are the same at two other times.
+    bool are_fixed(double t, const double *y, const double *here, double tau,
+                   const std::tuple<double, double> &interval) const {
+        const auto [low, high] = interval;
+        const double before = t - low, after = high - t, room = std::max(before, after);
+        const double side = after >= before ? 1.0 : -1.0, far = t + side * std::min(room, tau);
+        if (far == t || !(0.0 < tau && tau < ENDLESS)) return false;
+        const bool centred = std::min(before, after) >= TIME_ROOM * TIME_SHARE * tau;
+        const double step = centred ? std::nearbyint(std::log2(TIME_SHARE * tau))
+                                    : std::floor(std::log2(std::min(TIME_SHARE * tau, room / 6.0)));
+        return have_values(far, y, here) && have_values(t + side * std::exp2(step), y, here);
+    }
+
+    // Whether the gradients agree with differences along two directions, `ways`, of values that have double precision.
+    bool have_right_gradients(double t, const double *y, const double *f, const double *G, const double *here,
+                              double tau, const double *ways) const {
+        const double moving = largest(f), size = largest(y);
+        const double reach = size > 0.0 && moving > 0.0 ? std::min(tau, size / moving) : tau;
+        std::vector<Single> single(l_);
+        for (int64_t i = 0; i < l_; ++i) single[i].add(here[i]);
+        Buffer way(m_), ends[2] = {Buffer(l_), Buffer(l_)};
+        const int width = static_cast<int>(m_ / n_);
+        for (const double *direction : {ways, ways + m_}) {
+            for (int64_t j = 0; j < m_; ++j)
+                way[j] = direction[j] * (modulus(y, j / width) + reach * modulus(f, j / width));
+            evaluate(t, shifted(y, CHECK_STEP, way.data()).data(), ends[0].data());
+            evaluate(t, shifted(y, -CHECK_STEP, way.data()).data(), ends[1].data());
+            for (int64_t i = 0; i < l_; ++i) {
+                const double *row = G + i * m_, above = ends[0][i], below = ends[1][i];
+                const double difference = (above - below) * (0.5 / CHECK_STEP), along = dot(row, way.data(), m_);
+                const double noise = CHECK_NOISE / CHECK_STEP * EPS * std::max(std::abs(above), std::abs(below));
+                if (!(std::abs(difference - along) <= CHECK_TOLERANCE * abs_dot(row, way.data(), m_) + noise))
+                    return false;
+                single[i].add(above);
+                single[i].add(below);
+            }
+        }
+        return std::none_of(single.begin(), single.end(), [](const Single &found) { return bool(found); });
+    }
+
+    nb::list kept_;  // every object that is called
+    int type_;
+    int64_t n_, m_, l_ = 0;
+    std::vector<PythonCall> inv_, grad_;
+};
+
+int traverse(PyObject *self, visitproc visit, void *arg) {
+    Py_VISIT(Py_TYPE(self));
+    if (nb::inst_ready(self)) Py_VISIT(nb::inst_ptr<InvariantFunctions>(self)->kept().ptr());
+    return 0;
+}
+
+int clear(PyObject *self) {
+    nb::inst_ptr<InvariantFunctions>(self)->clear();
+    return 0;
+}
+
+PyType_Slot slots[] = {
+    {Py_tp_traverse, reinterpret_cast<void *>(traverse)}, {Py_tp_clear, reinterpret_cast<void *>(clear)}, {0, nullptr}};
+
+}  // namespace
+
+void add_examination(nb::module_ &module) {
+    using Functions = InvariantFunctions;
+    nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(slots),
+                          "The invariants of a run and their gradients, each as a `Call`.")
+        .def(nb::init<const nb::tuple &, const nb::tuple &, int64_t, bool>(), "values"_a, "gradients"_a, "n"_a,
+             "is_complex"_a)
+        .def("values", &Functions::values, "t"_a, "y"_a, "Return all values (l,).")
+        .def("gradients", &Functions::gradients, "t"_a, "y"_a, "f"_a, "Return all gradients (l, n).")
+        .def("is_in_order", &Functions::is_in_order, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "tau"_a, "interval"_a,
+             "directions"_a,
+             "Whether precision, gradients and invariance are beyond doubt at a state with these gradients and values.")
+        .def("rates_by_values", &Functions::rates_by_values, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a,
+             "scales"_a,
+             "Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a "
+             "kink. Rates that are within the rounding of the values are 0.")
+        .def("rate_shares", &Functions::rate_shares, "t"_a, "y"_a, "f"_a, "target"_a, "scales"_a, "own"_a = nb::none(),
+             "Return rates of change along f by gradients and by values, without the rates `own`, in units of their "
+             "terms; (l,) each.");
+    module.attr("CHECK_STEP") = CHECK_STEP;
+    module.attr("CHECK_TOLERANCE") = CHECK_TOLERANCE;
+    module.attr("CHECK_NOISE") = CHECK_NOISE;
+    module.attr("INVARIANCE_TOLERANCE") = INVARIANCE_TOLERANCE;
+    module.attr("TIME_SHARE") = TIME_SHARE;
+    module.attr("TIME_ROOM") = TIME_ROOM;
+}
+
+}  // namespace eip
