@@ -6,7 +6,7 @@ Each function takes what `integrate` takes: a function or a `Problem`, and all o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -199,7 +199,7 @@ def _refuse(function: str, options: dict[str, Any], also: Sequence[str] = ()) ->
     for name in (*OWN, *also):
         if name in options:
             raise TypeError(f"{function}() has no option {name!r}: it sets this option of integrate itself.")
-    known = {*(item.name for item in fields(Request)), *ProjectionOptions.names()} - {*OWN, *also, "projection"}
+    known = {*Request._fields, *ProjectionOptions.names()} - {*OWN, *also, "projection"}
     for name in options:
         if name not in known:
             raise TypeError(f"{function}() has no option {name!r}{nearest(name, sorted(known))}")

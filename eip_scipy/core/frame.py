@@ -14,6 +14,8 @@ from .inputs import refuse_units
 __all__ = ["frame_rows", "spanned"]
 
 SPANNED = 1e-9
+# Of a run without one.
+NO_FRAME = FrameRows(np.zeros((2, 1), INDEX), np.zeros(0, INDEX), np.zeros(0), np.zeros(0), np.zeros((2, 0, 0)))
 
 
 def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
@@ -25,9 +27,8 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         When the shapes disagree or C S is singular.
     """
     if frame is None:
-        C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
-    else:
-        C, M = _frame_matrices(frame, n, width)
+        return NO_FRAME
+    C, M = _frame_matrices(frame, n, width)
     starts, index, value = _sparse_rows(np.concatenate([C, M]))
     k = C.shape[0]
     weights = _by_bodies(C), _by_bodies(M)
@@ -93,8 +94,6 @@ def _by_bodies(a: np.ndarray) -> np.ndarray:
 
 
 def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rows = [np.flatnonzero(row) for row in a]
-    start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(INDEX)
-    index = np.concatenate([*rows, []]).astype(INDEX)
-    value = np.concatenate([*(row[r] for row, r in zip(a, rows, strict=True)), []]).astype(float)
-    return start, index, value
+    rows, index = np.nonzero(a)
+    start = np.concatenate([[0], np.cumsum(np.count_nonzero(a, axis=1))])
+    return start.astype(INDEX), index.astype(INDEX), a[rows, index]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "count", "filled", "flag", "has_unit", "is_date", "is_number", "real_array", "reals", "refuse_units",
+    "count", "filled", "flag", "has_unit", "is_date", "is_number", "is_plain", "real_array", "reals", "refuse_units",
     "require_arguments", "shown",
 ]  # fmt: skip
 
@@ -44,6 +44,8 @@ def refuse_units(**arguments: Any) -> None:
         If a value is a date, or a quantity or time of astropy, pint, unyt or a similar package.
     """
     for name, value in arguments.items():
+        if is_plain(value):
+            continue
         for item in _leaves(value):
             if is_date(item):
                 raise TypeError(
@@ -55,6 +57,14 @@ def refuse_units(**arguments: Any) -> None:
                     f"{name}: {shown(item)} has a unit; expected plain numbers, in the units of the equations. Convert "
                     "it first: x.to_value('AU') with astropy, x.m_as('AU') with pint."
                 )
+
+
+def is_plain(value: Any) -> bool:
+    """Return whether a value is a plain number, an array of numbers, or a list or tuple of plain numbers, for sure."""
+    kind = type(value)
+    if kind is np.ndarray:
+        return value.dtype.kind in "fiubc"
+    return kind in PLAIN or (kind in (tuple, list) and all(type(item) in PLAIN for item in value))
 
 
 def _leaves(value: Any) -> Any:
@@ -115,6 +125,8 @@ def real_array(name: str, value: Any, error: type[Exception] = ValueError) -> np
 
 def is_number(value: Any) -> bool:
     """Return True if a value is a real number that a float can represent; False for a bool and for an array."""
+    if type(value) is float:
+        return True
     number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     return number and reals(value) is not None
 

@@ -84,29 +84,32 @@ def native_functions(
     values = None if params is None else params.values
     rhs = function_alone(fun, kind, "acceleration" if second_order else "fun", values, second_order=second_order)
     inv, grad, slopes = list[Native](), list[Native](), list[Native]()
+    width = 2 if y0.dtype.kind == "c" else 1
     for k, (wide, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         item, value = _of_state(wide, number)
         name = f"invariant {label!r}"
         if item.args:
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
-        shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
-        inv.append(_native(item.function, value._replace(shape=shape), name))
+        l_i = invariants.starts[k + 1] - invariants.starts[k]
+        shape = () if invariants.scalar[k] else (l_i,)
+        inv.append(_native(item.function, value, name, l_i, shape=shape))
         if item.gradient is None and isinstance(item.function, PointerFunction):
-            grad.append(Native(None, inv[-1].floats * n * (2 if y0.dtype.kind == "c" else 1)))
+            grad.append(Native(None, l_i * n * width))
             continue
         if item.gradient is None:
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
-        rows = value._replace(shape=(*shape, value.size), real=False, takes_f=item.uses_f)
-        rows = rows._replace(in_place=item.in_place, gradient=True)
-        grad.append(_native(item.gradient, rows, f"gradient of {name}"))
+        rows = {"shape": (*shape, value.size), "real": False, "takes_f": item.uses_f, "in_place": item.in_place}
+        size = l_i * value.size * width
+        grad.append(_native(item.gradient, value, f"gradient of {name}", size, **rows, gradient=True))
         if wide.of_state is not None and wide.of_state.by_parameters is not None:
-            columns = value._replace(shape=(*shape, wide.of_state.parameters))
-            slopes.append(_native(wide.of_state.by_parameters, columns, f"derivatives by parameters of {name}"))
+            p, slope = wide.of_state.parameters, wide.of_state.by_parameters
+            slopes.append(_native(slope, value, f"derivatives by parameters of {name}", l_i * p, shape=(*shape, p)))
+    by_differences = any(found.function is None for found in grad)
     return rhs._replace(
         inv=_addresses(inv),
         grad=_addresses(grad),
         by_parameters=_addresses(slopes),
-        floors=invariants.floors,
+        floors=invariants.floors if by_differences else None,
         owner=rhs.owner | {"inv": inv, "grad": grad, "by_parameters": slopes},
     )
 
@@ -127,7 +130,8 @@ def function_alone(
     NotCompilableError
         As by `native_functions`.
     """
-    rhs = _native(fun, kind, name)
+    width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
+    rhs = _native(fun, kind, name, math.prod(kind.shape) * width)
     return NativeFunctions(
         rhs=rhs.entry,
         inv=(),
@@ -149,11 +153,13 @@ def with_events(
     NotCompilableError
         As by `native_functions`.
     """
+    if not events:
+        return functions
     number = _number(params, y0)
     event = list[Native]()
     for k, function in enumerate(events):
         own, kind = _of_state(function, number)
-        event.append(_native(own, kind, f"event {k}"))
+        event.append(_native(own, kind, f"event {k}", 1))
     return functions._replace(event=_addresses(event), owner=functions.owner | {"event": event})
 
 
@@ -168,8 +174,9 @@ def with_jacobian(
         As by `native_functions`.
     """
     half = y0.size // 2
-    kind = _number(params, y0)._replace(shape=(half,), size=half, real=False)
-    found = _native(jacobian, kind._replace(takes_f=True, in_place=True, gradient=True), "jacobian")
+    kind, floats = _number(params, y0), half * (2 if y0.dtype.kind == "c" else 1)
+    product = {"shape": (half,), "size": half, "real": False, "takes_f": True, "in_place": True, "gradient": True}
+    found = _native(jacobian, kind, "jacobian", floats, **product)
     return functions._replace(jacobian=found.entry, owner=functions.owner | {"jacobian": [found]})
 
 
@@ -183,14 +190,16 @@ def with_rates(
     NotCompilableError
         As by `native_functions`.
     """
-    found = list[Native]()
+    if not invariants.balances.items:
+        return functions
+    found, number = list[Native](), _number(params, y0)
     for k, item in invariants.balances.items.items():
-        shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
+        l_i = invariants.starts[k + 1] - invariants.starts[k]
         if item.rate_function is None:
-            found.append(Native(None, math.prod(shape)))
+            found.append(Native(None, l_i))
             continue
-        kind = _number(params, y0)._replace(shape=shape, takes_f=item.rate_uses_f, gradient=True)
-        found.append(_native(item.rate_function, kind, f"rate of balance {invariants.labels[k]!r}"))
+        rate = {"shape": () if invariants.scalar[k] else (l_i,), "takes_f": item.rate_uses_f, "gradient": True}
+        found.append(_native(item.rate_function, number, f"rate of balance {invariants.labels[k]!r}", l_i, **rate))
     rates = invariants.rates(adaptive, [native.entry for native in found])
     return functions._replace(rates=rates, owner=functions.owner | {"rate": found})
 
@@ -215,9 +224,8 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
     return Kind((), y0.size, params.values.size, y0.dtype.char, real=True, scalars=params.scalars)
 
 
-def _native(fun: Any, kind: Kind, name: str) -> Native:
-    width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
-    floats = math.prod(kind.shape) * width
+def _native(fun: Any, kind: Kind, name: str, floats: int, **others: Any) -> Native:
+    """Return a function with its address; it fills so many floats, and takes and gives what `kind` and `others` say."""
     if isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)
     if jit_is_off():
@@ -226,7 +234,7 @@ def _native(fun: Any, kind: Kind, name: str) -> Native:
         raise NotCompilableError(f"{name} is not a Numba function; decorate it with @numba.njit")
     from .numba_pointers import compiled  # which loads Numba
 
-    return Native(compiled(fun, kind, name), floats)
+    return Native(compiled(fun, kind._replace(**others), name), floats)
 
 
 def _addresses(functions: list[Native]) -> tuple[tuple[int, int], ...]:

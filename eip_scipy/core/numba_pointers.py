@@ -28,10 +28,11 @@ _inlined = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
 
 
 class Pointer(NamedTuple):
-    """The address of a function, and what keeps its code."""
+    """The address of a function, what keeps its code, and whether the function returns None in some places."""
 
     address: int
     library: Any
+    may_lack_value: bool = False
 
 
 class Compiled(NamedTuple):
@@ -76,7 +77,7 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
             raise NotCompilableError(f"{name} returns a list or a tuple: return np.array([...])") from error
         lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         raise NotCompilableError(f"{name} does not compile for this state: {' '.join(lines[:2])}") from error
-    if any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures):
+    if pointer.may_lack_value:
         raise NotCompilableError(f"{name} returns None in some places, and a number or an array in others")
     return Compiled(pointer, fun, name, kind)
 
@@ -95,7 +96,9 @@ def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
     arguments = types.float64, state, state, out, floats
     with global_compiler_lock:
         call.compile(arguments)
-        return _c_function(call.overloads[arguments], kind)
+        pointer = _c_function(call.overloads[arguments], kind)
+    lacks = any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures)
+    return pointer._replace(may_lack_value=lacks)
 
 
 def _c_function(compiled: Any, kind: Kind) -> Pointer:

@@ -17,8 +17,12 @@ from .pointers import by_pointer
 from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
 from .units import units as known_units
 
-__all__ = ["Deferred", "Problem", "bind", "component_names", "library_variational", "made", "native_invariant"]
+__all__ = [
+    "BROUGHT", "Deferred", "Problem", "bind", "component_names", "library_variational", "made", "native_invariant",
+]  # fmt: skip
 
+# Options of the projection that a problem brings.
+BROUGHT = ("invariants", "metric", "blocks", "frame")
 MOST = 12  # components that are printed
 MOMENTS, DURATIONS = ("t_span", "t_eval", "t"), ("h", "first_step", "max_step")
 # Starting times that differ by less are equal, because a Julian date in one float has errors of up to 20 microseconds.
@@ -188,8 +192,7 @@ class Problem:
             raise TypeError(f"{self.name}: the problem has no {'interval' if t_span is None else 'start'}; give one.")
         brought: dict[str, Any] = {}
         if hasattr(method, "TABLEAU"):  # an EIP method; this module does not import the solvers
-            names = ("invariants", "metric", "blocks", "frame")
-            brought = {name: value for name in names if (value := getattr(self, name)) is not None}
+            brought = {name: value for name in BROUGHT if (value := getattr(self, name)) is not None}
             if method.TABLEAU.drives:
                 brought["invariants"] = self.stiff_invariants
             fixed = self.h is not None and not method.TABLEAU.drives

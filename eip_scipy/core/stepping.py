@@ -203,6 +203,9 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     refuse_units(rtol=rtol, atol=atol)
     out = []
     for name, value in (("rtol", rtol), ("atol", atol)):
+        if isinstance(value, float) and 0.0 <= value < math.inf:
+            out.append(np.full(n, value))
+            continue
         a = reals(value)
         if a is None:
             raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {shown(value)}.")

@@ -448,9 +448,9 @@ def ensemble(
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
     common["acceleration"] = acceleration
     request = Request.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
-    request = dataclasses.replace(request.with_pointers(), **own.of(0))
+    request = request.with_pointers()._replace(**own.of(0))
     if request.args is not None or not everyone.params.shape[1]:
-        request = dataclasses.replace(request, params=None)
+        request = request._replace(params=None)
     task = Task(request, reduce, keep, total, own.padded.shape[1] if own else None)
     plan, doubts = _first_that_starts(task, everyone)
     everyone = everyone._replace(y0s=np.ascontiguousarray(everyone.y0s, plan.dtype))
@@ -673,7 +673,7 @@ def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
     """Check the options of `integrate`; `reduced`: states go into statistics or a store."""
     if reduced and options.get("variations") is not None:
         raise ValueError("ensemble: variations= cannot be combined with out= or reduce=; omit one of them.")
-    known = {option.name for option in dataclasses.fields(Request)} - ALONE | set(ProjectionOptions.names())
+    known = set(Request._fields) - ALONE | set(ProjectionOptions.names())
     for name in options:
         if name not in known:
             raise TypeError(f"ensemble() has no option {name!r}{nearest(name, (*OWN, *known))}")
@@ -756,7 +756,7 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
     starts, params = everyone.y0s, everyone.params
     for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
         own = None if task.request.params is None else params[k].copy()
-        request = dataclasses.replace(task.request, y0=starts[k].copy(), params=own, **everyone.own.of(k))
+        request = task.request._replace(y0=starts[k].copy(), params=own, **everyone.own.of(k))
         tried = dataclasses.replace(task, request=request)
         try:
             ready = tried.prepared(tried.request.y0, own, check_start=True)

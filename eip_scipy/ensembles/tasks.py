@@ -80,7 +80,7 @@ class Task:
         self, y0: np.ndarray, params: np.ndarray | None, own: Mapping[str, Any] = NOTHING, *, check_start: bool = False
     ) -> Prepared:
         """Prepare the run of one member as `integrate` does; `own` contains its interval and times."""
-        return prepared(replace(self.request, y0=y0, params=params, **own), check_start=check_start)
+        return prepared(self.request._replace(y0=y0, params=params, **own), check_start=check_start)
 
 
 class Members(NamedTuple):
@@ -210,7 +210,7 @@ class Plan:
     def compile(self, *, progress: bool = False) -> Plan:
         """Compile the functions and return the plan itself; done before threads start, which would all compile."""
         ready = self._ready
-        loop = Loop(replace(ready, request=replace(ready.request, progress=progress)), Keeper())
+        loop = Loop(replace(ready, request=ready.request._replace(progress=progress)), Keeper())
         self.why_not = loop.why_not
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets or self.task.rows is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -40,8 +39,8 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     if not is_number(t) or not origin.sign * (t - origin.t) > 0:
         raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
     request = origin.request
-    asked = {item.name: getattr(request, item.name) for item in fields(Request) if item.name not in OWN}
-    asked |= {**request.projection, "invariants": origin.invariants}
+    asked = {name: getattr(request, name) for name in Request._fields if name not in OWN}
+    asked |= {**request.projection, "invariants": origin.kept()}
     if result.t_events is not None:
         asked["events"] = ContinuedEvents(as_events(asked["events"]), result.t_events)
     if options.get("t_eval") is not None:

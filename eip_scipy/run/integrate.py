@@ -8,13 +8,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import fields, replace
 from typing import Any, Unpack
 
 import numpy as np
 
 from ..core.examination import is_check_due, steps_to_check
 from ..core.failures import failure
+from ..core.invariants import Invariant
 from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
@@ -213,7 +213,7 @@ def integrate(
     """
     asked = dict(locals())  # the fields of Request have the same names and defaults
     _check_names(projection)
-    request = Request(**{item.name: asked[item.name] for item in fields(Request)})
+    request = Request(*map(asked.__getitem__, Request._fields))
     keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
     with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
         return Loop(prepared(request), keeper).run()
@@ -223,7 +223,7 @@ def _check_names(projection: Iterable[str]) -> None:
     known = ProjectionOptions.names()
     for name in projection:
         if name not in known:
-            own = (item.name for item in fields(Request) if item.name != "projection")
+            own = (name for name in Request._fields if name != "projection")
             others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
 
@@ -452,16 +452,20 @@ class Loop:
             epoch=self.prepared.epoch,
         )
         t, y = events.last if self._event_ended else driver.now
-        kept, asked = driver.run.invariants.with_targets(at_end=not self._event_ended), self.prepared.asked
-        variations = self.prepared.variations
+        asked, variations = self.prepared.asked, self.prepared.variations
         if variations is not None:
             columns = variations.columns
             result["variations"] = columns.apart(driver.y[:rows])[1]
             result["columns"] = self.prepared.described_columns
-            asked, kept = replace(asked, variations=columns.after(y)), variations.with_targets(kept)
-        origin = Origin(asked, t, _own(y.copy(), self.prepared), driver.schedule.span.sign, kept)
+            asked = asked._replace(variations=columns.after(y))
+        origin = Origin(asked, t, _own(y.copy(), self.prepared), driver.schedule.span.sign, self._kept)
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
+
+    def _kept(self) -> tuple[Invariant, ...]:
+        """Return the invariants with the values that the run keeps as their targets."""
+        kept = self.driver.run.invariants.with_targets(at_end=not self._event_ended)
+        return kept if self.prepared.variations is None else self.prepared.variations.with_targets(kept)
 
     def _solution(self) -> Any:
         """Return the run as a function of time, or None."""

@@ -12,6 +12,7 @@ import numpy as np
 from ..core.inputs import filled
 from ..core.states import as_derivative
 from ..core.steppers import check_halves
+from ..engine.native import LibraryFunction
 
 __all__ = ["FORMS", "INTERPRETED"]
 
@@ -39,7 +40,7 @@ def _interpreted_in_place(
     fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun"
 ) -> Callable[..., None]:
     """The user's right-hand side in place, looked at in its first call; NaN in `out` then shows what it leaves out."""
-    first = True
+    first = not isinstance(fun, LibraryFunction)
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
         nonlocal first

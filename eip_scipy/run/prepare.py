@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..core.acceleration import BY_NAME, AccelerationField
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.driven import Jacobian
-from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
+from ..core.inputs import count, flag, is_plain, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
 from ..core.multistep import times
 from ..core.native_functions import native_functions, with_events, with_jacobian, with_rates
 from ..core.options import ProjectionOptions
 from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
-from ..core.problem import Problem, made
+from ..core.problem import BROUGHT, Problem, made
 from ..core.results import Diagnostics
 from ..core.run_spec import RunSpec
 from ..core.runs import Counted, Run
@@ -57,15 +58,14 @@ class _Default:
 DEFAULT: Any = _Default()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Request:
+class Request(NamedTuple):
     """The arguments of `integrate` as given; `projection` contains only the projection options that were given."""
 
     fun: Any = None
     acceleration: Any = None
     t_span: Any = None
     y0: Any = None
-    method: Any
+    method: Any = None
     h: Any = DEFAULT
     args: Any = None
     params: Any = None
@@ -88,7 +88,7 @@ class Request:
     atol: Any = DEFAULT
     first_step: Any = None
     max_step: Any = np.inf
-    projection: Mapping[str, Any] = field(default_factory=dict)
+    projection: Mapping[str, Any] = MappingProxyType({})
 
     @classmethod
     def of(cls, **keywords: Any) -> Request:
@@ -100,7 +100,7 @@ class Request:
         """Return the request with C function pointers wrapped so that Python can call them."""
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
         fun, acceleration = by_pointer(self.fun, "fun"), by_pointer(self.acceleration, "acceleration")
-        return replace(self, fun=fun, acceleration=acceleration, events=as_events(self.events), jacobian=jacobian)
+        return self._replace(fun=fun, acceleration=acceleration, events=as_events(self.events), jacobian=jacobian)
 
     @property
     def function(self) -> Any:
@@ -183,9 +183,9 @@ class System:
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
         """Return the functions of the loop, and which of them are called from Python and why (None if none is)."""
-        in_python, numbers = self._in_python(run), scalars(self.extra)
+        numbers = scalars(self.extra)
         if wanted is False:
-            return in_python, "interpreted: compiled=False"
+            return self._in_python(run), "interpreted: compiled=False"
         try:
             if run.tableau.in_python:
                 kind = "a solver" if run.tableau.drives else "a one-step method"
@@ -200,13 +200,13 @@ class System:
         except NotCompilableError as reason:
             if wanted:
                 raise
-            return in_python, f"interpreted: {reason}"
+            return self._in_python(run), f"interpreted: {reason}"
         try:
             return with_events(functions, self.events.functions, params, run.y0), None
         except NotCompilableError as reason:
             if wanted:
                 raise
-            return functions._replace(python=in_python), f"events are called from Python: {reason}"
+            return functions._replace(python=self._in_python(run)), f"events are called from Python: {reason}"
 
     @property
     def _native_form(self) -> tuple[Any, str]:
@@ -336,7 +336,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     request = _plain(request)
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
     if request.method is None:
-        request = replace(request, method=default_method(request.fun))
+        request = request._replace(method=default_method(request.fun))
     method = _method(request.method)
     _check_choices(request)
     if request.jac is not None and not method.drives:
@@ -422,8 +422,7 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
 def _widened(request: Request, variations: Variations) -> Request:
     """Return the request for the state extended by its columns."""
     extra = extra_arguments(request.args, request.params)
-    return replace(
-        request,
+    return request._replace(
         fun=variations.rhs,
         y0=variations.columns.wide(_state(request.y0), floats(extra)),
         jacobian=None,
@@ -449,7 +448,10 @@ def _plain(request: Request) -> Request:
     if not isinstance(problem, Problem):
         return request
     names = ("t_span", "y0", "t_eval", "h", "first_step", "max_step", "params")
-    return replace(request, **problem.plain(**{name: getattr(request, name) for name in names}))
+    given = {name: value for name in names if not is_plain(value := getattr(request, name)) and value is not DEFAULT}
+    if not given:
+        return request
+    return request._replace(**problem.plain(**{"t_span": request.t_span, "y0": request.y0} | given))
 
 
 def _second_order_hint(fun: Any) -> str:
@@ -513,7 +515,6 @@ def _with_problem(request: Request) -> tuple[Request, str]:
     """Complete the request with what a `Problem` provides; return it and the form of its function."""
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
-    extra_arguments(request.args, params)  # raises an error if they are wrong
     problem, in_place = request.fun, flag("in_place", request.in_place)
     if request.acceleration is not None:
         if problem is not None:
@@ -525,37 +526,37 @@ def _with_problem(request: Request) -> tuple[Request, str]:
     elif problem is None:
         raise TypeError("integrate: fun is missing; give a function fun(t, y), a Problem, or acceleration=a(t, q).")
     if not isinstance(problem, Problem):
-        projection |= _with_run_params(projection, params, request.args)
+        projection |= _without_own(projection, extra_arguments(request.args, params))
         fun, form = _function_and_form(problem, in_place)
-        return replace(request, fun=fun, t_span=t_span, y0=y0, projection=projection), form
+        return request._replace(fun=fun, t_span=t_span, y0=y0, projection=projection), form
     if request.args is not None:
         raise TypeError("args: a Problem has params; pass params=..., or its functions instead of the Problem.")
-    brought = {option.name for option in fields(problem)} & set(ProjectionOptions.names())
-    own_options = {name: getattr(problem, name) for name in brought}
+    own_options = {name: getattr(problem, name) for name in BROUGHT}
     if request.method.TABLEAU.drives:
         own_options["invariants"] = problem.stiff_invariants
     projection = own_options | projection
-    projection |= _with_run_params(projection, problem.params)
     if params is None and problem.rhs is not None:
         params = problem.params
-    projection |= _with_run_params(projection, params)
+    projection |= _without_own(projection, *((values,) for values in (problem.params, params) if values is not None))
     own = problem.fun if problem.rhs is None else problem.rhs
     fun, form = _function_and_form(own, problem.rhs is not None)
     jacobian = problem.jacobian if request.jacobian is None else request.jacobian
     fixed = request.h is DEFAULT and not request.adaptive and not request.method.TABLEAU.drives
     h = problem.h if fixed else request.h
-    found = replace(request, fun=fun, t_span=t_span, y0=y0, params=params, h=h, projection=projection)
-    return replace(found, jacobian=jacobian), form
+    found = {"fun": fun, "t_span": t_span, "y0": y0, "params": params, "h": h, "projection": projection}
+    return request._replace(**found, jacobian=jacobian), form
 
 
-def _with_run_params(projection: Mapping[str, Any], params: Any, args: Any = None) -> dict[str, Any]:
-    """Return the invariants without their args if these equal what the run passes on itself."""
+def _without_own(projection: Mapping[str, Any], *extra: tuple[Any, ...]) -> dict[str, Any]:
+    """Return the invariants without their args if these equal one of `extra`, which the run passes on itself."""
     if "invariants" not in projection:
         return {}
     items = as_invariants(projection["invariants"])
-    extra = (() if params is None else (params,)) if args is None else tuple(args)
-    if extra:
-        items = tuple(with_args(item, ()) if are_same(item.args, extra) else item for item in items)
+    if any(item.args for item in items):
+        known = [given for given in extra if given]
+        items = tuple(
+            with_args(item, ()) if any(are_same(item.args, given) for given in known) else item for item in items
+        )
     return {"invariants": items}
 
 

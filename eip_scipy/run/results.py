@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -29,15 +30,15 @@ class Origin(NamedTuple):
         Last state of the run, saved or not.
     sign : float
         Direction of time, 1 or -1.
-    invariants : tuple of Invariant
-        Invariants of the run, with the kept values as their targets.
+    kept : callable
+        ``kept()`` returns the invariants of the run, with the kept values as their targets.
     """
 
     request: Any
     t: float
     y: np.ndarray
     sign: float
-    invariants: Any
+    kept: Callable[[], Any]
 
 
 if TYPE_CHECKING:
