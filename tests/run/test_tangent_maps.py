@@ -239,7 +239,9 @@ def in_c(name, folder):
     rates, params, *_ = SYSTEMS[name]
     lines = [f"double {item} = Y[{k}], d{k} = dY[{k}];" for k, item in enumerate(rates)]
     lines += [f"double {item} = P[{k}];" for k, item in enumerate(params)]
-    lines += [f"out[{k}] = {sympy.ccode(sympy.sympify(text))};" for k, text in enumerate(product_with_jacobian(name))]
+    own = {item: sympy.Symbol(item) for item in (*rates, *params, "t", *(f"d{k}" for k in range(len(rates))))}
+    products = [sympy.sympify(text, locals=own) for text in product_with_jacobian(name)]
+    lines += [f"out[{k}] = {sympy.ccode(product)};" for k, product in enumerate(products)]
     arguments = "double t, const double *Y, const double *dY, double *out, const double *P"
     source = folder / "product.c"
     source.write_text(f"#include <math.h>\nint product({arguments}) {{\n{chr(10).join(lines)}\nreturn 0; }}\n")
