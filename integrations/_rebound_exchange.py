@@ -1,4 +1,4 @@
-"""Problems and runs from REBOUND's simulations and archives, and back; public in `eip_scipy.integrations.rebound`."""
+"""Conversion of problems and runs from and to REBOUND's simulations and archives; public in `integrations.rebound`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from eip_scipy.problems.gravity.nbody import component_names, nbody
 if TYPE_CHECKING:
     from eip_scipy.core.problem import Problem
 
-# REBOUNDx's forces by ours.
+# REBOUNDx's forces, by our names.
 REBOUNDX = {"gr": "1pn", "gr_full": "eih", "gr_potential": "gr-potential"}
 OURS = {ours: theirs for theirs, ours in REBOUNDX.items()} | {"j2": "gravitational_harmonics"}
 MAGIC = b"REBOUND Binary File"
 UNKNOWN_UNITS = "as in the REBOUND simulation"
-# G times a template's mass is a G m of ours to the rounding of one product and one quotient.
+# G times a template's mass equals our G m up to the rounding of one product and one quotient.
 SAME = 1e-15
 
 
@@ -53,9 +53,9 @@ def problem_from_simulation(
     h : float, optional
         A sensible fixed step; default: the magnitude of sim.dt.
     forces : str or sequence of str, optional
-        What the simulation's additional forces are, by the names that `nbody` has for them; () for none that matter.
-        Default: what REBOUNDx has attached, where it is known: "gr" (here "1pn"), "gr_full" ("eih") and "gr_potential"
-        ("gr-potential").
+        The simulation's additional forces, by the names that `nbody` has for them; () if none of them matters.
+        Default: the forces that REBOUNDx has attached, if they are known: "gr" (here "1pn"), "gr_full" ("eih") and
+        "gr_potential" ("gr-potential").
     constants : ForceConstants, optional
         As for `nbody`, with `forces`.
     names : sequence of str, optional
@@ -68,31 +68,31 @@ def problem_from_simulation(
     -------
     Problem
         In the simulation's units of length and time, with params = sim.G times the masses, and `G`. Test particles have
-        the mass 0. Where ``sim.units`` are set, quantities of astropy are converted to them.
+        mass 0. If ``sim.units`` are set, quantities of astropy are converted to them.
 
     Raises
     ------
     TypeError
-        For something else than a simulation, such as the path of an archive.
+        If `sim` is not a simulation, for example the path of an archive.
     ValueError
-        `t_span` starts at another time than the state; or the simulation has what the N-body problem lacks
-        (variational particles, softening, forces that are not known, collisions, boundaries ...): the message says
-        which and why it is not supported.
+        If `t_span` does not start at the time of the state, or if the simulation has features that the N-body problem
+        lacks (variational particles, softening, forces that are not known, collisions, boundaries ...): the message
+        says which and why it is not supported.
 
     Warns
     -----
     UserWarning
-        When the simulation has what ends it or watches it, which a problem cannot hold: exit_max_distance,
+        If the simulation has features that end or observe it and that a problem cannot hold: exit_max_distance,
         exit_min_distance (`exit_events` has events for them) and a heartbeat.
 
     Notes
     -----
-    Particles from ``sim.N_active`` on attract nothing, with ``sim.testparticle_type`` 0: masses that they have are
-    dropped, which changes no motion. With 1 they act on the active ones but not on each other; energy and angular
-    momentum are then those of another system, and only masses of 0, or a single one, are taken.
+    Particles from ``sim.N_active`` on attract nothing if ``sim.testparticle_type`` is 0: their masses are dropped,
+    which does not change the motion. With 1 they act on the active ones but not on each other; energy and angular
+    momentum are then those of another system, and only masses of 0, or a single one, are accepted.
 
-    "gr" of REBOUNDx takes positions and velocities in Jacobi's coordinates, "1pn" relative to the Sun: they differ in
-    the planets' masses, by a part in a thousand of the effect.
+    "gr" of REBOUNDx uses positions and velocities in Jacobi coordinates, "1pn" those relative to the Sun. The two
+    differ in the planets' masses, by a part in a thousand of the effect.
     """
     if not isinstance(sim, rebound.Simulation):
         raise TypeError(
@@ -129,7 +129,7 @@ def problem_from_simulation(
 
 
 class _Exit:
-    """A terminal event: 0 where the largest or smallest distance has the value at which a simulation ends."""
+    """Terminal event that is 0 if the largest or smallest distance has the value at which a simulation ends."""
 
     terminal, direction = True, 0.0
 
@@ -154,9 +154,10 @@ def exit_events(sim: rebound.Simulation) -> list[_Exit]:
     Returns
     -------
     list of callable
-        For ``integrate(problem, ..., events=exit_events(sim))``: where the largest distance of a particle from the
-        origin reaches ``sim.exit_max_distance``, and where two particles come as near as ``sim.exit_min_distance``;
-        one for each of the two that is set. REBOUND looks after each step, an event is located within it.
+        For ``integrate(problem, ..., events=exit_events(sim))``: one event if the largest distance of a particle from
+        the origin reaches ``sim.exit_max_distance``, and one if two particles come as near as
+        ``sim.exit_min_distance``. Only the distances that are set have an event. REBOUND checks them after each step;
+        an event is located within it.
     """
     given = {name: float(getattr(sim, name)) for name in ("exit_max_distance", "exit_min_distance")}
     return [_Exit(name, limit) for name, limit in given.items() if limit > 0]
@@ -197,33 +198,32 @@ def to_simulation(
     y : array_like, shape (6 N,), optional
         The state (q, v); default: the start of a problem, the `row` of a run.
     row : int, optional
-        Which saved state of a run; default: -1, the last one.
+        Index of a saved state of the run; default: -1, the last one.
     t : float, optional
-        The simulation's time; default: that of the row, or the start of the problem; with `y` of a run the time of the
-        row that is equal to it.
+        The simulation's time; default: that of the row, or the start of the problem. If `y` is a state of a run, the
+        default is the time of the row that equals it.
     template : rebound.Simulation, optional
-        A simulation of as many bodies, a copy of which gets the state and the time: integrator, step, units, names,
-        radii, and the masses of test particles are its own.
+        A simulation of as many bodies. A copy of it gets the state and the time and keeps its integrator, step, units,
+        names, radii, and the masses of test particles.
 
     Returns
     -------
     rebound.Simulation
         With the bodies' names (REBOUND 5; hashes before). Without a `template` masses and G are those of the simulation
-        that the problem came from; else in solar masses where the problem has units that REBOUND knows; else G = 1 and
-        m = G m. Where the last bodies have no mass, ``N_active`` leaves them out. The centre of mass is left where it
-        is.
+        that the problem came from. Otherwise they are in solar masses if the problem has units that REBOUND knows, and
+        G = 1 and m = G m if not. ``N_active`` excludes trailing bodies without mass. The centre of mass is not moved.
 
     Raises
     ------
     TypeError
-        For what is no problem of bodies or a run of one.
+        If `run` is neither a problem of bodies nor a run of one.
     ValueError
-        When shapes or masses do not fit, or there is no such row.
+        If shapes or masses do not fit, or there is no such row.
 
     Warns
     -----
     UserWarning
-        When the problem has forces besides Newton's, which a simulation has from REBOUNDx only: attach them there.
+        If the problem has forces other than Newton's, which a simulation gets from REBOUNDx only: attach them there.
     """
     bodies = bodies_of(run)
     at, start = _chosen(run, bodies, y, row, t)
@@ -247,23 +247,23 @@ def to_archive(run: Any, path: str | os.PathLike[str], *, template: rebound.Simu
     Parameters
     ----------
     run : IntegrationResult
-        Of a problem of bodies. What was saved is written: give `save_every` or `t_eval`.
+        A run of a problem of bodies. All saved states are written: choose them by `save_every` or `t_eval`.
     path : path-like
-        A new file; one that is there is not replaced.
+        A new file; an existing one is not replaced.
     template : rebound.Simulation, optional
         As for `to_simulation`.
 
     Raises
     ------
     FileExistsError
-        When there is something at `path`.
+        If `path` exists.
     TypeError, ValueError
         As by `to_simulation`.
 
     Notes
     -----
-    ``rebound.Simulationarchive(path)[k]`` is row k, from which REBOUND may go on; `read_archive` reads all of them at
-    once.
+    ``rebound.Simulationarchive(path)[k]`` is row k, from which REBOUND can continue; `read_archive` reads all of them
+    at once.
     """
     place = os.fspath(path)
     if os.path.lexists(place):
@@ -284,7 +284,7 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
     ----------
     path : path-like
     every : int, optional
-        Read each so many-th snapshot.
+        Read every `every`-th snapshot.
     names : sequence of str, optional
         Names of the bodies; default: those of the particles in the first snapshot (REBOUND 5), or their numbers.
 
@@ -292,25 +292,26 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
     -------
     OptimizeResult
         Times ``t`` (m,), states (q, v) ``y`` (6 N, m), ``gm`` (N,), ``component_names``, ``units`` and ``message``;
-        `eip_scipy.results.to_xarray`, `eip_scipy.results.plot`, `orbital_elements` and the like take it. One snapshot
-        with all of its settings is ``rebound.Simulation(path, snapshot=k)``, which `problem_from_simulation` takes.
+        `eip_scipy.results.to_xarray`, `eip_scipy.results.plot`, `orbital_elements` and similar functions accept it. One
+        snapshot with all of its settings is ``rebound.Simulation(path, snapshot=k)``, which `problem_from_simulation`
+        takes.
 
     Raises
     ------
     FileNotFoundError
-        When there is no file.
+        If there is no such file.
     ValueError
-        When REBOUND cannot read it, or bodies or masses change from one snapshot to another.
+        If REBOUND cannot read it, or if bodies or masses change from one snapshot to another.
     """
     place, every = os.fspath(path), count("every", every)
     if not os.path.isfile(place):
         raise FileNotFoundError(f"read_archive: no file at {place}")
     with open(place, "rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise ValueError(f"read_archive: {place} is no archive of REBOUND.")
+            raise ValueError(f"read_archive: {place} is not an archive of REBOUND.")
     times, states, first = [], [], None
     with warnings.catch_warnings():
-        # Functions of a simulation are never in a file, and here nothing is integrated.
+        # A file never contains functions of a simulation, and nothing is integrated here.
         warnings.filterwarnings("ignore", "You have to reset function pointers", RuntimeWarning)
         try:
             archive = rebound.Simulationarchive(place)
@@ -342,7 +343,7 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
 
 
 def state(sim: rebound.Simulation) -> np.ndarray:
-    """The state (q, v) of all particles."""
+    """Return the state (q, v) of all particles."""
     q = np.empty((sim.N, 3))
     v = np.empty((sim.N, 3))
     sim.serialize_particle_data(xyz=q, vxvyvz=v)
@@ -355,7 +356,7 @@ def _set_state(sim: rebound.Simulation, y: np.ndarray) -> None:
 
 
 def _active(sim: rebound.Simulation) -> int:
-    """How many particles, from the first, attract the others; N_active is -1 for all, as unsigned too."""
+    """Return the number of leading particles that attract the others; N_active is -1, perhaps unsigned, for all."""
     return int(sim.N_active) if 0 <= sim.N_active < sim.N else int(sim.N)
 
 
@@ -367,17 +368,17 @@ def _attracting_masses(sim: rebound.Simulation) -> np.ndarray:
 
 
 def _names(sim: rebound.Simulation) -> tuple[str, ...]:
-    """The particles' names; a number for one without, or whose name another one has too."""
+    """Return the particles' names, or the number of a particle that has no name or shares it with another."""
     given = [getattr(particle, "name", None) for particle in sim.particles][: sim.N]
     return tuple(name if name is not None and given.count(name) == 1 else str(k) for k, name in enumerate(given))
 
 
 def _archived_names(archive: rebound.Simulationarchive) -> tuple[str, ...]:
-    """The names in the first snapshot.
+    """Return the names in the first snapshot.
 
-    REBOUND 5.2 finds them by their addresses in the process that wrote them, one after the other: where a new address
-    is an old one of another name, one particle gets that of the other. With the wrong ones still there the next are
-    elsewhere.
+    REBOUND 5.2 finds names by their addresses in the process that wrote them. If a new address equals
+    an old one of another name, a particle gets the wrong name. The names of later snapshots are
+    stored at other addresses while the wrong ones exist.
     """
     held: list[rebound.Simulation] = []
     while len(held) < 4:
@@ -390,7 +391,7 @@ def _archived_names(archive: rebound.Simulationarchive) -> tuple[str, ...]:
 
 
 def _units(sim: rebound.Simulation) -> str:
-    """The units of length and time, as a `Problem` knows them."""
+    """Return the units of length and time as a `Problem` knows them."""
     names = sim.units
     if names["length"] is None or names["time"] is None:
         return UNKNOWN_UNITS
@@ -399,12 +400,12 @@ def _units(sim: rebound.Simulation) -> str:
 
 
 def _named(size: float, known: dict[str, float], base: str) -> str:
-    """A unit by its name, or as a number of metres or seconds."""
+    """Return a unit by its name, or as a number of metres or seconds."""
     return next((name for name, own in known.items() if own == size), f"{float(size)!r} {base}")
 
 
 def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
-    """What REBOUNDx adds, by our names, and the constants of it."""
+    """Return our names of the forces that REBOUNDx adds, and their constants."""
     if not sim._additional_forces:
         return (), None
     extras = getattr(sim, "_extras_ref", None)
@@ -430,7 +431,7 @@ def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants 
 
 
 def _parameter(thing: Any, name: str) -> Any:
-    """A parameter of REBOUNDx's, None where it is not set."""
+    """Return a parameter of REBOUNDx, or None if it is not set."""
     try:
         return thing.params[name]
     except AttributeError:
@@ -438,7 +439,7 @@ def _parameter(thing: Any, name: str) -> Any:
 
 
 def _force_names(extras: Any) -> list[str]:
-    """Names of the forces that REBOUNDx has attached: a list in C, which it has no function for."""
+    """Return the names of the forces that REBOUNDx has attached: a list in C, for which it has no function."""
     import reboundx
 
     names, node = [], extras._additional_forces
@@ -450,7 +451,7 @@ def _force_names(extras: Any) -> list[str]:
 
 
 def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) -> tuple[float, np.ndarray]:
-    """Time and state that are asked for."""
+    """Return the requested time and state."""
     refuse_units(y=y, t=t)
     problem = bodies.problem
     rows = 0 if run is problem else len(run.t)
@@ -476,12 +477,12 @@ def _time_of(run: Any, y: Any, t: float | None) -> float:
         return t
     equal = (run.y == np.reshape(y, (-1, 1))).all(axis=0)
     if not equal.any():
-        raise ValueError("to_simulation: y is no saved state of the run; say at which time: t=...")
+        raise ValueError("to_simulation: y is not a saved state of the run. Give its time: t=...")
     return float(run.t[np.argmax(equal)])
 
 
 def _new(bodies: Bodies) -> rebound.Simulation:
-    """A simulation with the masses and names, at rest in the origin."""
+    """Return a simulation with the masses and names, at rest in the origin."""
     sim, n = rebound.Simulation(), bodies.gm.size
     G = bodies.problem.G
     if names := _rebound_units(bodies.problem, G):
@@ -499,7 +500,7 @@ def _new(bodies: Bodies) -> rebound.Simulation:
 
 
 def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | None:
-    """REBOUND's names of the problem's units, with the unit of mass that makes G what it is."""
+    """Return REBOUND's names of the problem's units, with the unit of mass that gives G the required value."""
     known = problem.unit_system
     if known is None:
         return None
@@ -519,7 +520,7 @@ def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | 
 
 
 def _like(template: rebound.Simulation, bodies: Bodies) -> rebound.Simulation:
-    """A copy of the template, if it has these bodies."""
+    """Return a copy of the template if it has these bodies."""
     if not isinstance(template, rebound.Simulation):
         raise TypeError(f"to_simulation: template must be a rebound.Simulation, got {shown(template)}.")
     own = template.G * _attracting_masses(template)
@@ -534,7 +535,7 @@ def _like(template: rebound.Simulation, bodies: Bodies) -> rebound.Simulation:
 def _refuse_unsupported(sim: rebound.Simulation) -> None:
     passive = [particle.m for particle in sim.particles][_active(sim) : sim.N]
     obstacles = (
-        (sim.N_var > 0, "variational particles: they are no bodies, and our state has no place for them"),
+        (sim.N_var > 0, "variational particles: they are not bodies, and our state cannot hold them"),
         (sim.N < 2, f"{sim.N} particles: gravity needs at least two"),
         (
             sim.testparticle_type != 0 and len(passive) > 1 and any(passive),

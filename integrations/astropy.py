@@ -1,12 +1,12 @@
-"""Quantities and times of astropy, in and out.
+"""Conversion of quantities and times of astropy.
 
-In: `eip_scipy.problems.nbody` takes masses, positions, velocities, spans and steps with units, and epochs; `integrate`
-and `Problem.solve_ivp` take them for ``t_span``, ``t_eval``, ``h``, ``first_step``, ``max_step`` and ``y0`` of a
-problem that knows its units, and times (`astropy.time.Time`, in any scale) of one that has an epoch;
-`eip_scipy.integrations.jpl.initial_data` takes a time. That needs no import of this module. Elsewhere a value with a
+Input: `eip_scipy.problems.nbody` takes masses, positions, velocities, spans and steps with units, and epochs;
+`integrate` and `Problem.solve_ivp` take them for ``t_span``, ``t_eval``, ``h``, ``first_step``, ``max_step`` and ``y0``
+of a problem that knows its units, and times (`astropy.time.Time`, in any scale) of a problem that has an epoch;
+`eip_scipy.integrations.jpl.initial_data` takes a time. This needs no import of this module. Elsewhere a value with a
 unit is a TypeError that names the argument: no unit is dropped.
 
-Out: `times`, `positions` and `velocities` of a run. `span` makes a ``t_span`` of Julian dates whose scale is said.
+Output: `times`, `positions` and `velocities` of a run. `span` makes a ``t_span`` of Julian dates on a stated scale.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ __all__ = ["positions", "span", "times", "velocities"]
 
 
 def span(start: Any, end: Any, *, scale: str | None = None) -> tuple[Time, Time]:
-    """A ``t_span`` from Julian dates on a stated time scale.
+    """Make a ``t_span`` from Julian dates on a stated time scale.
 
     Parameters
     ----------
     start, end : float or (float, float) or Time or Quantity
-        Julian dates, in one number (good to 20 microseconds) or in two that are added up without loss; times of
-        astropy, which have a scale of their own; `end` also a duration, counted from the start.
+        Julian dates, as one number (accurate to 20 microseconds) or as two that are added without loss; or times of
+        astropy, which have their own scale; `end` may also be a duration, counted from the start.
     scale : {"tdb", "tt", "tai", "utc", "tcb", "tcg", "ut1"}, optional
-        Of the Julian dates; it must be given where there are some.
+        Time scale of the Julian dates; required if there are any.
 
     Returns
     -------
@@ -49,9 +49,9 @@ def span(start: Any, end: Any, *, scale: str | None = None) -> tuple[Time, Time]
     Raises
     ------
     TypeError
-        For a Julian date without a scale.
+        If a Julian date has no scale.
     ValueError
-        For a scale that astropy does not know.
+        If astropy does not know the scale.
 
     Examples
     --------
@@ -65,12 +65,12 @@ def span(start: Any, end: Any, *, scale: str | None = None) -> tuple[Time, Time]
 
 
 def times(run: Any, *, scale: str = "tdb") -> Time:
-    """The saved times of a run as times of astropy.
+    """Return the saved times of a run as times of astropy.
 
     Parameters
     ----------
     run : IntegrationResult or OdeResult
-        Of a `Problem` that has an `epoch`, by `integrate` or `Problem.solve_ivp`; loaded ones too.
+        A run by `integrate` or `Problem.solve_ivp` of a `Problem` that has an `epoch`; it may have been loaded.
     scale : str, optional
         "tdb" (the default), "utc" or another that astropy knows.
 
@@ -81,12 +81,12 @@ def times(run: Any, *, scale: str = "tdb") -> Time:
     Raises
     ------
     TypeError
-        When the run has no epoch or no unit of time.
+        If the run has no epoch or no unit of time.
     """
     epoch = getattr(run, "epoch", None)
     if epoch is None:
         raise TypeError(
-            "times: the run has no epoch, so its times are no dates; give one to the problem: nbody(..., epoch=...)."
+            "times: the run has no epoch, so its times have no dates. Give one to the problem: nbody(..., epoch=...)."
         )
     time = _units(run)[1]
     dates = Time(epoch[0], epoch[1] + np.asarray(run.t) * (time.si / DAY_S), format="jd", scale="tdb")
@@ -94,13 +94,13 @@ def times(run: Any, *, scale: str = "tdb") -> Time:
 
 
 def positions(run: Any, unit: Any = None) -> units.Quantity:
-    """Positions of all bodies of a run, with their unit.
+    """Return the positions of all bodies of a run, with their unit.
 
     Parameters
     ----------
     run : IntegrationResult or OdeResult or OptimizeResult
-        Of bodies, in a problem that knows its units, by `integrate` or `Problem.solve_ivp`; or what
-        `eip_scipy.integrations.rebound.read_archive` has read.
+        A run of bodies by `integrate` or `Problem.solve_ivp`, in a problem that knows its units, or the result of
+        `eip_scipy.integrations.rebound.read_archive`.
     unit : str or Unit, optional
         Default: that of the problem.
 
@@ -111,13 +111,13 @@ def positions(run: Any, unit: Any = None) -> units.Quantity:
     Raises
     ------
     TypeError
-        When the run has no units, or is not one of bodies.
+        If the run has no units, or is not one of bodies.
     """
     return _part(run, 0, _as_astropy(_units(run)[0]), unit)
 
 
 def velocities(run: Any, unit: Any = None) -> units.Quantity:
-    """Velocities of all bodies of a run, with their unit.
+    """Return the velocities of all bodies of a run, with their unit.
 
     Parameters
     ----------

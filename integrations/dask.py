@@ -1,6 +1,6 @@
-"""Ensembles on Dask: members on the workers of a cluster, from processes of this machine to a supercomputer.
+"""Ensembles on Dask: members run on the workers of a cluster, from processes of this machine to a supercomputer.
 
-``ensemble(..., executor="dask")`` takes the cluster that Dask's configuration names (``DASK_SCHEDULER_ADDRESS``), else
+``ensemble(..., executor="dask")`` takes the cluster that Dask's configuration names (``DASK_SCHEDULER_ADDRESS``), or
 starts processes on this machine that listen on its loopback interface only. ``executor=client`` takes a
 `distributed.Client`. Functions travel by value or by name, as Dask sends them, and are compiled once in each worker.
 
@@ -36,9 +36,9 @@ __all__ = ["DaskExecutor", "local_client", "pool"]
 ENCRYPTED = ("tls", "wss")
 WITHIN_A_PROCESS = "inproc"
 RUNNING = "running"
-# Seconds: between two looks at whether there are workers, and before a member is tried that may kill one.
+# Seconds between two checks for workers, and before a member is tried that may kill one.
 PATIENCE, GRACE = 20.0, 1.0
-# How often all workers of this machine may be lost without a result in between.
+# Number of times that all workers of this machine may be lost without a result in between.
 LOSSES = 3
 KEPT = (
     "What was done is in this exception's .partial; with out= or checkpoint= the same call with resume=True goes on "
@@ -47,19 +47,19 @@ KEPT = (
 
 
 class DaskExecutor:
-    """A client together with what it may do; for ``ensemble(..., executor=)``.
+    """Pair a client with its permissions, for ``ensemble(..., executor=)``.
 
     Parameters
     ----------
     client : distributed.Client
     allow_insecure : bool, optional
-        Go on where the cluster is reached over a network without encryption. Whoever reaches such a scheduler or worker
-        can run code on it as you (CVE-2021-42343): only where nobody else reaches the network.
+        Continue if the cluster is reached over a network without encryption. Anyone who reaches such a scheduler or
+        worker can run code on it as you (CVE-2021-42343): use it only if nobody else reaches the network.
 
     Raises
     ------
     PermissionError
-        When the cluster listens beyond this machine without TLS, and `allow_insecure` is false.
+        If the cluster listens beyond this machine without TLS, and `allow_insecure` is false.
     """
 
     def __init__(self, client: distributed.Client, *, allow_insecure: bool = False) -> None:
@@ -69,7 +69,7 @@ class DaskExecutor:
 
 
 def local_client(workers: int | None = None) -> distributed.Client:
-    """A client of processes on this machine, one thread each, that listen on its loopback interface only.
+    """Start a client of processes on this machine, one thread each, that listen on its loopback interface only.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def local_client(workers: int | None = None) -> distributed.Client:
     Raises
     ------
     RuntimeError
-        When a process dies while it starts.
+        If a process dies while it starts.
     """
     loopback = "127.0.0.1"
     try:
@@ -96,10 +96,10 @@ def local_client(workers: int | None = None) -> distributed.Client:
             worker_dashboard_address=f"{loopback}:0",
         )
     except RuntimeError as error:
-        # Dask's own traceback shows a hundred lines of its machinery, and no more than this.
+        # Dask's own traceback shows a hundred lines of its internals and no further information.
         raise RuntimeError(
-            f"a Dask worker of this machine died while it started ({error}): was it killed, is there too little memory "
-            "for so many, or does what Dask's configuration makes it load fail? Try fewer with local_client(workers)."
+            f"a Dask worker of this machine died while it started ({error}): it was killed, there is too little memory "
+            "for these workers, or what Dask's configuration loads fails. Try fewer with local_client(workers)."
         ) from None
     return distributed.Client(cluster)
 
@@ -110,17 +110,17 @@ def require_secure(client: distributed.Client) -> None:
     Raises
     ------
     PermissionError
-        With its address, and what to do.
+        If it does; the message names the address and says what to do.
     RuntimeError
-        When the client is closed.
+        If the client is closed.
     """
     _require_open(client)
     information = client.scheduler_info(n_workers=-1)
     for address in (information["address"], *information["workers"]):
         if not _is_secure(address):
             raise PermissionError(
-                f"the Dask cluster at {address} is reached over a network without encryption or authentication; "
-                "whoever reaches it can run code there as you (CVE-2021-42343). Start it with TLS "
+                f"the Dask cluster at {address} is reached over a network without encryption or authentication. "
+                "Anyone who reaches it can run code there as you (CVE-2021-42343). Start it with TLS "
                 "(distributed.Security), or, on a network that nobody else reaches, pass "
                 "executor=DaskExecutor(client, allow_insecure=True)."
             )
@@ -143,7 +143,7 @@ def _is_secure(address: str) -> bool:
 
 
 def pool(executor: Any, task: Task, key: str) -> DaskPool:
-    """Where the chunks of an ensemble run; for `eip_scipy.ensemble`.
+    """Return the pool that runs the chunks of an ensemble, for `eip_scipy.ensemble`.
 
     Parameters
     ----------
@@ -162,12 +162,12 @@ def pool(executor: Any, task: Task, key: str) -> DaskPool:
         return DaskPool(DaskExecutor(executor).client, task, key, own=False)
     if dask.config.get("scheduler-address", None):
         return DaskPool(DaskExecutor(distributed.Client()).client, task, key, own=True)
-    Plan(task).compile()  # here, the workers find it on the disk instead of all compiling the same
+    Plan(task).compile()  # compiled here, so that the workers find it on the disk instead of all compiling the same
     return DaskPool(local_client(), task, key, own=True)
 
 
 class DaskPool:
-    """Chunks as tasks of Dask, which runs those of a lost worker again on another."""
+    """Run chunks as tasks of Dask, which runs the tasks of a lost worker again on another one."""
 
     def __init__(self, client: distributed.Client, task: Task, key: str, *, own: bool) -> None:
         self._client, self._task, self._key, self._own = client, task, key, own
@@ -176,7 +176,7 @@ class DaskPool:
         self._warned = False
 
     def capacity(self) -> int:
-        """Threads of the workers that are there now; at least one, for those to come."""
+        """Return the number of threads of the present workers, at least one, for workers that are still starting."""
         with self._connected():
             return max(1, sum(self._client.nthreads().values()))
 
@@ -203,7 +203,7 @@ class DaskPool:
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """Let errors say that the cluster is gone, where it is."""
+        """Raise errors that say that the cluster is gone, if it is."""
         try:
             yield
         except Exception as error:
@@ -238,9 +238,9 @@ class DaskPool:
             self._open.discard(future)
 
     def _look_after_workers(self) -> bool:
-        """Whether there are any; new processes where all local ones are gone.
+        """Return whether there are any workers; start new processes if all local ones are gone.
 
-        A nanny gives up on a process that dies while it starts, and Dask waits then without end.
+        A nanny gives up on a process that dies while it starts, and Dask then waits without end.
         """
         if self._client.nthreads():
             return True
@@ -265,7 +265,7 @@ class DaskPool:
         return False
 
     def _wait_for_workers(self) -> None:
-        """A worker that dies before its nanny knows that it has started is not replaced by it."""
+        """Replace workers that died before their nanny knew that they had started, which it does not do itself."""
         until = time.monotonic() + PATIENCE
         while not self._client.nthreads():
             if time.monotonic() > until:
@@ -275,7 +275,7 @@ class DaskPool:
         time.sleep(GRACE)
 
     def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Iterable[Members]:
-        """A chunk that killed its workers, in halves of halves: the member that does it is found, the others run."""
+        """Bisect a chunk that killed its workers: the member that does it is found, the others run."""
         m = len(chunk.y0s)
         if m == 1:
             members = plan.empty(1)

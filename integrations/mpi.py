@@ -1,8 +1,8 @@
-"""The state of one run on the ranks of an MPI communicator: each holds a part, and the step runs on all of them.
+"""States of one run on the ranks of an MPI communicator: each rank holds a part, and the step runs on all of them.
 
-``over_ranks(EIPRK4)`` is a class for `scipy.integrate.solve_ivp` as `EIPRK4` is. The right-hand side that it is given
-fills a rank's part of the derivative; an invariant returns the same number on every rank and the gradient's part. The
-step and its projection are those of `EIPSolver`.
+``over_ranks(EIPRK4)`` is a class for `scipy.integrate.solve_ivp`, as `EIPRK4` is. The given right-hand side fills a
+rank's part of the derivative; an invariant returns the same number on every rank and its part of the gradient. The step
+and its projection are those of `EIPSolver`.
 
 Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
 """
@@ -33,18 +33,18 @@ except RuntimeError as error:
 
 __all__ = ["MPI", "RankError", "gathered", "over_ranks", "together", "total"]
 
-# Floats of each rank that travel in one message with the flag that says whether it has failed.
+# Number of floats of each rank that travel in one message with the flag that says whether it has failed.
 ROOM = 15
 
 OPTIONS = ("h", "vectorized", "invariants", "metric", "iterations", "every", "reuse_f", "check", "diagnostics")
 
 
 class RankError(RuntimeError):
-    """Another rank raised an error; the message is its own, with its number."""
+    """Error on another rank; the message is that of the error, with the rank's number."""
 
 
 def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
-    """An array of floats of every rank, in their order; its shape is the same on all.
+    """Return an array of floats of every rank, in the order of the ranks; its shape is the same on all.
 
     Parameters
     ----------
@@ -58,11 +58,11 @@ def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
     Raises
     ------
     RankError
-        When another rank has raised an error in what all do `together`.
+        If another rank has raised an error in a block of `together`.
     """
     part = np.array(a, dtype=float, order="C")  # "ascontiguousarray" would give a number an axis
     size, shape = part.size, (comm.size, *part.shape)
-    # Always of one size: a rank that has failed does not know for which sum the others wait.
+    # The message always has the same size: a rank that has failed does not know for which sum the others wait.
     message, messages = np.zeros(1 + ROOM), np.empty((comm.size, 1 + ROOM))
     if size <= ROOM:
         message[1 : 1 + size] = part.reshape(-1)
@@ -84,20 +84,20 @@ def _raise_that_of_another(comm: MPI.Comm) -> None:
 
 @contextmanager
 def together(comm: MPI.Comm) -> Iterator[None]:
-    """What all ranks do: an error that one of them raises here ends it on all, instead of letting the others wait.
+    """Run a block on all ranks: an error that one rank raises ends it on all, instead of letting the others wait.
 
-    The flag travels with the sums of `total` and `gathered`, one of which stands at the end of the block too. Steps of
+    The flag travels with the sums of `total` and `gathered`, one of which also ends the block. Steps of
     `over_ranks` are such blocks already.
 
     Parameters
     ----------
     comm : mpi4py.MPI.Comm
-        That of the sums.
+        The communicator of the sums.
 
     Raises
     ------
     RankError
-        On the ranks that have no error of their own, at their next sum.
+        On the ranks that have no error themselves, at their next sum.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 
 def total(comm: MPI.Comm, a: Any) -> Any:
-    """Sum over the ranks in their order, the same bits on each of them, which a reduction by MPI does not promise.
+    """Sum over the ranks in their order; all ranks get the same bits, which a reduction by MPI does not promise.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def total(comm: MPI.Comm, a: Any) -> Any:
 
 
 def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EIPSolver]:
-    """Make of an EIP method the class for states that lie on several ranks.
+    """Derive from an EIP method the class for states that are distributed over several ranks.
 
     Every rank calls `solve_ivp`, or the class itself and its ``step()``, with its part of the state.
 
@@ -153,20 +153,20 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     type
         A subclass of `method`. It steps with a fixed `h`, in the Euclidean metric, and takes the options `h`,
         `invariants`, `iterations`, `every` (a number), `reuse_f`, `check` and `diagnostics`. The check at the start
-        compares invariants between ranks, and with their gradients; whether they are invariants it does not see.
+        compares invariants between ranks, and with their gradients; it does not check that they are conserved.
 
     Raises
     ------
     TypeError
-        When `method` is no such class.
+        If `method` is not such a class.
 
     Notes
     -----
-    A correction is a combination of the gradients. On each rank their parts are written in an orthonormal basis of the
-    space that they span there, l numbers each for l invariants; what all ranks have together, (l, ranks * l), holds
-    every product of the gradients to round-off, and the engine projects on that, alike on all ranks. This is the first
-    half of a QR factorisation of tall matrices (Demmel, Grigori, Hoemmen & Langou, SIAM J. Sci. Comput. 34 (2012)
-    A206-A239).
+    A correction is a combination of the gradients. On each rank the parts of the gradients are written in an
+    orthonormal basis of the space that they span there, with l numbers each for l invariants. The array of all ranks,
+    (l, ranks * l), holds every product of the gradients to round-off, and the engine projects on it, identically on all
+    ranks. This is the first half of a QR factorisation of tall matrices (Demmel, Grigori, Hoemmen & Langou, SIAM J.
+    Sci. Comput. 34 (2012) A206-A239).
 
     Examples
     --------
@@ -184,7 +184,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(f"over_ranks: method must be an EIP class such as EIPRK4, got {method!r}.")
     if method.TABLEAU.in_python:
-        raise TypeError(f"over_ranks: {method.__name__} is no Runge-Kutta method; its step would see one rank's part.")
+        raise TypeError(f"over_ranks: {method.__name__} is not a Runge-Kutta method; its step would see one rank only.")
     if issubclass(method, SolverOfParts):
         raise TypeError(f"over_ranks: {method.__name__} is on ranks already.")
     members = {"COMM": MPI.COMM_WORLD if comm is None else comm, "__doc__": f"`{method.__name__}` over ranks."}
@@ -192,7 +192,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
 
 
 class _OverRanks(SolverOfParts):
-    """What `over_ranks` puts before a method."""
+    """Base class that `over_ranks` puts before a method."""
 
     COMM: MPI.Comm
 
@@ -224,14 +224,14 @@ class _OverRanks(SolverOfParts):
 
 
 def _refuse(name: str, options: dict[str, Any]) -> None:
-    """The options that a state on several ranks does not have.
+    """Reject options that a state on several ranks does not have.
 
     Raises
     ------
     TypeError
-        For an unknown option, or one of `EIPSolver` that is not among them.
+        If an option is unknown, or is one of `EIPSolver` that is not among them.
     ValueError
-        For a value that needs the whole state on one rank.
+        If a value needs the whole state on one rank.
     """
     for option in options:
         if option not in OPTIONS:
@@ -249,12 +249,12 @@ def _refuse(name: str, options: dict[str, Any]) -> None:
 
 
 def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.ndarray, h: float) -> None:
-    """What a run on one rank checks of gradients, on the plane through y along two random directions.
+    """Check gradients as a run on one rank does, on the plane through y along two random directions.
 
     Raises
     ------
     ValueError
-        On all ranks, when an invariant differs between them or from its gradient.
+        On all ranks, if an invariant differs between them or disagrees with its gradient.
     """
     for name, values in zip(known.names, gathered(comm, known.start_values).T, strict=True):
         if np.any(values != values[0]):

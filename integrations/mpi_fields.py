@@ -1,8 +1,8 @@
 """The rotating Gross-Pitaevskii equation with its field cut into slabs, one for each rank of an MPI communicator.
 
 A rank holds the field at some of the points x, for all y and z. It transforms along y and z where the field lies, and
-along x after a transposition, in which each rank sends to every other one what the two have in common. A right-hand
-side takes two transpositions; so does an energy, but for that of a raw result, whose right-hand side is known.
+along x after a transposition, in which each rank sends to every other rank the points that both hold. A right-hand
+side takes two transpositions. An energy takes two as well, unless the right-hand side is known, as for a raw result.
 
 Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
 """
@@ -30,14 +30,14 @@ class Slab(Grid):
     whole : Grid
     axis : int
     part : slice
-        Which points, from a start to a stop.
+        The points, from a start to a stop.
 
     Attributes
     ----------
     whole, part
         As given.
     shape : tuple of int
-        Of the part. The other attributes are those of the whole grid.
+        Shape of the part. The other attributes are those of the whole grid.
     """
 
     def __init__(self, whole: Grid, axis: int, part: slice) -> None:
@@ -49,17 +49,17 @@ class Slab(Grid):
         return f"Slab({self.whole!r}, {self._axis}, {self.part!r})"
 
     def points(self, axis: int) -> np.ndarray:
-        """Coordinates along one axis, of the points that are here."""
+        """Return the coordinates along one axis of the points on this rank."""
         points = self.whole.points(axis)
         return points[self.part] if axis == self._axis else points
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """All wavenumbers along one axis."""
+        """Return all wavenumbers along one axis."""
         return self.whole.wavenumbers(axis, odd=odd)
 
 
 class Transposition:
-    """How a field lies on the ranks, in slabs of x or turned, in slabs of y, and the way from one to the other.
+    """Distribution of a field over the ranks, in slabs of x or transposed, in slabs of y, and the ways between them.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Transposition:
     slab, turned : Slab
         The parts of this rank, (j, K[, L]) and (J, k[, L]).
     here, image : ndarray
-        Two turned fields of this rank, as transforms are from one array to another.
+        Two transposed fields of this rank, because transforms go from one array to another.
 
     Raises
     ------
@@ -88,7 +88,7 @@ class Transposition:
         self.slab, self.turned = Slab(grid, 0, xs[comm.rank]), Slab(grid, 1, ys[comm.rank])
         self.here, self.image = np.empty(self.turned.shape, complex), np.empty(self.turned.shape, complex)
         self._sent = np.empty(self.slab.size, complex)
-        # Sizes and places of what MPI carries. What stays on this rank is of no size for it.
+        # Sizes and offsets of the data that MPI carries. The part that remains on this rank has size 0.
         away = [rank != comm.rank for rank in range(comm.size)]
         along_y, along_x = self.slab.size // grid.shape[1], self.turned.size // grid.shape[0]
         sizes = [along_y * (y.stop - y.start) * far for y, far in zip(ys, away, strict=True)]
@@ -106,7 +106,7 @@ class Transposition:
         ]
 
     def turn(self, field: np.ndarray) -> None:
-        """Fill `here` with the turned field, where no rank has failed."""
+        """Fill `here` with the transposed field if no rank has failed."""
         gathered(self._comm, ())
         for y, block in self._blocks:
             np.copyto(block, field[:, y])
@@ -114,7 +114,7 @@ class Transposition:
         self._comm.Alltoallv([self._sent, self._apart], [self.here, self._turned])
 
     def turn_back(self, out: np.ndarray) -> None:
-        """Fill `out` with the field whose turned one is in `image`."""
+        """Fill `out` with the field whose transposed form is in `image`."""
         self._comm.Alltoallv([self.image, self._turned], [self._sent, self._apart])
         for y, block in self._blocks:
             np.copyto(out[:, y], block)
@@ -122,12 +122,12 @@ class Transposition:
 
 
 def _cuts(n: int, ranks: int) -> list[int]:
-    """Where n points are cut, as evenly as can be."""
+    """Return the places at which n points are cut, as evenly as possible."""
     return [n * rank // ranks for rank in range(ranks + 1)]
 
 
 class _TurnedMultiplier(Multiplier):
-    """A real factor of the modes along x, which may vary with y and z: between two transpositions."""
+    """Real factor of the modes along x, which may vary with y and z: applied between two transpositions."""
 
     def __init__(self, way: Transposition, factor: np.ndarray) -> None:
         self._way = way
@@ -141,7 +141,7 @@ class _TurnedMultiplier(Multiplier):
         self._way.turn_back(out)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
-        """The part of the sum that is on this rank."""
+        """Return this rank's part of the sum."""
         self._way.turn(psi)
         return super().expectation(fft, self._way.here, self._way.image)
 
@@ -158,7 +158,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
     grid : Grid
         The whole grid, in two or three dimensions.
     potential : callable or array_like, optional
-        A callable gets the coordinates of this rank's points; values are those on the whole grid or on this part.
+        A callable gets the coordinates of this rank's points; values are given on the whole grid or on this part.
     comm : mpi4py.MPI.Comm, optional
         Default: ``MPI.COMM_WORLD``.
     **options
@@ -168,7 +168,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
     ----------
     comm : mpi4py.MPI.Comm
     grid : Slab
-        This rank's part of the grid; the others are those of `GrossPitaevskii`.
+        This rank's part of the grid; the other attributes are those of `GrossPitaevskii`.
 
     Raises
     ------
@@ -212,14 +212,14 @@ class SlabGrossPitaevskii(GrossPitaevskii):
         return np.ascontiguousarray(np.reshape(whole, self.grid.whole.shape)[self.grid.part], dtype=complex)
 
     def linear_terms(self) -> list[tuple[Axes, Any]]:
-        """As `GrossPitaevskii.linear_terms`, but never all axes at once: along x it is a transposed field."""
+        """Return `GrossPitaevskii.linear_terms`, but never along all axes at once: along x the field is transposed."""
         if self.Omega != 0:
             return super().linear_terms()
         along_x, *others = (self.kinetic_factor(axis) for axis in range(self.grid.dim))
         return [((0,), along_x), (tuple(range(1, self.grid.dim)), sum(others))]
 
     def gather(self, psi: Any) -> np.ndarray | None:
-        """The whole field on rank 0, None elsewhere."""
+        """Return the whole field on rank 0, and None elsewhere."""
         field = self.as_field(psi)
         sizes = self.comm.gather(field.size)
         whole = np.empty(self.grid.whole.shape, complex) if self.comm.rank == 0 else None

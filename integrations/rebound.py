@@ -1,9 +1,9 @@
-"""REBOUND both ways: its simulations as problems, our runs as simulations and archives; and REBOUND as a judge.
+"""REBOUND: its simulations as problems, our runs as simulations and archives, and its integrators as references.
 
-As a judge its integrators run on our states, so that a comparison is fair. Masses enter as G m with G = 1, the Sun
-first, in the frame of the centre of mass. Fixed steps are counted and not timed: REBOUND's own clock accumulates
-rounding, which at 1000 years is more than WHFast's own error. WHFast and SABA run without safe mode and are
-synchronised before each reading, in a way that leaves the run itself untouched.
+REBOUND's integrators run on our states, so that a comparison is fair. Masses enter as G m with G = 1, the Sun
+first, in the frame of the centre of mass. Fixed steps are counted, not timed: REBOUND's own clock accumulates
+rounding errors, which at 1000 years exceed WHFast's own error. WHFast and SABA run without safe mode and are
+synchronised before each reading, in a way that does not change the run itself.
 
 REBOUND (H. Rein, S.-F. Liu, Astronomy & Astrophysics 537 (2012) A128) is free software under the GPL and is not
 distributed with this package; versions 4.6 and 5 are supported.
@@ -39,16 +39,16 @@ __all__ = [
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
 
-# IAS15's step criteria by REBOUND's numbers.
+# REBOUND's numbers of IAS15's step criteria.
 _CRITERIA = {"global": 1, "prs23": 2}
 
-# Steps between two looks at Ctrl-C, which Python handles only outside of REBOUND's loop. Version 4 counts in 32 bits.
+# Steps between two checks for Ctrl-C, which Python handles only outside of REBOUND's loop. Version 4 counts in 32 bits.
 _CHUNK = 100_000
 
 
 @dataclass(frozen=True)
 class ReboundRun:
-    """What `run` returns; m saved points, N bodies, n = 6 N.
+    """Result of `run`; m saved points, N bodies, n = 6 N.
 
     Attributes
     ----------
@@ -57,13 +57,13 @@ class ReboundRun:
     version : str
         REBOUND's version.
     t : ndarray, shape (m,)
-        Saved times k h, 0 and the end among them.
+        Saved times k h, including 0 and the end.
     y : ndarray, shape (n, m)
         States (q, v) at `t`, in the frame of the centre of mass.
     wall_time : float
-        Seconds spent in the integration and its synchronisations; reading and the invariants are not in it.
+        Seconds spent in the integration and its synchronisations, without reading and the invariants.
     steps : int
-        Steps taken; for "ias15" those that were accepted.
+        Number of steps; for "ias15" the number of accepted ones.
     energy_error : ndarray, shape (m,)
         ``|E(t) - E(0)| / |E(0)|`` of the Newtonian energy.
     angular_momentum_error : ndarray, shape (m,)
@@ -82,7 +82,7 @@ class ReboundRun:
 
 @dataclass(frozen=True)
 class ReboundSteps:
-    """What `ias15_steps` returns; m - 1 steps, N bodies, n = 6 N.
+    """Result of `ias15_steps`; m - 1 steps, N bodies, n = 6 N.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class ReboundSteps:
     y : ndarray, shape (n, m)
         States (q, v) at `t`.
     nfev : int
-        Evaluations of all bodies' accelerations.
+        Number of evaluations of all bodies' accelerations.
     """
 
     t: np.ndarray
@@ -100,7 +100,7 @@ class ReboundSteps:
 
 
 def simulation(gm: Any, y: Any) -> rebound.Simulation:
-    """Build a REBOUND simulation from a state of ours.
+    """Build a REBOUND simulation from one of our states.
 
     Parameters
     ----------
@@ -112,12 +112,12 @@ def simulation(gm: Any, y: Any) -> rebound.Simulation:
     Returns
     -------
     rebound.Simulation
-        With G = 1, m = gm and t = 0, moved to the frame of the centre of mass.
+        A simulation with G = 1, m = gm and t = 0, moved to the frame of the centre of mass.
 
     Raises
     ------
     ValueError
-        Shapes do not fit, a number is not finite, or a mass is not positive.
+        If shapes do not fit, a number is not finite, or a mass is not positive.
     """
     gm, y = _check_state(gm, y)
     sim = rebound.Simulation()
@@ -139,14 +139,14 @@ def megno(gm: Any, y: Any, *, t_end: float, dt: float, seed: int = 1) -> tuple[f
     t_end, dt : float
         End of the run from t = 0, and the step.
     seed : int, optional
-        Chooses the tangent vector.
+        Seed of the random tangent vector.
 
     Returns
     -------
     megno : float
         The mean MEGNO at the end.
     slope : float
-        Its slope against t (``Simulation.lyapunov()``), half of the exponent.
+        Slope of `megno` against t (``Simulation.lyapunov()``), half of the exponent.
     deviation : ndarray, shape (6 N,)
         The tangent vector at the start.
     """
@@ -155,7 +155,7 @@ def megno(gm: Any, y: Any, *, t_end: float, dt: float, seed: int = 1) -> tuple[f
     n = sim.N
     sim.integrator, sim.dt = "whfast", dt
     sim.init_megno(seed=seed)
-    # Version 4 has the variational particles behind the others.
+    # Version 4 stores the variational particles after the others.
     varied = list(sim.particles_var) if hasattr(sim, "particles_var") else list(sim.particles)[n:]
     deviation = np.array([*(p.xyz for p in varied), *(p.vxyz for p in varied)]).ravel()
     sim.integrate(t_end)
@@ -197,12 +197,12 @@ def run(
     t_end : float, optional
         End, a whole number of steps from 0; the run then ends at round(t_end / h) h.
     save_every : int, optional
-        Save each `save_every`-th state besides the first and the last; default: these two only.
+        Save every `save_every`-th state in addition to the first and the last; default: only these two.
     epsilon : float, optional
         Tolerance of "ias15"; default: REBOUND's own, 1e-9, which is tight: about machine precision.
     criterion : {"prs23", "global"}, optional
-        How "ias15" finds its steps: from each body's derivatives, which REBOUND prefers since version 4 and which
-        takes very small steps where an acceleration passes through zero; or from the largest over all bodies, as in
+        How "ias15" finds its steps: from each body's derivatives, which is REBOUND's default since version 4 and
+        takes very small steps if an acceleration passes through zero; or from the largest over all bodies, as in
         the paper of 2015. Default: REBOUND's own.
     prepare : callable, optional
         ``prepare(simulation)`` before the run, for example to add forces by REBOUNDx; what it returns is kept alive.
@@ -216,14 +216,14 @@ def run(
     Raises
     ------
     ValueError
-        An unknown integrator or a wrong value; the message says what was expected.
+        If the integrator is unknown or a value is wrong; the message says what was expected.
 
     Notes
     -----
     Saving does not disturb the steps of a fixed-step integrator: the states do not depend on `save_every`. Those of
-    "ias15" do, at the level of its round-off, for each saved time cuts a step.
+    "ias15" do, at the level of its round-off, because each saved time cuts a step.
 
-    REBOUND's own warnings come through, for example its RuntimeWarning when a step of WHFast, or of its corrector,
+    REBOUND's own warnings are passed on, for example its RuntimeWarning when a step of WHFast, or of its corrector,
     exceeds a period.
 
     References
@@ -269,7 +269,7 @@ def run(
 def ias15_steps(
     gm: Any, y0: Any, t_end: float, *, epsilon: float | None = None, criterion: str | None = None
 ) -> ReboundSteps:
-    """Integrate forward from t = 0 with IAS15, and look at each step and count each evaluation.
+    """Integrate forward from t = 0 with IAS15, record each step and count each evaluation.
 
     Parameters
     ----------
@@ -281,13 +281,13 @@ def ias15_steps(
     Returns
     -------
     ReboundSteps
-        The run takes the steps of ``run(gm, y0, "ias15", h=t_end, n_steps=1)``, which is to be timed instead: the
-        looking, from Python, takes many times longer.
+        The run takes the steps of ``run(gm, y0, "ias15", h=t_end, n_steps=1)``. Time that call instead: recording the
+        steps from Python takes many times longer.
 
     Raises
     ------
     ValueError
-        For a wrong value, as `run`.
+        If a value is wrong, as in `run`.
     """
     gm, y0 = _check_state(gm, y0)
     _count_steps(t_end, 1, None)
@@ -342,7 +342,7 @@ def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
     if not (t_end > 0 and math.isfinite(t_end)):
         raise ValueError(f"t_end must be positive and finite, got {t_end!r}")
     n_steps = round(t_end / h)
-    # The looser bound is for long runs, where the rounding of h alone makes t_end / h miss an integer.
+    # The looser bound is for long runs, in which the rounding of h alone moves t_end / h away from an integer.
     if n_steps < 1 or abs(t_end / h - n_steps) > max(1e-9, 8 * np.finfo(float).eps * n_steps):
         raise ValueError(
             f"t_end = {t_end!r} is {t_end / h!r} steps of h = {h!r}: a whole number is needed, for a shortened "
@@ -370,7 +370,7 @@ def _set_integrator(sim: rebound.Simulation, name: str) -> None:
     options = getattr(sim, f"ri_{family}") if version_4 else sim.integrator
     if family in ("whfast", "saba"):
         options.safe_mode = 0
-        # Synchronise a copy, so that a saved point leaves no trace in the run.
+        # A copy is synchronised, so that a saved point does not change the run.
         options.keep_unsynchronized = 1
     if family == "saba":
         options.type = "10,6,4" if version_4 else "10_6_4"
@@ -401,7 +401,7 @@ def _take_steps(sim: rebound.Simulation, n: int) -> None:
 
 
 def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative errors of energy and angular momentum along y (m, 6 N); absolute where the initial value is 0."""
+    """Return relative errors of energy and angular momentum along y (m, 6 N); absolute ones if the first value is 0."""
     q, v = np.moveaxis(y.reshape(len(y), 2, -1, 3), 1, 0)
     energy = 0.5 * (v**2).sum(axis=2) @ gm
     for i, j in combinations(range(gm.size), 2):

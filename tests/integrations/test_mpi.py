@@ -310,7 +310,7 @@ def test_grids_that_cannot_be_cut(grid, ranks):
     [
         ("EIPRK4", "must be an EIP class"),
         (EIPSolver, "must be an EIP class"),
-        (eip_method(Splitting(small()[0])), "no Runge-Kutta method"),
+        (eip_method(Splitting(small()[0])), "not a Runge-Kutta method"),
         (ALONE, "is on ranks already"),
     ],
 )

@@ -259,7 +259,7 @@ def test_archives_that_are_none(tmp_path):
     with pytest.raises(FileNotFoundError, match="no file at"):
         exchange.read_archive(tmp_path / "none.bin")
     (tmp_path / "text.bin").write_text("not an archive")
-    with pytest.raises(ValueError, match="is no archive of REBOUND"):
+    with pytest.raises(ValueError, match="is not an archive of REBOUND"):
         exchange.read_archive(tmp_path / "text.bin")
 
 
