@@ -1,4 +1,4 @@
-"""Other processes for what may go on next to a command's own work: one that is asked, or as many as there are cores."""
+"""Other processes that work in parallel to a command: a single one, or as many as there are cores."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["Beside", "workers"]
 
 
 class Beside:
-    """A process that does one call after the other; leaving the context ends it, whatever it does.
+    """A process that does one call after the other; leaving the context ends it at any time.
 
-    It is started anew, not forked: a fork copies locks that other threads hold. Until it has imported what the calls
-    need, a second or so passes.
+    It is started from scratch, not forked: a fork copies locks that other threads hold. It imports what the calls
+    need in about a second.
     """
 
     def __enter__(self) -> Beside:
@@ -39,17 +39,17 @@ class Beside:
         self._pipe.close()
 
     def start(self, call: Callable[[], Any]) -> None:
-        """Let it do `call`, which must pickle, and whose result must; that of the call before has been asked for."""
-        with contextlib.suppress(BrokenPipeError):  # `result` tells of it
+        """Start `call`, which must pickle like its result; the result of the previous call must have been read."""
+        with contextlib.suppress(BrokenPipeError):  # `result` reports it
             self._pipe.send(call)
 
     def result(self) -> Any:
-        """Wait for what the call returns, or raise what it raised.
+        """Wait for the value of the call, or raise its error.
 
         Raises
         ------
         UsageError
-            When the process is no more.
+            If the process has ended.
         """
         try:
             value, error = self._pipe.recv()
@@ -62,7 +62,7 @@ class Beside:
 
 @contextlib.contextmanager
 def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
-    """Start processes that share calls; leaving the context ends them, whatever they do.
+    """Start processes that share calls; leaving the context ends them at any time.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
     Yields
     ------
     callable
-        ``start(function, *args)`` puts a call in line and returns a function that waits for its value, or raises
+        ``start(function, *args)`` queues a call and returns a function that waits for its value, or raises
         UsageError if a process is no more. Function, arguments and value must pickle.
     """
     others = set(multiprocessing.active_children())
@@ -99,7 +99,7 @@ def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
 
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
-    """Ctrl-C in a terminal goes to all processes; one that starts now leaves it to this one."""
+    """Ignore Ctrl-C while a process starts: in a terminal it goes to all processes, and the command handles it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -19,12 +19,12 @@ PROGRAM = "eip-scipy"
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """One line, without the usage that argparse puts before it."""
+        """Print an error in one line, without the usage that argparse puts before it."""
         self.exit(WRONG_USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
 class _Version(argparse.Action):
-    """Asks for the version when it is wanted, which takes reading."""
+    """Action that reads the version only when it is requested, because reading takes time."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
         from eip_scipy import __version__
@@ -40,13 +40,13 @@ def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
     ----------
     argv : sequence of str, optional
         Arguments; default: those of the process.
-    **settings
+    Settings of the command, in place of its defaults.
         Of the command, in place of its own defaults.
 
     Returns
     -------
     int
-        Exit status: 0 done, 1 a check inside the command failed or a run is not to be trusted, 2 wrong usage, 3 the
+        Exit status: 0 done, 1 a check inside the command failed or a run is not reliable, 2 wrong usage, 3 the
         text could not be printed, though the files are written, 130 interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
@@ -64,7 +64,7 @@ def _longest_first() -> list[str]:
 
 
 def _no_command(words: list[str]) -> int:
-    """The first word is an option, or the first of a command's two words, or mistyped."""
+    """Raise an error for a first word that is an option, the first of a command's two words, or mistyped."""
     groups = {name.split()[0] for name in COMMANDS if " " in name} - set(COMMANDS)
     group = words.pop(0) if words and words[0] in groups else ""
     known = [name for name in COMMANDS if name.startswith(group)]
@@ -120,7 +120,7 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
 
 
 def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
-    """Those of the command, which are fields of it, and those of all commands."""
+    """Add the options of the command, which are its fields, and those of all commands."""
     for item in fields(command):
         if "help" not in item.metadata:
             continue

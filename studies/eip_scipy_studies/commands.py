@@ -1,4 +1,4 @@
-"""The commands: by its words where each stands, and what it does; exit statuses. Quick to import, for ``--help``."""
+"""The commands: location and purpose, by their words; exit statuses. Quick to import, for ``--help``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COMMANDS = {
         "run the solar system and compare with other methods (the paper's Experiment II)",
     ),
     "solar-system frontier": Entry(
-        "solar.frontier:Frontier", "error against cost of long runs by methods of high order, and their peers"
+        "solar.frontier:Frontier", "error against cost of long runs by methods of high order and by other packages"
     ),
     "solar-system truth": Entry("solar.truth:Truth", "force models against the ephemeris DE440 itself"),
     "charged-particle": Entry(
@@ -37,7 +37,7 @@ COMMANDS = {
     "hard-cases": Entry("hard.cases:HardCases", "run 35 hard cases with and without projection"),
     "hard-scenes": Entry(
         "hard.scenes:HardScenes",
-        "error against cost on high eccentricities, chaos and close encounters, beside IAS15",
+        "error against cost on high eccentricities, chaos and close encounters, compared with IAS15",
     ),
     "gpe ground-state": Entry(
         "condensates.states:GroundStates", "ground states of the rotating Gross-Pitaevskii equation (Experiment IV)"
@@ -51,10 +51,12 @@ COMMANDS = {
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
     "view": Entry("view:View", "a page that plays a saved run"),
-    "bench": Entry("bench.command:Bench", "this package beside SciPy, REBOUND, heyoka and others, on this machine"),
+    "bench": Entry(
+        "bench.command:Bench", "this package compared with SciPy, REBOUND, heyoka and others, on this machine"
+    ),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
     "study balances": Entry("measurements.balances:Balances", "what balances bring, and where they do not help"),
-    "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, beside IAS15"),
+    "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
     ),
@@ -62,16 +64,18 @@ COMMANDS = {
         "measurements.ensembles:Ensembles", "cost of a member, threads, workers, memory, growth with the size"
     ),
     "study exoplanets": Entry(
-        "measurements.exoplanets:Exoplanets", "three systems of exoplanets beside WHFast and IAS15"
+        "measurements.exoplanets:Exoplanets", "three systems of exoplanets compared with WHFast and IAS15"
     ),
     "study far": Entry("measurements.far:Far", "ten bodies over 100 000 years by several methods"),
     "study gpe": Entry(
-        "measurements.gpe:EquationCost", "cost of the Gross-Pitaevskii equation beside its transforms and RK4"
+        "measurements.gpe:EquationCost", "cost of the Gross-Pitaevskii equation compared with its transforms and RK4"
     ),
     "study gpe-efficiency": Entry("condensates.efficiency:AllRuns", "the paper's test of efficiency with all its runs"),
     "study gpe-methods": Entry("measurements.gpe_methods:BaseMethods", "RK4 and splittings on the paper's ring"),
     "study gpe-mpi": Entry("measurements.gpe_mpi:RanksCost", "the Gross-Pitaevskii equation on ranks of MPI"),
-    "study gradients": Entry("measurements.gradients:Gradients", "compiled gradients beside gradients written by hand"),
+    "study gradients": Entry(
+        "measurements.gradients:Gradients", "compiled gradients compared with gradients written by hand"
+    ),
     "study growth": Entry("measurements.growth:Growth", "growth of the error of position over 10 000 years"),
     "study import-time": Entry("measurements.import_time:ImportTime", "how long imports take"),
     "study long-orbits": Entry(
@@ -81,24 +85,30 @@ COMMANDS = {
         "measurements.metric_memory:MetricMemory", "the metric on problems whose error estimates mislead it"
     ),
     "study metric-table": Entry("measurements.metric_table:MetricTable", "what the metric does to the solar system"),
-    "study multistep": Entry("measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 beside WHFast, IAS15 and heyoka"),
+    "study multistep": Entry(
+        "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
+    ),
     "study nystrom-defaults": Entry(
         "measurements.nystrom_defaults:NystromDefaults", "two options of the Nyström methods that could be defaults"
     ),
     "study orbit-balances": Entry(
         "measurements.orbit_balances:OrbitBalances", "what each quantity of the orbits costs and gains as a balance"
     ),
-    "study overhead": Entry("measurements.overhead:Overhead", "cost of a step in solve_ivp beside SciPy's classes"),
+    "study overhead": Entry(
+        "measurements.overhead:Overhead", "cost of a step in solve_ivp compared with SciPy's classes"
+    ),
     "study particle-reference": Entry(
         "measurements.references:ParticleReference", "reference states of the charged particles"
     ),
     "study recommend": Entry("measurements.recommend:Recommended", "true errors of recommended runs on the hard cases"),
     "study relativity": Entry(
-        "measurements.relativity:Relativity", "ten bodies with relativity beside WHFast and IAS15"
+        "measurements.relativity:Relativity", "ten bodies with relativity compared with WHFast and IAS15"
     ),
     "study ring-grids": Entry("measurements.ring_grids:RingGrids", "the paper's ring on several grids"),
-    "study scene-reference": Entry("measurements.references:SceneReference", "reference states of the hard scenes"),
-    "study solar-cloud": Entry("measurements.solar_cloud:SolarCloud", "an ensemble of solar systems beside REBOUND"),
+    "study scene-reference": Entry("measurements.references:SceneReference", "reference states of the hard problems"),
+    "study solar-cloud": Entry(
+        "measurements.solar_cloud:SolarCloud", "an ensemble of solar systems compared with REBOUND"
+    ),
     "study solar-reference": Entry(
         "measurements.solar_reference:SolarReference", "states of the solar system in 80 bits"
     ),
@@ -109,11 +119,11 @@ COMMANDS = {
         "derivatives that runs carry along: errors, cost, chaos, a stability map",
     ),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
-    "study waves": Entry("measurements.waves:Waves", "errors against cost of waves beside SciPy's DOP853"),
+    "study waves": Entry("measurements.waves:Waves", "errors against cost of waves compared with SciPy's DOP853"),
     "study with-and-without": Entry("measurements.with_and_without:WithAndWithout", "the README's figure"),
     "study written": Entry("measurements.written:Written", "cost of a problem written as an expression"),
 }
-# Options of before, by command, and the command that does it now.
+# Former options by command, and the command that replaces each.
 MOVED = {
     ("solar-system", "--frontier"): "solar-system frontier",
     ("solar-system", "--truth"): "solar-system truth",

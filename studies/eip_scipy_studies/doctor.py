@@ -1,4 +1,4 @@
-"""``eip-scipy doctor``: what is installed, and whether it computes what it must, in seconds."""
+"""``eip-scipy doctor``: a list of what is installed, and short trials of whether it computes correctly."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
 
 class Trial(NamedTuple):
-    """What was looked at, the number found and the largest that will do."""
+    """Subject of a trial, the number found and the largest acceptable one."""
 
     name: str
     found: float
@@ -45,14 +45,14 @@ def _timed(name: str, bound: float, measure: Callable[[], float]) -> Trial:
     begin = perf_counter()
     try:
         found = measure()
-    except Exception as error:  # a part that does not even run is what the command looks for
+    except Exception as error:  # the command looks for parts that fail, whatever the error
         warn(f"{name}: {type(error).__name__}: {error}")
         found = math.nan
     return Trial(name, found, bound, perf_counter() - begin)
 
 
 def _defects() -> float:
-    """How far energy and angular momentum, by their formulas, go from their values at the start."""
+    """Return the largest changes of energy and angular momentum, by their formulas."""
     problem = kepler(relativistic=0.0)
     run = solve_ivp(problem.fun, (0, 20), problem.y0, method=EIPRK4, h=0.02, invariants=problem.invariants)
     x, y, vx, vy = run.y
@@ -61,7 +61,7 @@ def _defects() -> float:
 
 
 def _bits() -> float:
-    """Functions in Python and native ones: the largest difference of states, which must be none."""
+    """Return the largest difference of states by Python functions and by native ones, which must be 0."""
     problem = kepler()
     runs = problem.solve_ivp((0, 20), method=EIPRK4, h=0.02), integrate(problem, (0, 20), method=EIPRK4, h=0.02)
     return float(np.abs(runs[0].y[:, -1] - runs[1].y[:, -1]).max())
@@ -75,7 +75,7 @@ def _orbit() -> float:
 
 
 def _planets() -> float:
-    """A year of the solar system by two methods: the largest difference of places, in AU."""
+    """Integrate a year of the solar system by two methods; return the largest difference of positions, in AU."""
     problem = solar_system()
     runs = [integrate(problem, (0, 1), method=method, h=1 / n) for method, n in ((EIPRKN12, 64), (EIPRK4, 2000))]
     half = problem.y0.size // 2
@@ -83,7 +83,7 @@ def _planets() -> float:
 
 
 def _members() -> float:
-    """Members of an ensemble and their single runs: the largest difference, which must be none."""
+    """Return the largest difference between members of an ensemble and single runs, which must be 0."""
     problem = kepler()
     starts = problem.y0 * np.linspace(0.9, 1.1, 16)[:, None]
     together = ensemble(problem, (0, 5), starts, method=EIPRK4, h=0.05, progress=False)
@@ -101,7 +101,7 @@ CHECKS = (
 
 
 class Examined(NamedTuple):
-    """What the command found."""
+    """Results of the command."""
 
     installed: dict[str, Any]
     trials: list[Trial]
@@ -115,7 +115,7 @@ class Doctor(Study[Examined]):
     writes_files = False
 
     def measure(self, session: Session) -> Examined:
-        """Look what is there, and run each trial."""
+        """List what is installed, and run each trial."""
         found = Examined(show_config("dicts") or {}, [_timed(*trial) for trial in self.trials])
         if failed := [trial.name for trial in found.trials if not trial.passed]:
             names = ", ".join(failed)

@@ -35,11 +35,11 @@ class HardCase:
         The exact state at the end of ``problem.t_span``, to the last bit or so.
     invariant_names : tuple of str, length l
     weak : tuple of str
-        Those that hold only on the manifold of the start.
+        Invariants that hold only on the manifold of the start.
     growth : float
-        By how much a small relative perturbation of the start has grown at the end.
+        Growth of a small relative perturbation of the start up to the end.
     note : str
-        What makes it hard.
+        Why the case is hard.
     """
 
     name: str
@@ -52,14 +52,14 @@ class HardCase:
     note: str
 
     def error(self, y: np.ndarray) -> float:
-        """Error of a final state: largest component of the difference, relative to the largest component."""
+        """Return the error of a final state: largest component of the difference, relative to the largest component."""
         return float(np.max(np.abs(y - self.end)) / np.max(np.abs(self.end)))
 
     def drift(self, y: np.ndarray) -> float:
-        """Largest relative change of an invariant along states in columns, (n, m).
+        """Return the largest relative change of an invariant along states in columns, (n, m).
 
-        Relative to the invariant's first value, or to a thousandth of the largest of all invariants' where that is
-        more (an invariant may be zero).
+        The change is relative to the invariant's first value, or to a thousandth of the largest of all invariants if
+        that is larger (an invariant may be zero).
         """
         (invariant,) = self.problem.invariants
         values = np.array([invariant.fun(0.0, state) for state in y.T])
@@ -76,7 +76,7 @@ class CaseEquations(NamedTuple):
 
 
 class _Function:
-    """One of a case's functions, which pickles by what it is made from."""
+    """One of a case's functions, which pickles by its recipe."""
 
     def __init__(self, equations: str, params: dict[str, Any], which: str) -> None:
         self._made = equations, params, which
@@ -101,7 +101,7 @@ def hard_cases(names: Sequence[str] | None = None) -> tuple[HardCase, ...]:
     Parameters
     ----------
     names : sequence of str, optional
-        Those wanted; default: all 35.
+        Names of the cases; default: all 35.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def hard_cases(names: Sequence[str] | None = None) -> tuple[HardCase, ...]:
     Raises
     ------
     ValueError
-        For an unknown name.
+        If a name is unknown.
 
     Examples
     --------
@@ -702,7 +702,7 @@ def brockett() -> CaseEquations:
 
     def gradients(t, y):
         powers = np.eye(3), y[where], y[where] @ y[where]
-        counted = np.array([1, 1, 1, 2, 2, 2])  # off-diagonal entries stand twice in L
+        counted = np.array([1, 1, 1, 2, 2, 2])  # off-diagonal entries occur twice in L
         index = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])
         return np.array([(k + 1) * counted * power[index] for k, power in enumerate(powers)])
 

@@ -22,7 +22,7 @@ Found = dict[str, dict[str, str]]
 
 
 def fixed_step_methods() -> dict[str, type[EIPSolver]]:
-    """Find the solver classes that a user names: those with a tableau."""
+    """Find the solver classes with a tableau, which users name."""
     found = {name: getattr(eip_scipy, name) for name in eip_scipy.__all__ if name.startswith("EIP")}
     return {name: value for name, value in found.items() if hasattr(value, "TABLEAU")}
 
@@ -34,7 +34,7 @@ class Listing(Study[Found]):
     writes_files = False
 
     def measure(self, session: Session) -> Found:
-        """Names with the first lines of their docstrings, by their kind."""
+        """Return names with the first lines of their docstrings, by their kind."""
         sets = {name: solar_data.load(name) for name in solar_data.available()}
         others = {name: getattr(comparators, name) for name in comparators.__all__}
         functions = {name: make for name in problems.__all__ if _is_function(make := getattr(problems, name))}
@@ -64,7 +64,7 @@ def _is_function(item: Any) -> bool:
 
 
 def _makes_problems(function: Any) -> bool:
-    made = str(function.__annotations__.get("return"))  # as a time scale, which has none
+    made = str(function.__annotations__.get("return"))  # a time scale has no return type
     return "Problem" in made or "HardCase" in made
 
 

@@ -1,4 +1,4 @@
-"""Commands that take minutes: their checkpoints, and what `integrate` is told of them."""
+"""Commands that take minutes: their checkpoints, and the options of `integrate` for them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Checkpoints", "named", "positive"]
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoints:
-    """Settings of a study whose runs keep checkpoints; stands before `Study` among the bases."""
+    """Settings of a study whose runs keep checkpoints; a base class that comes before `Study`."""
 
     checkpoint: Path | None = option(
         None, "keep checkpoints of the runs that this package does in DIR", type=Path, metavar="DIR"
@@ -27,21 +27,21 @@ class Checkpoints:
     resume: bool = option(False, "with --checkpoint: go on from those that are in DIR")
 
     def check_settings(self) -> None:
-        """See that the options go together and the folder can be written to."""
+        """Check that the options go together and that the folder can be written to."""
         if self.resume and self.checkpoint is None:
             raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
         if self.checkpoint is not None:
             check_folder(self.checkpoint)
 
     def checkpoint_options(self, name: str) -> dict[str, Any]:
-        """Options of `integrate` for the checkpoints of the run of that name: one file each."""
+        """Return the options of `integrate` for the checkpoints of the run of that name: one file each."""
         if self.checkpoint is None:
             return {}
         file = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
         return {"checkpoint": self.checkpoint / f"{file}.npz", "resume": self.resume}
 
     def when_interrupted(self) -> str:
-        """Say which command goes on, if there are checkpoints."""
+        """Print the command that continues the run, if there are checkpoints."""
         if self.checkpoint is None:
             return ""
         return f"the same command with --resume goes on from the checkpoints in {str(self.checkpoint)!r}"
@@ -64,5 +64,5 @@ def positive(text: str) -> float:
 
 
 def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
-    """Put the method under another name, for its progress bar and for what is said of the run."""
+    """Rename the method for its progress bar and for messages about the run."""
     return type(name, (method,), {"__doc__": method.__doc__})

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-# First of all: its error says how matplotlib is installed.
+# Imported first, because its error says how matplotlib is installed.
 from eip_scipy.plotting import FLOOR, MARKERS, PALETTE, log_errors, method_styles, typeset  # isort: skip
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -50,14 +50,14 @@ __all__ = [
 ]
 
 WIDTH, HEIGHT = 6.4, 7.4
-LINE_HEIGHT = 0.19  # of the legend, inches
+LINE_HEIGHT = 0.19  # height of a line of the legend, inches
 FAINT = {"lw": 1.0, "ms": 4, "alpha": 0.85}
 OURS = {"lw": 2.4, "ms": 6, "zorder": 5}
 DPI = 160
 POINTS = 250
 LONG_LABEL = 24
 DENSITY = r"density $|\psi|^2$"
-VEIL = 0.13  # opacity of what the inside is seen through
+VEIL = 0.13  # opacity of the outside
 
 
 class ErrorSeries(NamedTuple):
@@ -69,7 +69,7 @@ class ErrorSeries(NamedTuple):
     invariants : mapping of str to array_like, shape (m,)
         Relative error of each invariant.
     trajectory : array_like, shape (m,)
-        Error of the trajectory; nan where unknown.
+        Error of the trajectory; nan if unknown.
     """
 
     t: Any
@@ -98,12 +98,12 @@ Styles = Mapping[str, Mapping[str, Any]]
 def errors_figure(
     series: Mapping[str, ErrorSeries], *, time: str, trajectory: str, title: str = "", styles: Styles | None = None
 ) -> Figure:
-    """Draw invariant errors in time, and beside them the trajectory error, without which they prove nothing.
+    """Draw invariant errors in time, and next to them the trajectory error, without which they prove nothing.
 
     Parameters
     ----------
     series : mapping of str to ErrorSeries
-        For each method; all with the same invariants.
+        Series by method; all have the same invariants.
     time, trajectory : str
         Labels of the time axis and of the trajectory's error, with units.
     title : str, optional
@@ -145,7 +145,7 @@ def longitude_figure(
     ----------
     t : array_like, shape (m,)
     errors : mapping of str to array_like, shape (k, m)
-        For each method the errors of the k planets; nan where unknown.
+        Errors of the k planets by method; nan if unknown.
     planets : sequence of str, length k
     time, error : str
         Labels of the axes, with units.
@@ -182,7 +182,7 @@ def orbits_figure(panels: Mapping[str, Orbits], bodies: Sequence[str], *, unit: 
     Parameters
     ----------
     panels : mapping of str to Orbits
-        For each method the orbits of k bodies.
+        Orbits of k bodies by method.
     bodies : sequence of str, length k
     unit : str
         Unit of length.
@@ -214,7 +214,7 @@ def orbit_in_time_figure(panels: Mapping[str, tuple[Any, Any]], *, unit: str, ti
     Parameters
     ----------
     panels : mapping of str to (array_like, array_like)
-        For each method times, (m,), and curves, (m, 2, points).
+        Times, (m,), and curves, (m, 2, points), by method.
     unit, time : str
         Unit of length, and label of the time.
     title : str, optional
@@ -279,7 +279,7 @@ def paper_kepler_figure(runs: Mapping[str, KeplerRun], *, title: str = "") -> Fi
             _envelope(row[1 + k], run.t, values, {"color": PALETTE[k], "ls": "-", "marker": ""})
             log_errors(row[1 + k], "t", label)
             low, high = np.log10(row[1 + k].get_ylim())
-            row[1 + k].set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # two labelled ticks at least
+            row[1 + k].set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # at least two labelled ticks
     return figure
 
 
@@ -304,7 +304,7 @@ class ParticleRow(NamedTuple):
     Attributes
     ----------
     orbits : mapping of str to Curves
-        By the panels' titles.
+        Curves by the panels' titles.
     invariants : mapping of str to (array_like, array_like)
         Times and relative errors.
     trajectory : str
@@ -325,7 +325,7 @@ def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figu
     Parameters
     ----------
     rows : mapping of str to ParticleRow
-        By the methods' names; all with as many orbits.
+        Rows by method; all have the same number of orbits.
     title : str, optional
 
     Returns
@@ -358,7 +358,7 @@ def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figu
 
 
 def _share_limits(axes: Iterable[Axes], *, both: bool) -> None:
-    """Give axes the limits that hold all of them, in y or in x and y."""
+    """Give all axes the same limits, in y or in x and y, which hold all of their data."""
     for get, put in (("get_ylim", "set_ylim"), ("get_xlim", "set_xlim"))[: 1 + both]:
         limits = np.array([getattr(axis, get)() for axis in axes])
         for axis in axes:
@@ -366,17 +366,17 @@ def _share_limits(axes: Iterable[Axes], *, both: bool) -> None:
 
 
 def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title: str = "", labels: int = 6) -> Figure:
-    """Draw errors with projection against errors without; below the diagonal projection helps.
+    """Draw errors with projection against errors without; projection helps below the diagonal.
 
     Parameters
     ----------
     errors : mapping of str to (float, float)
-        For each case the error without and with; those not finite or zero are left out.
+        Errors without and with projection by case; values that are not finite or zero are left out.
     what : str
         Name of the error, with its unit.
     title : str, optional
     labels : int, optional
-        How many of the largest gains get their names; those above the diagonal all do.
+        Number of the largest gains that are labelled with their names; all cases above the diagonal are.
 
     Returns
     -------
@@ -407,7 +407,7 @@ def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title:
         )
     gains = set(np.argsort(y / x)[:labels])
     for k, name in enumerate(good):
-        if worse[k]:  # to the left, where no other points are
+        if worse[k]:  # labelled to the left, where there are no other points
             axis.annotate(name, (x[k], y[k]), (-6, 3), textcoords="offset points", fontsize="x-small", ha="right")
         elif k in gains:
             axis.annotate(name, (x[k], y[k]), (6, -3), textcoords="offset points", fontsize="x-small")
@@ -431,9 +431,9 @@ class CostPanel(NamedTuple):
     cost : str
         Label of the cost, with its unit.
     curves : mapping of str to (array_like, array_like)
-        By method costs and errors; what is not a number above 0 is left out.
+        Costs and errors by method; values that are not numbers above 0 are left out.
     slopes : mapping of str to float, optional
-        Of some methods, each drawn as a line a little below the method's.
+        Slopes of some methods, each drawn as a line a little below the method's curve.
     """
 
     title: str
@@ -458,18 +458,18 @@ def cost_figure(
     Parameters
     ----------
     rows : sequence of sequences of CostPanel
-        A method has the same style in all.
+        Panels; a method has the same style in all.
     error : str
         Label of the error, with its unit.
     title, footnote : str, optional
     styles : mapping, optional
         From `method_styles`.
     largest : float, optional
-        Larger errors, of runs that are lost, are left out.
+        Larger errors, of runs that failed, are left out.
     size : (float, float), optional
-        Of a panel, in inches.
+        Size of a panel in inches.
     shared : bool, optional
-        Panels of a row have the same axis of errors, and those with the same cost that of the cost.
+        Panels of a row share the axis of errors, and those with the same cost share the axis of costs.
 
     Returns
     -------
@@ -479,7 +479,7 @@ def cost_figure(
     names = dict.fromkeys(name for row in rows for panel in row for name in panel.curves)
     styles = method_styles(names) if styles is None else styles
     figure = blank_figure(max(size[0] * columns, 6.5), size[1] * len(rows) + 1.1, title)
-    if footnote:  # above: the legend is below
+    if footnote:  # above the panels, because the legend is below
         figure.suptitle(f"{typeset(title)}\n{footnote}", fontsize="medium")
     axes = figure.subplots(len(rows), columns, sharey="row" if shared else "none", squeeze=False)
     first: dict[str, Axes] = {}
@@ -541,12 +541,12 @@ def linkage_figure(
 ) -> Figure:
     """Draw a linkage at several times, a panel for each run, and below errors against costs.
 
-    A dotted line leads from the last link at the last time to its pivot.
+    A dotted line connects the last link at the last time with its pivot.
 
     Parameters
     ----------
     drawings : mapping of str to Linkage
-        By the titles of the panels; all with the same times.
+        Linkages by the titles of the panels; all have the same times.
     panels : sequence of CostPanel, as many
     unit, time, error : str
         Unit of length, labels of the time and of the error.
@@ -589,7 +589,7 @@ def linkage_figure(
 
 
 def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> None:
-    """A dotted line below a method, with its slope below the shortest step."""
+    """Draw a dotted line below a method's curve, with its slope below the shortest step."""
     ends = np.array([h.min(), h.max()])
     line = 0.25 * error[np.argmax(h)] * (ends / ends[1]) ** slope
     axis.plot(ends, line, color="0.4", lw=1.0, ls=":")
@@ -604,7 +604,7 @@ class FieldPanel(NamedTuple):
     Attributes
     ----------
     density : array_like, shape (m, n)
-        By the first coordinate, then by the second.
+        Density by the first coordinate, then by the second.
     ends : tuple of float
         Lower and upper end of the first coordinate, then of the second.
     axes : tuple of str
@@ -612,7 +612,7 @@ class FieldPanel(NamedTuple):
     vortices : array_like, shape (k, 2)
         Positions to mark.
     followed : int, optional
-        Number of the one that is told from the others, to be followed from panel to panel.
+        Number of the vortex that is marked differently, to be followed from panel to panel.
     """
 
     density: Any
@@ -625,17 +625,17 @@ class FieldPanel(NamedTuple):
 def fields_figure(
     panels: Mapping[str, FieldPanel], *, title: str = "", columns: int = 3, shared: bool = False
 ) -> Figure:
-    """Draw densities in planes, with their vortices, a panel for each.
+    """Draw densities in planes with their vortices, one panel for each.
 
     Parameters
     ----------
     panels : mapping of str to FieldPanel
-        By the panels' titles.
+        Densities by the panels' titles.
     title : str, optional
     columns : int, optional
-        Panels abreast.
+        Number of panels in a row.
     shared : bool, optional
-        One scale of colours for all.
+        Use one colour scale for all.
 
     Returns
     -------
@@ -660,17 +660,17 @@ def fields_figure(
 
 
 def fields_movie(path: Any, panels: Sequence[FieldPanel], titles: Sequence[str], *, per_second: int) -> None:
-    """Write an animated GIF, a frame for each panel, on one scale of colours.
+    """Write an animated GIF with a frame for each panel, on one colour scale.
 
     Parameters
     ----------
     path : str or Path
-        Ends in ".gif".
+        Path that ends in ".gif".
     panels : sequence of FieldPanel
-        All of one shape.
+        Panels of the same shape.
     titles : sequence of str
     per_second : int
-        Frames.
+        Frames per second.
     """
     top = max(float(np.max(panel.density)) for panel in panels)
     figure = Figure(figsize=(5.2, 4.6), dpi=90, layout="constrained")
@@ -695,7 +695,7 @@ class SurfacePanel(NamedTuple):
     corners : array_like, shape (m, 3, 3)
         x, y and z of the three corners of each triangle.
     part : array_like of int, shape (m,)
-        What each triangle belongs to: 0 the outside, 1 the inside, 2 a part of it to be told from the rest.
+        Part to which each triangle belongs: 0 the outside, 1 the inside, 2 a part that is drawn differently.
     """
 
     corners: Any
@@ -710,19 +710,19 @@ def surfaces_figure(
     columns: int = 3,
     view: tuple[float, float] = (28.0, -62.0),
 ) -> Figure:
-    """Draw surfaces in space, a panel for each: the outside as a veil, and solid what lies inside.
+    """Draw surfaces in space, one panel for each: the outside transparent, the inside opaque.
 
     Parameters
     ----------
     panels : mapping of str to SurfacePanel
-        By the panels' titles.
+        Surfaces by the panels' titles.
     ends : sequence of (float, float)
         Lower and upper end of x, y and z.
     title : str, optional
     columns : int, optional
-        Panels abreast.
+        Number of panels in a row.
     view : (float, float), optional
-        From where: degrees above the plane of x and y, and degrees from the x axis.
+        View point: degrees above the plane of x and y, and degrees from the x axis.
 
     Returns
     -------
@@ -746,13 +746,13 @@ def surfaces_figure(
 
 
 def _shaded(corners: np.ndarray, part: np.ndarray, view: tuple[float, float]) -> np.ndarray:
-    """Colours (m, 4) of triangles in a light that comes from beside the viewer."""
+    """Return colours (m, 4) of triangles in a light that comes from the viewer's side."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal /= np.where(length > 0, length, 1.0)
     high, around = np.radians([view[0] + 15, view[1] - 30])
     light = np.array([np.cos(high) * np.cos(around), np.cos(high) * np.sin(around), np.sin(high)])
-    # Both sides are lit: through the veil the far side of the surface is seen from behind.
+    # Both sides are lit, because the far side of the surface is seen from behind through the transparent one.
     shade = 0.45 + 0.55 * np.abs(normal @ light)
     colour = np.array([to_rgba(PALETTE[5], VEIL), to_rgba(PALETTE[0]), to_rgba(PALETTE[2])])[part]
     colour[:, :3] *= shade[:, None]
@@ -760,7 +760,7 @@ def _shaded(corners: np.ndarray, part: np.ndarray, view: tuple[float, float]) ->
 
 
 def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) -> Any:
-    """Draw one density; the image, for a scale of colours or to be changed in a movie."""
+    """Draw one density; return the image, for a colour scale or to be changed in a movie."""
     density, ends, names, where, followed = panel
     image = axis.imshow(
         np.asarray(density).T, origin="lower", extent=ends, cmap="viridis", vmin=0.0, vmax=top, interpolation="bilinear"
@@ -779,7 +779,7 @@ def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) ->
 
 
 def blank_figure(width: float, height: float, title: str = "") -> Figure:
-    """Return an empty figure of this size in inches, in the layout that all figures have."""
+    """Return an empty figure of this size in inches, in the layout of all figures."""
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
     if title:
         figure.suptitle(typeset(title), fontsize="large")
@@ -787,7 +787,7 @@ def blank_figure(width: float, height: float, title: str = "") -> Figure:
 
 
 def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log: bool = False) -> None:
-    """Draw the largest magnitude in each of some hundred spans of time; noise drawn in full would be a block."""
+    """Draw the largest magnitude in each of some hundred intervals of time; noise drawn in full would fill the area."""
     t, magnitude = np.asarray(t, dtype=float), np.abs(np.asarray(values, dtype=float))
     n = min(t.size, magnitude.size)
     known = np.flatnonzero(np.isfinite(magnitude[:n]) & (t[:n] > 0))
@@ -803,13 +803,13 @@ def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log:
 
 
 def _marked(scale: np.ndarray, count: int = 6) -> list[int]:
-    """Numbers of `count` points about equally spaced, for markers."""
+    """Return the numbers of `count` points at about equal distances, for markers."""
     wanted = np.linspace(scale[0], scale[-1], 2 * count + 1)[1::2]
     return sorted({int(np.argmin(np.abs(scale - at))) for at in wanted})
 
 
 def _log_x(axis: Axes) -> None:
-    """Make x a log axis with labels at powers of ten; in a short span at 2 and 5 times those as well."""
+    """Make x a log axis with labels at powers of ten; in a short range also at 2 and 5 times those."""
     axis.set_xscale("log")
     low, high = axis.get_xlim()
     if high / low < 100:
@@ -819,12 +819,12 @@ def _log_x(axis: Axes) -> None:
 
 
 def _short(value: float, _: Any) -> str:
-    """A number of a log axis, where long ones would run into each other."""
+    """Format a number on a log axis whose long labels would overlap."""
     return f"{value:g}" if value < 1e4 else f"{value:.0e}".replace("e+0", "e")
 
 
 def _plane(axis: Axes, title: str, unit: str) -> None:
-    """Equal scales, and a cross for the central body."""
+    """Set equal scales, and draw a cross for the central body."""
     axis.plot(0, 0, ls="", marker="+", color="black", ms=8)
     axis.set_title(title, fontsize="medium")
     axis.set_aspect("equal", adjustable="box")
@@ -861,16 +861,16 @@ def side_by_side_figure(
     title: str = "",
     footnote: str = "",
 ) -> Figure:
-    """Draw the trajectory's error against time and, below, the invariants', a line for each peer.
+    """Draw the trajectory's error against time and, below, the invariants' errors, a line for each package.
 
     Parameters
     ----------
     series : mapping of str to mapping
-        For each peer arrays "seconds", "error" and "drift", the last with nan where it is not known.
+        Arrays "seconds", "error" and "drift" by package, the last with nan if it is not known.
     ours : collection of str
-        Those that are drawn heavier.
+        Names of the series that are drawn with heavier lines.
     levels : collection of float
-        Errors of the trajectory at which the text compares: dotted lines.
+        Errors of the trajectory at which the text compares, drawn as dotted lines.
     time : str, optional
         Label of the time.
     title, footnote : str, optional

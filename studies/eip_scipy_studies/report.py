@@ -1,4 +1,4 @@
-"""What the commands share: machine and versions, numbers and tables as text, files that are whole or not there."""
+"""Common functions of the commands: machine and versions, numbers and tables as text, complete files."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ __all__ = [
     "write_json",
 ]
 
-_untrusted: list[str] = []  # what was said of runs that are not to be trusted, since `listening` began
-_unsaid: list[str] = []  # why stdout took no text, since `printing` began
+_untrusted: list[str] = []  # messages about unreliable runs since `listening` began
+_unsaid: list[str] = []  # reasons why stdout took no text, since `printing` began
 
 
 class UsageError(Exception):
-    """Something the user gave cannot be used; the message is one line that says what to do. Exit status 2."""
+    """Error of the user's input; the message is one line that says what to do. Exit status 2."""
 
 
 def machine() -> dict[str, Any]:
@@ -65,7 +65,7 @@ def machine() -> dict[str, Any]:
 
 
 def describe_machine() -> str:
-    """Describe the machine in one line, as the titles of timings need it."""
+    """Describe the machine in one line, for the titles of timings."""
     known = machine()
     plural = "" if known["cpus"] == 1 else "s"
     return f"{known['processor']}, {known['cpus']} CPU{plural}, {platform.system()}, Python {platform.python_version()}"
@@ -83,13 +83,13 @@ def _processor() -> str:
 
 
 def needed(module: str, install: str = "") -> Any:
-    """Import what a study cannot do without.
+    """Import a module that a study needs.
 
     Parameters
     ----------
     module : str
     install : str, optional
-        What ``pip install`` takes. The integrations of the package say that themselves.
+        Argument of ``pip install``. The integrations of the package have their own message.
 
     Returns
     -------
@@ -98,13 +98,13 @@ def needed(module: str, install: str = "") -> Any:
     Raises
     ------
     UsageError
-        When the module is not installed; the message says how to install it.
+        If the module is not installed; the message says how to install it.
     """
     try:
         return import_module(module)
     except ImportError as error:
         if not install and (error.name or "eip_scipy").startswith("eip_scipy"):
-            raise  # the package itself is broken
+            raise  # the package itself is faulty
         raise UsageError(f"{error}: pip install {install}" if install else str(error)) from error
 
 
@@ -116,15 +116,15 @@ def cores() -> int:
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of Python, of eip_scipy, of what it needs and of its extras; None for what is absent."""
+    """Return the versions of Python, of eip_scipy, of its dependencies and extras; None for those that are absent."""
     found = show_config("dicts") or {}
     return {**found["versions"], **{name: extra["version"] for name, extra in found["extras"].items()}}
 
 
 def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
-    """Wrap a command's numbers for `write_json`: what was asked for, when, with which versions, on which machine.
+    """Wrap a command's numbers for `write_json` with the options, the date, the versions and the machine.
 
-    It says too whether all runs since `listening` began are to be trusted.
+    It also says whether all runs since `listening` began are reliable.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict
 
 
 def compact(value: float | None, digits: int = 2) -> str:
-    """Write a number in at most ``digits + 6`` characters; "-" stands for None and for what is not finite.
+    """Write a number in at most ``digits + 6`` characters; "-" stands for None and for values that are not finite.
 
     Examples
     --------
@@ -175,13 +175,13 @@ def table(head: Sequence[Sequence[str]], rows: Iterable[tuple[str, Sequence[str]
     ----------
     head : sequence of sequences of str
         The lines of each column's head, one sequence for each column.
-    rows : iterable of (str, sequence of str)
+    Label and cells; a row without cells is a heading.
         Label and cells; a row without cells is a heading of its own.
 
     Returns
     -------
     str
-        Without a newline at the end.
+        The table without a newline at the end.
     """
     body = list(rows)
     first = max(len(label) for label, cells in body if cells)
@@ -205,9 +205,9 @@ def _line(label: str, cells: Sequence[str], first: int, widths: Sequence[int]) -
 
 
 def say(text: str = "") -> None:
-    """Print on stdout; neither a terminal without Unicode nor a stdout that takes nothing ends the command.
+    """Print on stdout; a terminal without Unicode or a closed stdout does not end the command.
 
-    A reader that has left, say `head`, wants no more. Any other failure is noted for `printing`.
+    A reader that has closed the pipe, such as `head`, needs no more. Any other failure is noted for `printing`.
     """
     if sys.stdout is None or sys.stdout.closed:
         _unsaid.append("it is closed")
@@ -218,12 +218,12 @@ def say(text: str = "") -> None:
     except OSError as error:
         if not isinstance(error, BrokenPipeError):
             _unsaid.append(_reason(error))
-        # Python writes what is left when it closes stdout; let that go nowhere.
+        # Python writes the rest of its buffer when it closes stdout; the rest is discarded.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def warn(message: str) -> None:
-    """Print one line for the user on the error stream, if there is one that takes it."""
+    """Print one line for the user on the error stream, if there is a working one."""
     if sys.stderr is not None:
         with suppress(OSError):
             print(f"eip-scipy: {message}", file=sys.stderr, flush=True)
@@ -236,7 +236,7 @@ def printing() -> Iterator[list[str]]:
     Yields
     ------
     list of str
-        Filled as text is printed.
+        The reasons, added as text is printed.
     """
     _unsaid.clear()
     yield _unsaid
@@ -244,17 +244,17 @@ def printing() -> Iterator[list[str]]:
 
 @contextmanager
 def listening(kind: type[Warning]) -> Iterator[list[str]]:
-    """Collect warnings that a run is not to be trusted, each text once, instead of showing them.
+    """Collect warnings that a run is not reliable, each text once, instead of showing them.
 
     Parameters
     ----------
     kind : type
-        Theirs; others go where they went.
+        Their class; other warnings are not affected.
 
     Yields
     ------
     list of str
-        Filled as runs end; `document` looks at it, too.
+        The warnings, added as runs end; `document` reads it, too.
     """
     _untrusted.clear()
     with warnings.catch_warnings():
@@ -282,7 +282,7 @@ def listening(kind: type[Warning]) -> Iterator[list[str]]:
 def ended_by_sigterm() -> Iterator[None]:
     """Let SIGTERM end the block as Ctrl-C does, and afterwards the process, as the sender of the signal expects.
 
-    A handler of the user's own stays in place. A second SIGTERM does not disturb what the first one started.
+    A handler that the user has set is kept. A second SIGTERM does not disturb the reaction to the first one.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
@@ -308,12 +308,12 @@ def ended_by_sigterm() -> Iterator[None]:
 
 
 def check_folder(folder: Path) -> None:
-    """Make `folder` if need be and see that files can be written there.
+    """Make `folder` if necessary and check that files can be written there.
 
     Raises
     ------
     UsageError
-        When it cannot be made or written to.
+        If it cannot be made or written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -323,12 +323,12 @@ def check_folder(folder: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """See that a file can be written at `path`, in a folder that exists.
+    """Check that a file can be written at `path`, in a folder that exists.
 
     Raises
     ------
     UsageError
-        When it cannot.
+        If it cannot.
     """
     if path.is_dir():
         raise UsageError(f"cannot write {str(path)!r}: it is a folder")
@@ -344,7 +344,7 @@ def check_outputs(folder: Path, target: Path | None) -> None:
     Raises
     ------
     UsageError
-        When one of them cannot be written.
+        If one of them cannot be written.
     """
     check_folder(folder)
     if target is not None:
@@ -363,7 +363,7 @@ def _reason(error: OSError) -> str:
 
 @contextmanager
 def _whole(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path` that takes its place when all went well; an old file stays until then."""
+    """Yield a temporary path next to `path` that replaces it after success; an old file remains until then."""
     temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
@@ -375,13 +375,13 @@ def _whole(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, write: Callable[[Path], Any]) -> Path:
-    """Let `write` fill a temporary file that then takes the place of `path`; an interruption leaves no torn file.
+    """Let `write` fill a temporary file that then replaces `path`; an interruption leaves no incomplete file.
 
     Parameters
     ----------
     path : Path
     write : callable
-        ``write(temporary_path)``; the temporary path ends as `path` does.
+        ``write(temporary_path)``; the temporary path has the suffix of `path`.
 
     Returns
     -------
@@ -391,7 +391,7 @@ def write_file(path: Path, write: Callable[[Path], Any]) -> Path:
     Raises
     ------
     UsageError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     with _whole(path) as temporary:
         write(temporary)
@@ -399,7 +399,7 @@ def write_file(path: Path, write: Callable[[Path], Any]) -> Path:
 
 
 def write_json(path: Path, content: Any) -> Path:
-    """Write JSON; arrays become lists, and what is not finite null (JSON has no NaN)."""
+    """Write JSON; arrays become lists, and values that are not finite become null (JSON has no NaN)."""
     text = json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
     return write_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
@@ -417,7 +417,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
 
 
 def _plain(value: Any) -> Any:
-    """`value` made of Python's own types, None for numbers that are not finite."""
+    """Return `value` made of Python's own types, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

@@ -1,4 +1,4 @@
-"""What a command is: settings, a measurement, and what is shown of it; and the one runner of all commands.
+"""Definition of a command (settings, a measurement, and its output), and the one runner of all commands.
 
 A new command is a file with a subclass of `Study`, and a line in `eip_scipy_studies.commands`.
 """
@@ -62,7 +62,7 @@ def option(default: Any, text: str, **settings: Any) -> Any:
     default : object
         False makes a flag.
     text : str
-        What ``--help`` says.
+        Text of ``--help``.
     **settings
         As for `argparse.ArgumentParser.add_argument`; ``positional=True`` makes it an argument without dashes.
 
@@ -74,12 +74,12 @@ def option(default: Any, text: str, **settings: Any) -> Any:
 
 
 def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
-    """Make a ``type`` of an option that takes one of these names, and says which is nearest to another.
+    """Make a ``type`` of an option that takes one of these names, and suggests the nearest one for others.
 
     Parameters
     ----------
     what : str
-        What they name.
+        Kind of the names.
     known : collection of str
 
     Returns
@@ -97,29 +97,29 @@ def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
 
 
 def some_of(what: str, known: Collection[str]) -> Any:
-    """Make a field of a command that takes some of these names, one an option.
+    """Make a field of a command that takes some of these names, one option for each.
 
     Parameters
     ----------
     what : str
-        What they name.
+        Kind of the names.
     known : collection of str
 
     Returns
     -------
     dataclasses.Field
-        None: all.
+        A field; None stands for all.
     """
     text = f"one {what}, may be repeated; default: all ({', '.join(known)})"
     return option(None, text, action="append", type=one_of(what, known), metavar="NAME")
 
 
 class Verdict(Protocol):
-    """What the runner asks of a check."""
+    """Interface of a check for the runner."""
 
     @property
     def passed(self) -> bool:
-        """Whether it holds."""
+        """Return whether it holds."""
         ...
 
 
@@ -136,7 +136,7 @@ class Check(NamedTuple):
 
 
 class PartlyDone(KeyboardInterrupt):
-    """The user interrupted a measurement that leaves something to show."""
+    """Exception after an interrupt by the user in a measurement that has partial results."""
 
     def __init__(self, found: Any) -> None:
         super().__init__()
@@ -145,7 +145,7 @@ class PartlyDone(KeyboardInterrupt):
 
 @dataclass
 class Session:
-    """What a command runs in: where its files go, what it shows, whom it is compared with.
+    """Context of a command: folder of its files, its output, and the packages for comparison.
 
     Attributes
     ----------
@@ -158,13 +158,13 @@ class Session:
     quiet : bool
         Print nothing but errors.
     absent : list of str
-        What could not be compared with, said at the end.
+        Packages that are not available for comparison, printed at the end.
     written : set of Path
         Files that were made.
     unnamed : list of Path
-        Those of them that no line has named yet.
+        Those of them that no line has printed yet.
     open : ExitStack
-        What is to be closed when the command ends.
+        Resources to be closed when the command ends.
     """
 
     name: str
@@ -178,7 +178,7 @@ class Session:
 
     @property
     def shown(self) -> bool:
-        """Whether progress is shown: to a terminal only, as a file would fill with it."""
+        """Return whether progress is shown: only on a terminal, because it would fill a file."""
         return not self.quiet and sys.stderr is not None and sys.stderr.isatty()
 
     def bar(self, total: int | None, what: str, unit: str = "run", **settings: Any) -> Any:
@@ -188,13 +188,13 @@ class Session:
         return tqdm(total=total, desc=what, unit=unit, disable=not self.shown, **{"leave": False, **settings})
 
     def peer(self, name: str, methods: str) -> Any:
-        """Find one of `eip_scipy.integrations`; None, and a line at the end, where what it needs is not installed.
+        """Find one of `eip_scipy.integrations`; return None, and add a line at the end, if its package is missing.
 
         Parameters
         ----------
         name : str
         methods : str
-            What there is no comparison with then.
+            Methods that are then missing from the comparison.
 
         Returns
         -------
@@ -214,13 +214,13 @@ class Session:
             say(text)
 
     def wrote(self, path: Path) -> None:
-        """Note that a file is there; `name_files` prints it, once."""
+        """Note that a file was written; `name_files` prints it, once."""
         if path not in self.written:
             self.unnamed.append(path)
         self.written.add(path)
 
     def name_files(self) -> None:
-        """Print which files were made since the last time, with an empty line before the first of all."""
+        """Print the files that were made since the last time, with an empty line before the first of all."""
         first = len(self.unnamed) == len(self.written)
         for k, path in enumerate(self.unnamed):
             self.say(f"\nwrote {path}" if first and k == 0 else f"wrote {path}")
@@ -229,63 +229,63 @@ class Session:
 
 @dataclass(frozen=True, kw_only=True)
 class Command(ABC):
-    """Settings as fields: those made by `option` are the user's, the others change in tests and in other commands."""
+    """Settings as fields: those made by `option` are the user's, the others are changed by tests and other commands."""
 
     @abstractmethod
     def run(self, session: Session) -> int:
-        """Do it, and return the exit status."""
+        """Run the command, and return the exit status."""
 
     def arguments(self) -> dict[str, Any]:
-        """The user's settings, for the JSON."""
+        """Return the user's settings, for the JSON."""
         return {item.name: getattr(self, item.name) for item in fields(self) if "help" in item.metadata}
 
 
 class Study(Command, Generic[Found]):
-    """A command that measures something. The methods take what `measure` returned.
+    """A command that measures something. The methods take the result of `measure`.
 
-    A measurement must be there and a text; all else is optional. `writes_files` is False for one without CSV files and
-    figures.
+    The measurement and the text are required; everything else is optional. `writes_files` is False for a command
+    without CSV files and figures.
     """
 
     writes_files = True
 
     @abstractmethod
     def measure(self, session: Session) -> Found:
-        """Compute. What the user interrupts may raise `PartlyDone` with what there is."""
+        """Compute. After an interrupt by the user it may raise `PartlyDone` with the partial results."""
 
     @abstractmethod
     def text(self, found: Found) -> str:
-        """What is printed."""
+        """Return the text to be printed."""
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The content of the JSON."""
+        """Return the content of the JSON."""
         return {}
 
     def tables(self, found: Found) -> Mapping[str, Rows]:
-        """CSV files, by their names."""
+        """Return CSV files, by their names."""
         return {}
 
     def checks(self, found: Found) -> Sequence[Verdict]:
-        """What decides on the exit status."""
+        """Return the checks that decide on the exit status."""
         return ()
 
     def figures(self, found: Found) -> Figures:
-        """Make figures one by one. ImportError where what draws them is not installed, which a line then says."""
+        """Make figures one by one. An ImportError means that matplotlib is not installed, which is then printed."""
         return ()
 
     def refine(self, found: Found, session: Session) -> bool:
-        """Measure what takes long, with the text and the tables out; True where these are to be written anew."""
+        """Measure the long part after text and tables are written; return True if these must be written again."""
         return False
 
     def when_interrupted(self) -> str:
-        """What the user is told besides: how to go on."""
+        """Print further information for the user: how to continue."""
         return ""
 
     def check_settings(self) -> None:
         """Raise UsageError for settings that do not go together."""
 
     def run(self, session: Session) -> int:
-        """See `perform`; the settings and the files are looked at first."""
+        """See `perform`; the settings and the files are checked first."""
         self.check_settings()
         if self.writes_files:
             check_folder(session.out)
@@ -295,13 +295,13 @@ class Study(Command, Generic[Found]):
 
 
 class Measurement(Study[Found]):
-    """A study of times: what `measure` returns is in the JSON as it is, and the text begins with the machine."""
+    """A study of times: the result of `measure` is the content of the JSON, and the text begins with the machine."""
 
     writes_files = False
 
     @abstractmethod
     def table(self, found: Found) -> str:
-        """Lay out what was measured."""
+        """Lay out the measurements."""
 
     def text(self, found: Found) -> str:
         return f"{describe_machine()}\n\n{self.table(found)}"
@@ -311,7 +311,7 @@ class Measurement(Study[Found]):
 
 
 def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
-    """Measure, print, write, judge: what all commands have in common.
+    """Measure, print, write, check: the common part of all commands.
 
     Parameters
     ----------
@@ -321,7 +321,7 @@ def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
     Returns
     -------
     int, dict
-        Exit status: 0 done, 1 a check failed, 130 interrupted; and what is in the JSON.
+        Exit status: 0 done, 1 a check failed, 130 interrupted; and the content of the JSON.
     """
     with session.open:
         interrupted = ""
@@ -336,7 +336,7 @@ def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
             raise UsageError(f"not enough memory: {error}") from error
         except CheckpointError as error:
             raise UsageError(f"{error} On the command line, resume=True is --resume.") from error
-        try:  # files before text: a stdout that takes nothing loses no file, and a full disk no text
+        try:  # files before text: a closed stdout then loses no file, and a full disk no text
             numbers = _write_numbers(study, found, session)
         finally:
             session.say(study.text(found))

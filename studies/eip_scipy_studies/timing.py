@@ -1,4 +1,4 @@
-"""Times of functions that are compared: all of them in turn, and of each the least."""
+"""Times of functions that are compared: all of them in turn, with the least time of each."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_coun
 
 
 def many_calls(call: Callable[[], Any]) -> Action:
-    """Make a function that returns the processor time of one of several calls, of which reading the clock is no part.
+    """Make a function that returns the processor time of one of several calls, without the time of reading the clock.
 
-    `call` is called before, to compile and plan what it needs.
+    `call` is called once before, to compile and plan.
     """
     call()
     calls = max(1, int(2e-3 / max(clocked(call)(), 1e-6)))
@@ -38,7 +38,7 @@ def many_calls(call: Callable[[], Any]) -> Action:
             call()
 
     def run() -> float:
-        call()  # the state in which other functions left memory and caches is not measured
+        call()  # memory and caches in the state left by other functions are not measured
         return clocked(several, time.process_time)() / calls
 
     return run
@@ -52,9 +52,9 @@ def least(actions: Mapping[Name, Action], *, turns: int = 1, seconds: float = 0.
     actions : mapping of hashable to callable
         Functions that return their own times.
     turns : int, optional
-        How many times each of them is called. All are called in turn, so that other load disturbs all alike.
+        Number of calls of each of them. All are called in turn, so that other load affects all equally.
     seconds : float, optional
-        If it is not 0: take turns until so many seconds have passed, at least 3 turns.
+        If it is not 0: take turns until this number of seconds has passed, at least 3 turns.
 
     Returns
     -------

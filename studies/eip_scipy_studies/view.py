@@ -24,7 +24,7 @@ class Movie(NamedTuple):
 
     @property
     def trusted(self) -> bool:
-        """Whether the run is; a result of `solve_ivp` does not say."""
+        """Return whether the run is reliable; a result of `solve_ivp` does not say."""
         return bool(self.run.get("trusted", True))
 
 

@@ -1,4 +1,4 @@
-"""Error against cost: methods at several steps, timed on one machine; and what an error costs."""
+"""Error against cost: methods at several steps, timed on one machine; and the cost of an error."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class WorkPrecision:
     Attributes
     ----------
     points : tuple of WorkPoint
-        In the order of the methods and of their steps.
+        Points in the order of the methods and of their steps.
     states : tuple of ndarray
         Their final states.
     machine : str
-        The machine that the times hold for.
+        Machine on which the times were measured.
     """
 
     points: tuple[WorkPoint, ...]
@@ -66,23 +66,23 @@ def work_precision(
     in_all: float = math.inf,
     callback: Callable[[], Any] | None = None,
 ) -> WorkPrecision:
-    """Run methods at several steps and take error and time.
+    """Run methods at several steps and measure error and time.
 
     Parameters
     ----------
     methods : mapping of str to (callable, sequence of float)
-        For each method ``run(step) -> (wall_time, y)``, the seconds it took, compilation left out, and its final
+        ``run(step) -> (wall_time, y)`` for each method, the seconds without compilation, and the final
         state; and the steps. The state of a run that failed is nan.
     error : callable
         ``error(y) -> float``, the error of a final state.
     repeats : int, optional
-        Runs of each point, the least time of which counts: what disturbs a timing makes it longer, never shorter.
+        Runs of each point, the least time of which counts: disturbances make a timing longer, never shorter.
     enough_seconds : float, optional
-        No further run of a point that took longer.
+        A point that took longer is not run again.
     in_all : float, optional
-        Nor of one whose runs took so many seconds together.
+        A point whose runs took this number of seconds together is not run again.
     callback : callable, optional
-        ``callback()`` after each of the ``repeats`` runs of each point, those left out included.
+        ``callback()`` after each of the ``repeats`` runs of each point, including those that are left out.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def work_precision(
     Raises
     ------
     ValueError
-        When `repeats` is not positive.
+        If `repeats` is not positive.
     """
     if repeats < 1:
         raise ValueError(f"repeats must be at least 1, got {repeats!r}.")
@@ -99,7 +99,7 @@ def work_precision(
     states = [np.empty(0)] * len(points)
     spent = [0.0] * len(points)
     for turn in range(repeats):
-        # All points in turn, not each at once: another process that disturbs for a while disturbs one run of a point.
+        # All points in turn, not each one repeatedly: another process then disturbs only one run of a point.
         for k, point in enumerate(points):
             if point.wall_time <= enough_seconds and spent[k] <= in_all:
                 seconds, states[k] = methods[point.method][0](point.step)
@@ -117,13 +117,13 @@ def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
     Parameters
     ----------
     costs, errors : array_like, shape (m,)
-        Of the method's runs, from the cheapest to the dearest.
+        Costs and errors of the method's runs, in ascending cost.
     level : float
 
     Returns
     -------
     float
-        That of the cheapest run, an upper bound, where its error is smaller; nan where no run's is.
+        The cost; that of the cheapest run, an upper bound, if its error is smaller; nan if no run's error is.
     """
     if errors[0] <= level:
         return float(costs[0])
@@ -140,7 +140,7 @@ def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -
     Parameters
     ----------
     runs : iterable
-        With ``method`` and the two attributes named, such as `WorkPoint`.
+        Runs with ``method`` and the two named attributes, such as `WorkPoint`.
     cost, error : str, optional
 
     Returns
@@ -156,7 +156,7 @@ def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -
 
 
 def costs_at(curve: Curve, levels: Iterable[float], factor: float = 1.0) -> list[str]:
-    """Cells of a table: what each level of error costs, "<" before a bound and "-" where no run is as accurate."""
+    """Return cells of a table: the cost of each level of error, "<" before a bound and "-" if no run is as accurate."""
     return [("<" if curve[1][0] <= level else "") + compact(factor * cost_to_reach(*curve, level)) for level in levels]
 
 

@@ -179,7 +179,7 @@ def test_the_field_keeps_its_invariants():
 def test_unknown_names_are_refused(capsys):
     assert main(["bench", "--suite", "sollar"]) == 2
     assert "unknown suite 'sollar', expected one of all, kepler, solar, " in capsys.readouterr().err
-    with pytest.raises(UsageError, match="no peer 'nobody'; expected some of CyRK"):
+    with pytest.raises(UsageError, match="package 'nobody' is not known; expected some of CyRK"):
         Bench(peers=["nobody"]).check_settings()
 
 

@@ -142,7 +142,7 @@ def test_the_command_at_another_epoch(kernel, tmp_path, capsys, nothing_to_time)
     assert main(["solar-system", *SPAN, *options]) == 0
     printed = capsys.readouterr().out
     assert "from 2023-02-25 00:00:00 TDB" in printed
-    assert "Reference: the tightest run at hand, EIPRKN12 (tight)" in printed
+    assert "Reference: the tightest available run, EIPRKN12 (tight)" in printed
     found = json.loads(file.read_text())
     assert found["arguments"]["epoch"] == [2460000.5, 0.0]
     assert found["arguments"]["kernel"] == str(kernel)

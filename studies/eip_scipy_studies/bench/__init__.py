@@ -1,5 +1,6 @@
-"""``eip-scipy bench``: this package beside the field, on one machine.
+"""``eip-scipy bench``: comparison of this package with other packages, on one machine.
 
-`suites` says what is run, `peers` how each package is called, `worker` is the process that runs one of them, `process`
-starts it and reads what it answers, `compare` finds the costs at equal error, `page` and `figures` make the report.
+`suites` defines the problems and settings, `peers` how each package is called. `worker` is the process that runs one of
+them, `process` starts it and reads its answers, `compare` finds the costs at equal error, and `page` and `figures` make
+the report.
 """

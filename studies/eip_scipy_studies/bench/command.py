@@ -1,4 +1,4 @@
-"""``eip-scipy bench``: this package beside the field, each peer in a process of its own."""
+"""``eip-scipy bench``: comparison of this package with other packages, each in its own process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["Bench", "Found"]
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Study[Found]):
-    """The command. A run counts by the least of `repeats`; a sweep ends after a run of more than `patience` seconds."""
+    """The command. The least time of `repeats` runs counts; a sweep ends after a run longer than `patience` seconds."""
 
     suite: Sequence[str] = option(
         ("all",),
@@ -35,7 +35,10 @@ class Bench(Study[Found]):
         type=one_of("suite", ("all", *SUITES)),
     )
     peers: Sequence[str] | None = option(
-        None, "packages to compare with, as pip calls them, or beginnings of peers' names", nargs="+", metavar="PEER"
+        None,
+        "packages to compare with, by their names with pip, or beginnings of the names of methods",
+        nargs="+",
+        metavar="PEER",
     )
     repeats: int = 4
     enough: float = 0.12
@@ -45,14 +48,14 @@ class Bench(Study[Found]):
     field_of_peers: Mapping[str, Peer] = field(default_factory=lambda: PEERS)
 
     def check_settings(self) -> None:
-        """Peers must be known."""
+        """Raise an error if a package is not known."""
         for name in self.peers or ():
             if not any(_is(peer, name) for peer in PEERS.values()):
                 known = sorted({peer.distribution for peer in PEERS.values() if not peer.ours})
-                raise UsageError(f"there is no peer {name!r}; expected some of {', '.join(known)}")
+                raise UsageError(f"the package {name!r} is not known; expected some of {', '.join(known)}")
 
     def measure(self, session: Session) -> Found:
-        """Ask one peer after the other."""
+        """Run one package after the other."""
         found = Found(describe_machine(), datetime.now(UTC).strftime("%Y-%m-%d"))
         found.versions["eip_scipy"] = __version__
         asked = [
@@ -100,11 +103,11 @@ class Bench(Study[Found]):
             found.rows.append(Row(suite, scenes[-1]["title"], peer.takes, peer.name, said=reply.failed))
 
     def text(self, found: Found) -> str:
-        """Tables at equal error, and what did not run."""
+        """Return tables at equal error, and the failures."""
         return text(found)
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """All points, and the comparison at equal error."""
+        """Return all points, and the comparison at equal error."""
         compared = [
             {**each._asdict(), "ratio": each.ratio if math.isfinite(each.ratio) else None}
             for each in standings(found.rows)
@@ -112,7 +115,7 @@ class Bench(Study[Found]):
         return {"bench.csv": [row._asdict() for row in found.rows], "bench-equal-error.csv": compared}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The same, with the versions."""
+        """Return all rows, with the versions."""
         return {
             "rows": [row._asdict() for row in found.rows],
             "versions_of_peers": found.versions,
@@ -120,7 +123,7 @@ class Bench(Study[Found]):
         }
 
     def figures(self, found: Found) -> Figures:
-        """A figure for each scene and kind of function, and the report with all of them inside."""
+        """Draw a figure for each problem and kind of function, and write the report that contains them."""
         pictures, names = {}, {}
         for where, name, figure in drawn(found.rows, found.machine):
             yield name, figure

@@ -1,4 +1,4 @@
-"""Costs at equal error: our best method beside each peer, and why a peer wins where it does."""
+"""Costs at equal error: our best method compared with each package, with the reason if a package is faster."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ LEVELS = (1e-6, 1e-9)
 
 
 class Row(NamedTuple):
-    """One run, or what came instead; a line of the CSV file.
+    """Result of one run, or its failure; a line of the CSV file.
 
     Attributes
     ----------
     suite, scene, takes, peer : str
-        `takes`: what kind of function.
+        `takes`: the kind of function.
     setting, seconds, error, drift : float or None
     said : str
-        An error's first line, or what else there is to say.
+        The first line of an error, or another remark.
     """
 
     suite: str
@@ -38,23 +38,23 @@ class Row(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """A peer beside our best method at one error.
+    """Comparison of a package with our best method at one error.
 
     Attributes
     ----------
     suite, scene, takes, peer : str
     level : float
-        The error of the trajectory.
+        Error of the trajectory.
     seconds : float
-        nan where it did not come so far.
+        nan if no run reached this error.
     best : str
-        Our method.
+        Name of our method.
     ours : float
-        Its seconds; inf where none of ours came so far.
+        Its seconds; inf if none of our runs reached this error.
     tried : float
-        Seconds of the peer's longest run.
+        Seconds of the package's longest run.
     bound : bool
-        Whether `seconds` is a bound: the peer's cheapest run is more accurate than that.
+        True if `seconds` is a bound: the package's cheapest run is more accurate than `level`.
     """
 
     suite: str
@@ -70,17 +70,17 @@ class Standing(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """The peer's time by ours: above 1 where we are ahead."""
+        """Return the package's time divided by ours: above 1 if ours is faster."""
         return self.seconds / self.ours
 
     @property
     def lost(self) -> bool:
-        """Whether the peer won."""
+        """Return True if the package is faster."""
         return self.ratio < 1
 
 
 def groups(rows: Iterable[Row]) -> dict[tuple[str, str, str], dict[str, list[Row]]]:
-    """By suite, scene and kind of function the runs of each peer that have a time and an error."""
+    """Group the runs that have a time and an error by suite, problem and kind of function, and by package."""
     found: dict[tuple[str, str, str], dict[str, list[Row]]] = {}
     for row in rows:
         if row.seconds is not None and row.error is not None and math.isfinite(row.error):
@@ -89,7 +89,7 @@ def groups(rows: Iterable[Row]) -> dict[tuple[str, str, str], dict[str, list[Row
 
 
 def standings(rows: Iterable[Row], levels: Sequence[float] = LEVELS) -> list[Standing]:
-    """Each peer of each group beside our best; where we have no method of the kind, beside our compiled ones."""
+    """Compare each package of each group with our best method, or our compiled ones if there is none of the kind."""
     known = groups(rows)
     found = []
     for (suite, scene, takes), peers in known.items():
@@ -115,8 +115,8 @@ def _cost(runs: Sequence[Row], level: float) -> float:
     return cost_to_reach([row.seconds for row in runs], [row.error for row in runs], level)
 
 
-# Why a peer wins where it does, by the beginnings of suite, scene and peer, and the kind of function; the first that
-# fits is printed, and only beside a measured loss.
+# Reasons why a package is faster, by the beginnings of suite, problem and package, and the kind of function. The first
+# that fits is printed, and only with a measured loss.
 CHECKS = "Each call of ours looks at invariants and gradients, some milliseconds: most of so short a run."
 CHEAP = (
     "Its loop is compiled and calls nothing but the function; ours calls the invariants and their gradients too, and "
@@ -146,7 +146,7 @@ REASONS: tuple[tuple[str, str, str, str, str], ...] = (
 
 
 def reason(standing: Standing) -> str:
-    """Why the peer won; empty where it did not, or where nothing is known."""
+    """Return why the package is faster; empty if it is not, or if no reason is known."""
     if not standing.lost:
         return ""
     for suite, scene, takes, peer, why in REASONS:

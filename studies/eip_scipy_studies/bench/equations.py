@@ -1,7 +1,7 @@
-"""The equations of the scenes, written once for all packages: plain Python, Numba, heyoka's expressions and JAX.
+"""The equations of the problems, written once for all packages: plain Python, Numba, heyoka's expressions and JAX.
 
-The small ones are functions of a square root that return tuples of what the components of the state are made of.
-Bodies have one form for each: sums over arrays, loops, and what a package has for them.
+The small ones are functions of a square root that return the components as tuples. Systems of bodies have one form for
+each kind of function: sums over arrays, loops, and the package's own.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["EQUATIONS", "Functions", "Scene", "scene_from"]
 
 
 class Functions(NamedTuple):
-    """What a user writes: ``fun(t, y)``, ``values(t, y)``, ``gradients(t, y)``; ``acc(t, q)`` where q'' = acc."""
+    """Functions of users: ``fun(t, y)``, ``values(t, y)``, ``gradients(t, y)``, and ``acc(t, q)`` if q'' = acc."""
 
     fun: Callable[..., Any]
     values: Callable[..., Any]
@@ -87,7 +87,7 @@ def rigid_body(sqrt: Any) -> Functions:
 
 
 def particle(sqrt: Any) -> Functions:
-    """A charge in B = r e_z and the potential .01 / r; energy, canonical angular momentum."""
+    """A charge in B = r e_z and the potential 0.01 / r; energy, canonical angular momentum."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         r2 = y[0] * y[0] + y[1] * y[1]
@@ -116,17 +116,17 @@ EQUATIONS: Mapping[str, Callable[[Any], Functions]] = {
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A problem as a worker knows it.
+    """A problem as a worker receives it.
 
     Attributes
     ----------
     title, equations : str
-        The latter a key of `EQUATIONS`, "members" (of Kepler's problem), "bodies", "nls" or "case" (a hard case).
+        `equations` is a key of `EQUATIONS`, "members" (of Kepler's problem), "bodies", "nls" or "case" (a hard case).
     y0, end : ndarray, shape (n,)
-        Start, and the exact state at the end; (members, n) of members.
+        Start, and the exact state at the end; (members, n) for "members".
     t_end : float
     params : dict
-        Of bodies "gm"; of a case its "name"; of the field its "length".
+        "gm" for bodies, "name" for a case, "length" for the field.
     """
 
     title: str
@@ -137,7 +137,7 @@ class Scene:
     params: dict[str, Any]
 
     def plain(self) -> Functions:
-        """Plain Python functions that return arrays."""
+        """Return plain Python functions that return arrays."""
         if self.equations == "bodies":
             return _bodies(self.params["gm"])
         if self.equations == "nls":
@@ -149,13 +149,13 @@ class Scene:
         return Functions(*(_returning_array(function) for function in EQUATIONS[self.equations](math.sqrt)))
 
     def compiled(self) -> Functions:
-        """Functions jitted by Numba: ``fun(t, y, out)`` and ``acc(t, q, out)`` in place, the others return arrays."""
+        """Return jitted functions: ``fun(t, y, out)`` and ``acc(t, q, out)`` in place, the others return arrays."""
         njit = import_module("numba").njit
         name = "kepler" if self.equations == "members" else self.equations
         if self.equations == "bodies":
             return _jitted_bodies(np.array(self.params["gm"]), njit)
         if name not in EQUATIONS:
-            raise NotImplementedError("the bench has this scene as a plain Python function only")
+            raise NotImplementedError("the bench has this problem as a plain Python function only")
         fun, values, gradients, acc = EQUATIONS[name](math.sqrt)
         return Functions(
             _filling(njit(fun), njit),
@@ -165,11 +165,11 @@ class Scene:
         )
 
     def error(self, y: np.ndarray) -> float:
-        """Largest component of the difference to the exact end, relative to the largest component."""
+        """Return the largest component of the difference from the exact end, relative to the largest component."""
         return float(np.max(np.abs(np.asarray(y) - self.end)) / np.max(np.abs(self.end)))
 
     def drift(self, y: np.ndarray) -> float | None:
-        """Largest relative change of an invariant; for small ones relative to a thousandth of the largest."""
+        """Return the largest relative change of an invariant; for small ones relative to 0.001 of the largest."""
         if self.equations == "members":
             return None
         values = self.plain().values
@@ -178,7 +178,7 @@ class Scene:
 
 
 def scene_from(record: Mapping[str, Any]) -> Scene:
-    """The scene that a request holds."""
+    """Return the problem that a request holds."""
     y0, end = (np.array(record[name]) for name in ("y0", "end"))
     if record["complex"]:
         y0, end = y0.view(complex), end.view(complex)
@@ -221,7 +221,7 @@ def _bodies(gm: list[float]) -> Functions:
 
 
 def _jitted_bodies(gm: np.ndarray, njit: Any) -> Functions:
-    """The same by loops over pairs; the invariants are those of `nbody`, which are compiled."""
+    """N bodies by loops over pairs; the invariants are those of `nbody`, which are compiled."""
 
     @njit
     def acc(t, q, out):  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""The figures of the report, one for each scene and kind of function."""
+"""The figures of the report, one for each problem and kind of function."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from .suites import SUITES
 __all__ = ["Where", "drawn"]
 
 Where = tuple[str, str, str]
-"""Suite, scene and kind of function."""
+"""Suite, problem and kind of function."""
 SHORT = {PYTHON: "python", COMPILED: "compiled", OWN: "own"}
 
 
 def drawn(rows: list[Row], machine: str) -> Iterator[tuple[Where, str, Any]]:
-    """Where each figure belongs, the name of its file, and the figure."""
+    """Yield the place of each figure, the name of its file, and the figure."""
     from ..plotting import side_by_side_figure
 
     known = groups(rows)
@@ -28,7 +28,7 @@ def drawn(rows: list[Row], machine: str) -> Iterator[tuple[Where, str, Any]]:
         if SUITES[suite].task != "precision":
             continue
         shown = dict(peers)
-        if not any(PEERS[name].ours for name in shown):  # beside the same of ours as in the tables
+        if not any(PEERS[name].ours for name in shown):  # compare with the same methods of ours as the tables do
             compiled = known.get((suite, scene, COMPILED), {})
             shown |= {name: runs for name, runs in compiled.items() if PEERS[name].ours}
         series = {name: _arrays(runs) for name, runs in shown.items()}

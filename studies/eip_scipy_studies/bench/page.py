@@ -21,18 +21,18 @@ __all__ = ["Found", "html", "markdown", "text"]
 
 @dataclass
 class Found:
-    """What was measured.
+    """Everything that was measured.
 
     Attributes
     ----------
     machine, date : str
     rows : list of Row
     versions : dict
-        Of the peers' packages, by their names with pip; ours among them.
+        Versions of the packages, including ours, by their names with pip.
     absent : dict
-        By the same names why a package did not run.
+        Reasons why packages did not run, by the same names.
     took : dict
-        By suite and peer the seconds that asking took.
+        Seconds that each package took, by suite and package.
     """
 
     machine: str
@@ -45,7 +45,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the report: a heading, its columns' heads, rows of cells, and lines below."""
+    """Table of the report: a heading, the heads of its columns, rows of cells, and lines below."""
 
     title: str
     head: list[str]
@@ -75,7 +75,7 @@ def _times(value: float) -> str:
 
 
 def _equal_error(found: Found, suite: str) -> list[Table]:
-    """One table for each scene and kind of function: seconds at each level, and the ratio to our best."""
+    """Make one table for each problem and kind of function: seconds at each level, and the ratio to our best."""
     known = [each for each in standings(found.rows) if each.suite == suite]
     tables = []
     for where in dict.fromkeys((each.suite, each.scene, each.takes) for each in known):
@@ -101,7 +101,7 @@ def _equal_error(found: Found, suite: str) -> list[Table]:
 
 
 def _losses(group: list[Standing]) -> list[str]:
-    """A line for each reason: which peers won for it, where and by how much."""
+    """Make a line for each reason: the packages that are faster for it, the place and the ratio."""
     by_reason: dict[str, list[str]] = {}
     for each in group:
         if each.lost:
@@ -143,7 +143,7 @@ def _tables(found: Found, suite: str) -> list[Table]:
 
 
 def _failures(found: Found, suite: str) -> list[str]:
-    """What peers said instead of a result, first, in each scene."""
+    """Return the first error or warning of each package in each problem."""
     if SUITES[suite].task == "asked":
         return []
     said: dict[str, str] = {}
@@ -154,7 +154,7 @@ def _failures(found: Found, suite: str) -> list[str]:
 
 
 def _field(found: Found) -> Table:
-    """The packages, what they take, and those that did not run."""
+    """List the packages, the functions they take, and those that did not run."""
     rows = []
     for name in dict.fromkeys(peer.distribution for peer in PEERS.values()):
         if name in found.versions or name in found.absent:
@@ -168,12 +168,12 @@ def _suites(found: Found) -> list[str]:
 
 
 HOW = (
-    "Each package runs in a process of its own, one after the other, one thread. The error of the trajectory is the "
+    "Each package runs in its own process, one after the other, with one thread. The error of the trajectory is the "
     "largest component of the difference to the exact final state, relative to its largest component; exact states are "
     "closed forms, or come from arithmetic of more digits. The time is that of a whole call, the least of several, "
-    'without imports and compilation, interpolated to the error; "by ours" is the peer\'s time by that of our cheapest '
-    'method. Absolute tolerances are a thousandth of the relative ones, for all. "<": the cheapest run is more '
-    'accurate than that. ">": no run was as accurate, the longest of which took so many times our time; longer ones '
+    'without imports and compilation, interpolated to the error; "by ours" is the time divided by that of our cheapest '
+    'method. Absolute tolerances are 0.001 of the relative ones, for all. "<": the cheapest run is more '
+    'accurate than that. ">": no run was as accurate, and the ratio is that of the longest run; longer ones '
     "were not tried."
 )
 
@@ -198,7 +198,7 @@ def text(found: Found) -> str:
 
 
 def markdown(found: Found, names: Mapping[Where, str]) -> str:
-    """The same for the documentation, with the figures by their names beside it."""
+    """Lay out all tables for the documentation, with the names of the figures next to them."""
 
     def cell(value: str) -> str:
         return value.replace("|", "\\|").replace("<", "&lt;")
@@ -228,25 +228,25 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff; m
 h1 { font-size: 1.7rem; margin: .5rem 0; } h2 { border-top: 2px solid #0072b2; padding-top: .6rem; margin-top: 2.5rem; }
 h3 { margin-bottom: .3rem; } .kind, .meta { color: #555; font-weight: normal; }
 nav a { margin-right: 1rem; white-space: nowrap; } a { color: #0060a0; }
-.scene { display: grid; grid-template-columns: minmax(0, 26rem) minmax(0, 1fr); gap: 0 1.5rem; align-items: start; }
-.scene.plain { grid-template-columns: minmax(0, 1fr); } .plain td, .plain th { text-align: left; }
+.problem { display: grid; grid-template-columns: minmax(0, 26rem) minmax(0, 1fr); gap: 0 1.5rem; align-items: start; }
+.problem.plain { grid-template-columns: minmax(0, 1fr); } .plain td, .plain th { text-align: left; }
 img { width: 100%; height: auto; } .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .86rem; } td, th { padding: .22rem .6rem; text-align: right;
   border-bottom: 1px solid #ddd; white-space: nowrap; } td:first-child, th:first-child { text-align: left; }
 td.words { text-align: left; white-space: normal; min-width: 14rem; }
 tr.ours td { background: #e8f2fa; font-weight: 600; }
 td.lost { background: #fbe6d9; } ul { padding-left: 1.2rem; } li { font-size: .9rem; }
-@media (max-width: 52rem) { .scene { grid-template-columns: minmax(0, 1fr); } body { padding: .6rem; } }
+@media (max-width: 52rem) { .problem { grid-template-columns: minmax(0, 1fr); } body { padding: .6rem; } }
 """
 
 
 def html(found: Found, figures: Mapping[Where, Any]) -> str:
-    """One page that needs nothing else: figures inside, no network."""
+    """Return one self-contained page: figures are inside, and no network is needed."""
     suites = _suites(found)
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8>",
         '<meta name=viewport content="width=device-width, initial-scale=1">',
-        f"<title>eip_scipy beside the field</title><style>{STYLE}</style>",
+        f"<title>eip_scipy compared with other packages</title><style>{STYLE}</style>",
         "<h1>Side by side with the field</h1>",
         f"<p class=meta>{escape(found.date)}, {escape(found.machine)}</p><p>{escape(HOW)}</p>",
         "<nav>" + " ".join(f'<a href="#{name}">{escape(SUITES[name].title)}</a>' for name in suites) + "</nav>",
@@ -277,7 +277,7 @@ def _scene(each: Table, figures: Mapping[Where, Any]) -> str:
     notes = "".join(f"<li>{escape(note)}" for note in each.notes)
     head = "".join(f"<th>{escape(name)}" for name in each.head)
     return (
-        f"{title}<div class='scene{'' if picture else ' plain'}'>{picture}<div><div class=wide><table><tr>{head}</tr>"
+        f"{title}<div class='problem{'' if picture else ' plain'}'>{picture}<div><div class=wide><table><tr>{head}</tr>"
         f"{rows}</table></div>{f'<ul>{notes}</ul>' if notes else ''}</div></div>"
     )
 

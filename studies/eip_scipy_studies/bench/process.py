@@ -1,4 +1,4 @@
-"""One peer in a process of its own: a request goes in as JSON, answers come out line by line as they are known."""
+"""One package in its own process: a request is sent as JSON, and answers are read line by line as they arrive."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ WORKER = "eip_scipy_studies.bench.worker"
 
 @dataclass(frozen=True)
 class Reply:
-    """What a worker answered.
+    """Answers of a worker.
 
     Attributes
     ----------
     answers : list of dict
-        Until its end, or until it was ended.
+        Answers until its end, or until it was stopped.
     version : str or None
-        That of the peer's package.
+        Version of the package.
     first : float or None
         Seconds from the start of the process to its first answer.
     failed : str
-        Why it did not come to its end; empty where it did.
+        Why it did not finish; empty if it did.
     """
 
     answers: list[dict[str, Any]]
@@ -57,7 +57,7 @@ def ask(request: Mapping[str, Any], limit: float, worker: str = WORKER) -> Reply
     Reply
     """
     begin = perf_counter()
-    # One thread for all; what hides a problem of threads is the same for all then.
+    # One thread for all: this is a fair comparison, and a problem with threads cannot distort it.
     quiet = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         process = subprocess.Popen(
@@ -73,7 +73,7 @@ def ask(request: Mapping[str, Any], limit: float, worker: str = WORKER) -> Reply
         try:
             answers, first = _read(process, request, begin)
             status = process.wait()
-        finally:  # Ctrl-C among other things
+        finally:  # after Ctrl-C too
             late.cancel()
             process.kill()
             process.wait()
@@ -96,13 +96,13 @@ def _read(
 ) -> tuple[list[dict[str, Any]], float | None]:
     assert process.stdin is not None
     assert process.stdout is not None
-    with contextlib.suppress(BrokenPipeError):  # it has died: its status tells
+    with contextlib.suppress(BrokenPipeError):  # the process has died: its status says so
         process.stdin.write(json.dumps(request))
         process.stdin.close()
     answers: list[dict[str, Any]] = []
     first = None
     for line in process.stdout:
-        if not line.endswith("\n"):  # ended within a line
+        if not line.endswith("\n"):  # stopped within a line
             break
         first = perf_counter() - begin if first is None else first
         answers.append(json.loads(line))

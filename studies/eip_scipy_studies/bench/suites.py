@@ -1,4 +1,4 @@
-"""What is run: scenes with their exact ends, and the settings at which each peer is asked."""
+"""The suites: problems with their exact ends, and the settings at which each package is run."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from .peers import COMPILED, OWN, PEERS, PYTHON, Peer
 __all__ = ["SUITES", "Suite"]
 
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-13)
-TIGHTEST = 1e-12  # of LSODA, which takes hundreds of times longer beyond it
+TIGHTEST = 1e-12  # for LSODA, which takes hundreds of times longer at smaller tolerances
 HARD = ("kepler_e09", "arenstorf", "schwarzschild", "spherical_pendulum", "heisenberg", "three_wave")
 MEMBERS, TURNS = 256, 10
 
 
 @dataclass(frozen=True)
 class Suite:
-    """A group of scenes.
+    """A group of problems.
 
     Attributes
     ----------
     name, title : str
     task : str
-        What the worker does: "precision", "first", "asked" or "overhead".
+        Task of the worker: "precision", "first", "asked" or "overhead".
     make : callable
-        ``make()(peer)``: records for a request, with settings; none where the peer is not asked.
+        ``make()(peer)``: records for a request, with settings; none if the method is not run.
     note : str
-        What a reader must know.
+        Explanation for the reader.
     """
 
     name: str
@@ -63,7 +63,7 @@ def _record(
 
 
 def _for(peer: Peer, records: list[dict[str, Any]], tolerances: tuple[float, ...] = TOLERANCES) -> list[dict[str, Any]]:
-    """Those that the peer is asked for, with its settings."""
+    """Return the records for this method, with its settings."""
     if " LSODA" in peer.name.upper():
         tolerances = tuple(max(tolerance, TIGHTEST) for tolerance in tolerances)
     found = []
@@ -87,7 +87,8 @@ def _geometric(first: int, last: int, count: int) -> list[int]:
     return [round(n) for n in np.geomspace(first, last, count)]
 
 
-# Ends of the longer runs: heyoka's Taylor series in 80-bit arithmetic at a tolerance of 1e-20; Kepler's is the start.
+# Ends of the longer runs come from heyoka's Taylor series in 80-bit arithmetic at a tolerance of 1e-20; Kepler's is the
+# start.
 HENON_HEILES = {20_000: (0.2181875948347214, -0.17465537956592206, -0.33518077097563637, -0.2694826521686965)}
 RIGID_BODY = {
     1_000: (0.17156870152565235, -0.593824253511304, 0.7860896492121903),
@@ -96,7 +97,7 @@ RIGID_BODY = {
 
 
 def kepler() -> list[dict[str, Any]]:
-    """Three small systems; compiled code goes on for longer: a call begins with checks that take milliseconds."""
+    """Three small systems; runs of compiled code are longer, because the checks of a call take milliseconds."""
     orbit, regular, top = (case.problem for case in hard_cases(["kepler_e06", "henon_heiles_regular", "euler_top"]))
     compiled = COMPILED, OWN
 
@@ -128,7 +129,7 @@ def solar() -> list[dict[str, Any]]:
     stored = stored_cases()[outer.name]["params"]
     gm = [stored["G"] * m for m in stored["masses"]]
     both = (PYTHON, COMPILED, OWN)
-    few = (1e-9, 1e-13)  # heyoka compiles for ten seconds at each
+    few = (1e-9, 1e-13)  # heyoka compiles for ten seconds at each tolerance
     outer_steps = {
         "EIPRKN12": _geometric(200, 900, 5), "EIPGJ12": _geometric(4700, 12000, 4),
         "WHFast": _geometric(250, 16000, 6), "heyoka": few,
@@ -158,19 +159,19 @@ def particle() -> list[dict[str, Any]]:
 
 
 def field() -> list[dict[str, Any]]:
-    """A soliton on a ring, so wide and so finely resolved that the closed form is that of the grid to 1e-10."""
+    """A soliton on a ring, so wide and finely resolved that the closed form is that of the grid to 1e-10."""
     problem = soliton(points=256, length=50.0, t_end=2.0)
     assert problem.reference is not None
     return [_record("NLS soliton", "nls", problem.y0, problem.reference(2.0), 2.0, length=50.0)]
 
 
 def hard() -> list[dict[str, Any]]:
-    """A handful of the hard cases, plain functions."""
+    """Some of the hard cases, as plain functions."""
     return [_case(name, name.replace("_", " "), "case", takes=(PYTHON,)) for name in HARD]
 
 
 def members() -> list[dict[str, Any]]:
-    """Kepler orbits of e = 0 ... .6, whole revolutions: the end is the start."""
+    """Kepler orbits of e = 0 ... 0.6, whole revolutions: the end is the start."""
     e = np.linspace(0.0, 0.6, MEMBERS)
     starts = np.array([1 - e, 0 * e, 0 * e, np.sqrt((1 + e) / (1 - e))]).T
     steps = {"EIPRKN12": _geometric(200, 1000, 5)}
@@ -179,16 +180,16 @@ def members() -> list[dict[str, Any]]:
 
 
 def first_use() -> list[dict[str, Any]]:
-    """One short solution, each in a process of its own."""
+    """One short solution, each in its own process."""
     (orbit,) = hard_cases(["kepler_e03"])
     steps = {"EIPRKN12": [250], "EIPGJ12": [4000], "heyoka": [1e-9]}
     t_end = orbit.problem.t_span[1]
     takes = (PYTHON, COMPILED, OWN)
-    return [_record("Kepler, e = .3, 10 turns", "kepler", orbit.problem.y0, orbit.end, t_end, steps, takes)]
+    return [_record("Kepler, e = 0.3, 10 turns", "kepler", orbit.problem.y0, orbit.end, t_end, steps, takes)]
 
 
 def asking() -> list[dict[str, Any]]:
-    """What peers are asked for besides a real system's solution, with the option that asks for it."""
+    """Requests other than the solution of a real system, with the option for each."""
     (orbit,), (wave,) = hard_cases(["kepler_e03"]), hard_cases(["three_wave"])
     steps = {"EIPRKN12": [250], "EIPGJ12": [4000]}
     real = ("kepler", orbit.problem.y0, orbit.end, orbit.problem.t_span[1], steps, (PYTHON, COMPILED, OWN))
@@ -201,7 +202,7 @@ def asking() -> list[dict[str, Any]]:
 
 
 def _one_setting(records: list[dict[str, Any]]) -> Callable[[Peer], list[dict[str, Any]]]:
-    """At one tolerance, and for the first method of each package only, with each kind of function."""
+    """One tolerance, only the first method of each package, with each kind of function."""
     able = [peer for peer in PEERS.values() if _for(peer, records)]
     first = {(peer.distribution, peer.takes): peer.name for peer in reversed(able)}.values()
     return lambda peer: _for(peer, records, (1e-9,)) if peer.name in first else []
@@ -236,11 +237,11 @@ KEPLER = "The same function for all; compiled runs go on for twenty times as lon
 SOLAR = "Six bodies over 200 000 days, ten bodies (DE440) over a year, and over a century in compiled code."
 PARTICLE = "A charge in a field that grows with the radius (Qin et al. 2013), t = 500."
 FIELD = "A soliton of the nonlinear Schroedinger equation, 256 complex components by FFT, t = 2."
-HARD_CASES = "Kepler of e = .9, Arenstorf, a zoom-whirl orbit, constraints, spins, and a complex system."
+HARD_CASES = "Kepler of e = 0.9, Arenstorf, a zoom-whirl orbit, constraints, spins, and a complex system."
 OVERHEAD = (
     "A rigid body to t = 1000 at a tolerance of 1e-9: time of a run by its evaluations, less the function itself."
 )
 FIRST_USE = "From the start of a process to its first solution: imports, compilation, a short orbit."
-ENSEMBLE = "Orbits of e = 0 ... .6 over ten turns, one core; the error is that of the worst member."
+ENSEMBLE = "Orbits of e = 0 ... 0.6 over ten turns, one core; the error is that of the worst member."
 ASKED = "What the packages say to options of ours, and to a complex state."
 SUITES: dict[str, Suite] = {suite.name: suite for suite in _described()}

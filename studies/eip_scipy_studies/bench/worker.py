@@ -1,9 +1,9 @@
-"""The process that runs one peer: reads a request in JSON on stdin, answers in lines of JSON on stdout.
+"""Process that runs one package: it reads a request in JSON on stdin and answers in lines of JSON on stdout.
 
     python -m eip_scipy_studies.bench.worker < request.json
 
-A request names the peer, a task and scenes; each answer is written as soon as it is known, so that a worker that is
-ended keeps what it had. What a peer prints goes to stderr.
+A request names the method, a task and problems. Each answer is written as soon as it is known, so that a stopped worker
+keeps its results. Output of the package goes to stderr.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Answers = Iterator[dict[str, Any]]
 
 
 def precision(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Time and errors of each scene at its settings, from the loosest on."""
+    """Write time and errors of each problem at its settings, from the loosest on."""
     for record in request["scenes"]:
         try:
             scene = scene_from(record)
@@ -38,7 +38,7 @@ def precision(peer: Peer, request: Mapping[str, Any]) -> Answers:
             yield from _points(solve, scene, record, request, peer.warm)
         except ImportError:
             raise
-        except Exception as error:  # whatever a package raises is the answer, and the next scene goes on
+        except Exception as error:  # any error of a package is its answer, and the next problem follows
             yield {"scene": record["title"], "said": first_line(error)}
 
 
@@ -51,7 +51,7 @@ def _points(
 ) -> Answers:
     for k, setting in enumerate(record["settings"]):
         try:
-            if warm or k == 0:  # what is compiled and looked up on the way
+            if warm or k == 0:  # compilation and caches are not timed
                 solve(setting)
             seconds, y = _least(partial(solve, setting), request["enough"], request["repeats"])
         except ImportError:
@@ -72,7 +72,7 @@ def _points(
 
 
 def _least(action: Callable[[], np.ndarray], enough: float, repeats: int) -> tuple[float, np.ndarray]:
-    """Least time of at most so many calls, of at least one; no further one after `enough` seconds in all."""
+    """Return the least time of at most `repeats` calls and at least one; stop after `enough` seconds in all."""
     least, spent, y = np.inf, 0.0, np.empty(0)
     for _ in range(repeats):
         begin = perf_counter()
@@ -85,14 +85,14 @@ def _least(action: Callable[[], np.ndarray], enough: float, repeats: int) -> tup
 
 
 def first(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """One solution, which the other side times together with the start of this process."""
+    """Compute one solution, which the other side times together with the start of this process."""
     (record,) = request["scenes"]
     scene = scene_from(record)
     yield {"scene": record["title"], "error": scene.error(peer.prepare(scene)(record["settings"][0]))}
 
 
 def asked(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """What happens when a peer is asked for something: the first line of its error or warning, or how well it did."""
+    """Record the response to a request: the first line of the error or warning, or the accuracy."""
     for record in request["scenes"]:
         scene, extra = scene_from(record), dict(record["extra"])
         functions = scene.plain()
@@ -118,7 +118,7 @@ def _crossing(t: float, y: np.ndarray) -> float:
 
 
 def overhead(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Time of one evaluation of the user's function in a run, and of the function alone."""
+    """Measure the time of one evaluation of the user's function in a run, and of the function alone."""
     (record,) = request["scenes"]
     scene = scene_from(record)
     setting = record["settings"][0]
@@ -143,12 +143,12 @@ def _call(fun: Callable[..., Any], y: np.ndarray) -> Any:
 
 
 class _Counting(Scene):
-    """A scene whose function counts its calls."""
+    """A problem whose function counts its calls."""
 
     calls = 0
 
     def plain(self) -> Functions:
-        """The functions of the scene, counted."""
+        """Return the functions of the problem, counted."""
         functions = super().plain()
 
         def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
@@ -168,7 +168,7 @@ TASKS: dict[str, Callable[[Peer, Mapping[str, Any]], Answers]] = {
 
 
 def first_line(error: BaseException) -> str:
-    """The kind of an error and the first line of what it says."""
+    """Return the kind of an error and the first line of its message."""
     said = str(error).strip().split("\n")[0]
     return f"{type(error).__name__}: {said}" if said else type(error).__name__
 
@@ -176,7 +176,7 @@ def first_line(error: BaseException) -> str:
 def main() -> None:
     """Answer one request."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a package prints is no answer
+    os.dup2(2, 1)  # output of a package is not an answer
 
     def say(answer: Mapping[str, Any]) -> None:
         answers.write(json.dumps(answer) + "\n")

@@ -1,4 +1,4 @@
-"""Methods that the projection is measured against; each stands alone and knows no solver of this package.
+"""Methods that the projection is compared with; each is independent and uses no solver of this package.
 
 `stormer_verlet` is the symplectic leapfrog of order 2 for q'' = a(t, q), in both of its forms; `boris` the pusher for
 charged particles; `implicit_midpoint` the symplectic method of order 2 for any Hamiltonian. `crank_nicolson`,

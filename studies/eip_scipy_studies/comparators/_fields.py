@@ -29,13 +29,13 @@ class FieldResult:
     Attributes
     ----------
     t : ndarray, shape (m,)
-        Saved times, the first and the last of the interval among them.
+        Saved times, including the first and the last of the interval.
     y : ndarray, shape (n, m)
         States at `t`, flat and complex; ``gpe.grid.field(y)`` for fields. nan from where a scheme failed.
     nfev : int
-        Evaluations of the nonlinear term, each with a pair of transforms: linear solves, in other words.
+        Number of evaluations of the nonlinear term, each with a pair of transforms: linear solves, in other words.
     wall_time : float
-        Seconds spent in the integration, plans of transforms excluded.
+        Seconds spent in the integration, without plans of transforms.
     message : str
         "completed", or why and where the scheme failed.
     """
@@ -48,7 +48,7 @@ class FieldResult:
 
 
 class FieldScheme:
-    """A scheme on its way; its subclasses implement `restart` and `step`.
+    """A scheme during a run; its subclasses implement `restart` and `step`.
 
     Parameters
     ----------
@@ -72,21 +72,21 @@ class FieldScheme:
         self._rotation = np.empty(gpe.grid.size if gpe.Omega else 0, complex)
 
     def start(self, psi: np.ndarray) -> None:
-        """Go back to t0, with a copy of `psi`."""
+        """Return to t0, with a copy of `psi`."""
         self.psi = psi.copy()
         self.nfev = 0
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was computed from former states."""
+        """Discard everything that was computed from former states."""
         raise NotImplementedError
 
     def step(self, h: float) -> str:
-        """Advance `psi` by h, signed; returns why that failed, or nothing."""
+        """Advance `psi` by h, signed; return the reason for a failure, or nothing."""
         raise NotImplementedError
 
     def rotation(self, field: np.ndarray) -> np.ndarray:
-        """-Omega Lz field, flat and in a buffer; (0,) without rotation."""
+        """Return -Omega Lz field, flat and in a buffer; (0,) without rotation."""
         if self.gpe.Omega:
             shape = self.gpe.grid.shape
             self.gpe.angular(field.reshape(shape), self._rotation.reshape(shape))
@@ -104,10 +104,10 @@ class FieldScheme:
 
 
 class FixedPoint:
-    """Solves ``m = psi - i c (K + W(m)) m``: K and a constant w implicit, W - w from the iterate before.
+    """Solver of ``m = psi - i c (K + W(m)) m``: K and a constant w are implicit, W - w comes from the previous iterate.
 
     The iteration ``m <- (1 + i c (K + w))^-1 rhs(m)``, ``rhs(m) = psi - i c (W(m) - w) m``, contracts by about
-    c max|W - w| where W is pointwise. The change of `rhs` from one iterate to the next is the residual of the equation
+    c max|W - w| if W is pointwise. The change of `rhs` from one iterate to the next is the residual of the equation
     itself, not of the preconditioned one, and costs no transform.
 
     Parameters
@@ -116,7 +116,7 @@ class FixedPoint:
     tol : float
         Bound of the residual's norm relative to that of the state.
     c, w : float
-        w is best the middle of the range of W.
+        The best w is the middle of the range of W.
     """
 
     def __init__(self, scheme: FieldScheme, tol: float, c: float, w: float) -> None:
@@ -126,14 +126,14 @@ class FixedPoint:
         self._means: list[np.ndarray] = []
 
     def solve(self, rhs: Callable[[np.ndarray, np.ndarray], float], guess: np.ndarray) -> tuple[np.ndarray, str]:
-        """Find m, in an array that stays as it is for the next three solutions only.
+        """Find m, in an array that remains unchanged for the next three solutions only.
 
         Parameters
         ----------
         rhs : callable
             ``rhs(m, values)`` replaces `values` and returns the norm of their change.
         guess : ndarray, shape (n,)
-            Used until three solutions are known, from which then a parabola is extrapolated.
+            Used until three solutions are known, from which a parabola is then extrapolated.
 
         Returns
         -------
@@ -189,7 +189,7 @@ class Implicit(FieldScheme):
         self._solver = None
 
     def solver(self, c: float) -> tuple[FixedPoint, bool]:
-        """The solver for c, and whether it is a new one, without solutions before."""
+        """Return the solver for c, and whether it is a new one, without solutions before."""
         new = self._solver is None or self._solver.c != c
         if self._solver is None or new:
             self._solver = FixedPoint(self, self._tol, c, self._w)
@@ -200,7 +200,7 @@ class Implicit(FieldScheme):
         raise NotImplementedError
 
     def cross(self, solver: FixedPoint, start: np.ndarray) -> str:
-        """Replace `start` by the state at the other end; returns why that failed, or nothing."""
+        """Replace `start` by the state at the other end; return the reason for a failure, or nothing."""
 
         def rhs(mean: np.ndarray, values: np.ndarray) -> float:
             self.potential(start, mean, self._W)
@@ -212,12 +212,12 @@ class Implicit(FieldScheme):
 
 
 def check_tol(tol: Any) -> float:
-    """`tol` as a float.
+    """Return `tol` as a float.
 
     Raises
     ------
     ValueError
-        When it does not lie between round-off and 1.
+        If it does not lie between round-off and 1.
     """
     if isinstance(tol, bool) or not isinstance(tol, (int, float, np.integer, np.floating)) or not 1e-15 <= tol < 1:
         raise ValueError(f"tol must be a number from 1e-15 to 1, got {tol!r}")
@@ -225,12 +225,12 @@ def check_tol(tol: Any) -> float:
 
 
 def check_equation(gpe: Any) -> GrossPitaevskii:
-    """`gpe`, when it is an equation.
+    """Return `gpe` if it is an equation.
 
     Raises
     ------
     TypeError
-        When it is no `GrossPitaevskii`.
+        If it is not a `GrossPitaevskii`.
     """
     if not isinstance(gpe, GrossPitaevskii):
         raise TypeError(f"gpe must be a GrossPitaevskii, got {type(gpe).__name__}; of a problem pass problem.equation")
@@ -246,13 +246,13 @@ def march(
     save_every: int | None,
     observe: Callable[[Any], float] = lambda scheme: math.nan,
 ) -> tuple[FieldResult, np.ndarray]:
-    """Take all steps; also returns what `observe` says of the scheme at each saved state."""
+    """Take all steps; also return the values of `observe(scheme)` at the saved states."""
     steps = FixedSteps.of(t_span, h, save_every)
     psi = check_equation(gpe).as_field(y0).reshape(-1)
     if not np.isfinite(psi).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
     if math.isclose(steps.h, steps.last, rel_tol=1e-9):
-        steps = steps._replace(last=steps.h)  # what differs by round-off only is no step of another length
+        steps = steps._replace(last=steps.h)  # a difference in round-off only does not make a step of another length
     ys = np.full((steps.saved.size, psi.size), np.nan, complex)
     observed = np.full(steps.saved.size, np.nan)
 

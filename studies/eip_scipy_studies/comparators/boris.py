@@ -26,8 +26,8 @@ def boris(
     """Integrate m x'' = q (E + x' x B) by the Boris pusher with a fixed step.
 
     Half a step along the velocity, half of the electric kick, a rotation around B, the other half of the kick, half a
-    step along the velocity: one evaluation of the fields in a step. The method is reversible, of order 2 and keeps
-    phase-space volume, but is not symplectic; the rotation alone keeps the kinetic energy exactly where E is 0.
+    step along the velocity: one evaluation of the fields per step. The method is reversible, of order 2 and keeps
+    phase-space volume, but is not symplectic; the rotation alone keeps the kinetic energy exactly if E is 0.
 
     Parameters
     ----------
@@ -44,19 +44,20 @@ def boris(
     params : array_like, shape (p,), optional
         Passed to `fields` as a float64 array when given.
     save_every : int, optional
-        Save each `save_every`-th state besides the first and the last; default: these two only.
+        Save every `save_every`-th state in addition to the first and the last; default: only these two.
 
     Returns
     -------
     FixedStepResult
-        A record with t (m,), y (6, m), nfev, wall_time [s] and message. Positions and velocities are of the same time.
+        A record with t (m,), y (6, m), nfev, wall_time [s] and message. Positions and velocities belong to the same
+        time.
 
     Raises
     ------
     TypeError
-        The state or `params` are not made of real numbers, or `fields` is not callable.
+        If the state or `params` are not made of real numbers, or `fields` is not callable.
     ValueError
-        An argument has a wrong value. The message says what came and what was expected.
+        If an argument has a wrong value. The message gives the value and what was expected.
 
     References
     ----------

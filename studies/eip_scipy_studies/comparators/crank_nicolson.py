@@ -26,7 +26,7 @@ def crank_nicolson(
     """Integrate the Gross-Pitaevskii equation by the energy-preserving Crank-Nicolson scheme.
 
     ``i (psi' - psi) / h = (K + V - Omega Lz + beta / 2 (|psi'|^2 + |psi|^2)) (psi' + psi) / 2``, K = -Laplace / 2.
-    Order 2; keeps mass and energy to the residual that the solver leaves.
+    Order 2; keeps mass and energy up to the residual of the solver.
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ def crank_nicolson(
     y0 : array_like
         Initial field, of the grid's shape or flat.
     h : float
-        Length of a step, positive in both directions; the last one is shortened where `h` does not divide the interval.
+        Length of a step, positive in both directions; the last one is shortened if `h` does not divide the interval.
     tol : float, optional
         Bound of the norm of each step's residual, relative to that of the state.
     save_every : int, optional
-        Save each `save_every`-th state besides the first and the last; default: these two only.
+        Save every `save_every`-th state in addition to the first and the last; default: only these two.
 
     Returns
     -------
@@ -50,16 +50,16 @@ def crank_nicolson(
     Raises
     ------
     TypeError
-        `gpe` is no `GrossPitaevskii`.
+        If `gpe` is not a `GrossPitaevskii`.
     ValueError
-        An argument has a wrong value. The message says what came and what was expected.
+        If an argument has a wrong value. The message gives the value and what was expected.
 
     Notes
     -----
     Each step is solved for the mean of its two states by a fixed point that is preconditioned in the modes and starts
-    from a parabola through the three means before; an iteration takes a pair of transforms. It contracts where
+    from a parabola through the three means before; an iteration takes a pair of transforms. It contracts if
     h / 2 times half the range of ``V + beta |psi|^2`` is well below 1. A rotation, which is not diagonal in the modes,
-    takes two more pairs along one axis and asks for h below about 2 / (Omega r)^2, r the largest distance from the
+    takes two more pairs along one axis and needs h below about 2 / (Omega r)^2, with r the largest distance from the
     axis.
 
     References

@@ -39,25 +39,25 @@ def implicit_midpoint(
     params : array_like, shape (p,), optional
         Passed to `rhs` as a float64 array when given.
     save_every : int, optional
-        Save each `save_every`-th state besides the first and the last; default: these two only.
+        Save every `save_every`-th state in addition to the first and the last; default: only these two.
 
     Returns
     -------
     FixedStepResult
-        A record with t (m,), y (n, m), nfev, wall_time [s] and message. Where the iteration does not converge, with h
+        A record with t (m,), y (n, m), nfev, wall_time [s] and message. If the iteration does not converge, with h
         times the largest derivative of f above about 2, the run ends, and the states from there on are nan.
 
     Raises
     ------
     TypeError
-        The state or `params` are not made of real numbers, or `rhs` is not callable.
+        If the state or `params` are not made of real numbers, or `rhs` is not callable.
     ValueError
-        An argument has a wrong value. The message says what came and what was expected.
+        If an argument has a wrong value. The message gives the value and what was expected.
 
     References
     ----------
-    E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), theorems IV.2.1 and VI.4.2; the end of the
-    iteration as in section VIII.6.
+    E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), theorems IV.2.1 and VI.4.2; the stopping
+    criterion of the iteration as in section VIII.6.
 
     Examples
     --------

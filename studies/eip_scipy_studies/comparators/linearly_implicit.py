@@ -27,7 +27,7 @@ def linearly_implicit(
     """Integrate the Gross-Pitaevskii equation by the linearly implicit central difference scheme.
 
     ``i (psi'' - psi) / (2 h) = (K + V - Omega Lz + beta |psi'|^2) (psi'' + psi) / 2`` with K = -Laplace / 2: one linear
-    system a step, with coefficients that vary in space. Order 2; keeps the mass, and a form of two neighbours
+    system per step, with coefficients that vary in space. Order 2; keeps the mass, and a form of two neighbours
     in place of the energy.
 
     Parameters
@@ -47,11 +47,11 @@ def linearly_implicit(
 
     Notes
     -----
-    The first step, and a last one that is shorter, are steps of `crank_nicolson`, which has the same order and keeps
+    The first step, and a shorter last one, are steps of `crank_nicolson`, which has the same order and keeps
     the mass. The linear systems are solved as there, by a fixed point preconditioned in the modes; the bounds of h for
     its convergence are half of those there.
 
-    What is kept is ``(<psi'', L psi''> + <psi', L psi'>) / 2 + beta / 2 <|psi'|^2, |psi''|^2>``, L = K + V - Omega Lz.
+    The scheme keeps ``(<psi'', L psi''> + <psi', L psi'>) / 2 + beta / 2 <|psi'|^2, |psi''|^2>``, L = K + V - Omega Lz.
 
     References
     ----------

@@ -46,17 +46,18 @@ def sav_crank_nicolson(
     - ``i (psi' - psi) / h = K (psi' + psi) / 2 + (r' + r) / 2 b*``,
     - ``r' - r = Re <b*, psi' - psi>``,
 
-    where b* belongs to the state half a step ahead as extrapolated from the last two. Linear with constant
-    coefficients: one pair of transforms a step. Order 2; keeps a modified energy, but mass and energy to order 2 only.
+    where b* belongs to the state half a step ahead as extrapolated from the last two. The scheme is linear with
+    constant coefficients: one pair of transforms per step. Order 2; keeps a modified energy, but mass and energy to
+    order 2 only.
 
     Parameters
     ----------
     gpe : GrossPitaevskii
-        With Omega = 0.
+        An equation with Omega = 0.
     t_span, y0, h, save_every
         As for `crank_nicolson`.
     shift : float, optional
-        C, such that E1 + C stays positive. Default: 1, and ten times what a negative E1 takes away at the start.
+        C, such that E1 + C remains positive. Default: 1, plus ten times the magnitude of a negative E1 at the start.
 
     Returns
     -------
@@ -66,11 +67,11 @@ def sav_crank_nicolson(
     Raises
     ------
     TypeError, ValueError
-        As `crank_nicolson`; when `gpe` rotates; and when `shift` is no finite number or leaves E1 + C not positive.
+        As `crank_nicolson`; if `gpe` rotates; and if `shift` is not a finite number or does not make E1 + C positive.
 
     Notes
     -----
-    The first step is taken twice: with b* of the start, then with that of the mean of its ends.
+    The first step is taken twice: with b* of the start, then with b* of the mean of its ends.
 
     References
     ----------
@@ -101,7 +102,7 @@ def sav_crank_nicolson(
 
 
 def interaction(gpe: GrossPitaevskii, psi: np.ndarray) -> float:
-    """E1, the potential and the interaction energy."""
+    """Return E1, the potential and the interaction energy."""
     return gpe.grid.cell * float(interaction_energy(gpe.as_field(psi), gpe.V, gpe.beta))
 
 
@@ -123,7 +124,7 @@ class _SAV(FieldScheme):
         super().__init__(gpe)
         self.shift, self.r = shift, math.nan
         self._modes, self._new_modes, self._force, self._new, self._before = (np.empty_like(self.psi) for _ in range(5))
-        self._h: float | None = None  # of the step before
+        self._h: float | None = None  # that of the previous step
         self._c = math.nan
         self._inverse = self._modes
 
@@ -147,7 +148,7 @@ class _SAV(FieldScheme):
         return failure
 
     def _new_state(self, other: np.ndarray, a: float) -> tuple[float, str]:
-        """The step with b* of psi + a (psi - other), into `_new` and `_new_modes`; returns r' and a failure."""
+        """Take the step with b* of psi + a (psi - other), into `_new` and `_new_modes`; return r' and a failure."""
         gpe, force = self.gpe, self._force
         square = gpe.grid.cell * fields.nonlinear_force(self.psi, other, a, self.V, gpe.beta, force) + self.shift
         if not square > 0:

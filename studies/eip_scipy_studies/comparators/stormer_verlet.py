@@ -44,13 +44,13 @@ def stormer_verlet(
         Initial state (q, v), real.
     h : float
         Length of a step, positive in both directions. Step k starts at t0 + k h; the last one ends on the end of the
-        interval exactly, shortened where `h` does not divide the interval.
+        interval exactly, shortened if `h` does not divide the interval.
     form : {"kick-drift-kick", "drift-kick-drift"}
         Order of the updates within a step: v first and last (velocity Verlet), or q first and last.
     params : array_like, shape (p,), optional
         Passed to `acc` as a float64 array when given.
     save_every : int, optional
-        Save each `save_every`-th state besides the first and the last; default: these two only.
+        Save every `save_every`-th state in addition to the first and the last; default: only these two.
 
     Returns
     -------
@@ -60,14 +60,15 @@ def stormer_verlet(
     Raises
     ------
     TypeError
-        The state, `params` or what `acc` returns is not made of real numbers.
+        If the state, `params` or the value of `acc` is not made of real numbers.
     ValueError
-        An argument has a wrong value, or `acc` returns a wrong shape. The message says what came and what was expected.
+        If an argument has a wrong value, or `acc` returns a wrong shape. The message gives the value and what was
+        expected.
 
     Notes
     -----
-    nfev is the number of steps plus one: the first evaluation, which also checks the shape, opens the
-    kick-drift-kick form, and the drift-kick-drift form has no further use for it.
+    nfev is the number of steps plus one: the first evaluation, which also checks the shape, starts the
+    kick-drift-kick form, while the drift-kick-drift form does not use it further.
 
     References
     ----------

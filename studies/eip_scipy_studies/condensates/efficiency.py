@@ -1,11 +1,11 @@
-"""The paper's test of efficiency: error against processor time for the NLS equation, EIP beside schemes that rival it.
+"""The paper's test of efficiency: error against processor time for the NLS equation, EIP compared with other schemes.
 
 Two problems on 64 x 64 points of [0, 2 pi)^2, beta = 1, to t = 1. The paper's plane wave is a stationary state: the
 gradients of mass and energy are parallel, so that a projection onto both has rank 1 (counted in the table), |psi|^2 is
 constant, so that the linear systems of LIC need no iteration, and splittings are exact. The modulated wave has none of
-that. Explicit steps are limited by the grid, those of the others are not. Times are processor seconds, the least of
-several runs taken in turn, less the least of a run of a single step: what the set-up takes, up to 20 ms, is left out.
-All methods have the same library of transforms.
+that. Explicit steps are limited by the grid, the others are not. Times are processor seconds, the least of
+several runs taken in turn, minus the least of a run of a single step, which removes the set-up of up to 20 ms.
+All methods use the same library of transforms.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ T_END = 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
 LONG = tuple(T_END / n for n in (25, 50, 100, 200, 400, 800, 1600, 3200, 6400))
 FOURTH = tuple(T_END / n for n in (10, 20, 40, 80, 160, 320))
-FIT_BETWEEN = 1e-11, 1e-2  # smaller errors are round-off, larger ones not yet of any order
-FITTED = 3  # of those the finest: longer steps of splittings are not of their order yet
+FIT_BETWEEN = 1e-11, 1e-2  # smaller errors are round-off, larger ones are not in the asymptotic range yet
+FITTED = 3  # number of the finest steps used: longer steps of splittings are not in the asymptotic range
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 WAVES = ("plane wave", "modulated wave")
 KEPT = ("mass", "energy")
-# Slopes in h that are known, to a tenth, those of CN and EIP-ME also drawn; and what EIP-ME may leave of both errors.
+# Known slopes in h, to 0.1 (those of CN and EIP-ME are also drawn), and the bounds of both invariant errors of EIP-ME.
 ORDERS = {
     "RK4": 4, "EIP-M": 4, "EIP-E": 4, "EIP-ME": 4, "CN": 2, "LIC": 2, "SAV/CN": 2, "Strang": 2,
     "splitting4-EIP": 4,
@@ -58,7 +58,7 @@ class Contender(NamedTuple):
 
 
 def stable_steps(problem: FieldProblem) -> list[float]:
-    """Steps below RK4's limit that divide the interval."""
+    """Return steps below RK4's limit that divide the interval."""
     assert problem.equation is not None
     limit = problem.equation.largest_step(problem.y0)
     return [T_END / ceil(T_END / (share * limit)) for share in SHARES]
@@ -74,12 +74,12 @@ def _own(problem: FieldProblem, h: float, t_end: float, base: Any, names: Sequen
 
 
 def runge_kutta(*names: str) -> Contender:
-    """EIP on RK4."""
+    """Return EIP on RK4."""
     return Contender(lambda problem, h, t_end: _own(problem, h, t_end, lambda gpe: EIPRK4, names), stable_steps)
 
 
 def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Contender:
-    """EIP on another one-step method, or without `names` that alone."""
+    """Return EIP on another one-step method, or without `names` that method alone."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> Any:
         return _own(problem, h, t_end, lambda gpe: eip_method(base(gpe)), names)
@@ -88,7 +88,7 @@ def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Cont
 
 
 def implicit(scheme: Callable[..., Any]) -> Contender:
-    """One of the paper's schemes."""
+    """Return one of the paper's schemes."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> tuple[np.ndarray, int, str]:
         result = scheme(problem.equation, (0.0, t_end), problem.y0, h)
@@ -111,7 +111,7 @@ METHODS = {
 
 
 def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
-    """A plane wave with bumps, and its state at the end by SciPy's DOP853 at its tightest."""
+    """Return a plane wave with bumps, and its state at the end by SciPy's DOP853 at its tightest tolerance."""
     gpe = plane_wave((points, points), fft=make_transforms().name).equation
     assert gpe is not None
     x, y = gpe.grid.mesh()
@@ -123,27 +123,27 @@ def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
 
 
 class Trial:
-    """One problem: its runs, and what besides error and time they tell.
+    """One problem with its runs, and the numbers that they give in addition to error and time.
 
     Parameters
     ----------
     problem : FieldProblem
     exact : ndarray
-        Its end.
+        Exact state at the end.
 
     Attributes
     ----------
     rows : dict
-        By (method, h) the numbers of a run.
+        Numbers of a run by (method, h).
     """
 
     def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:
         self.problem, self.exact = problem, exact
         self.rows: dict[tuple[str, float], dict[str, Any]] = {}
-        self._single: dict[str, float] = {}  # seconds of a single step, set-up included
+        self._single: dict[str, float] = {}  # seconds of a single step, including set-up
 
     def runner(self, name: str) -> Callable[[float], tuple[float, np.ndarray]]:
-        """``run(h)`` of a method, for `work_precision`."""
+        """Return ``run(h)`` of a method, for `work_precision`."""
         method = METHODS[name]
 
         def run(h: float) -> tuple[float, np.ndarray]:
@@ -159,7 +159,7 @@ class Trial:
         return run
 
     def errors(self, y: np.ndarray) -> dict[str, float]:
-        """Errors at the end, those of mass and energy relative."""
+        """Return errors at the end, those of mass and energy relative."""
         gpe, (start, end) = self.problem.equation, y.T
         assert gpe is not None
         difference = end - self.exact
@@ -171,7 +171,7 @@ class Trial:
         }
 
     def methods(self) -> dict[str, tuple[Callable[[float], tuple[float, np.ndarray]], Sequence[float]]]:
-        """All runners with their steps."""
+        """Return all runners with their steps."""
         return {name: (self.runner(name), method.steps(self.problem)) for name, method in METHODS.items()}
 
     def measure(self, repeats: int, callback: Callable[[], Any]) -> None:
@@ -185,18 +185,18 @@ class Trial:
             self.rows[point.method, point.step]["seconds"] = point.wall_time - self._single[point.method]
 
     def column(self, name: str, key: str) -> np.ndarray:
-        """A quantity of a method, by its steps."""
+        """Return a quantity of a method, by its steps."""
         return np.array([row[key] for (method, _), row in self.rows.items() if method == name])
 
     def slope(self, name: str) -> float:
-        """Fitted order; nan where two clean errors are not to be had, as of a splitting on the plane wave."""
+        """Return the fitted order; nan without two clean errors, for example for a splitting on the plane wave."""
         h, error = self.column(name, "h"), self.column(name, "error_max")
         clean = np.flatnonzero((error > FIT_BETWEEN[0]) & (error < FIT_BETWEEN[1]))[-FITTED:]
         return float(np.polyfit(np.log(h[clean]), np.log(error[clean]), 1)[0]) if clean.size > 1 else float("nan")
 
 
 class Slope(NamedTuple):
-    """A slope or an invariant's error, as it should be and as it is."""
+    """Expected and measured value of a slope or an invariant error."""
 
     wave: str
     quantity: str
@@ -206,7 +206,7 @@ class Slope(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether they agree."""
+        """Return whether they agree."""
         return abs(self.ours - self.known) <= self.slack
 
 
@@ -222,11 +222,11 @@ class Efficiency(Study[Found]):
     points : int
         Along each axis.
     repeats : int
-        Runs of each, the least time of which counts.
+        Runs of each point; the least time counts.
     orders : mapping of str to int
-        What the slopes should be.
+        Expected slopes.
     stem : str
-        Of the files' names.
+        Stem of the files' names.
     """
 
     points: int = 64
@@ -247,7 +247,7 @@ class Efficiency(Study[Found]):
         return trials
 
     def checks(self, found: Found) -> list[Slope]:
-        """Compare the slopes with the methods' orders, and what EIP-ME leaves of its invariants with round-off."""
+        """Compare the slopes with the methods' orders, and the invariant errors of EIP-ME with round-off."""
         slopes = [
             Slope(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
             for wave, trial in found.items()
@@ -288,7 +288,7 @@ class Efficiency(Study[Found]):
         }
 
     def figures(self, found: Found) -> Figures:
-        """Error against step and against time, a row for each wave."""
+        """Draw error against step and against time, a row for each wave."""
         from ..plotting import CostPanel, cost_figure
 
         rows = []

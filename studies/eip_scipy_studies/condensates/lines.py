@@ -1,4 +1,4 @@
-"""``eip-scipy gpe vortex-lines``: the paper's condensate in three dimensions, turned faster; its lines in time."""
+"""``eip-scipy gpe vortex-lines``: the paper's condensate in three dimensions, rotated faster; its lines in time."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ ROOM = ((-4.0, 4.0), (-4.0, 4.0), (-6.0, 6.0))
 class VortexLines(QuenchStudy):
     """The command.
 
-    The trap is round: what stands still in the slower frame goes on with it, and stays behind the faster one.
+    The trap is round: the stationary state of the slower frame continues to rotate with it, and lags behind the faster
+    frame.
 
     Attributes
     ----------
@@ -48,9 +49,9 @@ class VortexLines(QuenchStudy):
     saved : float
         Time between two saved states.
     energies_known : float
-        How well the energies of the start and below it are.
+        Accuracy of the energies of the start and below it.
     turn_known : float
-        rad: at the lines a tenth of the distance between two points of the grid.
+        rad: at the lines 0.1 of the distance between two points of the grid.
     """
 
     points: int = LINE_POINTS
@@ -97,13 +98,13 @@ class VortexLines(QuenchStudy):
         ]
 
     def _turn_check(self, moved: Motion) -> FieldCheck:
-        """The lines turn by the difference of the rotations times t."""
+        """Return the angle by which the lines turn: the difference of the rotations times t."""
         slower = OMEGA_BEFORE - OMEGA_AFTER
         off = float(np.abs(moved.angle - slower * moved.t).max())
         return FieldCheck(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
 
     def pictures(self, found: QuenchRuns) -> Figures:
-        """The plane z = 0, and surfaces of equal density."""
+        """Draw the plane z = 0, and surfaces of equal density."""
         from ..plotting import fields_figure, surfaces_figure
 
         moved = found.moved
@@ -132,7 +133,7 @@ def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[
 
 
 def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
-    """How far the reference ends from the closed form, the start turned and with the phase of mu t."""
+    """Return how far the reference ends from the closed form: the start, turned and with the phase of mu t."""
     assert made.reference is not None
     start = made.quench.problem.y0
     mu, turn = before.chemical_potential(start), OMEGA_AFTER - OMEGA_BEFORE
@@ -153,7 +154,7 @@ def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
 
 
 def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
-    """The surface, and the sector of it in which the line is that is followed."""
+    """Return the surface, and the sector of it that contains the followed line."""
     from ..plotting import SurfacePanel
 
     surface = density_surface(made.quench.equation, _field(made, k), LEVEL)

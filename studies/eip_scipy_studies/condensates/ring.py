@@ -33,9 +33,9 @@ class Ring(QuenchStudy):
     Attributes
     ----------
     condensate : callable
-        ``condensate(kappa, points)``, the equation.
+        ``condensate(kappa, points)``: the equation.
     kappas : (float, float)
-        Before and after.
+        Values before and after the quench.
     saved : float
         Time between two saved states.
     """
@@ -57,7 +57,7 @@ class Ring(QuenchStudy):
     sense: int = 1
 
     def check_settings(self) -> None:
-        """See that there is a step to take."""
+        """Raise an error if there is no step to take."""
         if self.t_end < self.reference_step:
             least = f"{self.reference_step:g}, the reference's step"
             raise UsageError(f"--t-end: expected at least {least}, got {self.t_end:g}")
@@ -67,7 +67,7 @@ class Ring(QuenchStudy):
         return {"h": self.step, "t_end": self.t_end}
 
     def measure(self, session: Session) -> QuenchRuns:
-        """All runs, from the ground state: from a file, from beside the checkpoints, or searched."""
+        """Do all runs, from the ground state: from a file, from the folder of the checkpoints, or computed."""
         before, after = (self.condensate(kappa, self.points) for kappa in self.kappas)
         if self.start is not None:
             start = load_state(self.start, before)
@@ -86,7 +86,7 @@ class Ring(QuenchStudy):
         return self.do_runs(quench, session)
 
     def pictures(self, found: QuenchRuns) -> Figures:
-        """Density and vortices at some times, and as a film."""
+        """Draw density and vortices at some times, and as a film."""
         from ..plotting import fields_figure, fields_movie
 
         quench, fields, moved = found.quench, found.fields, found.moved
@@ -108,7 +108,7 @@ class Ring(QuenchStudy):
 
 
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
-    """One panel for each saved state, all of the first one's size, which is the largest."""
+    """Return one panel for each saved state, all of the size of the first one, which is the largest."""
     from ..plotting import FieldPanel
 
     fields = np.abs(gpe.grid.field(y)) ** 2

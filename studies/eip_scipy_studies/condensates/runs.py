@@ -23,7 +23,7 @@ from ..study import Figures, PartlyDone, Rows, Session, Study, option
 __all__ = ["METHODS", "SHOWN", "FieldCheck", "FieldRun", "Motion", "Quench", "QuenchRuns", "QuenchStudy", "motion"]
 
 METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
-SHOWN = "EIP-ME"  # whose fields are kept, for the figures
+SHOWN = "EIP-ME"  # fields of this method are kept, for the figures
 REFERENCE = "EIPDOP853"
 MASS_KEPT = 1e-14
 SMALL = 1e-3
@@ -32,7 +32,7 @@ SENSES = {1: "anticlockwise", -1: "clockwise"}
 
 
 class FieldCheck(NamedTuple):
-    """What must hold, its value, and whether it does."""
+    """A condition, its value, and whether it holds."""
 
     what: str
     value: Any
@@ -41,24 +41,24 @@ class FieldCheck(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Quench:
-    """A condensate whose trap or rotation changes at t = 0, and what is to be seen of it.
+    """A condensate whose trap or rotation changes at t = 0, and the settings of its report.
 
     Attributes
     ----------
     name : str
-        Of its files.
+        Name in its files.
     title : str
     problem : FieldProblem
-        With the step of RK4, from the stationary state of the equation before.
+        Problem with the step of RK4, from the stationary state of the equation before the quench.
     reference_step : float
-        Of EIPDOP853, which the others are compared with.
+        Step of EIPDOP853, with which the others are compared.
     interval : float
         Time between two saved states, short enough to follow the vortices.
     snapshots : tuple of float
     sense : int
-        In which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
+        Direction in which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
     energy_kept : float
-        Bound on the absolute error of the energy where it is kept.
+        Bound on the absolute error of the energy in runs that keep it.
     """
 
     name: str
@@ -72,23 +72,23 @@ class Quench:
 
     @property
     def equation(self) -> GrossPitaevskii:
-        """The equation after the quench."""
+        """Return the equation after the quench."""
         assert self.problem.equation is not None
         return self.problem.equation
 
     @property
     def step(self) -> float:
-        """The step of RK4."""
+        """Return the step of RK4."""
         assert self.problem.h is not None
         return self.problem.h
 
     @property
     def t_end(self) -> float:
-        """End of the run."""
+        """Return the end of the run."""
         return self.problem.t_span[1]
 
     def shown(self, t: np.ndarray) -> list[int]:
-        """Which of the saved times are those of the snapshots, as far as the run goes."""
+        """Return the indices of the saved times of the snapshots, as far as the run goes."""
         return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
 
 
@@ -100,11 +100,11 @@ class FieldRun:
     ----------
     t : ndarray, shape (m,)
     mass_error, energy_error, field_error : ndarray, shape (m,)
-        Absolute; the last is the norm of the difference from the reference.
+        Absolute errors; the last is the norm of the difference from the reference.
     wall_time : float
     nfev : int
     n_rank_reduced : int
-        Projections in which the gradients were parallel, as at a stationary state.
+        Number of projections in which the gradients were parallel, as at a stationary state.
     """
 
     t: np.ndarray
@@ -118,7 +118,7 @@ class FieldRun:
 
 @dataclass(eq=False)
 class QuenchRuns:
-    """The runs of a quench, those of `METHODS` that were done.
+    """The runs of a quench: those of `METHODS` that were done.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class QuenchRuns:
     moved : Motion or None
         The vortices of `SHOWN`.
     more : list of FieldCheck
-        Checks beside those of all quenches.
+        Checks in addition to those of all quenches.
     notes : list of str
         Lines for the head of the table.
     """
@@ -145,14 +145,14 @@ class QuenchRuns:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The vortices in time, in three dimensions those of the middle plane.
+    """The vortices in time; in three dimensions those of the middle plane.
 
     Attributes
     ----------
     t : ndarray, shape (m,)
     vortices : list of Vortices
     angle : ndarray, shape (m,)
-        By how much they have turned about the centre, on average, positive anticlockwise [rad].
+        Mean angle by which they have turned about the centre, positive anticlockwise [rad].
     """
 
     t: np.ndarray
@@ -160,12 +160,12 @@ class Motion:
     angle: np.ndarray
 
     def off(self, k: int, x: Any, y: Any) -> Any:
-        """Angles of points from where one vortex, the rightmost at the start, is in the state k, in (-pi, pi]."""
+        """Return the angles of points from one vortex, the rightmost at the start, in the state k, in (-pi, pi]."""
         a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
         return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
 
     def followed(self, k: int) -> int | None:
-        """Which of the vortices in the state k that one is; None where there is none."""
+        """Return the index of that vortex in the state k; None if it is not there."""
         if not (self.vortices[0].charges.size and self.vortices[k].charges.size):
             return None
         return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
@@ -204,7 +204,7 @@ def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
 
 
 def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
-    """Follow the vortices: each goes on as before, then to the nearest one in the next state; the median counts.
+    """Follow the vortices: each is extrapolated, then matched with the nearest one in the next state; medians count.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
 
 
 def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
-    """Median of the turns from each old angle, `guess` added, to the nearest new one."""
+    """Return the median of the turns from each old angle, `guess` added, to the nearest new one."""
     if not (old.size and new.size):
         return guess
     difference = np.angle(np.exp(1j * (new[None, :] - old[:, None] - guess)))
@@ -235,7 +235,7 @@ def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
 
 
 def _checks(made: QuenchRuns) -> list[FieldCheck]:
-    """Vortices keep their count and turn as they should, and each invariant that is kept is kept."""
+    """Check that vortices keep their number and turn as expected, and that each preserved invariant is kept."""
     found, quench, moved = [], made.quench, made.moved
     if moved is not None:
         at = quench.shown(moved.t)
@@ -290,7 +290,7 @@ def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
 
 
 def _value(value: Any) -> str:
-    """A check's number, an error short and what is not small with the digits that it is compared in."""
+    """Format a check's number: an error shortly, other numbers with the digits in which they are compared."""
     if isinstance(value, float):
         return compact(value, 3) if abs(value) < SMALL else f"{value:.6g}"
     return str(value)
@@ -307,17 +307,17 @@ def _radius(found: Vortices) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class QuenchStudy(Checkpoints, Study[QuenchRuns]):
-    """What the commands on quenches have in common."""
+    """Common part of the commands on quenches."""
 
     seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
 
     def do_runs(self, quench: Quench, session: Session) -> QuenchRuns:
-        """Run the reference and each of `METHODS`; what the user interrupts leaves those that were done.
+        """Run the reference and each of `METHODS`; an interrupt by the user keeps the completed runs.
 
         Raises
         ------
         RuntimeError
-            When a run fails.
+            If a run fails.
         """
         made = QuenchRuns(quench)
         run = partial(_run, quench, session.shown, self.checkpoint_options)
@@ -357,7 +357,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         return numbers
 
     def figures(self, found: QuenchRuns) -> Figures:
-        """The errors in time, and what the fields look like."""
+        """Draw the errors in time, and the fields."""
         from ..plotting import ErrorSeries, errors_figure
 
         quench = found.quench
@@ -375,7 +375,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
 
     @abstractmethod
     def pictures(self, found: QuenchRuns) -> Figures:
-        """Of the fields."""
+        """Draw the fields."""
 
 
 def _moved(made: QuenchRuns) -> Motion | None:

@@ -53,23 +53,23 @@ __all__ = [
 PUBLISHED = {0.0: 3.9459469, 0.65: 3.6506129, 0.71: 3.4997148, 0.76: 3.3475310, 0.80: 3.1904172}
 PUBLISHED_DIGITS = 1e-5
 RING_ENERGY, LINES_ENERGY, LINES = -115.270, 3.3029, 2
-SADDLE_ENERGY, SADDLE_LINES = 3.3293, 4  # of the state in the paper's figure
+SADDLE_ENERGY, SADDLE_LINES = 3.3293, 4  # the state in the paper's figure
 RING_POINTS, LINE_POINTS = 256, 64
 TRAP_TOLERANCE, RING_TOLERANCE, LINES_TOLERANCE, SADDLE_TOLERANCE = 1e-6, 1e-8, 1e-5, 1e-8
 MOST_LINES, LINES_RADIUS, LINES_ITERATIONS = 4, 1.5, 1000
-VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the room around it
+VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the margin around it
 Update = Callable[[str], Any]
 Ends = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A stationary state and where it came from.
+    """A stationary state and its origin.
 
     Attributes
     ----------
     label : str
-        What told its start from the others.
+        Distinguishing property of its start.
     equation : GrossPitaevskii
     state : GroundState
     published : float or None
@@ -82,12 +82,12 @@ class Found:
 
     @property
     def count(self) -> int:
-        """Number of vortices, in three dimensions in the middle plane."""
+        """Return the number of vortices, in three dimensions in the middle plane."""
         return len(vortices(self.equation, self.state.psi).charges)
 
 
 def trap(settings: GroundStates, update: Update) -> list[Found]:
-    """The lowest of several starts for each rotation."""
+    """Return the lowest of several states for each rotation."""
     grid = Grid((settings.trap_points, settings.trap_points), -10.0, 10.0)
     found = []
     for Omega, published in settings.published.items():
@@ -102,12 +102,12 @@ def trap(settings: GroundStates, update: Update) -> list[Found]:
 
 
 def ring(settings: GroundStates, update: Update) -> list[Found]:
-    """The paper's ring."""
+    """Return the paper's ring."""
     return [search_ring(settings.seed, update)]
 
 
 def search_ring(seed: int, update: Update) -> Found:
-    """Walk over numbers of vortices and windings to the ground state of the paper's ring."""
+    """Search over numbers of vortices and windings for the ground state of the paper's ring."""
     gpe = ring_condensate(points=RING_POINTS)
     tried: list[tuple[float, int, int]] = []
 
@@ -121,7 +121,7 @@ def search_ring(seed: int, update: Update) -> Found:
 
 
 def lines(settings: GroundStates, update: Update) -> list[Found]:
-    """States of the paper's 3D condensate from starts with 0 ... 4 lines, and the saddle with four."""
+    """Return states of the paper's 3D condensate from starts with 0 ... 4 lines, and the saddle with four."""
     gpe = line_condensate(points=LINE_POINTS)
     rng = np.random.default_rng(settings.seed)
     found = []
@@ -134,7 +134,7 @@ def lines(settings: GroundStates, update: Update) -> list[Found]:
 
 
 def search_saddle(points: int, update: Update) -> Found:
-    """The paper's state with four lines, a saddle: the start has a square's symmetry, and the descent keeps it."""
+    """Return the paper's state with four lines, a saddle: the descent keeps the square symmetry of the start."""
     update(f"lines, {SADDLE_LINES} imprinted without noise")
     gpe = line_condensate(points=points)
     start = imprint(gpe, polygon(SADDLE_LINES, LINES_RADIUS))
@@ -142,7 +142,7 @@ def search_saddle(points: int, update: Update) -> Found:
 
 
 def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
-    """Where the descent goes from a state with a little noise: from a saddle to a lower state."""
+    """Continue the descent from a state with a little noise: from a saddle it leads to a lower state."""
     update("lines, down from the saddle")
     start = with_noise(saddle, np.random.default_rng(seed))
     state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
@@ -160,7 +160,7 @@ Results = dict[str, list[Found]]
 
 
 class KnownState(NamedTuple):
-    """A number of a state that is known, and ours."""
+    """Known value of a number of a state, and ours."""
 
     quantity: str
     known: float
@@ -170,13 +170,13 @@ class KnownState(NamedTuple):
 
     @property
     def record(self) -> dict[str, Any]:
-        """For the JSON."""
+        """Return the entry of the JSON."""
         known = {"quantity": self.quantity, "known": self.known, "ours": self.ours}
         return {**known, "matched": self.passed, "note": self.note}
 
     @property
     def line(self) -> str:
-        """One line of the text."""
+        """Return one line of the text."""
         note = f" ({self.note})" if self.note else ""
         verdict = "ok" if self.passed else "FAILED"
         return f"{verdict:<6} {self.quantity} {self.known:.10g}, ours {self.ours:.10g}{note}"
@@ -211,7 +211,7 @@ class GroundStates(Study[Results]):
             return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
 
     def checks(self, found: Results) -> list[KnownState]:
-        """Compare with known energies. A lower energy than a published one is no miss."""
+        """Compare with known energies. A lower energy than a published one is not a failure."""
         checks = []
         for item in found.get("trap", ()):
             known, ours = self.published[item.equation.Omega], item.state.energy
@@ -251,7 +251,7 @@ class GroundStates(Study[Results]):
         return {"states": _rows(found), "checks": [check.record for check in self.checks(found)]}
 
     def figures(self, found: Results) -> Figures:
-        """The fields that `gpe ring` starts from, as files; densities and vortices."""
+        """Write the fields that `gpe ring` starts from, and draw densities and vortices."""
         for name, states in found.items():
             if name != "trap":
                 yield f"{name}.npz", partial(_save, min(states, key=lambda item: item.state.energy))
@@ -293,7 +293,7 @@ def _rows(results: Results) -> Rows:
 
 
 def panels(name: str, found: list[Found]) -> dict[str, Any]:
-    """Densities to draw: one panel for each state, of lines in the plane z = 0 and of the lowest in x = 0 too."""
+    """Return densities to draw: one panel for each state; lines in the plane z = 0, the lowest also in x = 0."""
     from ..plotting import FieldPanel
 
     out = {}
@@ -322,7 +322,7 @@ def _counted(count: int, kind: str) -> str:
 def cropped(
     density: np.ndarray, grid: Grid, axes: tuple[int, int], half: float | None = None
 ) -> tuple[np.ndarray, Ends]:
-    """The middle of a plane, by default with little of the empty space around the condensate, and its ends."""
+    """Return the middle of a plane, by default with little of the empty space around the condensate, and its ends."""
     if half is None:
         seen = (np.any(density > VISIBLE * density.max(), axis=1 - k) for k in (0, 1))
         half = MARGIN * max(float(np.abs(grid.points(a)[there]).max()) for a, there in zip(axes, seen, strict=True))
@@ -358,7 +358,7 @@ def _save(item: Found, path: Path) -> None:
 
 @contextmanager
 def searching(session: Session) -> Iterator[Update]:
-    """Show what is searched, and for how long; yields what takes the words for it."""
+    """Show the subject and the time of a search; yield the function that takes these words."""
     with session.bar(None, "", bar_format="{desc} [{elapsed}]") as bar:
         yield bar.set_description_str
 
@@ -366,7 +366,7 @@ def searching(session: Session) -> Iterator[Update]:
 def kept_state(
     settings: Checkpoints, session: Session, gpe: GrossPitaevskii, search: Callable[[Update], Found]
 ) -> np.ndarray:
-    """The field to start from: with ``--resume`` the one beside the checkpoints, else the one that `search` finds.
+    """Return the initial field: with ``--resume`` the one next to the checkpoints, else the one that `search` finds.
 
     Parameters
     ----------
@@ -391,12 +391,12 @@ def kept_state(
 
 
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
-    """Read the field of a state of `save_state`, which must be one of `gpe`.
+    """Read the field of a state of `save_state`, which must belong to `gpe`.
 
     Raises
     ------
     UsageError
-        When the file cannot be read, or holds a state of another grid or equation.
+        If the file cannot be read, or holds a state of another grid or equation.
     """
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:

@@ -27,7 +27,7 @@ TOLERANCES = {"EIPDOP853": 1e-9}
 USUAL_TOLERANCE = 1e-6
 ATOL_PER_RTOL = 1e-3
 
-# The bars, set for one tolerance of two methods; the last three for the error metric only.
+# Bounds, set for one tolerance of two methods; the last three for the error metric only.
 SETTINGS = {("EIPRK45", 1e-6), ("EIPDOP853", 1e-9)}
 SMALL_DRIFT, MAY_EXCEED, MEDIAN_DRIFT = 1e-9, 2, 1e-12
 LEAST_GAIN = {"EIPRK45": 20.0, "EIPDOP853": 15.0}
@@ -35,7 +35,7 @@ WORST_GAIN = {"EIPRK45": 1 / 3}
 LARGEST_ERROR = {"EIPDOP853": 1e-7}
 
 NEIGHBOURS = (math.sqrt(10.0), 1 / math.sqrt(10.0))
-# Why projection does not help here. Each was found from errors at five tolerances, with all metrics and directions.
+# Reasons why projection does not help. Each was found from errors at five tolerances, with all metrics and directions.
 CAUSES = {
     "kepler_e00": "the plain method is lucky: its phase lag, which grows as t, and the lead from its loss of energy, "
     "which grows as t^2, cancel near the end of this run. Projection takes away the second; the lag stays, with every "
@@ -65,7 +65,7 @@ class CaseOutcome:
         Largest relative change of an invariant.
     steps, nfev : int
     failure : str
-        Why it did not reach its end, or empty.
+        Why it did not reach its end; empty if it did.
     rank_reduced, rejected_projections : int
         Steps with parallel gradients, and projections that failed.
     """
@@ -98,7 +98,7 @@ class Comparison:
 
     @property
     def gain(self) -> float:
-        """By what factor projection reduces the final error."""
+        """Return the factor by which projection reduces the final error."""
         return _ratio(self.plain.error, self.projected.error)
 
 
@@ -107,7 +107,7 @@ def _ratio(a: float, b: float) -> float:
 
 
 def adaptive_methods() -> dict[str, type[EIPSolver]]:
-    """Find the solver classes that choose their steps, for systems of the first order."""
+    """Find the solver classes with adaptive steps, for systems of the first order."""
     return {
         name: method
         for name, method in fixed_step_methods().items()
@@ -139,7 +139,7 @@ def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | No
     Returns
     -------
     CaseOutcome
-        Also where the run raised, with the exception as its failure.
+        Also for a run that raised an error, which is its failure.
     """
     problem, record = case.problem, Diagnostics()
     options: dict[str, Any] = {} if metric is None else {"invariants": problem.invariants, "metric": metric}
@@ -156,7 +156,7 @@ def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | No
                 **options,
             )
             drift = case.drift(sol.y)
-    except Exception as error:  # whatever it is, the other cases are still to be run
+    except Exception as error:  # after any error the other cases are still to be run
         return CaseOutcome(math.nan, math.nan, 0, 0, f"{type(error).__name__}: {error}")
     failure = "" if sol.success else sol.message
     if not (failure or np.isfinite(sol.y).all()):
@@ -207,13 +207,13 @@ def compare(
 
 
 def geometric_mean(values: Iterable[float]) -> float:
-    """Geometric mean of those that are finite and positive; nan of none."""
+    """Return the geometric mean of the finite positive values; nan if there are none."""
     logs = [math.log(x) for x in values if 0 < x < math.inf]
     return math.exp(sum(logs) / len(logs)) if logs else math.nan
 
 
 def summary(results: Sequence[Comparison]) -> dict[str, Any]:
-    """Reduce the comparison to the numbers that the bars are set for."""
+    """Compute the numbers for which the bounds are set."""
     worst = min(results, key=lambda r: r.gain if r.gain == r.gain else -math.inf)
     drifts = [r.projected.drift for r in results]
     return {
@@ -279,7 +279,7 @@ def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -
 
 
 def _times(gain: float) -> str:
-    """Put a gain in words: "2.7 times worse", "310 times better"."""
+    """Format a gain in words: "2.7 times worse", "310 times better"."""
     if not math.isfinite(gain):
         return "-"
     factor, word = (gain, "better") if gain >= 1 else (1 / gain, "worse")
@@ -345,7 +345,7 @@ def _worse(results: Sequence[Comparison]) -> list[str]:
 
 
 def cause(result: Comparison) -> str:
-    """Say why a case gets worse, or at least whether it does at neighbouring tolerances."""
+    """Return why a case gets worse, or at least whether it does at neighbouring tolerances."""
     if result.case.name in CAUSES:
         return CAUSES[result.case.name]
     if geometric_mean([result.gain, *result.nearby[:2]]) >= 1:
@@ -380,11 +380,11 @@ class HardCases(Study[list[Comparison]]):
 
     @property
     def tolerance(self) -> float:
-        """The relative one."""
+        """Return the relative tolerance."""
         return self.rtol or TOLERANCES.get(self.method, USUAL_TOLERANCE)
 
     def arguments(self) -> dict[str, Any]:
-        """The options, and what follows from them."""
+        """Return the options, and values that follow from them."""
         rtol = self.tolerance
         return {"method": self.method, "rtol": rtol, "atol": ATOL_PER_RTOL * rtol, "metric": self.metric}
 

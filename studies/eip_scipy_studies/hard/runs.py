@@ -1,6 +1,6 @@
-"""The hard scenes run by several methods: errors against stored states or a closed form, evaluations, time.
+"""The hard problems run by several methods: errors against stored states or a closed form, evaluations, time.
 
-Nothing is printed or written here. REBOUND comes in as a module, or None, so that this one needs no extra.
+This module prints and writes nothing. REBOUND is passed as a module, or None, so that no extra is needed.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from ..work_precision import work_precision
 
 __all__ = ["SCENES", "Contender", "HardScene", "Outcome", "Point", "Spread", "measure", "methods", "scene"]
 
-# Of IAS15, by its step criterion; each starts where the steps are about as long as its corrector converges with.
+# Settings of IAS15, by its step criterion; each starts where the steps are about as long as its corrector can handle.
 EPSILONS = {"prs23": (1e-4, 1e-5, 1e-6, 1e-7, 1e-9), "global": (1e-2, 1e-3, 1e-4, 1e-6, 1e-9)}
 ATOL_PER_RTOL = 1e-3
 ENOUGH_SECONDS = 0.4
 MOST_SAVES = 20_000
-# Longer than any scene takes in fictitious time, which ends at an event.
+# Longer than any problem takes in fictitious time, which ends at an event.
 FAR = 1e6
 
 
 @dataclass(frozen=True)
 class Spread:
-    """At which settings all methods run, from coarse to fine, and how often.
+    """Settings of all methods, from coarse to fine, and the number of repeats.
 
     Attributes
     ----------
     tolerances : tuple of float
     steps_per_turn : tuple of int
-        Of fictitious time.
+        Steps per turn in fictitious time.
     epsilons : mapping of str to tuple of float
-        Of IAS15, by its step criterion.
+        Tolerances of IAS15, by its step criterion.
     repeats : int
-        Timed runs of each point at most, the least time of which counts; fewer of one that takes long. A short run is
-        timed often, so that one of them fits between two disturbances by other processes.
+        Maximum number of timed runs of each point, of which the least time counts; long runs are repeated less. A short
+        run is timed often, so that one of them fits between two disturbances by other processes.
     """
 
     tolerances: tuple[float, ...] = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -67,18 +67,18 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class HardScene:
-    """A problem with a known state at its end, and what the methods need to know.
+    """A problem with a known state at its end, and the data that the methods need.
 
     Attributes
     ----------
     name, title : str
     problem : Problem
     g : callable
-        What a unit of fictitious time is worth, see `time_transformed`.
+        Value of a unit of fictitious time, see `time_transformed`.
     steps : tuple of int
         Numbers of fixed steps in the whole run, for EIPRKN12.
     level : float
-        The error at which costs are compared: what a user would be content with, and most methods reach.
+        Error at which costs are compared: sufficient for a user, and reached by most methods.
     """
 
     name: str
@@ -90,7 +90,7 @@ class HardScene:
 
     @property
     def end(self) -> np.ndarray:
-        """The exact state at the end."""
+        """Return the exact state at the end."""
         assert self.problem.reference is not None
         state = self.problem.reference(self.problem.t_span[1])
         assert state is not None
@@ -98,18 +98,18 @@ class HardScene:
 
     @property
     def dimensions(self) -> int:
-        """Coordinates of a body."""
+        """Return the coordinates of a body."""
         return int(self.problem.blocks)
 
     def error(self, y: np.ndarray) -> float:
-        """Largest distance of a body from its true position, for a final state; nan for one that is not finite."""
+        """Return the largest distance of a body from its true position in a final state; nan if it is not finite."""
         if not np.isfinite(y).all():
             return math.nan
         half = y.size // 2
         return float(np.linalg.norm((y - self.end)[:half].reshape(-1, self.dimensions), axis=1).max())
 
     def invariant_errors(self, y: np.ndarray) -> tuple[float, float]:
-        """Largest error of H and of L along states in columns: relative, or absolute where the value is zero."""
+        """Return the largest error of H and of L along states in columns: relative, or absolute if the value is 0."""
         found = []
         for item in self.problem.invariants:
             values = np.array([np.atleast_1d(item.fun(0.0, state, *item.args)) for state in y.T])
@@ -119,7 +119,7 @@ class HardScene:
         return energy, momentum
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """G m and the state of the bodies for REBOUND, which has no fixed centre: Kepler's are two of equal mass."""
+        """Return G m and the state for REBOUND, which has no fixed centre: Kepler's bodies are two equal masses."""
         problem = self.problem
         if self.dimensions == 3:
             assert problem.params is not None
@@ -128,7 +128,7 @@ class HardScene:
         return np.array([0.5, 0.5]), np.stack([relative / 2, -relative / 2], axis=1).ravel()
 
     def from_bodies(self, y: np.ndarray) -> np.ndarray:
-        """States of those bodies, in columns, as states of the problem."""
+        """Return states of those bodies, in columns, as states of the problem."""
         if self.dimensions == 3:
             return y
         q1, q2, v1, v2 = y.reshape(4, 3, -1)
@@ -173,7 +173,7 @@ SCENES: dict[str, Callable[[], HardScene]] = {
 
 
 def scene(name: str) -> HardScene:
-    """Make a scene by its name, a key of `SCENES`."""
+    """Make a problem by its name, a key of `SCENES`."""
     return SCENES[name]()
 
 
@@ -183,11 +183,11 @@ class Outcome(NamedTuple):
     Attributes
     ----------
     y : ndarray, shape (n, m)
-        States that were saved, the last at the end.
+        Saved states, the last at the end.
     nfev : int
     wall_time : float
     failure : str
-        Why it did not reach its end, or empty.
+        Why it did not reach its end; empty if it did.
     """
 
     y: np.ndarray
@@ -197,16 +197,16 @@ class Outcome(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """A way to run a scene.
+    """A way to run a problem.
 
     Attributes
     ----------
     setting : str
-        What the settings are: "rtol", "h", "ds" or "epsilon".
+        Kind of the settings: "rtol", "h", "ds" or "epsilon".
     settings : tuple of float
         From coarse to fine.
     run : callable
-        ``run(setting, look) -> Outcome``; with ``look`` the steps' states are saved and the time means nothing.
+        ``run(setting, look) -> Outcome``; with ``look`` the states of all steps are saved, and the time is meaningless.
     """
 
     setting: str
@@ -221,14 +221,14 @@ class Point(NamedTuple):
     ----------
     scene, method, setting : str
     value : float
-        Of the setting.
+        Value of the setting.
     nfev : int
     wall_time : float
         Seconds, the least of several runs.
     error : float
         Largest distance of a body from its true position at the end; nan for a run that failed.
     energy_error, momentum_error : float
-        Largest along the run, see `HardScene.invariant_errors`.
+        Largest error along the run, see `HardScene.invariant_errors`.
     failure : str
     """
 
@@ -245,7 +245,7 @@ class Point(NamedTuple):
 
 
 def methods(of: HardScene, spread: Spread, rebound: Any = None) -> dict[str, Contender]:
-    """Set up the methods for a scene.
+    """Set up the methods for a problem.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def methods(of: HardScene, spread: Spread, rebound: Any = None) -> dict[str, Con
 def measure(
     of: HardScene, spread: Spread, rebound: Any = None, callback: Callable[[], Any] = lambda: None
 ) -> list[Point]:
-    """Run all methods on a scene.
+    """Run all methods on a problem.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def _adaptive(problem: Problem, options: dict[str, Any], rtol: float, look: bool
 
 
 def _fictitious(problem: Problem, end: Callable[..., float], options: dict[str, Any], h: float, look: bool) -> Outcome:
-    # Without looking, only the start and the event are saved.
+    # Without `look`, only the start and the event are saved.
     every = 1 if look else round(FAR)
     run = _outcome(integrate(problem, method=_on(problem, EIPDOP853), h=h, events=end, save_every=every, **options))
     return run._replace(y=run.y[:-1])

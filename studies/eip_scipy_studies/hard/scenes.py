@@ -1,4 +1,4 @@
-"""``eip-scipy hard-scenes``: high eccentricities, chaos, close encounters; error against cost beside other methods."""
+"""``eip-scipy hard-scenes``: high eccentricities, chaos, close encounters; error against cost of several methods."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Results = dict[str, tuple[HardScene, list[Point]]]
 
 
 class Found(NamedTuple):
-    """The points by their scenes, and the machine."""
+    """The points by their problems, and the machine."""
 
     results: Results
     machine: str
@@ -39,7 +39,7 @@ def _failures(failures: list[str]) -> list[str]:
 
 
 def _costs(results: Results) -> list[str]:
-    """What each method costs at each scene's error level, evaluations and time."""
+    """Return the cost of each method at each problem's error level, evaluations and time."""
     scenes = [of for of, _ in results.values()]
     names = list(dict.fromkeys(p.method for _, points in results.values() for p in points))
     lines = []
@@ -71,15 +71,15 @@ class HardScenes(Study[Found]):
         rebound = session.peer("rebound", "WHFast and IAS15")
         scenes = [scene(name) for name in self.arguments()["scenes"]]
         points = sum(len(method.settings) for of in scenes for method in methods(of, self.spread, rebound).values())
-        with session.bar(self.spread.repeats * points, "hard scenes") as bar:
+        with session.bar(self.spread.repeats * points, "hard problems") as bar:
             results = {of.name: (of, measure(of, self.spread, rebound, bar.update)) for of in scenes}
         return Found(results, describe_machine())
 
     def text(self, found: Found) -> str:
         lines = [
-            "Hard scenes: error against cost",
+            "Hard problems: error against cost",
             f"{found.machine}; one thread, least of at most {self.spread.repeats} runs.",
-            "error: largest distance of a body from its true position at the end, in the scene's unit.",
+            "error: largest distance of a body from its true position at the end, in the problem's unit.",
             "dH, dL: largest error along the run, relative (L absolute where it is zero).",
             "EIPDOP853, EIPRKN12: H and L kept. DOP853: the same compiled loop without them.",
             "IAS15: prs23 is REBOUND's own step criterion, global that of 2015; on Kepler it moves two bodies.",
@@ -100,7 +100,7 @@ class HardScenes(Study[Found]):
         return {"points": _rows(found.results)}
 
     def figures(self, found: Found) -> Figures:
-        """Error against evaluations and time, two panels for each scene."""
+        """Draw error against evaluations and time, two panels for each problem."""
         from ..plotting import CostPanel, cost_figure
 
         every = list(found.results.values())
@@ -114,7 +114,7 @@ class HardScenes(Study[Found]):
             cost_figure(
                 rows,
                 error="error of position at the end",
-                title="Hard scenes: error against cost (errors above 1 left out)",
+                title="Hard problems: error against cost (errors above 1 left out)",
                 footnote=f"{found.machine}; one thread, least of at most {self.spread.repeats}",
                 largest=1.0,
                 size=(4.0, 2.8),

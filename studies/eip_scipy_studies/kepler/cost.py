@@ -22,14 +22,14 @@ from ..work_precision import Curve, Runner, cost_to_reach, costs_at, curves, wor
 __all__ = ["Found", "KeplerCost", "KeplerPoint"]
 
 FIXED: dict[type[EIPSolver], tuple[int, ...]] = {
-    # Steps in the whole run.
+    # Numbers of steps in the whole run.
     EIPRK2: (10_000, 30_000, 100_000, 300_000, 1_000_000),
     EIPRK3: (4_000, 10_000, 30_000, 100_000, 300_000),
     EIPRK4: (2_000, 4_000, 10_000, 30_000, 100_000),
     EIPRK5: (2_000, 4_000, 10_000, 20_000, 40_000),
 }
 PAIRS: dict[type[EIPSolver], tuple[float, ...]] = {
-    # Relative tolerances; atol is a thousandth.
+    # Relative tolerances; atol is 0.001 of them.
     EIPRK23: (1e-4, 1e-5, 1e-6, 1e-7, 1e-8),
     EIPRK45: (1e-4, 1e-6, 1e-8, 1e-10, 1e-11),
     EIPDOP853: (1e-4, 1e-6, 1e-8, 1e-10, 1e-12),
@@ -48,7 +48,7 @@ class KeplerPoint(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The runs, each method's from the cheapest to the dearest, and the machine."""
+    """The runs, those of each method in ascending cost, and the machine."""
 
     points: list[KeplerPoint]
     machine: str
@@ -56,7 +56,7 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class KeplerCost(Study[Found]):
-    """The command: several steps and tolerances, each timed `repeats` times, the least of which counts."""
+    """The command: several steps and tolerances, each timed `repeats` times; the least time counts."""
 
     t_end: float = 200.0
     repeats: int = 5

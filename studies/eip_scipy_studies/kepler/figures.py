@@ -1,4 +1,4 @@
-"""The paper's figures 1 and 2: perturbed Kepler orbits, errors of the invariants, and beside them that of the orbit."""
+"""The paper's figures 1 and 2: perturbed Kepler orbits, with the errors of the invariants and of the orbit."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ __all__ = ["KeplerFigures", "KeplerRun", "KnownValue"]
 
 STEP = 0.03
 ORBIT_END = 100.0
-REFINEMENT = 6  # steps of the reference in one
-# check=False: the paper's RK2 keeps both invariants and loses the orbit, which is what the figure shows.
+REFINEMENT = 6  # number of steps of the reference in one step
+# check=False, because the paper's RK2 keeps both invariants and loses the orbit, which the figure shows.
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False, "check": False}
 FIGURES: dict[str, tuple[str, dict[str, tuple[type[EIPSolver], str]]]] = {
     "fig-kepler-1.png": (
@@ -50,7 +50,7 @@ class KeplerRun:
     t : ndarray, shape (m,)
     y : ndarray, shape (4, m)
     energy_error, momentum_error, position_error : ndarray, shape (m,)
-        Absolute, the last against the reference.
+        Absolute errors, the last against the reference.
     """
 
     t: np.ndarray
@@ -61,7 +61,7 @@ class KeplerRun:
 
 
 class KnownValue(NamedTuple):
-    """An error that is known to two digits, and ours."""
+    """Error that is known to two digits, and ours."""
 
     method: str
     quantity: str
@@ -70,7 +70,7 @@ class KnownValue(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether the digits agree."""
+        """Return whether the digits agree."""
         return compact(self.ours) == self.known
 
     @property
@@ -87,7 +87,7 @@ Found = dict[str, KeplerRun]
 class KeplerFigures(Study[Found]):
     """``reproduce fig-kepler``: the methods of both figures in the paper's setting, by the names in the figures.
 
-    The reference is EIPDOP853 with a sixth of the step, compensated; with a third it differs by 1e-11 at t = 2000.
+    The reference is EIPDOP853 with 1/6 of the step, compensated; with 1/3 it differs by 1e-11 at t = 2000.
     """
 
     t_end: float = 2000.0

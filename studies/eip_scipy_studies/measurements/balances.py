@@ -1,4 +1,4 @@
-"""``eip-scipy study balances``: last errors with and without balances, where they help and where they do not.
+"""``eip-scipy study balances``: final errors with and without balances, in cases in which they help or do not help.
 
 Each system runs with the same fixed steps (the close encounter with the same tolerances) without projection and with
 one or more sets of balances, in the default metric unless a line says otherwise. Systems in space are run in several
@@ -57,8 +57,7 @@ class Case(NamedTuple):
     """A system in one rotation: a run of it, its sets of balances, and which floats of the state are compared.
 
     `steps` are h, or rtol and atol; `finer` is how many steps of the reference there are in one step (or rtol over
-    that of the reference). The error is the largest
-    one of the vectors at `places`.
+    that of the reference). The error is the largest one of the vectors at `places`.
     """
 
     run: Callable[..., Any]
@@ -516,14 +515,14 @@ class Row(NamedTuple):
 
 
 class Found(NamedTuple):
-    """All rows, and the curves of the figure: times, errors without and errors with, by system."""
+    """All rows, and the curves of the figure: times, errors without and errors with balances, by system."""
 
     rows: list[Row]
     curves: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def finer_steps(case: Case, share: float = 1.0) -> dict[str, Any]:
-    """Return the options of a reference, or of one by a multiple of its step."""
+    """Return the options of a reference, or of a run with a multiple of its step."""
     exact = {"invariants": (), "compensated": True}
     if "h" in case.steps:
         return {**exact, "h": case.steps["h"] * share / case.finer}
@@ -567,7 +566,7 @@ def curve(system: System, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     found = [
         case.run(**case.steps, invariants=items, save_every=every) for items in ((), next(iter(case.sets.values())))
     ]
-    n = min(right.t.size, found[0].t.size) - 1  # the last states may be of shorter steps
+    n = min(right.t.size, found[0].t.size) - 1  # the last states may belong to shorter steps
     errors = [system.times * distance(case, run.y[:, 1:n], right.y[:, 1:n]) for run in found]
     return right.t[1:n], errors[0], errors[1]
 
@@ -659,7 +658,7 @@ def summary(rows: list[Row]) -> dict[str, float]:
 
 
 def bars(groups: Mapping[tuple[str, str], list[Row]]) -> list[str]:
-    """Return what does not hold: too little gained, worse, or worse without a warning."""
+    """Return the conditions that do not hold: too little gained, worse, or worse without a warning."""
     lines = []
     for (name, kept), rows in groups.items():
         system, one = SYSTEMS[name], summary(rows)

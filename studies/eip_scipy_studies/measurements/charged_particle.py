@@ -2,12 +2,13 @@
 
 1. Time of a step in the tokamak: plain RK4, EIP-HL with both metrics and with wider spacings, Boris, implicit midpoint;
    and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp: 5000). Runs in turn,
-   the least time of each, without what comes before the first step; the ratios are of one and the same process.
+   the least time of each, without the time before the first step; the ratios are taken within one process.
 2. Error against cost in the uniform field and on both orbits of the tokamak: error of position and of the guiding
    centre (averaged over a gyration) at the end of the paper's interval, EIP methods and the same without projection in
-   the canonical form, Boris and heyoka (where installed) in the form (x, v).
+   the canonical form, Boris and heyoka (if installed) in the form (x, v).
 
-Times are processor times of the thread, which on an idle machine are wall times and on a busy one still mean something.
+Times are processor times of the thread. On an idle machine they are wall times; on a busy one they are still
+meaningful.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ ROUNDS = 5
 
 
 def speed(turns: int, share: float) -> dict[str, float]:
-    """Microseconds for a step of the banana orbit; `share`: of the steps."""
+    """Return microseconds per step of the banana orbit; `share`: of the steps."""
     problem, other = tokamak(), tokamak(form="velocity")
     h, rhs = problem.h, problem.rhs
     assert h is not None
@@ -92,7 +93,7 @@ def speed_text(best: dict[str, float]) -> str:
 
 
 class Point(NamedTuple):
-    """One method at one setting: seconds, and errors of position and guiding centre at the end."""
+    """Result of one method at one setting: seconds, and errors of position and guiding centre at the end."""
 
     scene: str
     method: str
@@ -103,7 +104,7 @@ class Point(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One method at one setting: its seconds without saving, and its states (t, y), with the last gyrations."""
+    """One method at one setting: seconds of a run without saving, and the states (t, y), with the last gyrations."""
 
     method: str
     setting: float
@@ -113,7 +114,7 @@ class Case(NamedTuple):
 
 
 def cases(problem: ParticleProblem, other: ParticleProblem, with_heyoka: bool) -> Iterator[Case]:
-    """All methods and settings: steps in units of the paper's, or tolerances. `other` has the states (x, v)."""
+    """Return all methods and settings: steps in units of the paper's, or tolerances. `other` has the states (x, v)."""
     fine, wide, wider = (1.0, 0.5, 0.25, 0.125), (2.0, 1.0, 0.5, 0.25), (4.0, 2.0, 1.0, 0.5)
     for name, method, factors in (("RK4", EIPRK4, fine), ("RK45", EIPRK45, wide), ("DOP853", EIPDOP853, wider)):
         for factor in factors:
@@ -134,7 +135,7 @@ def cases(problem: ParticleProblem, other: ParticleProblem, with_heyoka: bool) -
 
 
 def spacing(factor: float) -> int:
-    """Steps between two saved states: those are at multiples of the paper's step."""
+    """Return the number of steps between two saved states, which are at multiples of the paper's step."""
     return max(round(1 / factor), 1)
 
 
@@ -190,10 +191,10 @@ def tail_times(problem: ParticleProblem) -> np.ndarray:
 
 
 def costs(name: str, repeats: int, share: float, with_heyoka: bool) -> list[Point]:
-    """Run all methods on a share of one scene's interval, in turn; the least time of several turns counts."""
+    """Run all methods on a share of one problem's interval, in turn; the least time of several turns counts."""
     problem, other = (shortened(scene(name, form=form), share) for form in ("canonical", "velocity"))
     assert problem.h is not None
-    # A quarter of the paper's step, compensated: 1e-9 from the states stored with the problem.
+    # The reference has 1/4 of the paper's step, compensated: it is 1e-9 from the states stored with the problem.
     run = integrate(problem, method=EIPDOP853, h=problem.h / 4, save_every=4, compensated=True, invariants=())
     truth = ParticleOrbit(problem, run.t[-TAIL - 1 :], run.y[:, -TAIL - 1 :])
     chosen = list(cases(problem, other, with_heyoka))
@@ -206,7 +207,7 @@ def costs(name: str, repeats: int, share: float, with_heyoka: bool) -> list[Poin
 
 
 def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
-    """A share of the interval, whole in the longest steps."""
+    """Return a share of the interval, a whole number of the longest steps."""
     assert problem.h is not None
     if share == 1:
         return problem
@@ -215,7 +216,7 @@ def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
 
 
 def errors(orbit: ParticleOrbit, truth: ParticleOrbit) -> tuple[float, float]:
-    """Errors of position and of the averaged guiding centre at the end."""
+    """Return errors of position and of the averaged guiding centre at the end."""
     step = round(float(np.median(np.diff(orbit.t))) / float(np.median(np.diff(truth.t))))
     count = TAIL // step + 1
     tail = ParticleOrbit(orbit.problem, orbit.t[-count:], np.ascontiguousarray(orbit.y[:, -count:]))
@@ -271,7 +272,7 @@ class ParticleCost(Measurement[Found]):
         return {"charged-particle-cost.csv": [point._asdict() for point in found.points]}
 
     def figures(self, found: Found) -> Figures:
-        """Draw one figure for each scene."""
+        """Draw one figure for each problem."""
         from ..plotting import CostPanel, cost_figure
 
         kinds = {"position": "position", "guiding_centre": "guiding centre"}

@@ -1,9 +1,9 @@
-"""``eip-scipy study ensembles``: cost of a member of an ensemble, and what more cores and workers bring.
+"""``eip-scipy study ensembles``: cost of a member of an ensemble, and the gain from more cores and workers.
 
 Kepler's problem with H and L, EIPRK4, fixed step. Everything that is compared runs in turns, and the least times count.
-Beside the wall time stands the processor time that the same work took, which other load on the machine hardly touches.
+Next to the wall time is the processor time of the same work, which other load on the machine hardly affects.
 
-1. One thread against the loop of single runs that are set up already (their `wall_time`), per step.
+1. One thread against the loop of single runs that are already set up (their `wall_time`), per step.
 2. Two threads against one; two Dask workers on the loopback interface against one.
 3. Peak memory of processes with `members`, a tenth and ten times as many, their trajectories reduced.
 4. The whole job, `members` of `steps` steps each, on all cores.
@@ -49,7 +49,7 @@ def starts(members: int) -> np.ndarray:
 
 
 def seconds(members: int, steps: int, executor: Any) -> float:
-    """Wall time of an ensemble, from call to result."""
+    """Return the wall time of an ensemble, from call to result."""
     y0s = starts(members)
     begin = time.perf_counter()
     run = ensemble(kepler(), (0.0, steps * H), y0s, h=H, executor=executor)
@@ -59,7 +59,7 @@ def seconds(members: int, steps: int, executor: Any) -> float:
 
 
 def single(members: int, steps: int) -> float:
-    """Time of as many single runs, without what comes before their steps."""
+    """Return the time of as many single runs, without the time before their steps."""
     problem, y0s = kepler(), starts(members)
     return sum(integrate(problem, (0.0, steps * H), y0, method=EIPRK4, h=H, check=False).wall_time for y0 in y0s)
 
@@ -94,7 +94,7 @@ def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
     clients = {"one Dask worker": local_client(1), "two Dask workers": local_client(2)}
     try:
         for client in clients.values():
-            seconds(members, 10, client)  # what a worker does once
+            seconds(members, 10, client)  # exclude the one-time work of a worker
         actions = {
             name: (lambda c=c: sum(c.run(time.process_time).values()), lambda c=c: seconds(members, steps, c))
             for name, c in clients.items()
@@ -107,7 +107,7 @@ def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
 
 
 def memory(members: int) -> dict[str, float]:
-    """Return megabytes of a process: of the states, its peak, and that above imports and starts."""
+    """Return megabytes of a process: of the states, its peak, and the peak without imports and starts."""
     code = MEMORY.format(members=members, h=H)
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     base, peak = (int(text) / 1024 for text in printed.split())
@@ -126,7 +126,7 @@ class Ensembles(Measurement[dict[str, Any]]):
     curve_steps: int = option(200, "steps of each member where their number grows (%(default)s)", type=int)
 
     def measure(self, session: Session) -> dict[str, Any]:
-        seconds(16, self.steps, None)  # compiled before
+        seconds(16, self.steps, None)  # compile before the measurement
         few = max(16, self.members // 10)
         compared = threads(few, self.steps, self.repeats) | workers(few, self.steps, self.repeats)
         return {
@@ -171,7 +171,7 @@ class Ensembles(Measurement[dict[str, Any]]):
         return {"ensembles.csv": found["curve"]}
 
     def figures(self, found: dict[str, Any]) -> Figures:
-        """Draw the time against members, with a line of slope 1, and the time for each member."""
+        """Draw the total time against the number of members, with a line of slope 1, and the time per member."""
         from eip_scipy.plotting import PALETTE
 
         from ..plotting import blank_figure

@@ -1,8 +1,8 @@
-"""``eip-scipy study exoplanets``: EIPGJ14 and EIPRKN12 beside WHFast and IAS15 on three systems of exoplanets.
+"""``eip-scipy study exoplanets``: EIPGJ14 and EIPRKN12 compared with WHFast and IAS15 on three systems of exoplanets.
 
 A resonant chain (seven planets with the periods, masses and transits of TRAPPIST-1's, on circles at the start), a
 planet of eccentricity 0.6 with one further out, and a hot Jupiter with two companions under the relativistic potential
-in 1/r^2, which is REBOUNDx's `gr_potential` on the other side. Errors of position [AU], of the innermost planet and the
+in 1/r^2, which is REBOUNDx's `gr_potential` there. Errors of position [AU], of the innermost planet and the
 largest of another one's, against heyoka in 80-bit arithmetic, run anew each time; wall times are the least of three in
 turns, one core. ``pip install reboundx heyoka``.
 """
@@ -34,7 +34,7 @@ EARTH = 3.003e-6  # solar masses
 
 
 class System(NamedTuple):
-    """A problem, the period of its innermost planet, and how many steps in it are to be taken."""
+    """A problem, the period of its innermost planet, and the numbers of steps per period."""
 
     problem: Problem
     period: float
@@ -47,7 +47,7 @@ class System(NamedTuple):
 def planets(
     star: float, elements: list[tuple[float, float, float, float, float, float]], years: float, relativity: bool = False
 ) -> Problem:
-    """Bodies on ellipses about a star of so many solar masses, in the frame of their barycentre.
+    """Return bodies on ellipses about a star of the given mass [solar masses], in the frame of their barycentre.
 
     `elements`: mass [solar masses], semi-major axis [AU], eccentricity, inclination, argument of the pericentre, mean
     anomaly [rad].
@@ -86,14 +86,14 @@ def chain(share: float) -> System:
 
 
 def eccentric(share: float) -> System:
-    """A planet of eccentricity .6 within .5 AU, and a heavier one outside."""
+    """A planet of eccentricity 0.6 within 0.5 AU, and a heavier one outside."""
     elements = [(1e-3, 0.5, 0.6, 0.1, 0.3, 1.0), (2e-3, 5.0, 0.1, 0.0, 2.0, 4.0)]
     problem = planets(1.0, elements, 300.0 * share)
     return System(problem, 0.5**1.5, False, (240, 280, 320, 400), (32, 40, 50, 64), (30, 60, 120, 240, 480))
 
 
 def hot_jupiter(share: float) -> System:
-    """A planet of 1e-3 in 2.9 days, with relativity; a light one beyond it, and a far one."""
+    """A planet of mass 1e-3 with a period of 2.9 days, with relativity; a light one beyond it, and a distant one."""
     elements = [
         (1e-3, 0.04, 0.02, 0.0, 1.0, 0.0), (3e-5, 0.09, 0.01, 0.02, 2.0, 2.0), (3e-3, 1.4, 0.1, 0.05, 0.0, 4.0),
     ]  # fmt: skip

@@ -1,7 +1,8 @@
-"""``eip-scipy study far``: ten bodies over 100 000 years, where no reference reaches, by methods of several kinds.
+"""``eip-scipy study far``: ten bodies over 100 000 years, longer than any reference, by methods of several kinds.
 
-How far the runs are from one of them with twice the steps. Two methods that share nothing but the balances, and come to
-the same places, are the evidence; the packaged reference, which ends after 10 000 years, says how good that one run is.
+The numbers are the distances of the runs from one of them with twice the steps. Two methods that share only the
+balances and reach the same positions are the evidence. The packaged reference, which ends after 10 000 years, gives the
+error of that run.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ def ways() -> dict[str, dict[str, Any]]:
 
 
 class Found(NamedTuple):
-    """Times, and of each run its seconds and the distances (m, 10) of the bodies from the finest run [AU].
+    """Times, and for each run its seconds and the distances (m, 10) of the bodies from the finest run [AU].
 
-    `known`: those of the finest run from the reference, at its times.
+    `known`: distances of the finest run from the reference, at its times.
     """
 
     times: np.ndarray
@@ -58,7 +59,7 @@ class Far(Measurement[Found]):
     ias15: bool = option(False, "IAS15 too, which takes minutes")
 
     def measure(self, session: Session) -> Found:
-        needed("eip_scipy.integrations.rebound")  # before runs that take minutes
+        needed("eip_scipy.integrations.rebound")  # checked before runs that take minutes
         times = np.array([t for t in DECADES if t < self.years] + [self.years])
         problem, own = solar_system(years=self.years), ways()
         peers = {"WHFast (c17), 1 d": "whfast-c17"} | ({"IAS15": "ias15"} if self.ias15 else {})

@@ -1,7 +1,7 @@
-"""``eip-scipy study gpe``: cost of the rotating Gross-Pitaevskii equation beside transforms and plain RK4.
+"""``eip-scipy study gpe``: cost of the rotating Gross-Pitaevskii equation compared with transforms and plain RK4.
 
-Processor time, the least of several; functions that are compared are taken in turn, so that other load on the machine
-disturbs all alike. One thread. "transforms" are a library's alone, a pair along each axis: x, and then the other axes
+Processor time, the least of several; functions that are compared are called in turn, so that other load on the machine
+affects all equally. One thread. "transforms" are a library's alone, a pair along each axis: x, and then the other axes
 together.
 """
 
@@ -82,10 +82,10 @@ def steps(shape: Shape, seconds: float) -> Times:
         for count in (1, STEPS + 1):
             functions[name, count] = clocked(partial(run, kept, count, others), process_time)
     found = least(functions, turns=3, seconds=seconds)
-    # Not in turn with the others: what it leaves behind slows the one after it for tens of steps.
+    # Not in turn with the others: it slows the next function for tens of steps.
     scipy = RK45(gpe.fun, 0.0, psi, 1e3, first_step=h, max_step=h, rtol=1e-2, atol=1.0)
     found |= least({("RK45", "solve_ivp"): many_calls(scipy.step)}, turns=3, seconds=seconds / 5)
-    for name in VARIANTS:  # without what a run of a single step takes
+    for name in VARIANTS:  # without the time of a run of a single step
         found[name, "integrate"] = (found.pop((name, STEPS + 1)) - found.pop((name, 1))) / STEPS
     return {key: 1e3 * t for key, t in found.items()}
 
@@ -147,7 +147,7 @@ class EquationCost(Measurement[dict[str, dict[Shape, Times]]]):
         }
 
     def figures(self, found: dict[str, dict[Shape, Times]]) -> Figures:
-        """Draw the cost of f against the number of points, and N log N beside it."""
+        """Draw the cost of f against the number of points, with N log N."""
         from eip_scipy.plotting import method_styles
 
         from ..plotting import blank_figure

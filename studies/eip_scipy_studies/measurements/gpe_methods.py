@@ -2,9 +2,9 @@
 
 RK4 and splittings. The start is the ring's ground state for kappa = 0.3, one row of 38 vortices around a winding of
 123, in the trap of kappa = 0.7. Errors at the end: that of the field is the norm of its difference from EIPDOP853 with
-h = 2.5e-4 on the same grid in the same frame, which shares no part of its step with the others but the right-hand side.
-It is the error of the steps alone: the grid's own is larger, and another one in the frame at rest. Times are processor
-seconds, the least of several, all points in turn.
+h = 2.5e-4 on the same grid in the same frame, which shares only the right-hand side with the others. It is the error of
+the steps alone: the error of the grid is larger, and differs in the frame at rest. Times are processor seconds, the
+least of several, all points in turn.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ SPLITTING_STEPS = (2.5e-3, 2e-3, 1.6e-3, 1.25e-3, 1e-3)
 
 
 def grid_error(gpe, turning, resting):
-    """Norm of the difference of the two frames' solutions, which is the grid's doing."""
+    """Return the norm of the difference of the two frames' solutions, which is caused by the grid."""
     angle = gpe.Omega * turning[0].t_span[1]
     return float(np.sqrt(gpe.mass(rotated(gpe, resting[1], angle).ravel() - turning[1])))
 
 
 def runners(psi, t_end, points):
-    """Return (run, steps) of each method, defects by (method, h), the grid's error, and the error of a state.
+    """Return (run, steps) of each method, invariant errors by (method, h), the grid's error, and the error of a state.
 
     ``run(h) -> (seconds, y)``, where y is the difference from the reference of its frame.
     """
@@ -81,7 +81,7 @@ def runners(psi, t_end, points):
 
 
 class Found(NamedTuple):
-    """Points, the changes of mass and energy by method and step, and the difference that the grid makes."""
+    """Points, the changes of mass and energy by method and step, and the difference that the grid causes."""
 
     points: tuple[WorkPoint, ...]
     defects: dict[tuple[str, float], tuple[float, float]]

@@ -1,8 +1,8 @@
-"""``eip-scipy study gpe-mpi``: cost of the Gross-Pitaevskii equation on ranks of MPI, beside one processor.
+"""``eip-scipy study gpe-mpi``: cost of the Gross-Pitaevskii equation on ranks of MPI, compared with one processor.
 
     mpirun -n 2 python -m mpi4py -m eip_scipy study gpe-mpi
 
-Least wall-clock times, taken in turn; ranks that have no part in a measurement sleep. One thread on each rank.
+Least wall-clock times, taken in turn; ranks that do not take part in a measurement sleep. One thread on each rank.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ def world() -> Any:
 
 
 def wait():
-    """A barrier in which ranks sleep."""
+    """Wait for all ranks, sleeping meanwhile."""
     request = world().Ibarrier()
     while not request.Test():
         time.sleep(1e-4)
 
 
 def timed(function, comm):
-    """Seconds of the slowest rank."""
+    """Return the seconds of the slowest rank."""
     comm.Barrier()
     begin = time.perf_counter()
     function()
@@ -62,7 +62,7 @@ def start(gpe):
 
 
 class Case:
-    """The equation on the first ranks, on a single one without MPI where their number is 0."""
+    """Return the equation on the first ranks, or on a single one without MPI if their number is 0."""
 
     def __init__(self, shape, ranks):
         self.here = world().rank < max(ranks, 1)
@@ -86,12 +86,12 @@ class Case:
         return method(self.gpe.fun, 0.0, self.psi, 1e3, h=h, invariants=invariants, metric="euclidean")
 
     def measure(self):
-        """Seconds of f, of a step without invariants and of one that keeps both."""
+        """Return seconds of f, of a step without invariants and of one that keeps both."""
         functions = [lambda: self.gpe.rhs(0.0, self.psi, self.out), *(solver.step for solver in self.solvers)]
         return np.array([min(timed(function, self.comm) for _ in range(IN_A_ROW)) for function in functions])
 
     def results(self):
-        """Whole fields on rank 0: f at the start, and the state after some steps with projection."""
+        """Return whole fields on rank 0: f at the start, and the state after some steps with projection."""
         solver = self.solvers[1]
         for _ in range(STEPS):
             solver.step()
@@ -101,7 +101,7 @@ class Case:
 
 
 def counts():
-    """0 (no MPI), 1, 2, 4, ... and all ranks."""
+    """Return 0 (no MPI), 1, 2, 4, ... and the number of all ranks."""
     return sorted({0, *(2**k for k in range(world().size.bit_length()) if 2**k <= world().size), world().size})
 
 
@@ -138,7 +138,7 @@ class RanksCost(Measurement[dict[str, dict[int, list[float]]]]):
     def measure(self, session: Session) -> dict[str, dict[int, list[float]]]:
         shapes, seconds = (QUICK_SHAPES, 1.0) if self.quick else (SHAPES, SECONDS)
         found = {" x ".join(map(str, shape)): compare(shape, seconds) for shape in shapes}
-        if world().rank:  # the first one shows the results of all
+        if world().rank:  # the first rank shows the results of all
             session.json, session.quiet = None, True
         return found
 

@@ -1,7 +1,7 @@
-"""``eip-scipy study gradients``: cost of a compiled gradient beside one written by hand.
+"""``eip-scipy study gradients``: cost of a compiled gradient compared with one written by hand.
 
 Each system runs by `integrate` with hand-written jitted gradients and without any, in turn; the ratio is that of the
-least times. The hand-written ones share what they can within a function, as their author would write them.
+least times. The hand-written ones share common terms within a function, as their author would write them.
 """
 
 from __future__ import annotations

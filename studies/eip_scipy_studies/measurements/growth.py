@@ -1,4 +1,4 @@
-"""``eip-scipy study growth``: growth of the error of position over 10 000 years, beside Brouwer's law.
+"""``eip-scipy study growth``: growth of the position error over 10 000 years, compared with Brouwer's law.
 
 Ten bodies from DE440, Newtonian, by EIPGJ14, EIPRKN12, IAS15 and WHFast, against the packaged
 reference states. An error of longitude that comes from round-off alone grows as t^(3/2) (Brouwer 1937), one from a
@@ -28,7 +28,7 @@ __all__ = ["Growth"]
 
 BODIES = {"Mercury": 1, "Earth-Moon": 3, "Jupiter": 5}
 NYSTROM = {"method": EIPRKN12, "h": 1 / 64}
-ORDER_STEPS = 512, 1024  # a year, in all orders of the axes
+ORDER_STEPS = 512, 1024  # steps per year, in all orders of the axes
 
 
 def ways() -> dict[str, dict[str, Any]]:
@@ -38,14 +38,14 @@ def ways() -> dict[str, dict[str, Any]]:
         "EIPRKN12, every 10": {**NYSTROM, "every": 10},
         "RKN12, compensated": {**NYSTROM, "invariants": (), "compensated": True},
         "EIPGJ14": {"method": EIPGJ14, "h": 1 / 600},
-        # A power of two, so that all times are exact: with 1/600, its rounding alone puts the Earth 4e-12 AU off
+        # A power of two, so that all times are exact: the rounding of 1/600 alone moves the Earth by 4e-12 AU
         # by the end.
         "EIPGJ14, balances": {"method": EIPGJ14, "h": 1 / 512, **orbits_kept()},
     }
 
 
 def slope(times: np.ndarray, errors: np.ndarray) -> float:
-    """Return the exponent of the growth, without errors that are 0 (a logarithm has none); nan for a single time."""
+    """Return the exponent of the growth, ignoring errors that are 0 (their logarithm is infinite); nan for one time."""
     known = errors > 0
     return float(np.polyfit(np.log(times[known]), np.log(errors[known]), 1)[0]) if known.sum() > 1 else float("nan")
 
@@ -57,7 +57,7 @@ def spread(values: np.ndarray) -> list[str]:
 
 
 class Found(NamedTuple):
-    """Times, and of each method the seconds of the run and the errors (m, 10) of the bodies [AU].
+    """Times, and for each method the seconds of the run and the errors (m, 10) of the bodies [AU].
 
     `orders` has, for each number of steps a year, the errors (6, m, 10) of EIPGJ14 with balances in all orders of axes.
     """
@@ -74,7 +74,7 @@ def distances(states: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def in_orders(problem: Problem, times: np.ndarray, truth: np.ndarray, steps: int) -> np.ndarray:
-    """Return the errors (6, m, 10) of EIPGJ14 with balances and this many steps a year, in all orders of the axes."""
+    """Return the errors (6, m, 10) of EIPGJ14 with balances and `steps` steps per year, in all orders of the axes."""
     found = []
     for axes in ORDERS:
         start = replace(problem, y0=reordered(problem.y0, axes))
@@ -91,7 +91,7 @@ class Growth(Measurement[Found]):
     years: float = option(10_000.0, "length of the runs (%(default)s)", type=float)
 
     def measure(self, session: Session) -> Found:
-        needed("eip_scipy.integrations.rebound")  # before runs that take minutes
+        needed("eip_scipy.integrations.rebound")  # checked before runs that take minutes
         known = {t: y for t, y in reference_states().items() if t <= self.years}
         times, truth = np.array(list(known)), np.array(list(known.values())).T
         problem = solar_system(years=times[-1])

@@ -1,8 +1,8 @@
-"""``eip-scipy study import-time``: how long imports take, beside `scipy.integrate` and Numba.
+"""``eip-scipy study import-time``: duration of imports, compared with `scipy.integrate` and Numba.
 
-Each import runs in a fresh process, all in turn, so that a machine whose speed drifts does not decide; processor time
-less that of an empty process in the same round. The first round is not counted: it writes the bytecode. The median over
-the rounds, and that of the ratio to `import scipy.integrate` in the same round.
+Each import runs in a fresh process, all in turn, so that a drifting speed of the machine does not decide; processor
+time minus that of an empty process in the same round. The first round is not counted: it writes the bytecode. The
+median over the rounds, and that of the ratio to `import scipy.integrate` in the same round.
 """
 
 from __future__ import annotations

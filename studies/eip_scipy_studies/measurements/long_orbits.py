@@ -1,4 +1,4 @@
-"""``eip-scipy study long-orbits``: what projection, its spacing and compensation bring to EIPRKN12 over 1000 years.
+"""``eip-scipy study long-orbits``: effect of projection, its spacing and compensation on EIPRKN12 over 1000 years.
 
 Ten bodies, DE440 system barycentres, Newtonian. Errors of position [AU] against the packaged reference states (80
 bits); wall times are the least of three, on one core. EIPGJ14 and, if REBOUND is installed, IAS15, SABA(10,6,4) and

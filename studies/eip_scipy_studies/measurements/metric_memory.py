@@ -89,12 +89,12 @@ class Outcome:
 
     @property
     def ratio(self) -> float:
-        """The error relative to the unprojected run's."""
+        """Return the error relative to the unprojected run's."""
         return (self.error + 1e-15) / (self.plain + 1e-15)
 
 
 def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Outcome]:
-    """Yield all runs of a problem; `plain` keeps the unprojected errors."""
+    """Yield all runs of a problem; `plain` stores the unprojected errors."""
     for method in case.methods:
         for step in case.steps:
             control = {"h": step} if step >= 1e-3 or case.group == "SI units" else {"rtol": step, "atol": step}
@@ -147,7 +147,7 @@ def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invari
 
 
 def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """Return the same from U and grad U."""
+    """Return field and energy of (q, v) from U and grad U."""
 
     @njit
     def force(q, out):
@@ -597,7 +597,7 @@ class Andrews:
 
     @classmethod
     def spring(cls, q: np.ndarray) -> tuple[float, float, float, float]:
-        """Length, stretch and the ends' difference of the spring."""
+        """Return length, stretch and the difference of the ends of the spring."""
         ga = q[2]
         xd = cls.sd * np.cos(ga) + cls.sc * np.sin(ga) + cls.xb
         yd = cls.sd * np.sin(ga) - cls.sc * np.cos(ga) + cls.yb
@@ -623,7 +623,7 @@ class Andrews:
 
     @classmethod
     def terms(cls) -> list[list[tuple[float, float, tuple[float, ...]]]]:
-        """Each constraint as a sum of terms a cos(w q + p): (a, p, w)."""
+        """Return each constraint as a sum of terms a cos(w q + p): (a, p, w)."""
         h = -np.pi / 2  # sin x = cos(x - pi / 2)
         be, ga, bt, fe, oe = (1.0,), (0, 0, 1.0), (1.0, 1.0), (0, 0, 0, 1.0, 1.0), (0, 0, 0, 0, 0, 1.0, 1.0)
         de, ep = (0, 0, 0, 0, 1.0), (0, 0, 0, 0, 0, 0, 1.0)
@@ -834,7 +834,7 @@ def row(name: str, found: list[Outcome]) -> tuple[str, list[str]]:
 
 
 def scatter(chosen: Iterable[Case]) -> str:
-    """Count how often errors of chaotic problems differ by more than three times for no reason but chance."""
+    """Count how often errors of chaotic problems differ by more than a factor of three by chance."""
     chance, projected = [], []
     for case in chosen:
         for method in case.methods:

@@ -1,9 +1,9 @@
-"""``eip-scipy study metric-table``: what the metric of the projection does to the solar system.
+"""``eip-scipy study metric-table``: effect of the projection's metric on the solar system.
 
-RK4, h = 0.002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; they differ in which
-planet pays for it. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged reference states
-after 100 and 2000 years. Then the gain of Mercury's position over plain RK4 in random rotations of the axes, with
-blocks of 3 and without.
+RK4, h = 0.002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; they differ in the
+planet that is changed for it. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged
+reference states after 100 and 2000 years. Then the gain of Mercury's position over plain RK4 in random rotations of the
+axes, with blocks of 3 and without.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ __all__ = ["MetricTable"]
 
 STEP = 0.002
 SAVE_EVERY = 20
-GRAVITATION = 6.6743e-11  # turns G m [m^3/s^2] into masses [kg] for the row in SI momenta
+GRAVITATION = 6.6743e-11  # converts G m [m^3/s^2] to masses [kg] for the row in SI momenta
 OBLIQUITY = np.deg2rad(84381.448 / 3600)
 PLANETS = ("Mercury", "Venus", "EMB", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
 
 
 def longitudes(y: np.ndarray) -> np.ndarray:
-    """Unwrapped heliocentric ecliptic longitudes (9, m) of states (60, m)."""
+    """Return unwrapped heliocentric ecliptic longitudes (9, m) of states (60, m)."""
     q = y[:30].reshape(10, 3, -1)
     q = q[1:] - q[:1]
     north = np.cos(OBLIQUITY) * q[:, 1] + np.sin(OBLIQUITY) * q[:, 2]
@@ -42,28 +42,28 @@ def longitudes(y: np.ndarray) -> np.ndarray:
 
 
 def turn(angle: np.ndarray) -> np.ndarray:
-    """The angle in (-pi, pi]."""
+    """Return the angle in (-pi, pi]."""
     return np.pi - np.mod(np.pi - angle, 2 * np.pi)
 
 
 def reference_longitudes(near: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Longitudes of the reference state, their turns counted by a run `near` it (all errors below pi)."""
+    """Return longitudes of the reference state, with turns counted by a run `near` it (all errors below pi)."""
     last = longitudes(near)[:, -1]
     return last + turn(longitudes(reference[:, None])[:, 0] - last)
 
 
 def position_errors(y: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Distances [AU] of the planets from the reference."""
+    """Return distances [AU] of the planets from the reference."""
     return np.linalg.norm((y - reference)[:30].reshape(10, 3), axis=1)[1:]
 
 
 def momentum_weights(masses: np.ndarray) -> np.ndarray:
-    """Weights in (q, v) of the euclidean metric in (q, p)."""
+    """Return weights in (q, v) of the euclidean metric in (q, p)."""
     return np.concatenate([np.ones(30), np.repeat(1 / masses, 3)])
 
 
 def metric_rows(years: float) -> dict[str, np.ndarray]:
-    """Errors of longitude (9,) of each row of the table."""
+    """Return errors of longitude (9,) of each row of the table."""
     problem, si = solar_system(years=years), solar_system(years=years, units="SI")
     assert problem.params is not None
     assert si.params is not None
@@ -88,7 +88,7 @@ def metric_rows(years: float) -> dict[str, np.ndarray]:
 
 
 def rotation_gains(rotations: int, seed: int = 1) -> list[dict[str, float]]:
-    """Mercury's position error after 100 years, plain RK4's over EIP's, in random orientations of the axes."""
+    """Return Mercury's position error after 100 years, plain RK4's over EIP's, in random orientations of the axes."""
     data = load("de440")
     scale = 365.25
     out = []

@@ -1,13 +1,13 @@
-"""``eip-scipy study multistep``: EIPGJ14 and EIPGJ12, one evaluation a step, beside EIPRKN12 and other packages.
+"""``eip-scipy study multistep``: EIPGJ14 and EIPGJ12, one evaluation a step, against EIPRKN12 and other packages.
 
 1. Ten bodies, Newton, 1000 years: each run once in each of six rotations of the axes, in turns. Errors of position [AU]
    against the packaged reference state: Mercury's, the least and the largest over the rotations, and the largest of
    another planet. The ratios below the table are of least times.
 2. The same over 10 000 years (IAS15 once), against the packaged states.
-3. Kepler's problem with e = 0.6 and the relativistic term to t = 600, beside heyoka, which is compiled before.
+3. Kepler's problem with e = 0.6 and the relativistic term to t = 600, compared with heyoka, which is compiled before.
 4. EIPRKN12 over 100 years with steps of 0.02 yr, with and without projection, in the same rotations.
 
-One core, and nothing beside it: ratios of times are what counts. Parts 1, 2 and 4 need REBOUND, part 3 heyoka.
+One core without other load: ratios of times are the result. Parts 1, 2 and 4 need REBOUND, part 3 heyoka.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .orbits import Methods, Row, by_rebound, daily, orbit_table, rows, yearly
 __all__ = ["Multistep"]
 
 ROTATIONS = 6
-REPEATS = 200  # of runs of milliseconds
+REPEATS = 200  # for runs of milliseconds
 END, WANTED = 600.0, 1e-9
 OURS = ("EIPGJ14", "EIPGJ12", "EIPRKN12")
 Table = dict[str, Row]
@@ -45,10 +45,10 @@ class Multistep(Measurement[dict[str, Table]]):
     """The command."""
 
     parts: Sequence[int] = option((1, 2, 3, 4), "parts of the study", type=int, nargs="+", choices=(1, 2, 3, 4))
-    quick: bool = option(False, "a tenth of the spans and fewer rotations, to see that it runs")
+    quick: bool = option(False, "0.1 of the spans and fewer rotations, as a trial")
 
     def measure(self, session: Session) -> dict[str, Table]:
-        if 3 in self.parts:  # before the minutes that others take
+        if 3 in self.parts:  # before the minutes that the other parts take
             needed("heyoka", '"eip_scipy[heyoka]"')
         ways = {1: thousand_years, 2: ten_thousand_years, 3: against_heyoka, 4: with_projection}
         with session.bar(len(self.parts), "multistep", "part") as bar:
@@ -149,7 +149,7 @@ def against_heyoka(quick: bool) -> Table:
 
 
 def kepler_table(found: Table) -> str:
-    """Lay out what `against_heyoka` found, and what the wanted error costs beside heyoka."""
+    """Lay out the results of `against_heyoka`, and the cost of the wanted error compared with heyoka."""
     body = [(name, [f"{row['call']:.3f}", f"{row['steps']:.3f}", f"{row['error']:.1e}"]) for name, row in found.items()]
     lines = [table([["call [ms]"], ["steps [ms]"], ["error"]], body), ""]
     enough = {name: row for name, row in found.items() if row["error"] <= WANTED}
@@ -172,7 +172,7 @@ def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Cal
 
 
 def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
-    """Make the same run by heyoka, compiled before, and the seconds that it took."""
+    """Make the run by heyoka, compiled before; return the seconds that it took."""
     heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     assert problem.params is not None
     x, y, u, v = heyoka.make_vars("x", "y", "u", "v")
@@ -194,7 +194,7 @@ def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray]
 
 
 def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem, int], Methods], turns: int) -> Table:
-    """Run all methods in turn, in axes turned anew each time."""
+    """Run all methods in turn, in new random axes each time."""
     found = []
     for turn, rotation in enumerate([Rotation.identity(), *Rotation.random(turns - 1, np.random.default_rng(1))]):
         own = replace(problem, y0=rotation.apply(problem.y0.reshape(-1, 3)).ravel()) if turn else problem
@@ -204,7 +204,7 @@ def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem
 
 
 def compared(found: Table, mercury: float, others: float) -> list[str]:
-    """Say what the cheapest run of these errors takes, beside WHFast's time for Mercury and IAS15's."""
+    """Return the cost of the cheapest run with these errors, relative to WHFast's time for Mercury and IAS15's."""
     whfast = [row for name, row in found.items() if name.startswith("WHFast")]
     there = cost_to_reach([row["least"] for row in whfast], [row["worst"] for row in whfast], mercury)
     good = {name: row for name, row in found.items() if row["worst"] <= mercury and row["others"] <= others}

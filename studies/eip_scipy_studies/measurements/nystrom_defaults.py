@@ -1,16 +1,16 @@
 """``eip-scipy study nystrom-defaults``: two options of EIPRKN8 and EIPRKN12 that could be defaults.
 
-A projection where it tells more than round-off (`every="auto"`) and compensated sums, beside neither. Ten bodies over
-100 and 1000 years, orbits of exoplanets, the hard scenes and all hard cases whose forces do not change with the
-velocity; fixed steps that bring EIPRKN12 to about 1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances. Each number is over
-three neighbouring steps or tolerances, for a single run's last digits are luck: the geometric mean of the errors at the
-end and of the largest changes of an invariant along the run (up to 4000 of its rows), the sum of the times, and how
-many runs were not trusted. Exoplanets need heyoka and REBOUNDx.
+A projection only if the invariant error exceeds round-off (`every="auto"`) and compensated sums, against a run with
+neither. Ten bodies over 100 and 1000 years, orbits of exoplanets, the hard problems and all hard cases whose forces do
+not change with the velocity; fixed steps that bring EIPRKN12 to about 1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances.
+Each number is over three neighbouring steps or tolerances, because a single run's last digits are luck: the geometric
+mean of the errors at the end and of the largest changes of an invariant along the run (up to 4000 of its rows), the sum
+of the times, and how many runs were not reliable. Exoplanets need heyoka and REBOUNDx.
 
-What came of it: the error is that of projecting each step, compensated or not, but where rounding is most of it, and
-there both together divide it by up to 1000 (1000 years). But compensation takes 10 to 40 % more time in most runs,
-"auto" leaves invariants at 1e-9 to 1e-7 between projections at loose tolerances, and with either members of an ensemble
-do not go side by side. Neither is never worse, so neither is a default.
+Result: the error is that of projecting each step, compensated or not, unless rounding is most of it; then both options
+together divide it by up to 1000 (1000 years). But compensation takes 10 to 40 % more time in most runs, "auto" leaves
+invariant errors of 1e-9 to 1e-7 between projections at loose tolerances, and with either option members of an ensemble
+are not vectorised. Runs without them are never worse, so neither is a default.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ NEIGHBOURS = 1.0, 0.97, 0.94
 LEVELS = 1e-3, 1e-6, 1e-9, 1e-12
 TOLERANCES = 1e-5, 1e-8, 1e-11
 REPEATS = 3
-MOST_STEPS = 40_000  # an eighth of it in Python
+MOST_STEPS = 40_000  # 1/8 of it in Python
 MOST_ROWS = 4_000
 
 
 class System(NamedTuple):
-    """A problem and the error of its last state, relative to its largest component; `natively`: it is timed."""
+    """A problem and the error of its last state, relative to its largest component; `natively`: the run is timed."""
 
     problem: Problem
     error: Callable[[np.ndarray], float]
@@ -72,7 +72,7 @@ def by_reference(problem: Problem, size: float = 1.0) -> System:
 
 
 def systems() -> Iterator[tuple[str, Callable[[], System]]]:
-    """Yield the systems by name, made when they are wanted."""
+    """Yield the systems by name, made on demand."""
     for years in (100.0, 1000.0):
         yield f"ten bodies, {years:g} yr", partial(_solar, years)
     for name in ("resonant chain", "e = .6", "hot Jupiter"):
@@ -146,7 +146,7 @@ def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], ro
 
 
 def steps(system: System) -> list[int]:
-    """Return numbers of steps that bring EIPRKN12, each step projected, below the levels, as far as it gets there."""
+    """Return numbers of steps that bring EIPRKN12 with projected steps below the levels, as far as possible."""
     found, n, left = list[int](), 8, list(LEVELS)
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     while left and n < (MOST_STEPS if system.natively else MOST_STEPS // 8):
@@ -160,7 +160,7 @@ def steps(system: System) -> list[int]:
 
 
 def settings(system: System) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Yield names of settings, and the neighbours that each stands for."""
+    """Yield names of settings, and the neighbouring values of each."""
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     for n in steps(system):
         save = {"save_every": max(1, n // MOST_ROWS)}
@@ -179,7 +179,7 @@ def rows(name: str, make: Callable[[], System]) -> Iterator[dict[str, Any]]:
     system = make()
     for setting, options in settings(system):
         for method in (EIPRKN8, EIPRKN12):
-            # In turns, for the machine may have other work to do.
+            # In turn, because the machine may have other work to do.
             runs = [{way: run_one(system, method, o | more) for way, more in WAYS.items()} for o in options]
             for way in WAYS:
                 own = [turn[way] for turn in runs]
@@ -216,7 +216,7 @@ class NystromDefaults(Measurement[list[dict[str, Any]]]):
         return found
 
     def table(self, found: list[dict[str, Any]]) -> str:
-        """Lay out errors and changes of each way, times over the first way's, and how many runs are not trusted."""
+        """Lay out errors and changes of each way, times over the first way's, and the number of unreliable runs."""
         heads = [[way if what == "error" else "", what] for way in WAYS for what in ("error", "drift", "time", "bad")]
         body = []
         for k in range(0, len(found), len(WAYS)):

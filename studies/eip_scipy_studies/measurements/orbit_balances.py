@@ -1,8 +1,8 @@
-"""``eip-scipy study orbit-balances``: what each quantity of the orbits costs and gains, as a balance.
+"""``eip-scipy study orbit-balances``: cost and gain of each quantity of the orbits, as a balance.
 
-Energies, angular momenta and Laplace vectors of all orbits (``balances=`` of `nbody`), in each combination, beside runs
-without projection and runs that keep the totals. All runs are made in the six orders of the coordinate axes, in turns:
-times (of the processor) are the least of the six, errors of position are medians.
+Energies, angular momenta and Laplace vectors of all orbits (``balances=`` of `nbody`), in each combination, against
+runs without projection and runs that keep the totals. All runs are made in the six orders of the coordinate axes, in
+turns: times (of the processor) are the least of the six, errors of position are medians.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ KEPT: dict[str, tuple[str, ...] | None] = {
     "E, h, e": ("energy", "momentum", "laplace"),
 }
 TILTED = Rotation.from_euler("xyz", [0.3, 0.5, 0.7])
-UNIT = "E"  # whose time is 1
+UNIT = "E"  # the set whose time is 1
 
 
 class System(NamedTuple):
@@ -50,12 +50,12 @@ class System(NamedTuple):
 
 
 def ten_bodies(years: float, **options: Any) -> System:
-    """Return the solar system against its packaged state at one of the times of `reference_states`."""
+    """Return the solar system with its packaged state at one of the times of `reference_states`."""
     return System(partial(solar_system, years=years), reference_states()[years], options)
 
 
 def eccentric(years: float, **options: Any) -> System:
-    """Return a planet with a = 1 AU, e = 0.6 and a heavier one outside, against a run with steps 20 times shorter."""
+    """Return a planet with a = 1 AU, e = 0.6 and a heavier one outside; the exact state has 20 times shorter steps."""
     sun, masses, e = 4 * math.pi**2, (1e-4, 1e-3), 0.6
     gm = sun * np.array([1, *masses])
     speed = math.sqrt(sun * (1 + masses[0]) * (1 + e) / (1 - e))
@@ -69,7 +69,7 @@ def eccentric(years: float, **options: Any) -> System:
     return System(problem, fine.y[:, -1], options)
 
 
-# Each takes the share of its span that is run.
+# Makers of the systems, by the share of the span that is run.
 SYSTEMS: dict[str, Callable[[float], System]] = {
     "ten bodies, 1000 years, EIPGJ14, 1/512 yr": lambda share: ten_bodies(1000 * share, method=EIPGJ14, h=1 / 512),
     "ten bodies, 100 years, EIPDOP853, 1/256 yr": lambda share: ten_bodies(100 * share, method=EIPDOP853, h=1 / 256),
@@ -78,7 +78,7 @@ SYSTEMS: dict[str, Callable[[float], System]] = {
 
 
 class Cost(NamedTuple):
-    """Seconds of the processor, and errors of place [AU] of the innermost planet and of the worst other one."""
+    """Seconds of the processor, and position errors [AU] of the innermost planet and of the worst other one."""
 
     seconds: float
     innermost: float
@@ -112,7 +112,7 @@ class OrbitBalances(Measurement[dict[str, dict[str, Cost]]]):
 
 
 def costs(system: System) -> dict[str, Cost]:
-    """Return what is measured of each set of balances."""
+    """Return the measurements of each set of balances."""
     problems = {kept: system.problem(balances=quantities or None) for kept, quantities in KEPT.items()}
     problems["nothing"] = replace(problems["nothing"], invariants=())
     found: dict[str, list[Cost]] = {kept: [] for kept in KEPT}

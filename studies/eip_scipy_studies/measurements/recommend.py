@@ -1,7 +1,7 @@
-"""``eip-scipy study recommend``: how well `recommend` does on the 35 hard cases.
+"""``eip-scipy study recommend``: accuracy of `recommend` on the 35 hard cases.
 
 Wanted, expected and true error of the recommended run; the true one is that of `recommendation.run()` against the exact
-final state. Two counts: true errors between a tenth of the wanted one and ten times it, and those that are at most ten
+final state. Two counts: true errors between 0.1 and 10 times the wanted one, and those that are at most ten
 times it. Times: of the search, and of the run.
 """
 

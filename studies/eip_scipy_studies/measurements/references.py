@@ -1,8 +1,8 @@
 """``eip-scipy study particle-reference`` and ``scene-reference``: states in extended precision.
 
-heyoka's Taylor series in 80 to 160 bits make the reference states that the library and the studies carry as data:
-``particle_references.json`` and ``scene_references.json``. Each
-command writes its states as a file in the folder of ``--out`` and prints how far they are from what is known otherwise.
+heyoka's Taylor series in 80 to 160 bits give the reference states that the library and the studies carry as data:
+``particle_references.json`` and ``scene_references.json``. Each command writes its states as a file in the folder of
+``--out`` and prints their distances from other known states.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ class Reference(Study[Found]):
         return "\n".join(found.lines)
 
     def figures(self, found: Found) -> Figures:
-        """Give the file of the states: what is not a CSV file is written as figures are."""
+        """Write the file of the states: a file that is not CSV is written as figures are."""
         text = json.dumps({"about": found.about, "states": found.states}, indent=1) + "\n"
         yield self.file, lambda path: path.write_text(text, encoding="utf-8")
 
 
-# Charged particles. heyoka integrates the form (x, v) with B written out; so the canonical equations and A are tested
-# by the states, not used for them. The first momentum is that of the problem, rounded to double precision as there.
+# Charged particles. heyoka integrates the form (x, v) with B written out; therefore the states test the canonical
+# equations and A and do not use them. The first momentum is that of the problem, rounded to double precision as there.
 
 
 def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
@@ -89,7 +89,7 @@ def vector_potential(name: str, x: Any, number: Any) -> list[Any]:
 
 
 def _log(r: Any, number: Any) -> Any:
-    """Logarithm of numbers near 1: Newton's method on exp, whose series is short there."""
+    """Return the logarithm of numbers near 1: Newton's method on exp, whose series is short there."""
     result = number(float(np.log(float(r))))
     for _ in range(3):
         term = total = number(1.0)
@@ -153,12 +153,12 @@ class ParticleReference(Reference):
         return Found(lines, about, stored)
 
 
-# Hard scenes. The order of the Taylor series and the tolerance follow the precision. The differences say how far a
-# scene can be known: 64 bits are not enough for the three bodies of Burrau at t = 70.
+# Hard problems. The order of the Taylor series and the tolerance follow the precision. The differences say how well a
+# problem can be solved: 64 bits are not enough for the three bodies of Burrau at t = 70.
 
 
 def scenes() -> list[tuple[Problem, list[float]]]:
-    """Return the scenes without a closed form, with the times of the states to store."""
+    """Return the problems without a closed form, with the times of the states to store."""
     return [
         (pythagorean(), [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0]),
         (figure_eight(), [figure_eight(n).t_span[1] for n in (1, 10, 100)]),
@@ -194,7 +194,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneReference(Reference):
-    """Final states of the scenes; the difference from 113 bits and, if REBOUND is installed, from IAS15."""
+    """Final states of the problems; the difference from 113 bits and, if REBOUND is installed, from IAS15."""
 
     file = "scene_references.json"
     bits: int = option(160, "precision in bits (%(default)s)", type=int)
@@ -212,7 +212,7 @@ class SceneReference(Reference):
             for t, a, b in zip(times, difference(rows, fewer), difference(rows, double), strict=True):
                 lines.append(f"{problem.name:14} t = {t:<12.6g} from {CHECK_BITS} bits: {a:.1e}   from IAS15: {b:.1e}")
         about = (
-            "Final states (q of all bodies, v of all bodies) of the scenes in problems/scenes.py: heyoka "
+            "Final states (q of all bodies, v of all bodies) of the problems in problems/scenes.py: heyoka "
             f"{heyoka.__version__}, Taylor, {self.bits}-bit arithmetic; made by `eip-scipy study scene-reference`."
         )
         return Found(lines, about, stored)

@@ -1,8 +1,8 @@
-"""``eip-scipy study relativity``: ten bodies with relativity beside WHFast, SABA and IAS15 with REBOUNDx.
+"""``eip-scipy study relativity``: ten bodies with relativity, against WHFast, SABA and IAS15 with REBOUNDx.
 
 The force is the potential in 1/r^2 of Nobili & Roxburgh, the same in both packages: `forces="gr-potential"` here,
 `gr_potential` there. Errors of position [AU] against heyoka in 80-bit arithmetic, run anew each time; wall times are
-the least of three, one core. REBOUNDx (GPL) and heyoka are no dependencies: ``pip install reboundx heyoka``.
+the least of three, one core. REBOUNDx (GPL) and heyoka are optional: ``pip install reboundx heyoka``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``eip-scipy study ring-grids``: the paper's ring on several grids, the grid's own error beside that of the steps.
+"""``eip-scipy study ring-grids``: the paper's ring on several grids, errors of the grid and of the steps.
 
 All runs start from the ground state for kappa = 0.3 on the paper's 256 x 256 points, by its Fourier modes, in the trap
 of kappa = 0.7. They are splittings of order 4 with both invariants kept, in the frame at rest; the last one is what
@@ -40,7 +40,7 @@ def ground(file, points, tol):
 
 
 def on_grid(field, points):
-    """The field on another number of points along each axis, by its Fourier modes."""
+    """Return the field on another number of points along each axis, by its Fourier modes."""
     return resample(resample(field, points, axis=0), points, axis=1)
 
 
@@ -52,7 +52,7 @@ def edge(field):
 
 
 class GridRun:
-    """A run's fields at the snapshots in the frame at rest, and its vortices seen from the rotating one."""
+    """A run's fields at the snapshots in the frame at rest, and its vortices in the rotating one."""
 
     def __init__(self, psi, points, t_end, *, shown, turning=False):
         gpe = ring_condensate(RING.kappas[1], points=points)
@@ -64,7 +64,7 @@ class GridRun:
         result = integrate(problem, method=method, save_every=round(RING.saved / problem.h), progress=shown)
         self.label = f"{points} x {points}, {'turning, RK4' if turning else 'at rest, splitting'}"
         self.wall_time = result.wall_time
-        # The phases of a field at rest are those of the turning one at turned points: vortices are found in either.
+        # The phases of a field at rest are those of the rotating one at rotated points: vortices are found in either.
         moved = motion(gpe, result.t, result.y)
         self.times = [at for at in RING.snapshots if at <= t_end + 1e-9]
         at = [int(np.argmin(np.abs(result.t - t))) for t in self.times]

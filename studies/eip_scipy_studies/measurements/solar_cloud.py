@@ -1,9 +1,9 @@
-"""``eip-scipy study solar-cloud``: an ensemble of solar systems with perturbed starts, beside REBOUND.
+"""``eip-scipy study solar-cloud``: an ensemble of solar systems with perturbed starts, compared with REBOUND.
 
-`ensemble` with EIPRKN12 and EIPGJ14 on one core, every member with its own H and L, beside the same runs by `integrate`
-one at a time, and WHFast with corrector 17 and IAS15 from REBOUND. Of what runs one at a time a sample of the members
-is run: each costs the same. Errors of Mercury's position [AU] at the end against IAS15, itself good to 1e-11, the
-largest over the sample. Least processor times of five turns.
+`ensemble` with EIPRKN12 and EIPGJ14 on one core, every member with its own H and L, against the same runs by
+`integrate` one at a time, and WHFast with corrector 17 and IAS15 from REBOUND. Runs one at a time use a sample of the
+members, because each costs the same. Errors of Mercury's position [AU] at the end against IAS15, itself accurate to
+1e-11, the largest over the sample. Least processor times of five turns.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .orbits import Row
 __all__ = ["SolarCloud"]
 
 REPEATS = 5
-# Of each method the steps a year, and its options.
+# Steps per year of each method, and its options.
 METHODS: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
     "EIPRKN12": ((36, 38, 44), {"method": EIPRKN12, "every": 10}),
     "EIPGJ14": ((236, 255, 300, 405, 460), {"method": EIPGJ14}),
@@ -38,7 +38,7 @@ SPREAD = 1e-6  # of each coordinate, relative
 
 
 def clones(problem: Problem, members: int) -> np.ndarray:
-    """Return perturbed starts, each in the frame of its own barycentre, to which REBOUND's integrators go."""
+    """Return perturbed starts, each in the frame of its own barycentre, which REBOUND's integrators use."""
     assert problem.params is not None
     factors = 1 + SPREAD * np.random.default_rng(1).standard_normal((members, problem.y0.size))
     states = (problem.y0 * factors).reshape(members, 2, -1, 3)
@@ -58,7 +58,7 @@ class SolarCloud(Measurement[dict[str, Row]]):
         needed("eip_scipy.integrations.rebound")
         problem = solar_system(years=self.years)
         starts = clones(problem, self.members)
-        ensemble(problem, (0, 0.1), starts[:16], method=EIPRKN12, h=0.02, executor=1)  # loads what it needs
+        ensemble(problem, (0, 0.1), starts[:16], method=EIPRKN12, h=0.02, executor=1)  # loads and compiles
         runs = self._runs(problem, starts)
         states: dict[str, np.ndarray] = {}
 
@@ -77,7 +77,7 @@ class SolarCloud(Measurement[dict[str, Row]]):
         }
 
     def _runs(self, problem: Problem, starts: np.ndarray) -> dict[str, tuple[int, Callable[[], np.ndarray]]]:
-        """Return how many members each row of the table runs, and the run."""
+        """Return the number of members of each row of the table, and the run."""
         few, span = starts[: self.sample], (0.0, self.years)
         found: dict[str, tuple[int, Callable[[], np.ndarray]]] = {}
 

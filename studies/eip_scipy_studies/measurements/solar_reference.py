@@ -150,7 +150,7 @@ def apart(a: Array, b: Array) -> Array:
 
 
 class Found(NamedTuple):
-    """Times, the states, and how far other runs are from them, by what they are."""
+    """Times, the states, and the distances of other runs from them, by kind."""
 
     years: list[float]
     states: list[Array]
@@ -190,7 +190,7 @@ class SolarReference(Study[Found]):
         return "\n".join(lines)
 
     def figures(self, found: Found) -> Figures:
-        """Give the file of the states: what is not a CSV file is written as figures are."""
+        """Write the file of the states: a file that is not CSV is written as figures are."""
         about = (
             "Newtonian ten-body solar system from the state of problems.solar_system() in AU and Julian years: all "
             "positions [AU], then all velocities [AU/yr], by time in Julian years; Gauss-Jackson of order 14 in 80 "

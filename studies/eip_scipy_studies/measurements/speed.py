@@ -4,8 +4,8 @@
    hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
 2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
 3. Compiled Kepler to t = 300 with 3001 times in t_eval against saving each step; a section of 1600 crossings against
-   the run without it. Whole calls.
-4. A process: from its start to its first compiled step, with a user's functions that no cache knows.
+   the run without it. Times of whole calls.
+4. A process: from its start to its first compiled step, with user functions that are not in any cache.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
 
 
 def per_step(seconds: Callable[[int], float], runs: int, steps: int = STEPS) -> float:
-    """Seconds of one step, without what a run begins with: from the least times of runs of two lengths.
+    """Return the seconds of one step, without the start of a run: from the least times of runs of two lengths.
 
     ``seconds(n)`` is the time of a run of n steps.
     """
@@ -166,7 +166,7 @@ def call_time(action: Callable[[], Any], calls: int) -> float:
 
 
 def of_integrate(h: float, **arguments: Any) -> Callable[[int], float]:
-    """The time of a run of n steps, without what comes before them."""
+    """Return the time of a run of n steps, without the time before them."""
     return lambda n: integrate(t_span=(0.0, n * h), h=h, **arguments).wall_time
 
 
@@ -268,7 +268,7 @@ def process_times(turns: Turns) -> dict[str, float]:
         code = USER % ((1.0 + 0.001 * k,) * 3)
         printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         firsts.append([float(x) for x in printed.split()])
-    rest = np.median(np.array(firsts[1:]), axis=0)  # the first one may write bytecode
+    rest = np.median(np.array(firsts[1:]), axis=0)  # the first process may write bytecode
     return {
         "a process: import [s]": float(rest[0]),
         "a process: start to the end of its first compiled run [s]": float(rest[1]),

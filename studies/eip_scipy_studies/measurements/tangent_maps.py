@@ -1,11 +1,11 @@
-"""``eip-scipy study tangent-maps``: what projection brings to derivatives by the start and by parameters.
+"""``eip-scipy study tangent-maps``: effect of projection on derivatives by the start and by parameters.
 
 The state-transition matrix of Kepler's problem against its closed form; periodic orbits of the restricted three-body
-problem; Lyapunov exponents beside heyoka's variational equations, from one start and as means over a chaotic sea; MEGNO
-beside REBOUND's variational particles, and with relativity, which these do not know, beside differences of orbits; what
-columns of derivatives cost, by the source of the products with the Jacobian, and what they save in a fit. The figure is
-a map of MEGNO over the second of two planets' axis and eccentricity, by both.
-``pip install "eip_scipy[heyoka,rebound,sympy]"``.
+problem; Lyapunov exponents compared with heyoka's variational equations, from one start and as means over a chaotic
+sea; MEGNO compared with REBOUND's variational particles, and with relativity, which these lack, compared with
+differences of orbits; the cost of columns of derivatives, by the source of the products with the Jacobian, and their
+gain in a fit. The figure is a map of MEGNO over the second of two planets' axis and eccentricity, by both. ``pip
+install "eip_scipy[heyoka,rebound,sympy]"``.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class TangentMaps(Measurement[Found]):
             return Found(**parts, axes=axes, eccentricities=eccentricities, **maps)
 
     def _maps(self, axes: np.ndarray, eccentricities: np.ndarray, numba: Any, session: Session) -> dict[str, Any]:
-        """MEGNO and the exponents over the grid, by us and, where it is installed, by REBOUND from the same vectors."""
+        """MEGNO and the exponents over the grid, by us and, if it is installed, by REBOUND from the same vectors."""
         peer = session.peer("rebound", "REBOUND's map of MEGNO")
         rates, energy = planets(numba)
         shape, end = (eccentricities.size, axes.size), self.map_periods * PERIOD
@@ -202,7 +202,7 @@ class TangentMaps(Measurement[Found]):
                     theirs["exponent"][i, j] = 2 * slope
                 run = megno(rates, (0, end), y0, deviation=deviation, params=m, in_place=True, method=EIPDOP853, h=STEP,
                             every=end / 2, invariants=energy)  # fmt: skip
-                # Close encounters, which these steps do not resolve, are chaos.
+                # Close encounters, which these steps do not resolve, count as chaos.
                 ours[i, j], slopes[i, j] = (run.megno, run.lyapunov) if run.trusted else (np.inf, np.nan)
         return {"map": ours, "rebound": theirs, "rates": {"exponent": slopes}}
 
@@ -259,7 +259,7 @@ class TangentMaps(Measurement[Found]):
         return "\n\n".join(blocks)
 
     def _compared(self, found: Found) -> str:
-        """Return how the two maps compare: the regular points of both, and the exponents of the chaotic ones."""
+        """Return a comparison of the two maps: the regular points of both, and the exponents of the chaotic ones."""
         ours, theirs = found.map, found.rebound["megno"]
         regular, chaotic = (ours < CALM) & (theirs < CALM), (ours > WILD) & (theirs > WILD)
         opposite = (ours < CALM) & (theirs > WILD) | (ours > WILD) & (theirs < CALM)
@@ -354,7 +354,7 @@ def _exponents(study: TangentMaps, session: Session, numba: Any) -> dict[str, li
     found: dict[str, list[float | None]] = {}
     for name, system in SYSTEMS.items():
         problem = system.problem()
-        # The first of these times is one in which rounding does not yet part the orbits.
+        # The first of these times is one at which rounding has not separated the orbits yet.
         for t_end in (200 * system.share, study.time * system.share):
             run = megno(problem, (0, t_end), system.y0, deviation=[1.0, 0.0, 0.0, 0.0], method=EIPDOP853, h=system.h)
             ours, theirs = float(run.log_size[-1] / t_end), None
@@ -369,8 +369,8 @@ def _exponents(study: TangentMaps, session: Session, numba: Any) -> dict[str, li
 def _sea(study: TangentMaps, session: Session, numba: Any) -> dict[str, Any]:
     """Average the largest exponent over starts of the chaotic sea: states of one chaotic orbit at equal distances.
 
-    Rounding parts two integrations of a chaotic orbit, and each sticks to islands for long times now and then: what can
-    agree is the mean.
+    Rounding separates two integrations of a chaotic orbit, and each sticks to islands for long times now and then: only
+    the means can agree.
     """
     heyoka = session.peer("heyoka", "heyoka's variational equations")
     system = SYSTEMS["Hénon-Heiles, E = 1/6"]
@@ -394,7 +394,7 @@ def _sea(study: TangentMaps, session: Session, numba: Any) -> dict[str, Any]:
 
 
 def _followed(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float | None]]:
-    """Compare exponents along one orbit: in pieces in which rounding does not part it, heyoka starts where we are."""
+    """Compare exponents along one orbit: in pieces that rounding does not separate, heyoka starts at our states."""
     heyoka = session.peer("heyoka", "heyoka's variational equations")
     found: dict[str, list[float | None]] = {}
     for name, system in SYSTEMS.items():
@@ -417,7 +417,7 @@ def _standard_error(values: np.ndarray) -> float:
 
 
 def _relativity(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float]]:
-    """Compare growth with a force that REBOUND's variational particles do not know with that of orbits' distances."""
+    """Compare growth with a force that REBOUND's variational particles lack with that of orbits' distances."""
     found, t_end, eps = {}, 50 * PERIOD, 1e-6
     direction = np.random.default_rng(0).standard_normal(18)
     direction /= np.linalg.norm(direction)

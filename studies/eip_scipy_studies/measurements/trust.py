@@ -95,7 +95,7 @@ def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 def sick_table(rows: list[dict[str, Any]]) -> list[list[str]]:
     """Count, group by group, how runs were reported, by the plainest of the ways of each run."""
-    table = [["what is wrong", "runs", *CHANNELS, "not told"]]
+    table = [["what is wrong", "runs", *CHANNELS, "not reported"]]
     for group, own in {**groups(rows), "all": rows}.items():
         counts = [sum(row["first"] == channel for row in own) for channel in (*CHANNELS, SILENT)]
         table.append([group, str(len(own)), *(str(count or "") for count in counts)])

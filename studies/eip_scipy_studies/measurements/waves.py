@@ -1,4 +1,4 @@
-"""``eip-scipy study waves``: waves by lines, errors against processor time beside SciPy's DOP853.
+"""``eip-scipy study waves``: waves by lines, errors against processor time compared with SciPy's DOP853.
 
 Three waves with closed forms: the breather of the nonlinear Schroedinger equation, a kink and an antikink of the
 sine-Gordon equation that meet, two solitons of the Korteweg-de Vries equation that overtake each other. Each by
@@ -32,19 +32,19 @@ __all__ = ["Waves"]
 
 OWN, RAW, EIP, SCIPY = "own method, projected", "own method alone", "EIPDOP853", "SciPy's DOP853"
 METHODS = (OWN, RAW, EIP, SCIPY)
-REPEATS, SHORT = 3, 1.0  # of runs below so many seconds; others run once
+REPEATS, SHORT = 3, 1.0  # runs that take less than `SHORT` seconds are repeated, others run once
 # Problem, fixed steps, tolerances.
 SCENES: dict[str, tuple[Any, tuple[float, ...], tuple[float, ...]]] = {
     "NLS breather": (breather(t_end=5.0, fft="scipy"), (0.02, 0.01, 0.005, 0.0025), (1e-4, 1e-8, 1e-10)),
     "sine-Gordon kinks": (sine_gordon_kinks(), (0.4, 0.35, 0.3, 0.25, 0.2), (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)),
     "KdV solitons": (korteweg_de_vries_solitons(), (0.03, 0.02, 0.015, 0.01, 0.007), (1e-4, 1e-8, 1e-10)),
 }
-LONG: dict[str, tuple[Any, float, float]] = {  # problem, end, step, which the times below are multiples of
+LONG: dict[str, tuple[Any, float, float]] = {  # problem, end, and a step of which the times below are multiples
     "NLS breather": (breather(fft="scipy"), 25.0, 0.01),
     "sine-Gordon breather": (sine_gordon_breather(), 1000.0, 0.125),
     "KdV solitons": (korteweg_de_vries_solitons((1.0, 0.6), (-20.0, 20.0), 256, 120.0), 160.0, 0.04),
 }
-TIMES = (0.1, 0.3, 1.0)  # of the longer runs, in parts of their length
+TIMES = (0.1, 0.3, 1.0)  # of the longer runs, as parts of their length
 
 
 def by_own(problem: Any, t: Any, h: float, **options: Any) -> tuple[np.ndarray, int | None]:
@@ -75,7 +75,7 @@ def methods(problem: Any, steps: Any, tolerances: Any) -> dict[tuple[str, float]
 
 
 def errors(problem: Any, t: float, y: np.ndarray) -> tuple[float, float]:
-    """The field's largest error, and the invariants' largest relative one."""
+    """Return the field's largest error, and the invariants' largest relative one."""
     start, end = (np.array([item.fun(0.0, state) for item in problem.invariants]) for state in (problem.y0, y))
     return float(np.abs(y - problem.reference(t)).max()), float(np.abs(end / start - 1).max())
 
@@ -147,7 +147,7 @@ class Waves(Measurement[dict[str, dict[str, list[dict[str, Any]]]]]):
 
 
 def figure(found: dict[str, list[dict[str, Any]]]) -> Any:
-    """Draw the waves in space and time, and below each the errors against the processor's time."""
+    """Draw the waves in space and time, and below each the errors against processor time."""
     from eip_scipy.plotting import method_styles
 
     from ..plotting import blank_figure

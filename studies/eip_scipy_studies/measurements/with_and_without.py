@@ -1,7 +1,7 @@
 """``eip-scipy study with-and-without``: the README's figure, a comet by RK45 and by EIPRK45.
 
-SciPy's `solve_ivp` runs both; EIPRK45 keeps the two invariants. The calls of `fun` and the largest errors of energy and
-of place in the first and the last period; the places are compared with Kepler's equation.
+SciPy's `solve_ivp` runs both; EIPRK45 keeps the two invariants. The numbers are calls of `fun` and the largest errors
+of energy and position in the first and the last period; positions are compared with Kepler's equation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""``eip-scipy study written``: cost of a problem written as an expression, beside functions written by hand.
+"""``eip-scipy study written``: cost of a problem written as an expression, compared with functions written by hand.
 
-Henon and Heiles' Hamiltonian to t = 10 000. The fresh process counts all from the start of Python: imports, the use of
-SymPy, Numba's compilation, the run. The compiled runs are measured in turn, and the least times compared.
+Henon and Heiles' Hamiltonian to t = 10 000. The time of the fresh process includes the start of Python, imports, the
+use of SymPy, Numba's compilation, the run. The compiled runs are measured in turn, and the least times compared.
 """
 
 from __future__ import annotations

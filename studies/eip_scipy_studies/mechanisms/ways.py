@@ -40,7 +40,7 @@ Way = Callable[[float], Outcome]
 
 
 class _TooManyCallsError(Exception):
-    """A run is not waited for."""
+    """Error that ends a run which takes too long."""
 
 
 def ways(problem: MechanicsProblem, session: Session) -> dict[str, Way]:
@@ -81,7 +81,7 @@ def _projected(problem: MechanicsProblem, invariants: Any, tolerance: float) -> 
 
 
 class _Calls:
-    """A number of calls, of which there may not be too many."""
+    """Counter of calls that ends a run with too many of them."""
 
     number = 0
 

@@ -46,7 +46,7 @@ class Reproduce(Command):
     studies: Mapping[str, Make] = field(default_factory=lambda: STUDIES)
 
     def run(self, session: Session) -> int:
-        """Each as a command of its own would, and one JSON of all; the numbers of all tables are in two lists of it."""
+        """Run each as its own command would, and write one JSON of all, with two lists of the numbers of all tables."""
         check_outputs(session.out, session.json)
         wanted = list(dict.fromkeys(self.studies if "all" in self.table else self.table))
         content: dict[str, Any] = {"cells": [], "orders": []}
@@ -55,7 +55,7 @@ class Reproduce(Command):
             if k > 0:
                 session.say()
             own = Session(name, session.out, None, session.quiet, session.absent)
-            if name == "fig-solar":  # a command of its own, which leaves its numbers
+            if name == "fig-solar":  # a separate command, which leaves its numbers
                 own.name, own.json = "solar-system", session.out / "solar-system.json"
             judged, numbers = perform(self.studies[name](), own)
             if judged == INTERRUPTED:

@@ -1,4 +1,4 @@
-"""``eip-scipy reproduce table1 ... table5``: the paper's numbers beside ours.
+"""``eip-scipy reproduce table1 ... table5``: the paper's numbers compared with ours.
 
 The paper's numbers, their misprints and the same computations in 50 digits are data: ``data/paper_tables.json``.
 """
@@ -34,7 +34,7 @@ TABLES = ("table1", "table2", "table3", "table4", "table5")
 LONGEST = 5  # the table that takes minutes
 OMEGA = 10.0
 METHODS: dict[str, type[EIPSolver]] = {"RK1": EIPRK1, "RK2": EIPRK2, "RK3": EIPRK3, "RK4": EIPRK4}
-# check=False: the paper's longest steps are far too long, and nobody need be told.
+# check=False: the paper's longest steps are far too long, which is known and need not be reported.
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False, "check": False}
 WIDE, NARROW, DIGITS = 12, 9, 8  # columns of the printed tables
 
@@ -48,11 +48,11 @@ class Value:
     paper : str
         The number as printed, its misprints corrected.
     ours, mpmath : float
-        The same from this package in double precision, and in 50 digits (nan where that is out of reach).
+        The same number from this package in double precision, and in 50 digits (nan if that is out of reach).
     roundoff : float
-        What round-off may change in it.
+        Possible change by round-off.
     printed : str or None
-        What the paper prints, where that is a misprint.
+        The misprint of the paper, if there is one.
     """
 
     paper: str
@@ -63,12 +63,12 @@ class Value:
 
     @property
     def paper_digits(self) -> int:
-        """Significant digits that the paper prints."""
+        """Return the significant digits that the paper prints."""
         return len(Decimal(self.paper).as_tuple().digits)
 
     @property
     def digits(self) -> int:
-        """Leading significant digits that agree once both numbers are rounded to them."""
+        """Return the leading significant digits that agree once both numbers are rounded to them."""
         paper, ours = Decimal(self.paper), Decimal(self.ours)
         for count in range(self.paper_digits, 0, -1):
             place = Decimal(1).scaleb(paper.adjusted() - count + 1)
@@ -78,12 +78,12 @@ class Value:
 
     @property
     def matched(self) -> bool:
-        """Whether every printed digit agrees."""
+        """Return whether every printed digit agrees."""
         return self.digits == self.paper_digits
 
     @property
     def within_roundoff(self) -> bool:
-        """Whether ours lies within round-off of what the paper would print so, or of the number in 50 digits.
+        """Return whether ours is within round-off of a number that the paper prints so, or of the number in 50 digits.
 
         In the second case the round-off is the paper's.
         """
@@ -93,13 +93,13 @@ class Value:
 
     @property
     def status(self) -> str:
-        """Either "matched", "round-off" or "differs"."""
+        """Return "matched", "round-off" or "differs"."""
         if self.matched:
             return "matched"
         return "round-off" if self.within_roundoff else "differs"
 
     def like_paper(self, value: float) -> str:
-        """`value` in the notation and with the digits of the paper."""
+        """Return `value` in the notation and with the digits of the paper."""
         decimals = len(self.paper.partition("e")[0].partition(".")[2])
         return f"{value:.{decimals}{'e' if 'e' in self.paper else 'f'}}"
 
@@ -176,7 +176,7 @@ class PaperTable(Study[list[Cell]]):
         return table_text(found)
 
     def checks(self, found: list[Cell]) -> list[Check]:
-        """No number differs by more than round-off."""
+        """Check that no number differs by more than round-off."""
         return [Check(self.name, passed(found))]
 
     def tables(self, found: list[Cell]) -> dict[str, Rows]:
@@ -187,13 +187,13 @@ class PaperTable(Study[list[Cell]]):
         }
 
     def numbers(self, found: list[Cell]) -> dict[str, Any]:
-        """All cells; the orders, which the paper prints in columns of their own, form a second list."""
+        """Return all cells; the orders, which the paper prints in separate columns, form a second list."""
         orders = [_record(cell, cell.order) for cell in found if cell.order is not None]
         return {"cells": [_record(cell, cell.error) for cell in found], "orders": orders}
 
 
 def _cells(series: Series, errors: list[float]) -> list[Cell]:
-    """The cells of one series."""
+    """Return the cells of one series."""
     about = _data()["tables"][str(series.table)]
     exact = [math.nan] * len(errors) if series.mpmath is None else [float(x) for x in series.mpmath]
     orders = _orders(series, errors, exact, about["roundoff"])
@@ -209,7 +209,7 @@ def _cells(series: Series, errors: list[float]) -> list[Cell]:
 
 
 def _orders(series: Series, errors: list[float], exact: list[float], roundoff: float) -> list[Value | None]:
-    """Order at each step but the first; round-off in two errors moves it in proportion to their size."""
+    """Return the order at each step but the first; round-off in two errors changes it in proportion to their size."""
     refinement = -np.diff(np.log(series.steps))
     observed, expected = (-np.diff(np.log(np.abs(values))) / refinement for values in (errors, exact))
     relative = roundoff / np.where(np.isnan(exact), errors, exact)
@@ -224,7 +224,7 @@ def _multiplier_errors(series: Series) -> list[float]:
 
 
 def _multiplier_error(series: Series, h: float) -> float:
-    """lambda_hat is what the projection does, lambda_star the paper's closed form at the same raw result."""
+    """Compare lambda_hat of the projection with lambda_star, the paper's closed form at the same raw result."""
     problem = harmonic(OMEGA)
     sol = solve_ivp(
         problem.fun,
@@ -257,7 +257,7 @@ def _raw_step(solver: type[EIPSolver], problem: Problem, y: np.ndarray, h: float
 
 
 def _last_defects(series: Series) -> list[float]:
-    """Tables 2 and 4: the last defect of the first invariant that is kept."""
+    """Tables 2 and 4: the last residual of the first preserved invariant."""
     problem = harmonic(OMEGA) if series.table == 2 else kepler(eccentricity=0.6, relativistic=0.005)
     return [_last_defect(problem, series, h) for h in series.steps]
 
@@ -281,7 +281,7 @@ def _field_differences(series: Series) -> list[float]:
 
 
 def _shared(stored: list[Series], start: Callable[..., Callable[[], Any]]) -> Callable[[Series], list[float]]:
-    """Return the same function after putting the runs of all series in line, those with most steps first."""
+    """Return the same function after queueing the runs of all series, those with most steps first."""
     runs = [(series, h) for series in stored for h in _field_steps(series)]
     waiting = {(series.name, h): start(_field_end, series, h) for series, h in sorted(runs, key=lambda run: run[1])}
     return lambda series: _field_changes([waiting[series.name, h]() for h in _field_steps(series)])
@@ -302,7 +302,7 @@ def _field_changes(ends: list[np.ndarray]) -> list[float]:
 
 
 def _run(problem: Problem, series: Series, h: float, t_end: float = 1.0) -> Any:
-    """round(t_end/h) steps of length h: the paper's last steps do not all end on t = 1."""
+    """Take round(t_end/h) steps of length h: the paper's last steps do not all end on t = 1."""
     kept = [item for item in problem.invariants if item.name[0].upper() in series.invariants]
     return integrate(
         problem,
@@ -320,7 +320,7 @@ _ERRORS = {1: _multiplier_errors, 2: _last_defects, 3: _differences, 4: _last_de
 
 
 def passed(cells: Iterable[Cell]) -> bool:
-    """Whether no number differs by more than round-off."""
+    """Return whether no number differs by more than round-off."""
     return all(value.status != "differs" for cell in cells for value in (cell.error, cell.order) if value is not None)
 
 
@@ -342,7 +342,7 @@ def _record(cell: Cell, value: Value) -> dict[str, Any]:
 
 
 def table_text(cells: list[Cell]) -> str:
-    """One table as text."""
+    """Lay out one table as text."""
     about = _data()["tables"][str(cells[0].table)]
     labels = [(cell.row, cell.column) if cells[0].table == 2 else (cell.column, cell.row) for cell in cells]
     width = max(len(label) for pair in labels for label in pair)
@@ -365,7 +365,7 @@ def _head(width: int, exact: bool) -> list[str]:
 
 
 def _values_text(cell: Cell) -> str:
-    """One line's numbers; those in 50 digits where a printed digit differs."""
+    """Lay out one line's numbers; those in 50 digits if a printed digit differs."""
     text = _value_text(cell.error, WIDE)
     if cell.order is not None:
         text += _value_text(cell.order, NARROW)
@@ -381,7 +381,7 @@ def _value_text(value: Value, width: int) -> str:
 
 
 def _summary(cells: list[Cell]) -> list[str]:
-    """How many numbers agree, and why the others do not."""
+    """Return how many numbers agree, and why the others do not."""
     errors = [cell.error for cell in cells]
     orders = [cell.order for cell in cells if cell.order is not None]
     counts = [f"{sum(v.matched for v in values)} of {len(values)}" for values in (errors, orders)]

@@ -21,14 +21,14 @@ Found = dict[str, ParticleStudy]
 
 @dataclass(frozen=True, kw_only=True)
 class ChargedParticle(Study[Found]):
-    """The command, in both fields; `paper_only` is what the paper's figures need, under their names."""
+    """The command, in both fields; `paper_only` selects the content of the paper's figures, under their names."""
 
     scenes: Sequence[str] = SCENES
     paper_only: bool = False
     stem: str = "charged-particle"
 
     def chosen(self) -> Sequence[str]:
-        """The scenes that run."""
+        """Return the problems that run."""
         return self.scenes
 
     def measure(self, session: Session) -> Found:
@@ -56,7 +56,7 @@ class ChargedParticle(Study[Found]):
         return {f"{self.stem}.csv": [row for scene in found.values() for row in report.rows(scene)]}
 
     def figures(self, found: Found) -> Figures:
-        """One for each field; a figure of the paper is one field."""
+        """Draw one figure for each field, as in the paper."""
         for name, figure in report.figures(found, paper_only=self.paper_only):
             yield f"{self.stem}.png" if self.paper_only else f"{self.stem}-{name}.png", figure
 
@@ -76,5 +76,5 @@ class Tokamak(ChargedParticle):
     orbit: str | None = option(None, "one orbit; default: both", choices=tuple(ORBITS))
 
     def chosen(self) -> Sequence[str]:
-        """The scenes of the orbit."""
+        """Return the problems of the orbit."""
         return [name for name in self.scenes if self.orbit in (None, name.removeprefix("tokamak-"))]

@@ -14,9 +14,9 @@ from .runs import PAPER_METHODS, ParticleRun, ParticleStudy
 
 __all__ = ["RangeCheck", "checks", "figures", "rows", "text"]
 
-CURVE_POINTS = 40_000  # at most about so many of an orbit's curve in a figure
-ROWS = 1000  # of each run in the CSV file
-ROUND_OFF = 1e-9  # relative: what "kept" means for H and L
+CURVE_POINTS = 40_000  # largest number of points, approximately, of an orbit's curve in a figure
+ROWS = 1000  # number of rows of each run in the CSV file
+ROUND_OFF = 1e-9  # relative bound for H and L to count as kept
 TIP = 1.0095
 TITLES = {
     "uniform": "Charged particle, uniform magnetic field and radial electric field",
@@ -36,7 +36,7 @@ class RangeCheck(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether it does; nan does not."""
+        """Return whether it does; nan does not."""
         return self.low <= self.value <= self.high
 
     @property
@@ -69,7 +69,7 @@ def checks(found: ParticleStudy) -> list[RangeCheck]:
 
 
 def _keepers(found: ParticleStudy) -> list[str]:
-    """The methods that keep both invariants."""
+    """Return the methods that keep both invariants."""
     return [name for name in found.lines if name.startswith("EIP-HL")]
 
 
@@ -153,7 +153,7 @@ LEGEND = {
 
 
 def text(found: ParticleStudy) -> str:
-    """Lay out the numbers and the checks of one scene."""
+    """Lay out the numbers and the checks of one problem."""
     got, problem = found.numbers, found.problem
     columns = {**SPECIAL[found.scene], **COMMON}
     body = [(name, [_cell(key, values[key]) for key in columns]) for name, values in got.items()]
@@ -197,9 +197,9 @@ def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -
     Parameters
     ----------
     studies : mapping of str to ParticleStudy
-        By their scenes.
+        Runs by problem.
     paper_only : bool, optional
-        Only the rows of the paper's figures, RK4 and EIP-HL, besides EIP-H in the uniform field.
+        Only the rows of the paper's figures, RK4 and EIP-HL, and EIP-H in the uniform field.
 
     Yields
     ------
@@ -209,7 +209,7 @@ def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -
     Raises
     ------
     ImportError
-        Without matplotlib.
+        If matplotlib is not installed.
     """
     from ..plotting import particle_figure
 
@@ -267,7 +267,7 @@ def _tokamak_row(orbits: Mapping[str, ParticleStudy], name: str) -> Any:
 
 
 def _thin(orbit: ParticleOrbit) -> np.ndarray:
-    """Points of a long orbit in (R, z): a few of each gyration are enough for the eye."""
+    """Return points of a long orbit in (R, z): a few of each gyration are enough for the eye."""
     every = max(orbit.t.size // CURVE_POINTS, 1)
     return np.stack([orbit.R[::every], orbit.z[::every]])
 

@@ -1,4 +1,4 @@
-"""Runs of the charged particles: the paper's method and others, and the numbers that tell them apart."""
+"""Runs of the charged particles: the paper's method and others, and the numbers that distinguish them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..long_runs import named
 __all__ = ["METHODS", "PAPER_METHODS", "SCENES", "ParticleRun", "ParticleStudy", "scene", "study"]
 
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False}
-REFINEMENT = 4  # steps of the reference in one
+REFINEMENT = 4  # number of steps of the reference in one step
 LAST_TURN = 100
 SCENES = ("uniform", *(f"tokamak-{orbit}" for orbit in ORBITS))
 
@@ -50,16 +50,16 @@ class ParticleRun:
 
 @dataclass(frozen=True, eq=False)
 class ParticleStudy:
-    """All runs of one scene.
+    """All runs of one problem.
 
     Attributes
     ----------
     scene : str
     problem : ParticleProblem
     reference : ParticleRun
-        DOP853 with a quarter of the step, compensated.
+        DOP853 with 1/4 of the step, compensated.
     reference_error : float
-        Its largest distance from the states stored with the problem; nan where the run has none.
+        Its largest distance from the states stored with the problem; nan if the run has none.
     lines : dict of str to ParticleRun
         By the methods' names.
     """
@@ -72,12 +72,12 @@ class ParticleStudy:
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, float]]:
-        """What each method got, the reference first; distances and angles against the reference.
+        """Return the results of each method, the reference first; distances and angles against the reference.
 
-        Of all scenes: ``energy_error``, ``momentum_error`` (relative, largest), ``phase_error`` (of the gyration at the
-        end, rad), ``position_error`` (at the end), ``nfev`` and ``wall_time``. Uniform field: ``gyroradius_first`` and
-        ``gyroradius_last`` (half the range of R in the first and the 100th turn, or the last where there are fewer),
-        and ``angle_error`` (of the guiding centre, averaged over a gyration; largest). Tokamak: ``tips``,
+        All problems have ``energy_error``, ``momentum_error`` (relative, largest), ``phase_error`` (of the gyration at
+        the end, rad), ``position_error`` (at the end), ``nfev`` and ``wall_time``. Uniform field: ``gyroradius_first``
+        and ``gyroradius_last`` (half the range of R in the first and the 100th turn, or the last where there are
+        fewer), and ``angle_error`` (of the guiding centre, averaged over a gyration; largest). Tokamak: ``tips``,
         ``tip_nearest`` and ``tip_farthest`` (guiding centre's R), ``extrema_error`` (largest error of the extrema of R
         and z in a poloidal turn of the reference) and ``moment_change`` (of the magnetic moment, averaged over the
         first and the last of these turns).
@@ -90,14 +90,14 @@ class ParticleStudy:
 
 
 def scene(name: str, **options: Any) -> ParticleProblem:
-    """Make the problem of a scene.
+    """Make a problem by its name.
 
     Parameters
     ----------
     name : str
         One of `SCENES`.
     **options
-        Of `uniform_field` or `tokamak`.
+        Options of `uniform_field` or `tokamak`.
     """
     return uniform_field(**options) if name == "uniform" else tokamak(name.removeprefix("tokamak-"), **options)
 
@@ -139,18 +139,18 @@ def _boris(problem: ParticleProblem) -> Any:
 def study(
     name: str, *, paper_only: bool = False, callback: Callable[[], Any] = lambda: None, **options: Any
 ) -> ParticleStudy:
-    """Run the methods on one scene, in the canonical form but for Boris, which is a method for (x, v).
+    """Run the methods on one problem, in the canonical form, except Boris, which is a method for (x, v).
 
     Parameters
     ----------
     name : str
         One of `SCENES`.
     paper_only : bool, optional
-        Leave out what the paper's figures do not need.
+        Leave out runs that the paper's figures do not need.
     callback : callable, optional
         ``callback()`` after each run.
     **options
-        Of the problem, such as ``t_end``.
+        Options of the problem, such as ``t_end``.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def _line(problem: ParticleProblem, run: Any) -> ParticleRun:
 
 
 def _distance(problem: ParticleProblem, orbit: ParticleOrbit) -> float:
-    """Largest distance from the stored positions."""
+    """Return the largest distance from the stored positions."""
     assert problem.reference is not None
     every = max((orbit.t.size - 1) // 100, 1)
     known = [(k, problem.reference(float(orbit.t[k]))) for k in range(every, orbit.t.size, every)]

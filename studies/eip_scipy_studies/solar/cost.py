@@ -1,4 +1,4 @@
-"""Error against cost for the solar system: what is timed, at which steps."""
+"""Error against cost for the solar system: methods and steps that are timed."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ __all__ = [
     "timed",
 ]
 
-ENOUGH_SECONDS = 0.2  # what disturbs so long a run is not seen on axes of many powers of ten
-MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first would not be stable
-MERCURY = 0  # of the planets, which start behind the Sun
+ENOUGH_SECONDS = 0.2  # disturbances of so long a run are invisible on axes of many powers of ten
+MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first number would be unstable
+MERCURY = 0  # number among the planets, which follow the Sun
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +57,11 @@ class TimedRun:
     ----------
     method : str
     step : float
-        Years; for heyoka its tolerance; nan for IAS15, which has its own.
+        Years; the tolerance for heyoka; nan for IAS15, which chooses its steps.
     wall_time : float
         Seconds.
     errors : ndarray, shape (9,)
-        Distance of each planet from the reference [AU]; nan where the run failed.
+        Distance of each planet from the reference [AU]; nan if the run failed.
     """
 
     method: str
@@ -71,17 +71,17 @@ class TimedRun:
 
     @property
     def mercury(self) -> float:
-        """Mercury's error."""
+        """Return Mercury's error."""
         return float(self.errors[MERCURY])
 
     @property
     def others(self) -> float:
-        """The largest error of another planet."""
+        """Return the largest error of another planet."""
         return float(np.delete(self.errors, MERCURY).max())
 
 
 def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
-    """Make a run over the problem's interval by steps of the runner's argument, in years; nan for one that failed."""
+    """Make a run over the problem's interval with the step that the runner passes, in years; nan if it failed."""
 
     def run(step: float) -> tuple[float, np.ndarray]:
         name = f"{method.__name__}, h = {step:.4g} yr"
@@ -92,7 +92,7 @@ def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
 
 
 def by_verlet(problem: Problem) -> Runner:
-    """Make the same run by Stoermer-Verlet."""
+    """Make the run by Stoermer-Verlet."""
 
     def run(step: float) -> tuple[float, np.ndarray]:
         result = leapfrog(problem, step, None)
@@ -102,7 +102,7 @@ def by_verlet(problem: Problem) -> Runner:
 
 
 def by_peer(problem: Problem, peer: Peer, integrator: str, **options: Any) -> Runner:
-    """Make the same run by an integrator of REBOUND, whose steps are shortened to divide the interval.
+    """Make the run by an integrator of REBOUND, whose steps are shortened to divide the interval.
 
     IAS15 chooses its own steps, for which the argument is nan.
     """
@@ -154,7 +154,7 @@ def timed(
 
 
 def panels(runs: Sequence[TimedRun], time: str = "wall time [s]") -> list[list[Any]]:
-    """Mercury's error and the largest of the others, for `eip_scipy_studies.plotting.cost_figure`."""
+    """Return Mercury's error and the largest of the others, for `eip_scipy_studies.plotting.cost_figure`."""
     from ..plotting import CostPanel
 
     kinds = {"mercury": "Mercury", "others": "the worst of the other planets"}
@@ -169,20 +169,20 @@ def cost(
     repeats: int,
     callback: Callable[[], Any] | None = None,
 ) -> list[TimedRun]:
-    """Final position errors against the time of the run, for several methods and steps.
+    """Return final position errors against the time of the run, for several methods and steps.
 
     Parameters
     ----------
     scene : SolarScene
-        Of the span to be timed.
+        Problem over the span to be timed.
     methods : mapping
         From `cost_methods`.
     peer : callable or None
-        REBOUND, if it is there.
+        REBOUND, if it is installed.
     repeats : int
-        Of each method and step, unless one took more than `ENOUGH_SECONDS`.
+        Repeats of each method and step, unless one took more than `ENOUGH_SECONDS`.
     callback : callable, optional
-        ``callback()`` after each run, those that are left out included.
+        ``callback()`` after each run, including those that are left out.
 
     Returns
     -------
@@ -199,13 +199,13 @@ def cost(
 def cost_methods(
     scene: SolarScene, method: type[EIPSolver], metric: str, peer: Peer | None
 ) -> dict[str, tuple[Runner, Sequence[float]]]:
-    """List what `cost` times, with the steps.
+    """List the methods and steps that `cost` times.
 
     Parameters
     ----------
     scene : SolarScene
     method : type
-        With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5), EIPRKN12 and
+        Timed with and without its projection, together with EIPRK5 (EIPRK4 for EIPRK5), EIPRKN12 and
         EIPGJ14.
     metric : {"error", "euclidean"}
     peer : callable or None

@@ -33,7 +33,7 @@ class Epoch(NamedTuple):
 
 
 def parse_epoch(text: str) -> Epoch:
-    """Read an epoch without loss: both parts are the numbers nearest to what is written.
+    """Read an epoch without loss: both parts are the numbers nearest to the text.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def parse_epoch(text: str) -> Epoch:
     Raises
     ------
     ValueError
-        With the accepted forms.
+        For any other text; the message names the accepted forms.
 
     Examples
     --------
@@ -96,13 +96,13 @@ class AnyEpoch:
 
 
 def kernels() -> Any:
-    """`eip_scipy.integrations.jpl`; what it needs is looked for when a kernel is read."""
+    """Return `eip_scipy.integrations.jpl`; its dependencies are imported when a kernel is read."""
     return import_module("eip_scipy.integrations.jpl")
 
 
 @contextmanager
 def one_line() -> Iterator[None]:
-    """Say in one line what an epoch, a kernel or a model cannot do."""
+    """Report in one line that an epoch, a kernel or a model cannot be used."""
     try:
         yield
     except (ImportError, OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""How far the runs of the solar system are from the truth, and the checks of the command."""
+"""Errors of the runs of the solar system against the reference, and the checks of the command."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TIGHT_POSITION = {"IAS15": 1e-8, TIGHT: 1e-7}  # AU, after 2000 years
 
 
 class PointErrors(NamedTuple):
-    """Errors of one run at one time; longitudes with their sign, in rad, nan where turns cannot be counted."""
+    """Errors of one run at one time; longitudes have a sign, in rad, and are nan if turns cannot be counted."""
 
     year: float
     reference: str
@@ -34,7 +34,7 @@ class PointErrors(NamedTuple):
 
 @dataclass
 class SolarRuns:
-    """The runs done so far and what follows from them; an interruption leaves it usable."""
+    """The completed runs and their results; it remains usable after an interruption."""
 
     scene: SolarScene
     order: int
@@ -45,15 +45,15 @@ class SolarRuns:
     repeats: int = 3
     """Timed runs of each, the least time of which counts."""
     beside: str = ""
-    """Name of the run that was done beside the others, on another core; empty: one after the other."""
+    """Name of the run that another core did in parallel; empty if all runs were done one after the other."""
 
     def errors(self, year: float) -> dict[str, PointErrors]:
-        """Errors of the runs at a time, where they are known."""
+        """Return errors of the runs at a time, if they are known."""
         found = {run.name: errors_at(self.scene, run, year, self.tight) for run in self.runs}
         return {name: errors for name, errors in found.items() if errors is not None}
 
     def checks(self) -> list[Check]:
-        """Do the command's checks, as far as there are runs for them."""
+        """Do the command's checks for the runs that there are."""
         return checks(self.scene, self.order, self.runs[0], self.tight) if self.runs else []
 
 
@@ -73,17 +73,17 @@ def longitude_errors(scene: SolarScene, run: MethodRun, truth: MethodRun) -> np.
     ----------
     scene : SolarScene
     run, truth : MethodRun
-        The run, and the one it is compared with.
+        The run, and the one with which it is compared.
 
     Returns
     -------
     ndarray, shape (9, m)
-        rad, at the times of `truth`. nan after the end of a run, and from where its longitude error changes too fast
+        rad, at the times of `truth`. nan after the end of a run, and as soon as its longitude error changes too fast
         between saved states for its turns to be counted.
 
     Notes
     -----
-    The difference of two longitudes changes slowly where the longitudes themselves do not: it is what is made
+    The difference of two longitudes changes slowly even if the longitudes do not: the difference is made
     continuous in time.
     """
     n = _common_saves(run, truth)
@@ -113,7 +113,7 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
 
 
 def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None) -> PointErrors | None:
-    """Errors of a run at one of the `report_times`.
+    """Return errors of a run at one of the `report_times`.
 
     Parameters
     ----------
@@ -121,12 +121,12 @@ def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun |
     run : MethodRun
     year : float
     tight : MethodRun or None
-        The run that counts the turns, and the reference where no state is stored.
+        The run that counts the turns, and the reference if no state is stored.
 
     Returns
     -------
     PointErrors or None
-        None where nothing is known: no reference at that time, the run is that reference, or it ended before.
+        None if nothing is known: no reference at that time, the run is that reference, or it ended before.
         Longitudes are nan without `tight`. Positions are relative to the centre of mass.
     """
     state, source = stored_state(scene, year), "stored states"
@@ -141,7 +141,7 @@ def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun |
 
 
 def _turns(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None, wrapped: np.ndarray) -> np.ndarray:
-    """Whole turns to be added to an error in (-pi, pi], as counted along the tightest run."""
+    """Return the whole turns to be added to an error in (-pi, pi], as counted along the tightest run."""
     if tight is None or _state_at(tight, year) is None:
         return np.full_like(wrapped, np.nan)
     counted = longitude_errors(scene, run, tight)[:, _index(tight, year)]
@@ -158,7 +158,7 @@ def _state_at(run: MethodRun, year: float) -> np.ndarray | None:
 
 
 def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | None) -> list[Check]:
-    """Conditions that hold for any sensible arguments; one that fails says that the numbers are not to be trusted.
+    """Check conditions that hold for any sensible arguments; a failure says that the numbers are not reliable.
 
     Parameters
     ----------
@@ -175,7 +175,8 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
     list of Check
     """
     done = [Check(f"{main.name} reached the end", not main.failure)]
-    # Defects are O(h^(2p + 2)): round-off for small steps; for large ones the factor is measured, with room of 10.
+    # Residuals are O(h^(2p + 2)): round-off for small steps; for large ones the factor is measured, with a margin of
+    # 10.
     bound = max(ROUND_OFF, 1e-3 * (FASTEST * scene.h) ** (2 * order + 2))
     for name, series in (("H", main.energy_error), ("L", main.momentum_error)):
         value = float(series.max())
@@ -186,7 +187,7 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
 
 
 def _reference_checks(scene: SolarScene, tight: MethodRun) -> list[Check]:
-    """Whether the run that counts turns follows the stored states, at the last of them."""
+    """Check that the run that counts turns follows the stored states, at the last of them."""
     stored = [year for year in report_times(scene) if stored_state(scene, year) is not None]
     at_end = errors_at(scene, tight, stored[-1], tight) if stored else None
     if at_end is None:

@@ -28,23 +28,23 @@ def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, 
     Parameters
     ----------
     study : SolarRuns
-        With its reference run, and for the last figure with the timings.
+        The runs, with the reference run, and for the last figure with the timings.
     part : slice, optional
-        Which of `FIGURES`.
+        Slice of `FIGURES` to make.
 
     Yields
     ------
     (str, Figure)
         File name and figure.
     """
-    # One style for a method in all figures; what was timed comes last, so that the runs look the same without it.
+    # A method has one style in all figures; timed methods come last, so that the runs look the same without them.
     styles = method_styles(dict.fromkeys([*(run.name for run in study.runs), *(item.method for item in study.cost)]))
     for name, figure in list(FIGURES.items())[part]:
         yield name, figure(study, styles)
 
 
 def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities of the planets relative to the centre of mass of all bodies further in.
+    """Return positions and velocities of the planets relative to the centre of mass of all inner bodies.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def osculating_orbits(scene: SolarScene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
-    """Compute the ellipses that the planets would follow around the bodies further in, if those were one.
+    """Compute the ellipses that the planets would follow around the inner bodies, if those were a single one.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _span(study: SolarRuns) -> str:
 
 
 def _longitudes(study: SolarRuns) -> dict[str, np.ndarray]:
-    """Longitude errors along each run but the reference."""
+    """Draw longitude errors along each run except the reference."""
     tight = study.tight
     if tight is None:
         return {}
@@ -118,7 +118,7 @@ def _errors_figure(study: SolarRuns, styles: Any) -> Any:
         styles=styles,
         time="time [yr]",
         trajectory=f"|longitude of Mercury - {_reference_name(study)}| [rad]",
-        title=f"Kept invariants are no proof of a right orbit: solar system, {_span(study)}",
+        title=f"Preserved invariants do not prove a correct orbit: solar system, {_span(study)}",
     )
 
 
@@ -138,7 +138,7 @@ def _longitude_figure(study: SolarRuns, styles: Any) -> Any:
 
 
 def _shown(study: SolarRuns) -> dict[str, MethodRun]:
-    """Stoermer-Verlet and the method asked for, as in the paper, and the reference."""
+    """Draw Stoermer-Verlet and the method asked for, as in the paper, and the reference."""
     verlet = next(run for run in study.runs if run.name == "SV")
     shown = {"Störmer-Verlet": verlet, study.runs[0].name: study.runs[0]}
     if study.tight:
@@ -147,7 +147,7 @@ def _shown(study: SolarRuns) -> dict[str, MethodRun]:
 
 
 def _sample(run: MethodRun) -> np.ndarray:
-    """Choose some saved states; not equally spaced, which may show a precession only at its own period."""
+    """Choose some saved states, not equally spaced: equal spacing may show a precession only at its own period."""
     golden = np.arange(1, ELLIPSES) * (np.sqrt(5.0) - 1) / 2 % 1.0
     return np.unique(np.append((golden * run.t.size).astype(int), [0, run.t.size - 1]))
 

@@ -1,4 +1,4 @@
-"""``eip-scipy solar-system frontier``: error against cost of long runs at high accuracy, beside the peers at hand."""
+"""``eip-scipy solar-system frontier``: error against cost of long runs at high accuracy, with other packages."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from .runs import KEPT, Peer, orbits_kept, whole_number
 
 __all__ = ["Found", "Frontier", "methods"]
 
-PATIENCE = 30.0  # a run of so many seconds is not repeated
+PATIENCE = 30.0  # longer runs, in seconds, are not repeated
 LEVELS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 
 def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | None) -> dict[str, Any]:
-    """List what is timed, with steps in years or tolerances.
+    """List the timed methods, with steps in years or tolerances.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
         The ten bodies, in AU and years.
     years : float
     peer, heyoka : callable or None
-        ``run`` of the integrations, where they are installed.
+        ``run`` of the integrations, if they are installed.
 
     Returns
     -------
@@ -75,7 +75,7 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
 
 
 def _dividing(years: float, wanted: Sequence[float]) -> list[float]:
-    """Steps shortened to divide the span."""
+    """Return steps shortened to divide the span."""
     return [years / whole_number(years / h) for h in wanted]
 
 
@@ -119,7 +119,7 @@ class Frontier(Study[Found]):
     repeats: int = 3
 
     def check_settings(self) -> None:
-        """See that there is a state to compare with."""
+        """Raise an error if there is no state to compare with."""
         if self.years not in reference_states():
             known = ", ".join(f"{t:g}" for t in reference_states())
             raise UsageError(f"there is no stored reference state: --years must be one of {known}, got {self.years:g}")
@@ -166,7 +166,7 @@ class Frontier(Study[Found]):
         return {"runs": _rows(found.runs)}
 
     def figures(self, found: Found) -> Figures:
-        """Mercury's error and that of the others, against time."""
+        """Draw Mercury's error and that of the others, against time."""
         from ..plotting import cost_figure
 
         yield (

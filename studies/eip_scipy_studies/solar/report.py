@@ -1,4 +1,4 @@
-"""What ``eip-scipy solar-system`` prints and writes: the table, its notes, and the rows of the files."""
+"""Output of ``eip-scipy solar-system``: the table, its notes, and the rows of the files."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _reference_line(study: SolarRuns) -> str:
     if sources == {"stored states"}:
         counted = f"; turns counted along {study.tight.name}" if study.tight else ""
         return f"Reference: stored states (80 bits) at {study.scene.years:g} yr{counted}"
-    return f"Reference: the tightest run at hand, {sources.pop()}"
+    return f"Reference: the tightest available run, {sources.pop()}"
 
 
 def _table(study: SolarRuns) -> str:
@@ -76,7 +76,7 @@ def _cell(study: SolarRuns, run: MethodRun, errors: PointErrors | None, quantity
 
 
 def _counts(tight: MethodRun | None) -> bool:
-    """Whether there is a run to count turns along."""
+    """Return whether there is a run to count turns along."""
     return tight is not None and not tight.failure
 
 
@@ -87,7 +87,7 @@ def _notes(study: SolarRuns) -> str:
         "Longitude: heliocentric, ecliptic, with whole turns. Position: from the centre of mass.",
         "SV: Stoermer-Verlet, kick-drift-kick." if "SV" in shown else "",
         "WHFast (c17: corrector of order 17), IAS15: REBOUND." if "IAS15" in shown else "",
-        f"{study.beside} ran beside the others, on another core." if study.beside in shown else "",
+        f"{study.beside} ran in parallel to the others, on another core." if study.beside in shown else "",
         f"{HIGH_ORDER}: Nystroem, order 12, projected at each tenth step, compensated." if HIGH_ORDER in shown else "",
         f"{MULTISTEP}: multistep, order 14, one evaluation a step, projected when it pays."
         if MULTISTEP in shown

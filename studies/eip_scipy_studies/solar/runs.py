@@ -1,6 +1,6 @@
-"""The solar system run by several methods: the scene that they share, the runs, and their states.
+"""The solar system run by several methods: the common problem, the runs, and their states.
 
-Nothing is printed or written here. REBOUND comes in as a function (`Peer`), so that this module needs no extra.
+This module prints and writes nothing. REBOUND is passed as a function (`Peer`), so that no extra is needed.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Peer = Callable[..., Any]
 WHFAST_DAYS = 5.0
 MOST_SAVES = 20_000
 HIGH_ORDER, TIGHT = "EIPRKN12", "EIPRKN12 (tight)"
-HIGH_ORDER_STEP = 1 / 64  # years: rounding, not the step, makes what errors are left
+HIGH_ORDER_STEP = 1 / 64  # years: the remaining errors come from rounding, not from the step
 KEPT: dict[str, Any] = {"every": 10, "compensated": True}
 """How long runs of high order keep their invariants."""
 MULTISTEP, BALANCED = "EIPGJ14", "EIPGJ14 (balances)"
@@ -60,16 +60,16 @@ POWERS = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 
 @dataclass(frozen=True, eq=False)
 class SolarScene:
-    """What all methods share: the problem, its data, and the times at which states are saved.
+    """Common input of all methods: the problem, its data, and the times at which states are saved.
 
     Attributes
     ----------
     problem : Problem
-        In AU and Julian years; its `h` divides the time between saves.
+        Problem in AU and Julian years; its `h` divides the time between saves.
     data : SolarSystemData
     years, h : float
     n_saves : int
-        States saved after the start, equally spaced.
+        Number of states saved after the start, equally spaced.
     every : int
         Steps between them.
     """
@@ -83,12 +83,12 @@ class SolarScene:
 
     @property
     def interval(self) -> float:
-        """Years between saved states."""
+        """Return the years between saved states."""
         return self.years / self.n_saves
 
     @property
     def planets(self) -> tuple[str, ...]:
-        """Names of the bodies without the Sun."""
+        """Return the names of the bodies without the Sun."""
         return self.data.bodies[1:]
 
 
@@ -102,15 +102,15 @@ class MethodRun:
     head : tuple of str
         The name on the lines of a table's head.
     step : float or None
-        Years; None where the method chooses its steps.
+        Years; None if the method chooses its steps.
     wall_time : float
-        Seconds, compilation and the reading of states left out.
+        Seconds, without compilation and the reading of states.
     t : ndarray, shape (m,)
     y : ndarray, shape (60, m)
     energy_error, momentum_error : ndarray, shape (m,)
         |H - H(0)| / |H(0)| and |L - L(0)| / |L(0)|.
     failure : str
-        Why the run did not reach its end, or empty.
+        Why the run did not reach its end; empty if it did.
     """
 
     name: str
@@ -125,7 +125,7 @@ class MethodRun:
 
 
 class PendingRun(NamedTuple):
-    """A run still to be done: ``start(progress)``; `has_bar`: whether it shows a progress bar by itself."""
+    """A run that is still to be done: ``start(progress)``; `has_bar` says whether it shows its own progress bar."""
 
     name: str
     start: Callable[[bool], MethodRun]
@@ -133,7 +133,7 @@ class PendingRun(NamedTuple):
 
 
 def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScene:
-    """Set the scene for a run of so many years.
+    """Make the problem for a run of `years` years.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScen
     years : float
         Length of the run in Julian years, > 0.
     h : float
-        Upper bound of the step in years; the step divides the time between saved states and is shortened where need be.
+        Upper bound of the step in years; the step divides the time between saved states and is shortened if necessary.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScen
     Raises
     ------
     ValueError
-        For a step that does not fit into the span or is below the spacing of numbers there, or for unknown data.
+        If a step does not fit into the span or is below the spacing of numbers there, or if the data are unknown.
     """
     FixedSteps.of((0.0, years), h, None)
     n_saves = whole_number(years / max(_save_interval(years), h))
@@ -162,7 +162,7 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScen
 
 
 def _save_interval(years: float) -> float:
-    """Dense enough to count turns, some hundred points for a curve, and 1, 10, 100 ... years among them."""
+    """Return an interval short enough to count turns and to draw curves, such that 1, 10, 100 ... years are saved."""
     for least_years, interval in ((200.0, 1.0), (100.0, 0.5), (40.0, 0.2), (1.0, 0.1)):
         if years >= least_years:
             return max(interval, years / MOST_SAVES)
@@ -191,7 +191,7 @@ def plan(
         `EIPRK1` ... `EIPRK5` or another fixed-step class.
     metric : {"error", "euclidean"}
     peer : callable or None
-        REBOUND, if it is there.
+        REBOUND, if it is installed.
     checkpoint_of : callable, optional
         ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
 
@@ -227,7 +227,7 @@ def plan(
 
 
 def metric_of(method: type[EIPSolver], metric: str) -> str:
-    """Return the metric that a method really has: euclidean without an error estimate."""
+    """Return the metric that a method uses: euclidean without an error estimate."""
     return metric if method.TABLEAU.has_estimate else "euclidean"
 
 
@@ -264,7 +264,7 @@ def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **checkpo
 
 
 def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run the tightest at hand without REBOUND: the method of order 12 with half of its step."""
+    """Run the tightest method that is available without REBOUND: the method of order 12 with half of its step."""
     return _high_order(scene, TIGHT, "tight", 2, progress, **checkpoint)
 
 
@@ -286,7 +286,7 @@ def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
 
 
 def _balanced(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Keep each planet's energy about the Sun as a balance, in place of the totals."""
+    """Keep each planet's energy about the Sun as a balance, instead of the totals."""
     per_save = whole_number(scene.interval / MULTISTEP_STEP)
     return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **orbits_kept(scene.data), **checkpoint)
 
@@ -360,7 +360,7 @@ def stored_state(scene: SolarScene, year: float) -> np.ndarray | None:
 
 
 def report_times(scene: SolarScene) -> list[float]:
-    """Years at which errors are reported: powers of ten with a stored reference state that were saved, and the end."""
+    """Return the years at which errors are reported: saved powers of ten with a stored reference state, and the end."""
     times = [t for t in np.linspace(0.0, scene.years, scene.n_saves + 1)[1:] if round(t, 9) in POWERS]
     stored = [round(float(t), 9) for t in times if stored_state(scene, t) is not None]
     return sorted({*stored, float(scene.years)})

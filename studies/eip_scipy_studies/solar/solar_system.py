@@ -26,13 +26,18 @@ from .runs import MethodRun, Peer, make_scene, plan
 __all__ = ["Found", "SolarSystem"]
 
 DATA = "de440"
-TEN_BODIES = [name for name in available() if len(load(name).bodies) == 10]  # what the tables and figures are made for
+TEN_BODIES = [
+    name for name in available() if len(load(name).bodies) == 10
+]  # sets for which the tables and figures are made
 COST_YEARS = 100.0
-BESIDE_FIGURES, OWN_FIGURES = slice(None, 4), slice(4, None)  # they take as long as the timings and the others
+BESIDE_FIGURES, OWN_FIGURES = (
+    slice(None, 4),
+    slice(4, None),
+)  # both parts take about as long as the timings and the other figures
 
 
 class Found(NamedTuple):
-    """The runs, REBOUND if it is there, and the process that did the longest run beside the others, and draws."""
+    """The runs, REBOUND if it is installed, and the process that runs the longest one in parallel and draws."""
 
     runs: SolarRuns
     peer: Peer | None
@@ -43,7 +48,7 @@ class Found(NamedTuple):
 class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
     """The command.
 
-    The longest run is done by a second process, from `beside_years` on: in shorter runs that costs what it saves.
+    A second process does the longest run, from `beside_years` on: in shorter runs its cost exceeds its gain.
     """
 
     years: float = option(2000.0, "length in Julian years (%(default)g)", type=positive)
@@ -68,7 +73,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return known | start
 
     def measure(self, session: Session) -> Found:
-        """Do the runs; what the user interrupts leaves those that were done."""
+        """Do the runs; an interrupt by the user keeps the completed ones."""
         method = fixed_step_methods()[self.method]
         with one_line():
             runs = SolarRuns(make_scene(self._start(), self.years, self.h), method.TABLEAU.order, repeats=self.repeats)
@@ -91,7 +96,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return data
 
     def _integrate(self, runs: SolarRuns, session: Session, peer: Peer | None, beside: Beside | None) -> None:
-        """Do the runs, the last of them beside the others if it may."""
+        """Do the runs, the last of them in parallel if possible."""
         method = fixed_step_methods()[self.method]
         tasks = plan(runs.scene, method, self.metric, peer, self.checkpoint_options)
         starts: list[Callable[[], MethodRun]] = [partial(task.start, session.shown) for task in tasks]
@@ -101,7 +106,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         for task, start in zip(tasks, starts, strict=True):
             if task.has_bar:
                 runs.runs.append(start())
-            else:  # what runs, and for how long
+            else:  # the current run, and its time
                 with session.bar(1, task.name, bar_format="{desc}: {elapsed}", leave=True) as bar:
                     runs.runs.append(start())
                     bar.update()
@@ -125,7 +130,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return report.text(found.runs, self)
 
     def checks(self, found: Found) -> list[Check]:
-        """Of the method, and of the run that others are compared with."""
+        """Return checks of the method, and of the reference run."""
         return found.runs.checks()
 
     def tables(self, found: Found) -> dict[str, Rows]:
@@ -136,7 +141,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return report.json_content(found.runs)
 
     def figures(self, found: Found) -> Figures:
-        """Those of the second process, and the others."""
+        """Draw the figures of the second process, and the others."""
         drawn = images(found.runs, slice(None) if found.beside is None else OWN_FIGURES)
         if found.beside is not None:
             drawn = found.beside.result() | drawn
@@ -145,7 +150,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
 
 
 def images(runs: SolarRuns, part: slice) -> dict[str, bytes]:
-    """Some of the figures as PNG files, by their names."""
+    """Return some of the figures as PNG files, by their names."""
     from .figures import figures
 
     found = {}

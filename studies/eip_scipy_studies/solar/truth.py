@@ -1,4 +1,4 @@
-"""``eip-scipy solar-system truth``: what each force is worth, measured against the ephemeris DE440 itself."""
+"""``eip-scipy solar-system truth``: effect of each force, measured against the ephemeris DE440 itself."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ __all__ = ["Found", "Model", "ModelRun", "Truth", "errors", "models", "run_model
 
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 STEP = 0.001
-MOON = "moon"  # no force but a body, chosen beside the forces
+MOON = "moon"  # a body, not a force, but chosen together with the forces
 KNOWN = (*(force for force in FORCES if force != "drag"), MOON)
 STANDARD = ((), ("1pn",), ("1pn", "moon-quadrupole"), ("1pn", MOON), ("1pn", "j2", MOON))
 REPORTED = (1.0, 10.0, 100.0)
 PANELS = ("Mercury", "EMB", "Mars", "Jupiter")
 ARCSEC = math.degrees(1.0) * 3600
-# The step may add this share of an error, and this many km, which no model here reaches.
+# The step may add this share of an error, and this many km, an error below that of any model here.
 STEP_SHARE, STEP_KM = 0.01, 1e-3
 
 
 class Model(NamedTuple):
-    """Forces beside Newton's, and whether the Moon is a body of its own."""
+    """Forces other than Newton's, and whether the Moon is a separate body."""
 
     forces: tuple[str, ...]
     moon: bool
 
     @property
     def name(self) -> str:
-        """Name in the table, by the words of the command line."""
+        """Return the name in the table, in the words of the command line."""
         return " + ".join(["Newton", *self.forces, *[MOON] * self.moon])
 
 
@@ -58,12 +58,12 @@ class ModelRun(NamedTuple):
 
 
 def models(forces: Sequence[str] | None) -> list[Model]:
-    """The models to be compared: Newton and the one asked for, or the standard ones.
+    """Return the models to be compared: Newton and the one asked for, or the standard ones.
 
     Raises
     ------
     ValueError
-        For forces that exclude each other.
+        If forces exclude each other.
     """
     asked = STANDARD if forces is None else ((), tuple(forces))
     found = [Model(check_forces(name for name in names if name != MOON), MOON in names) for names in asked]
@@ -71,14 +71,14 @@ def models(forces: Sequence[str] | None) -> list[Model]:
 
 
 def save_times(years: float, h: float) -> tuple[np.ndarray, int, float]:
-    """Times of saved states in years, the steps between them, and the step in years.
+    """Return times of saved states in years, the steps between them, and the step in years.
 
     1, 10, 100 and the end are among them; the time between them is a whole number of steps.
 
     Raises
     ------
     ValueError
-        When the step is longer than the time between saved states.
+        If the step is longer than the time between saved states.
     """
     span = abs(years)
     interval = span / 100 if span < 1 else 0.1 if span <= 200 else 1.0
@@ -106,7 +106,7 @@ def run_model(
     ----------
     model : Model
     data : SolarSystemData
-        With the Moon where the model has it.
+        Data with the Moon if the model has it.
     times : ndarray, shape (m,)
         Years, from `save_times`, with `every` and `step`.
     truth : dict of str to ndarray, shape (m, 3)
@@ -127,7 +127,7 @@ def run_model(
 def _positions(
     model: Model, data: SolarSystemData, times: np.ndarray, every: int, step: float, progress: bool
 ) -> dict[str, np.ndarray]:
-    """Heliocentric positions in km, as the ephemeris gives them."""
+    """Return heliocentric positions in km, as the ephemeris gives them."""
     problem = solar_system(data, years=float(times[-1]), h=step, forces=model.forces)
     method = named(EIPDOP853, model.name)
     result = integrate(problem, method=method, save_every=every, every="auto", compensated=True, progress=progress)
@@ -144,7 +144,7 @@ def _positions(
 def errors(
     own: dict[str, np.ndarray], truth: dict[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Distances in km, and angles as seen from the Sun in arcsec, between positions (m, 3) of each body of `truth`."""
+    """Return distances in km, and angles seen from the Sun in arcsec, between positions (m, 3) of each body."""
     km = {body: np.linalg.norm(own[body] - there, axis=1) for body, there in truth.items()}
     chord = {body: np.linalg.norm(_unit(own[body]) - _unit(there), axis=1) for body, there in truth.items()}
     return km, {body: 2 * np.arcsin(np.minimum(c / 2, 1.0)) * ARCSEC for body, c in chord.items()}
@@ -181,11 +181,11 @@ class Truth(AnyEpoch, Study[Found]):
     )
 
     def arguments(self) -> dict[str, Any]:
-        """What the runs depend on, beside the epoch."""
+        """Return the settings of the runs, except the epoch."""
         return {"years": self.years, "h": self.h, "forces": self.forces}
 
     def measure(self, session: Session) -> Found:
-        """Run the models; what the user interrupts leaves those that were done."""
+        """Run the models; an interrupt by the user keeps the completed runs."""
         h = min(STEP, abs(self.years)) if self.h is None else self.h
         epoch, jpl = self.epoch or PAPER_EPOCH, kernels()
         with one_line():
@@ -193,7 +193,7 @@ class Truth(AnyEpoch, Study[Found]):
             times, every, step = save_times(self.years, h)
             truth = jpl.heliocentric(epoch, times * YEAR_D, self.kernel)
             data = {moon: jpl.initial_data(epoch, self.kernel, moon=moon) for moon in {m.moon for m in chosen}}
-            for model in chosen:  # what cannot be combined is said before anything runs
+            for model in chosen:  # invalid combinations are reported before anything runs
                 solar_system(data[model.moon], forces=model.forces)
         found = Found([], next(iter(data.values())).epoch, step)
         try:
@@ -210,7 +210,7 @@ class Truth(AnyEpoch, Study[Found]):
         return found
 
     def checks(self, found: Found) -> list[Check]:
-        """What the step adds to an error must be a small share of it."""
+        """Check that the step adds only a small share to an error."""
         return [
             Check(
                 f"{run.model.name}: halving the step moves {body} by {moved:.2g} km, "
@@ -263,14 +263,14 @@ class Truth(AnyEpoch, Study[Found]):
 
 
 def reported(years: np.ndarray) -> list[int]:
-    """Places of 1, 10 and 100 years and of the end among the times."""
+    """Return the indices of 1, 10 and 100 years and of the end among the times."""
     span = np.abs(years)
     inside = [int(np.argmin(np.abs(span - year))) for year in REPORTED if year < span[-1] * (1 - 1e-9)]
     return [*inside, years.size - 1]
 
 
 def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
-    """The numbers of the table."""
+    """Return the numbers of the table."""
     return [
         _row(run, place, body) | {"step_km": run.step_km[body] if place == run.years.size - 1 else None}
         for run in runs
@@ -280,12 +280,12 @@ def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
 
 
 def csv_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
-    """All saved times but the start, where there is no error."""
+    """Return all saved times except the start, at which there is no error."""
     return [_row(run, k, body) for run in runs for k in range(1, run.years.size) for body in run.km]
 
 
 def _row(run: ModelRun, k: int, body: str) -> dict[str, Any]:
-    """The errors of a body at a saved time."""
+    """Return the errors of a body at a saved time."""
     return {
         "model": run.model.name,
         "years": float(run.years[k]),

@@ -34,9 +34,9 @@ class Case:
     size : float or ndarray
         Size of the components, by which the absolute tolerance and errors are measured.
     view : callable, optional
-        What is compared, by the last state; default: the state itself, by its `size`.
+        Function of the last state whose values are compared; default: the state itself, relative to `size`.
     truth : callable, optional
-        Returns what `view` is to return; default: that of SciPy's Radau at small tolerances.
+        Returns the expected value of `view`; default: that of SciPy's Radau at small tolerances.
     """
 
     fun: Callable[[float, Array], Array]
@@ -49,13 +49,13 @@ class Case:
     calls: int = field(default=0, init=False)
 
     def counted(self, t: float, y: Array) -> Array:
-        """The right-hand side; its calls are counted."""
+        """Evaluate the right-hand side and count the call."""
         self.calls += 1
         return self.fun(t, y)
 
     @cached_property
     def reference(self) -> Array:
-        """The state with which the last one of a run is compared."""
+        """Return the state with which the last one of a run is compared."""
         if self.truth is not None:
             return np.asarray(self.truth())
         atol = 1e-2 * TIGHT * self.size
@@ -74,7 +74,7 @@ class Case:
         share : float
             The absolute tolerance is ``share * rtol * size``.
         **options
-            Of `solve_ivp`.
+            Options of `solve_ivp`.
         """
         self.calls = 0
         run = solve_ivp(
@@ -199,7 +199,7 @@ def dumbbell() -> Case:
 def satellite() -> Case:
     """A tumbling body with a fluid inside that hardly slips; the length of its angular momentum.
 
-    The kinetic energy changes slowly, and is not kept: the length alone then leads to larger errors of the direction.
+    The kinetic energy changes slowly, and is not kept: the length alone then increases the errors of the direction.
     """
     inertia, fluid, friction = np.array([1.0, 2.0, 3.0]), 0.5, 1e4
 

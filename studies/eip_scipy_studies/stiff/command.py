@@ -4,8 +4,9 @@
    its constraints; absolute and relative tolerance alike.
 2. The flyball governor of the multibody benchmark library, 10 s, with constraints and angular momentum; the error is
    that of the slider's height.
-3. Ten stiff problems with invariants, and one whose invariant alone does harm (the satellite, whose energy changes
-   slowly and is not kept). In 2 and 3 absolute tolerances are 0.01 of the relative one, times the components' sizes.
+3. Ten stiff problems with invariants, and one whose invariant alone increases the error (the satellite, whose energy
+   changes slowly and is not kept). In 2 and 3 absolute tolerances are 0.01 of the relative one, times the components'
+   sizes.
 
 References of the mechanisms are in angles, those of the others by Radau at small tolerances. Calls are all evaluations
 of the right-hand side, those for numerical Jacobians included. Means are geometric.
@@ -30,7 +31,7 @@ __all__ = ["Stiff"]
 METHODS = {"Radau": EIPRadau, "BDF": EIPBDF}
 STARTS = ((1.2, 0.9, 0.5), (0.8, 0.3, 1.0), (1.5, 1.4, 1.0), (-0.7, 0.4, 0.9), (2.0, 1.6, 1.9))
 COUNTEREXAMPLE = "satellite"
-# The bounds: on a mean error and on mean calls, by method; on the governor's error; on the ten problems.
+# Bounds on a mean error and on mean calls, by method; on the governor's error; on the ten problems.
 CHAIN = {"Radau": (1 / 5, 1.25), "BDF": (1 / 3, 1.4)}
 GOVERNOR, WORST = 1 / 30, 2.0
 
@@ -119,7 +120,7 @@ class Stiff(Study[Found]):
 
     def checks(self, found: Found) -> Sequence[Check]:
         if self.quick:
-            return ()  # what is required are means over starts and tolerances
+            return ()  # the bounds apply to means over starts and tolerances
         checks = []
         for method, (error, calls) in CHAIN.items():
             rows = of(found["chain"], method=method)

@@ -35,9 +35,9 @@ class Natural:
     forces : callable
         ``forces(q, v) -> (n,)``.
     y0 : ndarray, shape (2 n,)
-        The state (q, v) at the start, which meets the constraints.
+        The state (q, v) at the start, which satisfies the constraints.
     turn : ndarray, shape (n, n), optional
-        Generator of the rotation that changes nothing: (turn q) . M v is the angular momentum.
+        Generator of the rotation under which the system is invariant: (turn q) . M v is the angular momentum.
     """
 
     mass: Array
@@ -48,7 +48,7 @@ class Natural:
     turn: Array | None = None
 
     def fun(self, t: float, y: Array) -> Array:
-        """The right-hand side, with the multipliers eliminated."""
+        """Evaluate the right-hand side, with the multipliers eliminated."""
         q, v = np.split(y, 2)
         G = self.forms @ q
         free = np.linalg.solve(self.mass, np.column_stack([self.forces(q, v), G.T]))
@@ -57,7 +57,7 @@ class Natural:
 
     @property
     def invariants(self) -> list[Invariant]:
-        """The constraints, on the level of the positions and of the velocities, and the angular momentum."""
+        """Return the constraints on positions and velocities, and the angular momentum."""
         k, H = len(self.values), self.forms
 
         def places(t: float, y: Array) -> Array:
@@ -102,9 +102,9 @@ def chain(angles: Sequence[float], damping: float = 1e4) -> Natural:
     Parameters
     ----------
     angles : sequence of float
-        Of the links from the vertical [rad].
+        Angles of the links from the vertical [rad].
     damping : float
-        [N m s].
+        Damping constant [N m s].
     """
     n = len(angles)
     link = np.kron(np.eye(n) - np.eye(n, k=-1), np.eye(2)).reshape(n, 2, 2 * n)  # the vector along a link, by q

@@ -1,4 +1,4 @@
-"""How each package is called; each is imported only in the process that runs it."""
+"""Adapters that call each package, which is imported only in the process that runs it."""
 
 from __future__ import annotations
 

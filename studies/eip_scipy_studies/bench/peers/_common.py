@@ -1,4 +1,4 @@
-"""What the adapters share: the record of a peer, and how packages are found."""
+"""Common part of the adapters: the record of a method, and the search for its package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..equations import Scene
 __all__ = ["ATOL", "COMPILED", "OWN", "PYTHON", "Peer", "package", "plain_fun"]
 
 PYTHON, COMPILED, OWN = "plain Python function", "function compiled by Numba", "equations in the package's own form"
-ATOL = 1e-3  # absolute tolerance by the relative one, for all
+ATOL = 1e-3  # ratio of the absolute tolerance to the relative one, for all
 
 Solve = Callable[[float], np.ndarray]
 """``solve(setting) -> y`` at the end."""
@@ -22,26 +22,26 @@ Solve = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Peer:
-    """One way to solve a scene.
+    """One way to solve a problem.
 
     Attributes
     ----------
     name : str
     distribution : str
-        What pip calls it.
+        Name of the package with pip.
     takes : str
         `PYTHON`, `COMPILED` or `OWN`.
     prepare : callable
         ``prepare(scene, **extra) -> solve``: imports the package, and builds what it needs once; `extra` goes to the
         package's own call.
     steps : bool
-        Whether the setting is a number of steps, not a tolerance.
+        True if the setting is a number of steps, not a tolerance.
     scenes : tuple of str
-        Equations that it is asked for; empty: all.
+        Equations for which it is run; empty: all.
     warm : bool
-        Whether each setting compiles code of its own, so that a run goes before those that count.
+        True if each setting compiles its own code, so that an uncounted run comes first.
     projects : bool
-        Whether it, too, gets the scene's invariants.
+        True if it also gets the problem's invariants.
     """
 
     name: str
@@ -55,20 +55,20 @@ class Peer:
 
     @property
     def keeps(self) -> bool:
-        """Whether it always gets the scene's invariants."""
+        """Return whether it always gets the problem's invariants."""
         return self.ours or self.projects
 
     @property
     def ours(self) -> bool:
-        """Whether it is a method of this package."""
+        """Return whether it is a method of this package."""
         return self.distribution == "eip_scipy"
 
 
 def package(name: str) -> Any:
-    """A peer's package, in the process that runs it: nothing else of this one imports it."""
+    """Import another package, in the process that runs it: no other module here imports it."""
     return import_module(name)
 
 
 def plain_fun(scene: Scene) -> Any:
-    """The user's function for all peers that take plain Python."""
+    """Return the user's function for all methods that take plain Python."""
     return scene.plain().fun

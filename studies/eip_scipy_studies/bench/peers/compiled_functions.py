@@ -1,4 +1,4 @@
-"""Peers that take functions compiled by Numba, by pointer: no Python in their loop."""
+"""Packages that take functions compiled by Numba, by pointer: their loop contains no Python."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve, package
 __all__ = ["PEERS"]
 
 MEMBERS = ("members",)
-LANES = 4  # of heyoka's batches: four doubles are a vector of AVX2
+LANES = 4  # width of heyoka's batches: four doubles are a vector of AVX2
 
 
 def _ours(method: str, scene: Scene) -> Solve:

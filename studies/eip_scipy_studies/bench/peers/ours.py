@@ -1,4 +1,4 @@
-"""Our own methods as some of the field."""
+"""Our own methods, in the form of the other packages' adapters."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _run(method: str, arguments: dict[str, Any], t_end: float, options: dict[str
 
 
 def _right_hand_side(method: str, functions: Functions) -> dict[str, Any]:
-    """Return the argument of `integrate` that a user writes: the accelerations where the method takes no more."""
+    """Return the argument of `integrate` that a user writes: the accelerations if the method needs no more."""
     if method in ("EIPRKN12", "EIPGJ12", "EIPGJ14"):
         return {"acceleration": functions.acc}
     return {"fun": functions.fun}
@@ -78,7 +78,7 @@ def _compiled(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
 
 
 def _with_own_function(scene: Scene, functions: Functions) -> Any:
-    """The package's problem, whose invariants are compiled, with the user's jitted function."""
+    """Return the package's problem, whose invariants are compiled, with the user's jitted function."""
     njit, right = package("numba").njit, functions.fun
     filling: Any = functions.acc
 
@@ -100,7 +100,7 @@ def _native(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
 
 
 def _each(takes: str, make: Any, scenes: tuple[str, ...]) -> list[Peer]:
-    """One method for each kind: adaptive of the first order, Nystrom and multistep for q'' = a(q)."""
+    """Return one method of each kind: adaptive of the first order, Nystrom and multistep for q'' = a(q)."""
     label = {PYTHON: "", COMPILED: " (jitted)", OWN: " (problem)"}[takes]
     second = scenes or SECOND_ORDER
     return [

@@ -1,4 +1,4 @@
-"""Peers that want the equations in their own form: heyoka's expressions, JAX's arrays, REBOUND's bodies."""
+"""Packages that need the equations in their own form: heyoka's expressions, JAX's arrays, REBOUND's bodies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _heyoka(scene: Scene, **extra: Any) -> Solve:
     made: dict[float, Any] = {}
 
     def solve(setting: float) -> np.ndarray:
-        if setting not in made:  # compiled for each tolerance, before the run that counts
+        if setting not in made:  # compiled for each tolerance, before the timed run
             made[setting] = heyoka.taylor_adaptive(system, start, tol=setting, **extra)
         integrator = made[setting]
         integrator.time, integrator.state[:] = 0.0, start
@@ -74,11 +74,11 @@ def _jax_bodies(jnp: Any, scene: Scene) -> Any:
 def _rebound(integrator: str, scene: Scene, **extra: Any) -> Solve:
     run = package("eip_scipy.integrations.rebound").run
     gm = np.array(scene.params["gm"])
-    centre, drift = (gm / gm.sum()) @ scene.y0.reshape(2, -1, 3)  # which it takes off
+    centre, drift = (gm / gm.sum()) @ scene.y0.reshape(2, -1, 3)  # REBOUND subtracts it
     moved = np.concatenate([np.tile(centre + scene.t_end * drift, gm.size), np.tile(drift, gm.size)])
 
     def solve(setting: float) -> np.ndarray:
-        # IAS15's tolerance is its own; the others take so many steps.
+        # IAS15 uses its own tolerance; for the other methods the setting is the number of steps.
         if integrator == "ias15":
             options = {"h": scene.t_end, "n_steps": 1, "epsilon": setting}
         else:

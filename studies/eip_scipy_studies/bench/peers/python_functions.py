@@ -1,4 +1,4 @@
-"""Peers that take the user's plain Python function, all of them the same."""
+"""Packages that take the user's plain Python function, the same one for all."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _homproj(scene: Scene, **extra: Any) -> Solve:
     count = np.size(functions.values(0.0, scene.y0))
 
     def one(k: int) -> dict[str, Any]:
-        # It hands the components over one by one.
+        # The package passes the components as separate arguments.
         return {
             "invariants": lambda *y: np.atleast_1d(functions.values(0.0, np.array(y)))[k],
             "gradients": lambda *y: np.atleast_2d(functions.gradients(0.0, np.array(y)))[k],

@@ -93,9 +93,9 @@ def own_steps() -> Iterator[Run]:
     yield from own("Kepler without 1/r^3", partial(kepler, 0.6, 0.0), "RK4 integrate, RK2 h=2e-3 integrate")
     three = "RK4 integrate, RKN12 integrate, DOP853 1e-8"
     yield from own("Kepler, e = 0", partial(kepler, 0.0, 0.0), three)
-    yield from own("Kepler, e = .9", partial(kepler, 0.9, 0.0, 50.0, 2e-3), three)
-    yield from own("Kepler, e = .99", partial(kepler, 0.99, 0.0, 50.0, 2e-4), three)
-    yield from own("Kepler, e = .9, in fictitious time", fictitious, "RK4 h=0.03, DOP853 1e-8")
+    yield from own("Kepler, e = 0.9", partial(kepler, 0.9, 0.0, 50.0, 2e-3), three)
+    yield from own("Kepler, e = 0.99", partial(kepler, 0.99, 0.0, 50.0, 2e-4), three)
+    yield from own("Kepler, e = 0.9, in fictitious time", fictitious, "RK4 h=0.03, DOP853 1e-8")
     eight = partial(figure_eight, 10.0)
     yield from own("figure eight", eight, "RKN12 integrate, RK4 h=0.01 integrate, RKN8 h=0.02 integrate, DOP853 1e-8")
     near = partial(short, pythagorean, 10.0)

@@ -1,4 +1,4 @@
-"""Faulty runs whose fault the start does not show, or of which the invariants know little: late leaks, light bodies."""
+"""Faulty runs whose fault is invisible at the start or hardly affects the invariants: late leaks, light bodies."""
 
 from __future__ import annotations
 

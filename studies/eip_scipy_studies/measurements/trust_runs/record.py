@@ -1,4 +1,4 @@
-"""A run, how it is carried out, and what came of it."""
+"""A run, its execution, and its result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from eip_scipy import EIPDOP853, Diagnostics, eip_method, ensemble, integrate
 from eip_scipy.problems import Problem
 from eip_scipy.solvers import EIPSolver
 
-# What a run that tells may do, the plainest first.
+# Ways in which a run may report a fault, the clearest first.
 ERROR, START, WARNING, FAILED, UNTRUSTED, SILENT = (
     "ValueError", "UserWarning", "ProjectionWarning", "status -1", "untrusted", "NOT TOLD",
 )  # fmt: skip
@@ -29,8 +29,8 @@ class Run:
     """One run.
 
     `way`: "solve_ivp"; "integrate", compiled where the functions are; "interpreted", by integrate; "ensemble", with
-    y0s and perhaps params in the options. `sick`: whether it must be told; for an ensemble the members that must.
-    `truth`: where false, the true end is not computed.
+    y0s and perhaps params in the options. `sick`: whether it must be reported; for an ensemble the members that must.
+    `truth`: if false, the true end is not computed.
     """
 
     group: str
@@ -71,7 +71,7 @@ def runs(
 ) -> Iterator[Run]:
     """One system in several ways, "RK45 1e-6, RK4 h=0.05 every=10 integrate": method, tolerance or options, way.
 
-    Options that are no words come as keywords; `user` is the one-step method that "user" stands for.
+    Options other than words are keywords; `user` is the one-step method that "user" stands for.
     """
     for text in ways.split(","):
         word, *rest = text.split()
@@ -105,7 +105,7 @@ class Outcome:
 
 
 def carry_out(run: Run) -> Outcome:
-    """The run, and what it said."""
+    """Return the run, and its warnings."""
     act = {"solve_ivp": _by_scipy, "ensemble": _members}.get(run.way, partial(_by_integrate, way=run.way))
     with warnings.catch_warnings(record=True) as said, np.errstate(all="ignore"):
         warnings.simplefilter("always")
@@ -114,7 +114,7 @@ def carry_out(run: Run) -> Outcome:
             outcome = act(run, problem, run.options)
         except ValueError as error:
             outcome = Outcome([ERROR], message=str(error))
-    if run.way != "ensemble" or not run.sick:  # of sick members each must be told
+    if run.way != "ensemble" or not run.sick:  # each faulty member must be reported
         outcome.told += [name for name in map(_kind, said) if name is not None]
     outcome.told = [name for name in CHANNELS if name in outcome.told]
     outcome.message = "; ".join([outcome.message, *(str(item.message) for item in said if _kind(item))]).strip("; ")
@@ -175,7 +175,7 @@ def _members(run: Run, problem: Problem, options: dict[str, Any]) -> Outcome:
 
 
 def _error(run: Run, problem: Problem, outcome: Outcome) -> float:
-    """Largest component of the error at the end, in units of the largest component."""
+    """Return the largest component of the error at the end, in units of the largest component."""
     truth = _truth(run.problem, outcome.t)
     assert outcome.y is not None
     return float(np.max(np.abs(outcome.y - truth)) / np.max(np.abs(truth)))

@@ -450,7 +450,7 @@ def with_friction() -> Iterator[Run]:
     at_rest = partial(runs, REST)
     friction = partial(s.pendulum, 0.2), partial(s.compiled_pendulum, 0.2)
     yield from at_rest(
-        "pendulum with friction .2",
+        "pendulum with friction 0.2",
         friction[0],
         "RK45 1e-3, RK45 1e-4, RK45 1e-8, DOP853 1e-6, RK23 1e-5, RK5 1e-6, RK5 h=0.05, RK4 h=0.05, "
         "RK3 h=0.05, RK2 h=0.05, RK1 h=0.01, RK4 h=0.05 metric=euclidean, RK4 h=0.05 every=10, "
@@ -458,25 +458,25 @@ def with_friction() -> Iterator[Run]:
         "RK4 h=0.05 interpreted",
     )
     yield from at_rest(
-        "pendulum with friction .2",
+        "pendulum with friction 0.2",
         friction[1],
         "RK4 h=0.05 integrate, RK45 1e-6 integrate, RK4 h=0.05 compensated integrate, "
         "RK2 h=0.05 integrate, RK1 h=0.01 integrate",
     )
     yield from at_rest(
-        "pendulum with friction .2, Verlet's method",
+        "pendulum with friction 0.2, Verlet's method",
         friction[0],
         "user h=0.02",
         user=s.Verlet(lambda t, q, v: -np.sin(q) - 0.2 * v),
     )
     yield from at_rest(
-        "pendulum with friction .2, an event ends it",
+        "pendulum with friction 0.2, an event ends it",
         friction[0],
         "RK45 1e-8, RK45 1e-8 interpreted",
         events=turns_back,
     )
     yield from at_rest(
-        "pendulum with friction .2, an event ends it", friction[1], "RK4 h=0.05 integrate", events=leaves
+        "pendulum with friction 0.2, an event ends it", friction[1], "RK4 h=0.05 integrate", events=leaves
     )
 
 
@@ -502,7 +502,7 @@ def false_invariants() -> Iterator[Run]:
     )
     yield from at_rest("friction from t = 3 on", late, "RK45 1e-6, RK4 h=0.02")
     yield from at_rest("friction on one side only", partial(s.spring, far_friction, 0.0, 1.5), "RK45 1e-6")
-    yield from at_rest("fall with drag .1", partial(s.falling, 0.1), "RK45 1e-6, RK3 h=0.1")
+    yield from at_rest("fall with drag 0.1", partial(s.falling, 0.1), "RK45 1e-6, RK3 h=0.1")
     yield from at_rest("L in an anisotropic trap", trap_turning, "RK45 1e-6, RK4 h=0.05, RKN8 1e-6")
     yield from at_rest(
         "L in an anisotropic trap",
@@ -510,7 +510,7 @@ def false_invariants() -> Iterator[Run]:
         "RK45 1e-6 integrate, RKN12 h=0.1 integrate, RK4 h=0.02 integrate",
     )
     yield from at_rest("L of Henon-Heiles, started at x = 0", henon_turning, "DOP853 1e-6")
-    yield from at_rest("L of Henon-Heiles beside its energy", two_false, "RK45 1e-6")
+    yield from at_rest("L of Henon-Heiles and its energy", two_false, "RK45 1e-6")
     yield from at_rest("L in a uniform field, started on its axis", uniform_on_axis, "RK45 1e-6")
     yield from at_rest("Laplace's vector of a precessing orbit", precessing, "RK45 1e-6, RK4 h=0.01")
     yield from at_rest("energy while the centre loses mass", losing_mass, "RK45 1e-7")
@@ -542,15 +542,15 @@ def false_invariants() -> Iterator[Run]:
 
 def visible() -> Iterator[Run]:
     seen = partial(runs, MOVING)
-    yield from seen("pendulum with friction .2", partial(s.pendulum, 0.2, v0=1.0), "RK45 1e-6, RK4 h=0.05")
+    yield from seen("pendulum with friction 0.2", partial(s.pendulum, 0.2, v0=1.0), "RK45 1e-6, RK4 h=0.05")
     yield from seen(
-        "pendulum with friction .2", partial(s.compiled_pendulum, 0.2, y0=(2.0, 1.0)), "RK4 h=0.05 integrate"
+        "pendulum with friction 0.2", partial(s.compiled_pendulum, 0.2, y0=(2.0, 1.0)), "RK4 h=0.05 integrate"
     )
-    yield from seen("fall with drag .1", partial(s.falling, 0.1, -1.0), "RK45 1e-6")
+    yield from seen("fall with drag 0.1", partial(s.falling, 0.1, -1.0), "RK45 1e-6")
     yield from seen("Toda lattice, harmonic energy", partial(s.toda, True, moving=True), "DOP853 1e-6")
     yield from seen("epidemic, another ratio", other_ratio, "RK45 1e-6")
     yield from seen("attitude, another norm", other_norm, "RK45 1e-6")
-    yield from seen("spins, S_x beside an axis", spin_sum, "RK45 1e-6")
+    yield from seen("spins, S_x near an axis", spin_sum, "RK45 1e-6")
     yield from seen("condensate, half the interaction", partial(half_beta, moving_packet), "RK45 1e-6")
 
 
@@ -566,27 +566,27 @@ def leaks() -> Iterator[Run]:
     for friction, how in ways.items():
         yield from leak(f"pendulum with friction {friction:g}", partial(s.pendulum, friction), how)
     yield from leak(
-        "pendulum with friction .001",
+        "pendulum with friction 0.001",
         partial(s.compiled_pendulum, 1e-3, 50.0),
         "RK45 1e-6 integrate, DOP853 1e-8 integrate, RK4 h=0.02 integrate, RK4 h=0.02 compensated every=10 integrate",
     )
     yield from leak(
         "spring with friction 1e-5", partial(s.compiled_spring, friction=1e-5, end=2000.0), "RK4 h=0.01 integrate"
     )
-    yield from leak("fall with drag .01", partial(s.falling, 1e-2), "RK45 1e-5")
+    yield from leak("fall with drag 0.01", partial(s.falling, 1e-2), "RK45 1e-5")
     pushed = partial(s.compiled_spring, force=1e-4, frequency=1.0, end=100.0)
     yield from leak(
         "spring pushed by 1e-4",
         pushed,
         "RKN12 h=0.1 integrate, RKN12 h=0.1 every=10 compensated integrate, RKN8 1e-8 integrate",
     )
-    yield from leak("satellite with drag .001", partial(dragged, 1e-3), "RK45 1e-6, DOP853 1e-8")
+    yield from leak("satellite with drag 0.001", partial(dragged, 1e-3), "RK45 1e-6, DOP853 1e-8")
     yield from leak("satellite with drag 1e-5", partial(dragged, 1e-5), "DOP853 1e-9")
     yield from leak(
         "post-Newtonian planets, Newton's energy", relativistic_planets, "DOP853 1e-10, DOP853 h=0.01 integrate"
     )
-    yield from leak("Schroedinger, loss of .001", lossy, "RK45 1e-6")
-    yield from leak("sine-Gordon with friction .001", partial(s.sine_gordon, friction=1e-3), "RK45 1e-6")
+    yield from leak("Schroedinger, loss of 0.001", lossy, "RK45 1e-6")
+    yield from leak("sine-Gordon with friction 0.001", partial(s.sine_gordon, friction=1e-3), "RK45 1e-6")
 
 
 def gradients() -> Iterator[Run]:
@@ -627,17 +627,17 @@ def long_steps() -> Iterator[Run]:
     )
     yield from too_long("pendulum", partial(s.pendulum, end=100.0), "RK45 1 atol=1, RK4 h=2.5")
     yield from too_long(
-        "Kepler, e = .6",
+        "Kepler, e = 0.6",
         partial(kepler, 0.6, 0.0, 60.0),
         "RK45 1 atol=1, DOP853 1 atol=1 integrate, RK4 h=1, RKN12 h=2",
     )
     yield from too_long(
-        "Kepler, e = .99, over the pericentre",
+        "Kepler, e = 0.99, over the pericentre",
         partial(kepler, 0.99, 0.0, 30.0),
         "RK4 h=0.1, RK4 h=0.03, RK5 h=0.05 integrate, RKN12 h=0.05, RKN12 h=0.2 every=10",
     )
     yield from too_long(
-        "Kepler, e = .99, from the apocentre", from_apocentre, "RK4 h=0.1, RK4 h=0.3, RKN12 h=0.1 integrate"
+        "Kepler, e = 0.99, from the apocentre", from_apocentre, "RK4 h=0.1, RK4 h=0.3, RKN12 h=0.1 integrate"
     )
     yield from too_long("stiff chain", stiff_chain, "RK4 h=0.05, RK45 10 atol=10", truth=False)
     yield from too_long(
@@ -701,10 +701,10 @@ def members() -> Iterator[Run]:
     orbits, crowd = (kepler(0.3, 0.0).y0 * (1 + 1e-5 * np.arange(count)[:, None]) for count in (10, 2000))
     orbits[6] = crowd[[5, 1500]] = kepler(0.99, 0.0).y0
     yield from one(
-        "one with e = .99 of 10", partial(kepler, 0.3, 0.0, 60.0), "RK4 h=0.05 ensemble", sick=(6,), y0s=orbits
+        "one with e = 0.99 of 10", partial(kepler, 0.3, 0.0, 60.0), "RK4 h=0.05 ensemble", sick=(6,), y0s=orbits
     )
     yield from one(
-        "two with e = .99 of 2000, in vectors",
+        "two with e = 0.99 of 2000, in vectors",
         partial(kepler, 0.3, 0.0, 200.0),
         "RK4 h=0.05 ensemble",
         sick=(5, 1500),
@@ -731,7 +731,7 @@ def rising_friction() -> Iterator[Run]:
         params=np.concatenate([rising, np.zeros((19992, 1))]),
     )
     yield from one(
-        "all of 10 with friction .001",
+        "all of 10 with friction 0.001",
         s.bare_pendulum,
         "RK45 1e-7 ensemble",
         sick=tuple(range(10)),
