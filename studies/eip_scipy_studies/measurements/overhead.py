@@ -55,7 +55,7 @@ TOLERANCES: dict[str, float] = {"rtol": 1e-6, "atol": 1e-9}
 STEPS = solve_ivp(fun, SPAN, Y0, **TOLERANCES).t.size - 1  # of RK45; the projection does not change their number
 SAMPLES = np.linspace(*SPAN, 10 * STEPS)
 CASES: dict[str, dict[str, Any]] = {
-    "EIPRK4, h = 0.03, H and L": {"method": EIPRK4, "h": 0.03, "invariants": BOTH},
+    "EIPRK4, h = .03, H and L": {"method": EIPRK4, "h": 0.03, "invariants": BOTH},
     "EIPRK23, H and L": {"method": EIPRK23, "invariants": BOTH, **TOLERANCES},
     "EIPRK45, H and L": {"method": EIPRK45, "invariants": BOTH, **TOLERANCES},
     "EIPDOP853, H and L": {"method": EIPDOP853, "invariants": BOTH, **TOLERANCES},
@@ -64,7 +64,7 @@ CASES: dict[str, dict[str, Any]] = {
     "EIPRK23, no invariants": {"method": EIPRK23, **TOLERANCES},
     "EIPRK45, no invariants": {"method": EIPRK45, **TOLERANCES},
     "EIPDOP853, no invariants": {"method": EIPDOP853, **TOLERANCES},
-    "EIPRK4, h = 0.03, no invariants": {"method": EIPRK4, "h": 0.03},
+    "EIPRK4, h = .03, no invariants": {"method": EIPRK4, "h": 0.03},
 }
 PEERS = {EIPRK4: "RK45", EIPRK45: "RK45", EIPRK23: "RK23", EIPDOP853: "DOP853"}
 
