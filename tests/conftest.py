@@ -1,4 +1,4 @@
-"""What holds for every test: order, ``needs_jit``, plotting without a screen, Ctrl-C, the profile of hypothesis."""
+"""Settings of all tests: order, ``needs_jit``, plotting without a screen, Ctrl-C, the profile of hypothesis."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ os.environ["MATPLOTLIBRC"] = str(Path(__file__).with_name("matplotlibrc"))
 # As in a terminal: what a shell starts in the background ignores Ctrl-C, with all its children, and tests press it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The same examples in each run, and no deadline: the first call of a function compiles it. To look for new
+# Each run uses the same examples, without a deadline: the first call of a function compiles it. To look for new
 # counterexamples: python -m pytest --hypothesis-profile=default
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")

@@ -83,7 +83,7 @@ ORBIT = {
 
 
 def orbit(method, rank=0, ranks=1, join=lambda part: part):
-    """Kepler's problem, some of its four components on each rank: one on each of four, beside two invariants."""
+    """Run Kepler's problem with its four components on the ranks: one on each of four, with two invariants."""
     part = slice(4 * rank // ranks, 4 * (rank + 1) // ranks)
 
     def fun(t, y):

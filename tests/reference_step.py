@@ -23,7 +23,7 @@ Array = np.ndarray
 
 @dataclass
 class Step:
-    """What a step is made with.
+    """Ingredients of a step.
 
     `fun` is f(t, y), `values` I(t, y) and `gradients` G(t, y) (l, n) of all invariants. `blocks` are lists of
     components; `frame` is (C, S); the metric is "error", "euclidean" or n weights. `remembered` holds the blocks'

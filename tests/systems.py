@@ -69,7 +69,7 @@ def momentum_gradient(t, y):
 
 H = Invariant(energy, energy_gradient, name="energy")
 L = Invariant(momentum, momentum_gradient, name="momentum")
-# The same energy by f: its gradient is (-a, v).
+# Energy with f: its gradient is (-a, v).
 H_USES_F = Invariant(energy, lambda t, y, f: np.array([-f[2], -f[3], y[2], y[3]]), name="energy", uses_f=True)
 
 

@@ -1,4 +1,4 @@
-"""What a user may get wrong: each mistake gets its answer, at once, and nothing computed is lost.
+"""Mistakes of users: each one is reported at once, and computed results are not lost.
 
 Failures on the way (NaN, blow-up, contradicting invariants, vanishing gradients) are in test_guards.
 """
@@ -208,7 +208,7 @@ def test_exceptions_of_the_user_pass_unchanged(driver, error):
 
 
 def check_partial(partial):
-    """Of a run that broke in the step from 0.5, saved every tenth step of .01."""
+    """Check the partial result of a run that failed in the step from 0.5, saved every tenth step of 0.01."""
     np.testing.assert_allclose(partial.t, [0.0, 0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-15)
     assert partial.y.shape == (2, 6)
     np.testing.assert_allclose(partial.y[0], np.cos(partial.t) + 2 * np.sin(partial.t), atol=1e-8)
@@ -327,7 +327,7 @@ def test_t_span_finite(span):
     "span", [(-math.inf, 0), (math.inf, 0), (-math.inf, math.inf), (math.inf, math.inf), (math.nan, 1), (0, math.nan)]
 )
 def test_start_of_t_span_finite_through_the_solver_class(span, invariants, step):
-    """It would never arrive; its end may be infinite, as a terminal event ends the run that it does not see."""
+    """A run from an infinite start never arrives; the end may be infinite, because a terminal event may end the run."""
     with pytest.raises(ValueError, match=r"t_span must be finite, got .*; only its end may be infinite"):
         by_scipy(t_span=span, invariants=invariants, **step)
 
@@ -349,7 +349,7 @@ def test_times_of_the_solver_class_are_real(ends):
 
 
 def test_unbounded_interval_through_the_solver_class():
-    """It cannot know whether an event ends the run."""
+    """The solver class accepts it, because it cannot know whether an event ends the run."""
     solver = EIPRK4(oscillator, 0.0, Y0, math.inf, h=0.1, invariants=SQUARE)
     for _ in range(25):
         solver.step()
@@ -501,7 +501,7 @@ def test_tolerances_finite(driver, name, value, step):
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
 @pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
 def test_tolerances_without_a_scale(driver, method, invariants):
-    """Where both the start and atol are 0 an error has no size; that is said, and nothing of overflow or of h."""
+    """An error has no scale if both the start and atol are 0; the message says so, and mentions no overflow and no h."""
     options = {"h": None, "method": method, "atol": [1e-6, 0.0], "invariants": invariants}
     with pytest.raises(ValueError, match="tolerances of component 1 are 0: y0 is 0 there, and so is `atol`"):
         driver(y0=[1.0, 0.0], **options)
@@ -512,7 +512,7 @@ def test_tolerances_without_a_scale(driver, method, invariants):
 @both
 @pytest.mark.parametrize(("method", "invariants"), [(EIPRK4, ()), (EIPRK4, SQUARE), (EIPRK45, SQUARE), (EIPRK45, ())])
 def test_component_that_stays_without_a_scale(driver, method, invariants):
-    """It has no error either; only SciPy's own steps cannot go on, and that is told as what it is."""
+    """The component has no error either; only SciPy's own steps fail, with a message that gives the cause."""
     options = {"h": None, "atol": 0, "first_step": 0.01, "invariants": invariants, "check": False}
     with np.errstate(invalid="ignore"):
         run = driver(lambda t, y: np.array([y[0], 0.0]), y0=[1.0, 0.0], method=method, **options)
@@ -1040,7 +1040,7 @@ def test_wrong_component_of_a_small_part_is_found(driver):
 
 @pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, 0.3])
 def test_gradients_vanish_at_an_extremum(angle):
-    """Squares of what is 0 at the start but for rounding, which is all that differences see."""
+    """The squares vanish at the start up to rounding, which is all that differences see."""
     c, s = np.cos(angle), np.sin(angle)
 
     def lenz(t, y):
@@ -1271,7 +1271,7 @@ def test_params_are_numbers(value):
         by_integrate(lambda t, y, p: oscillator(t, y), params=value)
 
 
-# What callers see while it runs.
+# Attributes that callers see during a run.
 
 
 def test_progress_goes_to_stderr(capsys):

@@ -24,7 +24,7 @@ def compiler(monkeypatch):
 def test_machines_without_a_compiler_bring_one(compiler, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert compiler.required() == ["ziglang>=0.17"]
-    # zig builds for the processor at hand otherwise.
+    # Otherwise zig builds for the processor of this machine.
     assert compiler.chosen().every == ("-mcpu=baseline",)
     assert compiler.chosen().executables["compiler_so_cxx"][:4] == [sys.executable, "-m", "ziglang", "c++"]
 

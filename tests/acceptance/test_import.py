@@ -1,4 +1,4 @@
-"""What `import eip_scipy` brings, and that names come when they are asked for."""
+"""Names that `import eip_scipy` provides, and names that are loaded on first use."""
 
 import subprocess
 import sys
@@ -84,7 +84,7 @@ print(Invariant.__name__)"""
 
 
 def test_no_folder_or_module_has_a_public_name():
-    """Its import would put it in the place of the function, which comes by name only."""
+    """Importing such a module would replace the function, which is only available by its name."""
     here = Path(eip_scipy.__file__).parent
     assert {path.stem for path in here.iterdir()} & {*eip_scipy.__all__} == set()
 

@@ -96,7 +96,7 @@ def test_one_newton_step_does_not():
 
 @pytest.mark.parametrize(("kept", "other"), [("H", 1), ("L", 0)])
 def test_the_invariant_that_is_not_kept_drifts(kept, other):
-    """What no drift means: the paper's EIP-H and EIP-L fail the same test by orders of magnitude."""
+    """The check for drift is meaningful: the paper's EIP-H and EIP-L fail the same test by orders of magnitude."""
     result = run(EIPRK4, "paper", kept=kept)
     defects = values(result)[0]
     defects = defects - defects[:, :1]

@@ -1,4 +1,4 @@
-"""Where a number belongs, values with a unit, and dates, are a TypeError that names the argument: never dropped."""
+"""Values with a unit, and dates, raise a TypeError that names the argument, instead of losing their unit."""
 
 import datetime
 
@@ -140,7 +140,7 @@ ARGUMENTS = [
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("call", "name", "value"), ARGUMENTS)
 def test_units_and_dates_are_refused(call, name, value, kind):
-    # Of a matrix or a pair of them the first part alone has a unit.
+    # Only the first part of a matrix or of a pair of them has a unit.
     pair = isinstance(value, tuple) and np.ndim(value[0])
     given = (KINDS[kind](value[0]), *value[1:]) if pair else KINDS[kind](value)
     with pytest.raises(TypeError, match=f"^{name}: .*(has a unit|is a date or a duration).*expected plain numbers"):
@@ -226,7 +226,7 @@ def test_states_for_rebound():
 
 
 def test_plain_numbers_of_all_kinds_are_taken():
-    """Among them those of arrays that could have a unit, and objects with such a name that are no numbers."""
+    """Numbers of arrays that could have a unit are accepted, and objects with such a name that are not numbers."""
     from fractions import Fraction
 
     plain = by_integrate()

@@ -1,4 +1,4 @@
-"""What a release says of itself: one version everywhere, what is promised about data, the page on what changed."""
+"""Statements of a release: one version everywhere, safe reading of data, the page of changes."""
 
 import ast
 import re
@@ -25,7 +25,7 @@ def test_one_version():
 
 
 def forbidden(tree):
-    """What reads data as code, in a module: imports, calls, NumPy's pickles."""
+    """Yield calls in a module that read data as code: imports, calls, NumPy's pickles."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from {alias.name.partition(".")[0] for alias in node.names} & UNPICKLES

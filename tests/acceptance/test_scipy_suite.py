@@ -1,8 +1,9 @@
 """SciPy's own suite for `solve_ivp`, test_ivp.py of its wheel, run over the adaptive classes.
 
-As it is shipped, but for the method's name: in the literal lists of methods that one is the class, and the others are
-left out. Those of the 25 tests that take the default method, RK45, or Radau, go on to do so, but for the class in the
-place of RK45. ``python -m pytest tests/acceptance/test_scipy_suite.py -k shipped -rP`` prints the count for each class.
+It runs as shipped, except for the name of the method: literal lists of methods contain the class only, without the
+other methods. Those of the 25 tests that take the default method, RK45, or Radau, keep it, except that the class takes
+the place of RK45. ``python -m pytest tests/acceptance/test_scipy_suite.py -k shipped -rP`` prints the count for each
+class.
 
 And more strictly: each of its tests once per class, which it gets too where it takes the default method, or an implicit
 one on the way to something else. The same holds for `eip_scipy.solve_ivp` with the class EIPRK45, and with SciPy's own
@@ -56,7 +57,7 @@ MISSED_BY_SCIPY = [
     ("test_duplicate_timestamps", "DOP853"),  # extrapolates an interpolant of degree 7 by 1600 steps
     ("test_array_rtol", "DOP853"),  # both its errors are far below the tolerance
 ]
-# The same for Radau and BDF: neither takes an array `rtol`.
+# Tests that Radau and BDF miss: neither takes an array `rtol`.
 MISSED_BY_IMPLICIT = {
     "Radau": {"test_array_rtol"},
     "BDF": {"test_args_single_value", "test_array_rtol", "test_duplicate_timestamps"},

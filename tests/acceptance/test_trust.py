@@ -1,4 +1,4 @@
-"""Runs that are not to be trusted, and runs that are: what users are told, through the public interface."""
+"""Unreliable and reliable runs: reports to users through the public interface."""
 
 import itertools
 import math

@@ -47,7 +47,7 @@ def by_integrate(fun, t_span, y0, *, method=EIPRK45, **options):
 both = pytest.mark.parametrize("driver", [by_scipy, by_integrate], ids=["solve_ivp", "integrate"])
 
 
-# It works, and what it buys.
+# Adaptive steps with projection work, and improve the results.
 
 
 @both
@@ -134,14 +134,15 @@ OPTIONS = {
     "first_step": {"invariants": H, "first_step": 0.01},
     "max_step": {"invariants": H, "max_step": 0.1},
 }
-# Of the last three one is the default, one does nothing in a correct run, and without the third the run is refused.
+# One of the last three options is the default, one has no effect in a correct run, and the run is refused without the
+# third.
 WITHOUT_EFFECT = "no invariants", "one", "two", "uses_f", "target", "metric error", "check", "project_initial"
 
 
 @methods
 @pytest.mark.parametrize("option", OPTIONS)
 def test_both_drivers_take_every_option(method, option):
-    """The same functions, so the same steps to round-off of the fixed arithmetic; and the invariants are kept."""
+    """Both drivers call the same functions, take the same steps to round-off, and keep the invariants."""
     options = {"rtol": 1e-4, "atol": 1e-6, **OPTIONS[option]}
     one, other = (driver(orbit, (0.0, 6.0), Y0, method=method, **options) for driver in (by_scipy, by_integrate))
     assert one.status == other.status == 0
@@ -361,7 +362,7 @@ def test_first_projection_fails(driver):
 
 @both
 def test_failed_projection_counts_only_in_a_row(driver):
-    """A failure now and then is mended each time: many rejections, and the run ends well."""
+    """Occasional failures are recovered each time: many steps are rejected, and the run ends well."""
     asked = []
 
     def value(t, y):
@@ -499,7 +500,7 @@ def test_counts_of_projections(driver, method):
 
 @both
 def test_max_correction_without_the_error_metric(driver):
-    """It is measured in local errors, which the euclidean metric does not look at."""
+    """The bound is measured in local errors, which the euclidean metric does not use."""
     run = driver(orbit, (0, 6), Y0, invariants=[H, L], metric="euclidean")
     assert math.isnan(run.diagnostics.max_correction)
 

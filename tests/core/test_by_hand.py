@@ -57,7 +57,7 @@ def stepped(solver, most=3000):
     return rows
 
 
-# What public code does with SciPy's solvers, each as a function of a solver that returns rows.
+# Typical uses of SciPy's solvers in public code, each as a function of a solver that returns rows.
 
 
 def moved_bound(s):
@@ -226,7 +226,7 @@ def test_given_targets_hold_after_an_impulse():
 
 
 def test_what_was_found_before_an_impulse_stays():
-    """Friction before the kick, told once; the run is not trusted afterwards either."""
+    """Friction before the kick is reported once; the run remains unreliable afterwards."""
     solver = EIPRK45(
         lambda t, y: np.array([y[1], -np.sin(y[0]) - 0.2 * y[1]]), 0, [2.0, 0.0], 20.0, rtol=1e-8, invariants=KEPT
     )
@@ -343,7 +343,7 @@ COPIED = [
 
 
 def rest(solver):
-    """What dense output gives in the last step, and all that is to come."""
+    """Return dense output in the last step, and everything that follows."""
     middle = solver.dense_output()(0.5 * (solver.t_old + solver.t))
     rows = stepped(solver)
     counts = solver.nfev, solver.njev, solver.nlu, solver.diagnostics.n_projections, getattr(solver, "seen", 0)

@@ -66,7 +66,7 @@ def test_scipy_s_own_classes():
 
 
 def test_a_class_like_scipy_s():
-    """The same steps as the class' own, to rounding; the energy is kept, and the order is the class'."""
+    """The class takes the steps of SciPy's class, to rounding; the energy is kept, and the order is the class'."""
     method = eip_method(CashKarp)
     assert (method.__name__, method.order, method.TABLEAU.has_estimate) == ("EIP_CashKarp", 5, True)
     given = {"rtol": 1e-8, "atol": 1e-10}
@@ -85,7 +85,7 @@ def test_a_class_like_scipy_s():
 
 
 def test_a_class_of_another_package():
-    """Its dense output too: the polynomial of RK23."""
+    """The class also has the dense output of RK23, its polynomial."""
     method = eip_method(Foreign)
     assert method.error_estimator_order == 2
     np.testing.assert_array_equal(method.P, RK23.P)

@@ -39,7 +39,7 @@ I0 = np.array([energy(0, Y0), momentum(0, Y0)])
 
 
 def defects(y):
-    """Of states (4, m)."""
+    """Return invariant errors of states (4, m)."""
     y = np.asarray(y).reshape(4, -1)
     return np.abs(np.array([energy(0, y), momentum(0, y)]) - I0[:, None])
 
@@ -137,7 +137,7 @@ def test_on_the_level_between_the_ends(method, variant):
 
 @pairs
 def test_unprojected_interpolation_leaves_the_manifold(method):
-    """What the projection is for, and that the test above can see it."""
+    """Interpolation without projection leaves the manifold, which shows that the test above is able to fail."""
     sol = solve(method, dense_output=True)
     t = np.linspace(0, 8, 500)
     assert defects(sol.sol(t)).max() > 1e-5
@@ -154,7 +154,7 @@ def test_scalar_and_array_times_agree(method, variant):
     for k in range(60):
         assert sol.sol(t[k]).shape == (len(sol.y),)
         np.testing.assert_allclose(sol.sol(t[k]), together[:, k], rtol=0, atol=3e-15)
-    # It is a function: the second call gives what the first gave, and does not disturb the run's numbers.
+    # The solution is a function: a second call returns the same values, and does not change the run's numbers.
     assert np.array_equal(sol.sol(t), together)
 
 
@@ -247,7 +247,7 @@ def test_order_of_interpolation(method, order, steps, option):
 
 @pairs
 def test_interpolation_is_as_good_as_scipy_s(method):
-    """Errors between the steps of the plain method: within a third of SciPy's own interpolants."""
+    """Errors between the steps of the plain method are within 1/3 of SciPy's own interpolants."""
     name = {EIPRK23: "RK23", EIPRK45: "RK45", EIPDOP853: "DOP853"}[method]
     t = np.linspace(0, 8, 997)
     exact = solve_ivp(orbit, (0, 8), Y0, method="DOP853", rtol=3e-14, atol=1e-16, t_eval=t).y

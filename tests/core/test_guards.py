@@ -215,7 +215,7 @@ def test_kepler_in_si_units_euclidean_says_so_or_holds(driver):
     assert np.isfinite(run.y).all()
     assert (run.max_defect <= 1e-10 * size).all()
     assert run.status == 0 or run.message.startswith("projection failed at t=")
-    # What a step of lower rank leaves is on record.
+    # The residual of a step of lower rank is recorded.
     assert (run.max_defect <= 1e-11 * size).all() or run.diagnostics.n_rank_reduced > 0
 
 
@@ -374,7 +374,7 @@ def test_row_inside_the_band_stays():
 
 
 def test_row_inside_the_band_is_not_corrected():
-    """Its own defect is round-off of its scale, though another one is projected."""
+    """The residual of the row is round-off of its scale, though another row is projected."""
     first = Invariant(lambda t, y: y[0], lambda t, y: np.array([1.0, 0.0]), target=1.0)
     noisy = Invariant(lambda t, y: y[1], lambda t, y: np.array([0.0, 1.0]), target=1.0, scale=1e12)
     result = project([1.1, 1.0 + 1e-6], [first, noisy])
@@ -491,7 +491,7 @@ def test_invariant_not_finite_later():
 
 
 def test_value_not_finite_at_the_projected_state():
-    """It was finite before the correction, which leads out of the domain."""
+    """The value was finite before the correction, which leaves the domain."""
     edge = Invariant(lambda t, y: y[0] if y[0] < 1.005 else math.nan, lambda t, y: np.ones(1), target=1.01, name="edge")
     with pytest.raises(ValueError, match="projection failed at t=0: invariant 'edge', residual nan, rank 1 of 1"):
         project([1.0], edge)
@@ -510,7 +510,7 @@ def test_correction_in_the_wrong_direction(driver):
 @both
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_gradient_not_finite_on_the_way(driver, bad):
-    """It must not switch the projection off without a word."""
+    """A gradient that is not finite does not silently disable the projection."""
     broken = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y if t < 0.45 else bad * y, name="broken")
     with np.errstate(all="ignore"):
         run = driver(oscillator, (0, 1), [1.0, 2.0], h=0.1, invariants=broken, check=False)
@@ -640,7 +640,7 @@ def test_no_flood_of_warnings(driver):
 
 @metrics
 def test_an_invariant_that_the_frame_holds(metric):
-    """Of its gradient rounding is left, which points anywhere; a compensated run sees its defects in every step."""
+    """Only rounding is left of the gradient, in any direction; a compensated run sees the residual in every step."""
     n = 6
     total = np.repeat([0.0, 1.0], n)
     frame = np.kron(np.eye(2), np.ones((1, n))), np.kron(np.eye(2), np.ones((n, 1)))

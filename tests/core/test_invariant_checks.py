@@ -166,7 +166,7 @@ def test_a_computed_gradient_close_to_a_singularity(distance, takes_complex):
 
 
 class RefusedError(Exception):
-    """What a library may raise that does not know complex numbers."""
+    """Error of a library that does not accept complex numbers."""
 
 
 @pytest.mark.parametrize("error", [RuntimeError, NotImplementedError, AssertionError, KeyError, RefusedError])

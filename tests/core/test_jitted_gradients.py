@@ -19,7 +19,7 @@ FUNCTIONS = {}
 
 
 def case(exact, shape=()):
-    """A jitted function beside the same for mpmath, of four numbers, or for a tuple of them."""
+    """Return a jitted function and its mpmath counterpart, of four numbers, or for a tuple of them."""
 
     def add(fun):
         FUNCTIONS[fun.__name__] = njit(fun), exact, shape

@@ -14,7 +14,7 @@ from eip_scipy import EIPRK4, Invariant, integrate
 from eip_scipy.problems import kepler
 
 Y0 = pericentre(0.6)
-# Of each method the options of a run with a few dozen steps.
+# Options of each method for a run of a few dozen steps.
 RUNS = {name: {"rtol": 1e-6, "atol": 1e-9} for name in ("EIPRK23", "EIPRK45", "EIPDOP853", "EIPRKN8", "EIPRKN12")}
 RUNS |= {name: {"h": 0.1} for name in ("EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPRKN12")}
 RUNS["EIPRK1"] = {"h": 0.01}
@@ -41,7 +41,7 @@ def assert_same_states(found, expected, times):
 @each_method
 @pytest.mark.parametrize("kept", [True, False], ids=["projected", "plain"])
 def test_pickled_dense_output(name, kept):
-    """Of solve_ivp and of integrate, with functions that do not pickle; the invariants hold as before."""
+    """Solutions of solve_ivp and of integrate pickle with functions that do not; the invariants hold as before."""
     invariants = local_invariants() if kept else ()
     method = getattr(eip_scipy, name)
     options = {**RUNS[name], "dense_output": True, "invariants": invariants}
@@ -67,7 +67,7 @@ def test_pickled_dense_output(name, kept):
 
 
 def work(e):
-    """What a worker process does: functions of its own, and a solution that it returns."""
+    """Run functions of its own in a worker process, and return a solution."""
     y0 = pericentre(e)
     return solve_ivp(
         lambda t, y: orbit(t, y), (0, 3), y0, method=EIPRK4, h=0.1, dense_output=True, invariants=local_invariants()

@@ -75,7 +75,7 @@ def exact(times, y0=Y0):
 
 
 def run(end, y0=Y0, **options):
-    """Integrate the orbit by its acceleration, with its Jacobian and in steps of 1/256 of its period unless told."""
+    """Integrate the orbit by its acceleration, with its Jacobian and by default in steps of 1/256 of its period."""
     options = {"acceleration": acceleration, "jacobian": jacobian, "h": STEP} | options
     return integrate(t_span=(0, end), y0=y0, **options)
 
@@ -205,7 +205,7 @@ def test_bits_do_not_depend_on_what_is_saved():
 
 @pytest.mark.needs_jit
 def test_python_jitted_and_native_functions_give_the_same_bits():
-    """Of Kepler's problem in three dimensions, the library's functions beside Python's."""
+    """Kepler's problem in three dimensions gives the same bits with the library's functions as with Python's."""
     problem = nbody([1.0, 1e-3], [[0, 0, 0], [0.8, 0, 0.1]], [[0, -1e-3, 0], [0, 1.2, 0.1]], t_span=(0, 20), h=0.05)
     native = integrate(problem, method=EIPGJ14)
     assert native.calls["jacobian"] == "native"
@@ -247,7 +247,7 @@ int jacobian(double t, const double *q, const double *dq, double *out, const dou
 
 
 def test_c_functions(tmp_path):
-    """By pointer, with params: the bits of Python's functions that compute the same."""
+    """C functions by pointer, with params, give the bits of Python functions that compute the same."""
     source = tmp_path / "functions.c"
     source.write_text(C_FUNCTIONS)
     library = ctypes.CDLL(str(shared_library(tmp_path / "functions.so", source)))
@@ -333,7 +333,7 @@ def test_members_have_the_bits_of_single_runs():
 
 @pytest.mark.parametrize("forces", ["gr-potential", "1pn", "eih", ("gr-potential", "j2")])
 def test_forces(forces):
-    """Relativity by velocities too, beside a tight run of another method."""
+    """Relativity depends on velocities too; the reference is a tight run of another method."""
     problem = solar_system(years=1, forces=forces)
     found = integrate(problem, method=EIPGJ14, h=1 / 600)
     other = integrate(problem, method=EIPDOP853, h=1 / 2000, compensated=True)
@@ -363,7 +363,7 @@ def test_velocities_are_found_in_solve_ivp():
 
 
 def test_solve_ivp():
-    """Its states are those at the newest end of the history; events and dense output as of any solver."""
+    """The states are those at the newest end of the history; events and dense output work as in any solver."""
     times = np.linspace(0, 20, 101)
     solution = solve_ivp(
         orbit,
@@ -484,7 +484,7 @@ def test_a_false_invariant_is_told():
     ],
 )
 def test_bad_options(options, error, message):
-    """What came, and what to do."""
+    """Messages give the value, and what to do."""
     with pytest.raises(error, match=message):
         run(1, **{"method": EIPGJ12, "h": 0.01, "jacobian": None, **KEPT, **options})
 
@@ -498,7 +498,7 @@ def test_states_that_are_none():
 
 
 def test_what_is_not_finite():
-    """Where it was, as of other methods."""
+    """Messages name the time of the failure, as those of other methods do."""
     broken = lambda t, q: -q if t < 1 else q * np.nan  # noqa: E731
     found = run(3, [1.0, 0.0], acceleration=broken, jacobian=None, method=EIPGJ12, h=0.03)
     assert found.status == -1

@@ -119,7 +119,7 @@ def test_samples_have_the_order_of_the_steps(method):
 
 @both
 def test_backward_and_complex(method):
-    """The same orbit backward, and in the complex plane as one component."""
+    """Dense output works for the orbit run backward, and in the complex plane as one component."""
     run = integrate(
         acceleration=pull, t_span=(0, -9), method=method, h=0.05, t_eval=-TIMES[:90], compiled=False, **KEPLER
     )
@@ -161,7 +161,7 @@ def test_evaluations_are_counted(method, further):
 
 
 def test_a_multistep_run_too_short_for_a_history():
-    """Its steps are those of the Nystrom method that starts it, and so are its samples."""
+    """The steps and the samples are those of the Nystrom method that starts the run."""
     times = np.linspace(0, 1, 41)
     run = integrate(acceleration=pull, t_span=(0, 1), method=EIPGJ12, h=0.125, t_eval=times, compiled=False, **KEPLER)
     assert largest(run.y - exact_kepler(times)) < 1e-9

@@ -57,7 +57,7 @@ def exact():
 @pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "metric": "euclidean"}])
 @pytest.mark.parametrize(("method", "n"), [(EIPRKN8, (8, 12)), (EIPRKN12, (4, 5))])
 def test_order(method, n, options, exact):
-    """Of one interval in steps so large that truncation is all there is."""
+    """The steps of one interval are so large that truncation dominates."""
     errors = [
         np.abs(
             integrate(
@@ -73,7 +73,7 @@ def test_order(method, n, options, exact):
 
 
 def accelerations(tableau, h):
-    """Those of the stages of the first step, by the definition."""
+    """Return the accelerations of the stages of the first step, by the definition."""
     q, v, k = Y0[:2], Y0[2:], []
     for i in range(tableau.n_stages):
         k.append(acceleration(0, q + tableau.c[i] * h * v + h * h * sum(tableau.A[i, j] * k[j] for j in range(i))))

@@ -63,7 +63,7 @@ def runs(method, **options):
     ids=lambda o: next(iter(o), "default"),
 )
 def test_fixed_steps_are_those_of_the_tableau(invariants, options):
-    """But for the last bits: the sums run in another order. The written-out method never takes f of a raw result."""
+    """Steps agree up to rounding: sums run in another order. The method by hand never evaluates f at a raw result."""
     options = {"h": 0.1, "metric": "euclidean", "invariants": invariants, **options}
     ours, tableau = runs(eip_method(RK4(oscillator)), **options), runs(EIPRK4, **{**options, "reuse_f": False})
     np.testing.assert_allclose(ours.y, tableau.y, rtol=0, atol=2e-14)

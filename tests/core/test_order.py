@@ -150,7 +150,7 @@ def rms(values):
 @pytest.mark.parametrize("options", LOCAL)
 @pytest.mark.parametrize("method", METHODS)
 def test_corrections_are_of_the_size_of_the_local_error(method, options):
-    """Of order p + 1, the first half of the theorem that the defects are of order 2 (p + 1)."""
+    """Corrections are of order p + 1, the first half of the theorem that the residuals are of order 2 (p + 1)."""
     p = method.TABLEAU.order
     steps = CORRECTION_STEPS[p] * np.array([1.0, 0.6])
     pairs = [[one_step(y, method, h, OPTIONS[options]) for y in AWAY_FROM_PERICENTRE] for h in steps]

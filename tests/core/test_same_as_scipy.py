@@ -15,11 +15,11 @@ from eip_scipy.problems import kepler
 EPS = np.finfo(float).eps
 SCIPY = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853}
 OURS = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853}
-# The same pairs with the package's own steps, whatever the classes do where nothing is to be projected.
+# Pairs with the package's own steps, whatever the classes do if nothing is projected.
 OWN = {name: eip_method(cls.TABLEAU) for name, cls in OURS.items()}
 PAIRS = [(name, cls) for table in (OURS, OWN) for name, cls in table.items()]
 # How far their states may be apart at default tolerances. The estimate is a difference of terms h K_i, so round-off of
-# them, eps h |f|, is a share eps h |f| / (estimate) of it, and an eighth to a third of that share goes into the next h.
+# them, eps h |f|, is a share eps h |f| / (estimate) of it, and 1/8 to 1/3 of that share goes into the next h.
 # The estimate is 1e-3 to 1e-6 with RK23 and RK45, but where the tolerance has left DOP853's step behind (its e5 is a
 # high power of h) 1e-10 and less; van der Pol's jumps then multiply a shift in time by another 1e3.
 OWN_LEVEL = {"RK23": 1e-9, "RK45": 1e-6, "DOP853": 2e-3}

@@ -65,7 +65,7 @@ def replaced(record, path, value):
 
 
 def spoilt(a):
-    """What an array must not be."""
+    """Yield arrays that are not accepted."""
     yield a.tolist()
     yield None
     yield a.astype(np.float32 if a.dtype.kind == "f" else np.complex64 if a.dtype.kind == "c" else np.int32)
@@ -253,7 +253,7 @@ def test_addresses_are_looked_at():
 
 
 def test_events_in_python_are_looked_at():
-    """Beside functions by address: as many as there is room for, and none by address then."""
+    """Python events are accepted next to functions by address, as many as there is room for; then none by address."""
 
     @ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4)
     def never(*arguments):

@@ -1,4 +1,4 @@
-"""The engine beside the method in plain NumPy, `reference_step`."""
+"""The engine compared with the method in plain NumPy, `reference_step`."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ FRAME = np.eye(6)[:1], np.eye(6)[:, :1] + 0.25 * np.eye(6)[:, 1:2]
 
 
 def length(cls):
-    """Of the step: its error is larger than what the targets are beside the start's values."""
+    """Return the length of a step, whose error exceeds the offset of the targets from the start's values."""
     return 0.5 if cls in (EIPDOP853, EIPRKN8, EIPRKN12) else 0.05
 
 

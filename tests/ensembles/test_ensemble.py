@@ -597,7 +597,7 @@ def test_a_closed_executor():
 
 @pytest.mark.parametrize("cancel", [True, False])
 def test_an_executor_that_is_closed_meanwhile(cancel, tmp_path):
-    """Where what was handed to it still comes back, that is kept too."""
+    """Members that were submitted and still return are kept too."""
     executor = ThreadPoolExecutor(1)
     options = {"h": 0.1, "chunk": 1, "checkpoint": tmp_path / "kept", "compiled": False}
     y0s = np.ones((100, 2))

@@ -270,7 +270,7 @@ def all_that_octets_do(t, y, out):
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_octets_are_floats_lane_by_lane():
-    """All that functions of octets are made of."""
+    """All operations of functions of batches give the floats of each lane."""
     starts = np.random.default_rng(11).normal(size=(8, 8))
     run = check_bits(all_that_octets_do, (0, 0.5), starts, method=EIPRK4, h=0.1, in_place=True, invariants=())
     assert run.side_by_side.all()

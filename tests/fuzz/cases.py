@@ -66,17 +66,17 @@ class Case:
 
     @property
     def regular(self) -> bool:
-        """Whether neighbouring motions stay neighbours, so that a run can be compared with the true one."""
+        """Return whether neighbouring motions stay neighbours, so that a run can be compared with the true one."""
         return self.growth < REGULAR
 
     @property
     def native(self) -> bool:
-        """Whether all functions are Numba functions."""
+        """Return whether all functions are Numba functions."""
         return self.system.name == jitted.NAME
 
     @property
     def terminal(self) -> bool:
-        """Whether an event may end the run."""
+        """Return whether an event may end the run."""
         return any(event.terminal for event in self.events)  # type: ignore[attr-defined]
 
     def error(self, y: Array) -> float:
@@ -152,7 +152,7 @@ def method(name: str) -> Any:
 
 
 def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function, for a bounded number of calls."""
+    """Return the function with a bound on the number of calls."""
     calls = 0
 
     def bounded(*args: Any) -> Any:
@@ -166,12 +166,12 @@ def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def with_params(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function with one more argument, whose first number is 1."""
+    """Return the function with one more argument, whose first number is 1."""
     return lambda t, y, p: fun(t, y) * p[0]
 
 
 def filling(fun: Callable[..., Any]) -> Callable[..., None]:
-    """The same function in place."""
+    """Return the function in place."""
 
     def fill(t: float, y: Array, out: Array, *params: Array) -> None:
         out[:] = fun(t, y, *params)
@@ -226,7 +226,7 @@ def random_case(seed: int) -> Case:
     )
 
 
-# What is kept.
+# Preserved quantities.
 
 
 def _chosen(rng: np.random.Generator, system: System) -> tuple[Quantity, ...]:
@@ -245,7 +245,7 @@ def _chosen(rng: np.random.Generator, system: System) -> tuple[Quantity, ...]:
 
 
 def _vanishes(a: Quantity, system: System) -> bool:
-    """Whether a part of it is rounding at the start: a square of that has no gradient to project along."""
+    """Return whether a part of it is rounding at the start: the square of that has no gradient to project along."""
     t, y = system.t0, system.y0
     return bool(np.any(np.abs(a.fun(t, y)) <= 1e-8 * (np.abs(a.grad(t, y)) @ np.abs(y))))
 
@@ -270,7 +270,7 @@ def _stacked(a: Quantity, b: Quantity) -> Quantity:
 
 
 def _leaking(rng: np.random.Generator, system: System, a: Quantity) -> Quantity:
-    """What is nearly kept: with a further term, whose rate may vanish at the start."""
+    """Return a quantity that is nearly kept, with a further term whose rate may vanish at the start."""
     y0, unit, power = system.y0, system.unit, int(rng.integers(1, 3))
     amount = 10 ** rng.uniform(-4, 0) * np.max(np.abs(a.fun(system.t0, y0)))
     way = rng.standard_normal(y0.size)
@@ -386,7 +386,7 @@ def _event(rng: np.random.Generator, k: int, size: Array) -> Callable[..., float
     return event
 
 
-# What is known of the motion.
+# Known properties of the motion.
 
 
 def _rate(system: System, sign: float) -> float:
@@ -429,7 +429,7 @@ def _truth(rng: np.random.Generator, system: System, times: Array) -> tuple[Arra
 
 
 def _states(system: System, y0: Array, times: Array, rtol: float, atol: Array) -> Array:
-    """By SciPy's DOP853, from one of the times to the next."""
+    """Return states by SciPy's DOP853, from one of the times to the next."""
     found, t, y = [], system.t0, y0
     for end in times:
         y = solve_ivp(counted(system.fun), (t, end), y, method="DOP853", rtol=rtol, atol=atol).y[:, -1]

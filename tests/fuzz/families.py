@@ -545,7 +545,7 @@ def random_system(rng: np.random.Generator) -> System:
 
 
 def begun_at(system: System, t0: float) -> System:
-    """The same motion, its clock set to t0."""
+    """Return the same motion with its clock set to t0."""
     kept = tuple(
         Quantity(
             k.name,
@@ -568,7 +568,7 @@ def begun_at(system: System, t0: float) -> System:
 
 
 def in_units(system: System, unit: Array) -> System:
-    """The same motion with y = unit z; velocities keep the unit of their positions."""
+    """Return the same motion with y = unit z; velocities keep the unit of their positions."""
     if system.acc is not None:
         unit = np.tile(unit[: unit.size // 2], 2)
     kept = tuple(

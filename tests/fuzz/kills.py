@@ -35,7 +35,7 @@ PATIENCE = 30.0
 
 
 def differences(kind: str, run: Any) -> Iterator[str]:
-    """What of a run is not that of the whole one, to the last bit."""
+    """Yield the parts of a run that differ from those of the whole one in any bit."""
     names = ["t", "y", "status", "max_defect", "trusted", "nfev", "njev", "nlu"]
     names += ["invariants"] if kind in SINGLE else ["failed", "max_correction", "message"]
     pairs = {name: (getattr(whole(kind), name), getattr(run, name)) for name in names}
@@ -98,7 +98,7 @@ def chain(seed: int, folder: Path, context: Any, most: int, killed: Counter[str]
 
 
 def kill(kills: int, seed: int, seconds: float = math.inf) -> tuple[Counter[str], list[str]]:
-    """Kill so many times; what was done, and what is wrong."""
+    """Kill the runs `kills` times; return the counts, and the faults."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["tests.fuzz.warm"])  # where the run starts in the repository's root
     killed, wrong, begin = Counter[str](), [], time.monotonic()
@@ -116,7 +116,7 @@ def kill(kills: int, seed: int, seconds: float = math.inf) -> tuple[Counter[str]
 def main(arguments: list[str] | None = None) -> int:
     """The script; returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.kills", description=__doc__.partition("\n")[0])
-    parser.add_argument("--kills", type=int, default=60, help="stop after so many")
+    parser.add_argument("--kills", type=int, default=60, help="stop after this number")
     parser.add_argument("--seed", type=int, default=0, help="the number of the first chain of kills")
     given = parser.parse_args(arguments)
     begin = time.monotonic()

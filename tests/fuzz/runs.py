@@ -76,7 +76,7 @@ def kept_in(kind: str, path: Path) -> dict[str, Any]:
 
 
 def work(kind: str, path: Path) -> None:
-    """What runs in the process that is killed."""
+    """Run the process that is killed."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # Ctrl-C prints where it came
     KINDS[kind](**kept_in(kind, path))

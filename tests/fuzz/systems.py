@@ -30,7 +30,7 @@ from eip_scipy import Diagnostics, ProjectionWarning, ensemble
 
 from .cases import METHODS, Case, TooManyCallsError, random_case
 
-# A trusted run may err so many times as much as the one without projection.
+# Largest error of a reliable run relative to the run without projection.
 FACTOR = 1e3
 # Errors of the true states and rounding, in units of what the motion makes of a small change.
 FLOOR = 1e-10
@@ -57,12 +57,12 @@ class Runs:
 
     @property
     def whole(self) -> Any:
-        """By `integrate`, every step saved."""
+        """Return the run by `integrate`, every step saved."""
         return self._whole[0]
 
     @property
     def warned(self) -> list[warnings.WarningMessage]:
-        """What it warned of."""
+        """Return the warnings of the run."""
         return self._whole[1]
 
     @cached_property
@@ -78,7 +78,7 @@ class Runs:
 
     @cached_property
     def scipy(self) -> Any:
-        """By SciPy's `solve_ivp`; the diagnostics and the warnings go with it."""
+        """Return the run by SciPy's `solve_ivp`, with its diagnostics and warnings."""
         record = Diagnostics()
         found, warned = observed(lambda: self.case.solve_ivp(diagnostics=record, dense_output=True))
         found.diagnostics, found.warned = record, warned
@@ -95,12 +95,12 @@ class Runs:
 
     @property
     def checked(self) -> bool:
-        """Whether the run was to look at itself."""
+        """Return whether the run checks its invariants."""
         return bool(self.case.projection.get("check", True))
 
     @property
     def healthy(self) -> bool:
-        """Whether nothing is wrong with the system, and the steps resolve it."""
+        """Return whether the system is correct, and the steps resolve it."""
         return not self.case.sick and self.allowed < FACTOR * 1e-2
 
 
@@ -112,7 +112,7 @@ def observed(call: Callable[[], Any]) -> tuple[Any, list[warnings.WarningMessage
 
 
 def same(one: Any, other: Any) -> bool:
-    """Bit for bit, but for the sign of zero and the kinds of NaN."""
+    """Compare bit for bit, except the sign of zero and the kinds of NaN."""
     return np.array_equal(one, other, equal_nan=True)
 
 
@@ -145,7 +145,7 @@ def different_events(run: Any, other: Any) -> Iterator[str]:
                 yield f"event {k} at {t!r}: {y!r}; integrate found {found!r}"
 
 
-# What must hold. Each check yields what is wrong.
+# Conditions on runs. Each check yields the violations.
 
 
 def finite(runs: Runs) -> Iterator[str]:
@@ -164,7 +164,7 @@ def finite(runs: Runs) -> Iterator[str]:
 
 
 def accurate(runs: Runs) -> Iterator[str]:
-    """A trusted run errs at most so many times as much as the one without projection."""
+    """Check that a reliable run errs at most `FACTOR` times as much as the one without projection."""
     run = runs.sampled
     if run.trusted and (runs.checked or not runs.case.sick) and math.isfinite(runs.allowed):
         error = runs.case.error(run.y)
@@ -176,7 +176,7 @@ def accurate(runs: Runs) -> Iterator[str]:
 
 
 def survives(runs: Runs) -> Iterator[str]:
-    """Where the steps resolve the motion, keeping what it keeps neither fails nor takes far more steps.
+    """Check that steps which resolve the motion neither fail nor become far more numerous with projection.
 
     Other directions and further iterations have no second tries where gradients are nearly parallel; they may fail.
     """
@@ -202,7 +202,7 @@ def kept(runs: Runs) -> Iterator[str]:
 
 
 def quiet(runs: Runs) -> Iterator[str]:
-    """No warning but for numerical gradients and doubts in the run."""
+    """Check that there are no warnings, except those of numerical gradients and of doubts in the run."""
     if runs.healthy:
         for warned in (*runs.warned, *runs.scipy.warned):
             if DIFFERENCES not in str(warned.message) and not issubclass(warned.category, ProjectionWarning):
@@ -352,7 +352,7 @@ def members(runs: Runs, **options: Any) -> Iterator[str]:
     if any(TooManyCallsError.__name__ in message for message in run.message):  # calls are counted for both together
         return
     alone = runs.whole
-    # The check of the start is made for the first member only: the others may be told the same at a later time.
+    # The start is checked for the first member only; the same report may come later for the others.
     checked = any(text in alone.message for text in (NO_INVARIANT, WRONG_GRADIENT))
     until = "; not to be trusted" if checked and not run.trusted[1] else " ("
     end = alone.t[-1], alone.status, alone.message.split(until)[0]
@@ -405,8 +405,8 @@ def look_at(seed: int) -> tuple[Runs | None, list[tuple[str, str]]]:
 def main(arguments: list[str] | None = None) -> int:
     """The script; returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.systems", description=__doc__.partition("\n")[0])
-    parser.add_argument("--seconds", type=float, default=math.inf, help="stop after so many seconds")
-    parser.add_argument("--count", type=int, default=None, help="stop after so many systems")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this number of seconds")
+    parser.add_argument("--count", type=int, default=None, help="stop after this number of systems")
     parser.add_argument("--seed", type=int, default=0, help="the number of the first system")
     given = parser.parse_args(arguments)
     if given.count is None and math.isinf(given.seconds):

@@ -367,7 +367,7 @@ def test_workers_that_do_not_come_back(monkeypatch):
 
 
 def test_a_cluster_without_workers_is_waited_for():
-    """As one that waits for its jobs to start; told once."""
+    """A cluster whose jobs have not started yet is waited for, which is reported once."""
     with pytest.warns(RuntimeWarning, match="the Dask cluster has no workers; waiting for some") as record:
         assert deserted(None, *[TimeoutError()] * 10).success
     assert len(record) == 1
@@ -385,7 +385,7 @@ def test_other_errors_stay_what_they_are():
 
 
 class Client:
-    """What `require_secure` asks a client."""
+    """Client with the attributes that `require_secure` reads."""
 
     status = "running"
 

@@ -23,7 +23,7 @@ from eip_scipy.problems import Grid, GrossPitaevskii, Splitting, harmonic_trap
 from eip_scipy.solvers import EIPSolver
 
 TESTS = Path(__file__).parents[1]
-# What belongs to this Python first: an MPI that pip installed.
+# An MPI that pip installed for this Python has precedence.
 MPIRUN = shutil.which("mpirun", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
 ALONE = over_ranks(EIPRK4, MPI.COMM_SELF)
 # Open MPI refuses to run as root and more ranks than cores; other libraries do not look at these.
@@ -41,7 +41,7 @@ def serial():
 
 
 def on_ranks(ranks, script, *arguments, cwd):
-    """What a script prints; a rank that waits for another forever runs into the timeout."""
+    """Return the output of a script; a rank that waits for another forever runs into the timeout."""
     command = [MPIRUN, "-n", str(ranks), sys.executable, "-m", "mpi4py", str(script), *arguments]
     done = subprocess.run(
         command, cwd=cwd, env=os.environ | OPEN_MPI, capture_output=True, text=True, timeout=300, check=False
@@ -121,7 +121,7 @@ FAILING = """
     calls = {}
 
     def at(where, value):
-        # Rank 1 raises in the so many-th call of one function.
+        # Rank 1 raises in one function, at the call whose number is failing[1].
         if where != failing[0] or comm.rank != 1:
             return value
         calls[where] = calls.get(where, 0) + 1
@@ -281,7 +281,7 @@ def test_parts_cover_the_grid():
 
 @pytest.mark.parametrize("shape", [(), (0,), (1, 2), (15,), (16,), (3, 7)])
 def test_sums_are_in_the_order_of_the_ranks(shape):
-    """Of the sizes that travel with the flag, and of larger ones."""
+    """The arrays have the sizes that travel with the flag, and larger ones."""
     a = np.random.default_rng(0).standard_normal(shape)
     found = gathered(MPI.COMM_SELF, a)
     assert found.shape == (1, *shape)

@@ -66,7 +66,7 @@ def test_ias15_meets_the_reference(years):
     ],
 )
 def test_truncation_error_after_a_century(integrator, h, expected):
-    """The same in versions 4.6 and 5.2; another order of the corrector changes the Earth's by 9 % in the last row."""
+    """Versions 4.6 and 5.2 agree; another order of the corrector changes the Earth's error by 9 % in the last row."""
     result = run(integrator, h=h, t_end=100 * YEAR)
     errors = position_errors(result, 100.0)[[MERCURY, VENUS, EARTH]]
     np.testing.assert_allclose(errors, expected, rtol=0.01, atol=1e-10)

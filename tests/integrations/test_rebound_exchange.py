@@ -52,7 +52,7 @@ def short_run(**options):
 
 
 def test_distances_that_end_a_simulation_are_events():
-    """A planet on a radial way out crosses 3; two bodies that fall together meet at .5: both to rounding."""
+    """A planet on a radial way out crosses 3; two bodies that fall together meet at 0.5: both to rounding."""
     sim = rebound.Simulation()
     sim.add(m=1.0)
     sim.add(m=0.0, x=1.0, vx=2.0)

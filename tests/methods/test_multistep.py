@@ -33,7 +33,7 @@ def test_published_coefficients():
 
 
 def missed_by_position(back, order, k):
-    """What the formula misses of q = t^(k + 2), by second differences, which take the sums out: exact fractions."""
+    """Return the residual of q = t^(k + 2), by second differences, which remove the sums: exact fractions."""
 
     def a(n):
         return (k + 2) * (k + 1) * Fraction(n) ** k
@@ -48,7 +48,7 @@ def missed_by_position(back, order, k):
 
 
 def missed_by_velocity(back, order, k):
-    """The same of v = t^(k + 1) / (k + 1), by first differences."""
+    """Return the residual of v = t^(k + 1) / (k + 1), by first differences."""
     change = sum(w * (Fraction(-j) ** k - Fraction(-j - 1) ** k) for j, w in enumerate(velocity_weights(back, order)))
     later, earlier = (Fraction(n) ** (k + 1) / (k + 1) for n in (-back, -back - 1))
     return later - earlier - Fraction(0) ** k - change
@@ -108,7 +108,7 @@ def test_interpolation(order):
 
 
 def amplitude(order, corrected, x, steps=3000):
-    """Of the recursion itself for q'' = -q after so many steps of length x, from an exact start."""
+    """Return the amplitude of the recursion for q'' = -q after `steps` steps of length x, from an exact start."""
     z = x * x
     P, D = (np.array([float(w) for w in f(order)]) for f in (lambda k: position_weights(-1, k), correction_weights))
     a = list(-np.cos(x * np.arange(-2, order)))
@@ -147,7 +147,7 @@ def test_limits_fall_with_the_order():
 
 @pytest.mark.parametrize("order", [3, 17, 4.0, True, "12"])
 def test_orders(order):
-    """What came, and what is known."""
+    """The residuals are those that are known."""
     with pytest.raises(ValueError, match=r"order must be an integer from 4 to 16, got"):
         GaussJackson(order=order)
 

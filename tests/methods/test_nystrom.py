@@ -27,7 +27,7 @@ NYSTROM4 = {
 }
 PAIR = {**LEAPFROG, "b_hat": ["1/2", 0], "b_prime_hat": [1, 0], "error_estimator_order": 1}
 HIGH = [RKN86, RKN1210]
-# Its position weights meet no moment but the first.
+# The position weights satisfy only the first moment.
 QUARTERS = NystromTableau("quarters", **{**LEAPFROG, "b": ["1/4", "1/4"]})
 METHODS = [NystromTableau("leapfrog", **PAIR), NystromTableau("nystrom4", **NYSTROM4), QUARTERS, *HIGH]
 
@@ -93,7 +93,7 @@ class Conditions:
         return total - Fraction(1, density(whole)) if isinstance(total, Fraction) else total - mpf(1) / density(whole)
 
     def residuals(self, key, order):
-        """Those of exactly this order of the local error: a position has gained one by its velocity."""
+        """Return residuals of exactly this order of the local error: a position has gained one by its velocity."""
         return [abs(self.residual(key, tree)) for tree in special_trees(order if "prime" in key else order - 1)]
 
 
@@ -176,7 +176,7 @@ def test_the_package_s_residuals_agree_with_the_sums():
 
 
 def arguments(tableau):
-    """What makes the same tableau again, with entries that may be changed."""
+    """Return the arguments that make the same tableau again, with entries that may be changed."""
     values = {key: value.tolist() for key, value in tableau.exact.items()}
     return {**values, "order": tableau.order, "error_estimator_order": tableau.error_estimator_order}
 

@@ -1,4 +1,4 @@
-"""Charged particles: fields against the paper's formulas in 30 digits, invariants, observables, fields of one's own."""
+"""Charged particles: fields against the paper's formulas in 30 digits, invariants, observables, user-defined fields."""
 
 import math
 from dataclasses import replace
@@ -215,7 +215,7 @@ def test_drifting_gyration_in_the_papers_field():
 
 
 def test_banana_tip():
-    """The first tip at a tenth of the paper's interval, by a method of order 8."""
+    """The first tip is found at 0.1 of the paper's interval, by a method of order 8."""
     problem = tokamak("banana", t_end=16_000)
     run = integrate(problem, method=EIPDOP853, h=2 * problem.h, save_every=1)
     orbit = ParticleOrbit(problem, run.t, run.y)
@@ -254,7 +254,7 @@ def test_averages_take_out_what_has_the_gyrations_period():
     np.testing.assert_allclose(orbit.averaged(t), t[:81] + 9.5 * math.pi / 10, rtol=1e-13)
 
 
-# --- fields of one's own ---
+# --- user-defined fields ---
 
 
 @njit
@@ -348,7 +348,7 @@ def test_plain_python_functions_do_as_well():
 
 
 def test_differences_take_the_fields_length():
-    """The same field on a small scale: length tells the step."""
+    """Differences of the same field on a small scale need its length, which determines their step."""
     small = 1e-6
     field = ParticleField(
         lambda x, y, z: (-y * math.cos(z / small), x * math.cos(z / small), 0.0), axisymmetric=True, length=small
@@ -448,7 +448,7 @@ def wire(x, y, z):
 
 
 def ripple(x, y, z):
-    """It changes over a thirtieth of the length that is the default."""
+    """Return a field that changes over 1/30 of the default length."""
     return math.sin(200 * x) * math.cos(200 * y), -math.cos(200 * x) * math.sin(200 * y), 1e3
 
 
@@ -483,7 +483,7 @@ def test_a_field_with_a_divergence_is_refused(field):
     ("field", "value"),
     [
         (lambda x, y, z: (1e-4 * x - x * z, -y * z, 1 + z * z), r"0\.0001"),
-        (lambda x, y, z: (x * z, y * z, 1 + z * z), r"0\.0\d+"),  # small beside dB_x/dz where the particle starts
+        (lambda x, y, z: (x * z, y * z, 1 + z * z), r"0\.0\d+"),  # small relative to dB_x/dz where the particle starts
     ],
 )
 def test_a_small_divergence_is_told(field, value):

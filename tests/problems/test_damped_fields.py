@@ -180,7 +180,7 @@ def test_damped_korteweg_de_vries_against_scipy():
 
 
 def test_a_damped_soliton_decays_as_perturbation_theory_says():
-    """Its speed falls as exp(-4 damping t / 3) (Ott & Sudan, Phys. Fluids 13 (1970) 1432), to the first order."""
+    """The speed falls as exp(-4 damping t / 3) (Ott & Sudan, Phys. Fluids 13 (1970) 1432), to the first order."""
     equation, start = soliton(1e-3)
     run = integrate(equation.problem(start, 20.0, 0.05))
     modes = equation.modes(run.y[:, -1])

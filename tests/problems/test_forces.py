@@ -1,4 +1,4 @@
-"""Forces beside Newton's: against formulas written anew in NumPy and mpmath, and against the sky."""
+"""Forces other than Newton's: against independent formulas in NumPy and mpmath, and against observations."""
 
 import math
 import warnings
@@ -40,7 +40,7 @@ def accelerations(given):
 
 
 def added(forces, **options):
-    """What the forces add to Newton's accelerations."""
+    """Return the accelerations that the forces add to Newton's."""
     return accelerations(problem(forces, **options)) - accelerations(problem(()))
 
 
@@ -116,7 +116,7 @@ def test_the_suns_post_newtonian_pull():
 
 
 def eih_lagrangian(q, v, over_c2):
-    """Landau & Lifshitz (106.17), as printed but for the masses, in mpmath."""
+    """Return the Lagrangian of Landau & Lifshitz (106.17), as printed except for the masses, in mpmath."""
     total = mpmath.mpf(0)
     m = [mpmath.mpf(x) for x in GM]
     d = {(a, b): [x - y for x, y in zip(q[a], q[b], strict=True)] for a, b in permutations(range(4), 2)}
@@ -318,7 +318,7 @@ def mercury(forces, mass=0.0, h=0.001, years=10.0):
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("forces", ["1pn", "eih", "gr-potential"])
 def test_perihelion_of_mercury_advances_as_it_should(forces):
-    """42.98 arcsec a century: the slope of the eccentricity vector's angle beside its periodic terms."""
+    """The advance is 42.98 arcsec a century: the slope of the eccentricity vector's angle, without periodic terms."""
     run = integrate(mercury(forces), method=EIPDOP853, save_every=10, invariants=())
     x, w = run.y[3:6] - run.y[:3], run.y[9:12] - run.y[6:9]
     r = np.linalg.norm(x, axis=0)
@@ -342,7 +342,7 @@ def test_known_energy_and_momentum_of_a_test_particle(years, options):
     second = (3 / 8 * v2**2 + 1.5 * GM_SUN * v2 / r + 0.5 * (GM_SUN / r) ** 2) / C_AU_YR**2
     E = v2 / 2 - GM_SUN / r + second
     J = (x[0] * v[1] - x[1] * v[0]) * (1 + (v2 / 2 + 3 * GM_SUN / r) / C_AU_YR**2)
-    # Of the mean: what they leave out, terms in 1/c^4, varies with the phase by 1.9e-14 and 4.9e-15.
+    # The deviation is from the mean: neglected terms in 1/c^4 vary with the phase by 1.9e-14 and 4.9e-15.
     assert np.abs(E / E.mean() - 1).max() < 2e-14
     assert np.abs(J / J.mean() - 1).max() < 6e-15
 
@@ -499,7 +499,7 @@ def test_test_particles_are_moved_by_no_correction():
     assert run.success
     assert run.diagnostics.n_projections > 0
     assert np.abs(run.invariants[0] / run.invariants[0, 0] - 1).max() < 1e-12
-    # It keeps its own energy about as well as a heavy asteroid would, and its orbit.
+    # The light body keeps its own energy about as well as a heavy asteroid would, and its orbit.
     small = nbody(np.append(gm[:-1], 1e-15), q, v, t_span=(0.0, 10.0), h=0.01)
     other = integrate(small, method=EIPRK5)
     np.testing.assert_allclose(run.y[30:33, -1], other.y[30:33, -1], atol=1e-6)

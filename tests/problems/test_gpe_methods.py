@@ -51,7 +51,7 @@ def test_scheme_is_symmetric_and_of_its_order(scheme):
 
 
 def packet(x, y, t):
-    """A Gaussian beside the centre in free motion."""
+    """Return a Gaussian away from the centre in free motion."""
     spread = 1 + 1j * t
     return np.exp(-((x - 2) ** 2 + (y - 1) ** 2) / (2 * spread)) / spread
 
@@ -103,7 +103,7 @@ def test_rotation(angle):
 
 
 def test_local_flow_is_a_phase():
-    """Of either sign and up to angles of 1e5, where their own rounding is 1e-11."""
+    """The angles have either sign and reach 1e5, where their own rounding is 1e-11."""
     psi = noise(Grid(4000, 0, 1))
     V = np.linspace(-50, 50, psi.size)
     for h, tolerance in ((0.1, 2e-14), (-0.1, 2e-14), (2e3, 3e-11)):
@@ -193,7 +193,7 @@ def test_rotating_condensate(condensate, method, kept):
 
 @pytest.mark.parametrize("kept", [(), KEPT], ids=["raw", "EIP"])
 def test_the_frame_at_rest(condensate, kept):
-    """Its field, rotated, is that of the rotating frame, as far as the grid resolves it; and so is its energy."""
+    """The rotated field and its energy are those of the rotating frame, as far as the grid resolves it."""
     problem, exact = condensate
     gpe, rest = problem.equation, at_rest(problem)
     assert rest.equation.Omega == 0
@@ -207,7 +207,7 @@ def test_the_frame_at_rest(condensate, kept):
     assert gpe.energy(seen) == pytest.approx(gpe.energy(problem.y0), abs=1e-7)
 
 
-# What is refused.
+# Refused arguments.
 
 
 def test_wrong_options():

@@ -48,7 +48,7 @@ def test_moments_are_sums_over_the_grid(state):
 
 
 def test_energy_from_moments_is_that_of_the_modes(state):
-    """By Parseval's theorem, and the local terms point by point."""
+    """The energy agrees with Parseval's theorem, and the local terms are summed point by point."""
     gpe, psi, _ = state
     field = psi.reshape(gpe.grid.shape)
     local = np.sum((gpe.V + 10.0 * np.abs(field) ** 2) * np.abs(field) ** 2)
@@ -85,7 +85,7 @@ def test_joint_is_the_invariants_one_by_one(state, names):
     np.testing.assert_allclose(values, [item.fun(0.0, psi) for item in kept], rtol=1e-13)
     np.testing.assert_allclose(gram, reals @ reals.T, rtol=1e-12)
     np.testing.assert_allclose(terms, np.abs(reals * psi.view(float)).sum(axis=1), rtol=1e-12)
-    for size in (1e-15, 1e-6):  # beside the state, and far from it
+    for size in (1e-15, 1e-6):  # near the state, and far from it
         mu = size * np.arange(1.0, 1.0 + count)
         out, moved = np.empty_like(psi), np.empty(count)
         joint.shift(0.0, psi, f, mu, out, moved)

@@ -34,7 +34,7 @@ def test_tubes_around_vortices():
     away = np.hypot(*(tubes[:, None, :2] - places).transpose(2, 0, 1))
     assert away.min(axis=1).max() < 0.5
     assert set(away.argmin(axis=1)) == {0, 1}
-    # What is outside is farther out than the vortices, but for their mouths at the ends.
+    # The outside is farther out than the vortices, except for their mouths at the ends.
     outside = middle[~surface.inside & (np.abs(middle[:, 2]) < 2)]
     assert np.hypot(*outside[:, :2].T).min() > 2
     assert len(vortices(gpe, psi).charges) == 2

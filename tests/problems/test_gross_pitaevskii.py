@@ -332,7 +332,7 @@ def test_plane_wave_has_rank_one():
     assert projections > 5
     assert diagnostics.n_rank_reduced == projections
     assert (run.max_defect < 1e-9 * np.abs(run.invariants[:, 0])).all()
-    # What is left is the error of RK4's phase: plain RK4's amplitude is wrong as well.
+    # The remaining error is that of RK4's phase: plain RK4's amplitude is wrong as well.
     bare = integrate(p, method=EIPRK4, invariants=())
     exact = p.reference(1.0)
     assert np.abs(run.y[:, -1] - exact).max() <= 1.01 * np.abs(bare.y[:, -1] - exact).max()
@@ -345,7 +345,7 @@ def test_plane_wave_needs_whole_modes():
         plane_wave((8, 8), 1)
 
 
-# What a user may get wrong.
+# Mistakes of users.
 
 
 @pytest.mark.parametrize(
@@ -401,7 +401,7 @@ def test_bad_states_and_names():
 
 
 def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
-    """Its components stand alone in the metric's blocks: arrays say so, not a million little ones."""
+    """The components are separate blocks of the metric, stored as arrays instead of a million small ones."""
     from eip_scipy.core import blocks as _blocks
 
     called = []

@@ -221,7 +221,7 @@ def test_a_core_finer_or_coarser_resolved_counts_once():
 
 
 def test_fast_rotation_needs_its_own_frame_to_be_counted():
-    """At Omega r = 24 the phase turns by 2.3 between two points; beside a vortex by more than pi."""
+    """At Omega r = 24 the phase turns by 2.3 between two points; near a vortex by more than pi."""
     gpe = GrossPitaevskii(Grid((210, 210), -10, 10), quartic_trap(1.2, 0.3, 1, 1), Omega=3.5, beta=1000)
     psi = ring_start(gpe, 38, 123)
     assert len(vortices(gpe, psi).charges) == 38

@@ -81,7 +81,7 @@ def names(*args, **options):
 
 
 def same_functions(found, known, points):
-    """Whether the gradients span the same spaces, and so the invariants the same functions."""
+    """Return whether the gradients span the same spaces, and so the invariants the same functions."""
     for y in points:
         a = np.array([item.grad(0.0, y) for item in found])
         b = np.array([grad(y) for grad in known])
@@ -400,7 +400,7 @@ def random_system(seed):
 
 
 def dissipative_system(seed):
-    """Oscillators, coupled by linear and other forces, with dampings from .1 to 1e-11 of several kinds."""
+    """Return oscillators, coupled by linear and other forces, with dampings from 0.1 to 1e-11 of several kinds."""
     rng = np.random.default_rng(1000 + seed)
     n = int(rng.integers(1, 4))
     K, masses = rng.normal(size=(n, n)), rng.random(n) + 0.5

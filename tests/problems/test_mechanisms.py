@@ -116,7 +116,7 @@ def test_it_pickles_and_its_members_keep_the_constraints(pendulum):
 
 
 def untraceable(function):
-    """The same function, which cannot be called with symbols."""
+    """Return the function in a form that cannot be called with symbols."""
 
     def call(*args):
         assert all(float(np.real(x)) == np.real(x) for x in np.ravel(args[-1]))
@@ -462,7 +462,7 @@ def test_lagranges_method_and_a_system_give_the_same_motion():
 
 
 def parabola_as_system(by_speeds):
-    """The same particle as a System of SymPy, whose equations are not formed yet."""
+    """Return the particle as a System of SymPy, whose equations are not formed yet."""
     x, y, u, v = me.dynamicsymbols("x y u v")
     m, g = sympy.symbols("m g")
     N, origin = me.ReferenceFrame("N"), me.Point("O")

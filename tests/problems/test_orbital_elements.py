@@ -106,7 +106,7 @@ def test_parabola_and_straight_line():
 
 
 def test_mean_anomaly_grows_with_time():
-    """Of a hyperbola too, through its pericentre: n (t - T)."""
+    """The mean anomaly of a hyperbola grows too, through its pericentre: n (t - T)."""
     gm = 4 * np.pi**2
     y0 = np.array([0, 0, 0, 3, 4, 0, 0, 0, 0, -6, 0.3, 1.0])
     problem = nbody([gm, 0.0], y0[:6].reshape(2, 3), y0[6:].reshape(2, 3), t_span=(0, 2), h=2e-3)

@@ -1,4 +1,4 @@
-"""Hard scenes: their starts, invariants and references; fictitious time; ``eip-scipy hard-scenes``."""
+"""Hard problems: their starts, invariants and references; fictitious time; ``eip-scipy hard-scenes``."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ def distance(problem, y, t):
     return np.linalg.norm((y - problem.reference(t))[:half].reshape(-1, 3), axis=1).max()
 
 
-# The scenes.
+# The problems.
 
 
 def test_pythagorean_energy_and_momentum():
@@ -212,7 +212,7 @@ def test_fixed_steps_in_fictitious_time_beat_fixed_steps():
     assert run.status == 1
     assert run.y[-1, -1] == 20.0 or abs(run.y[-1, -1] - 20.0) < 1e-13
     error = np.abs(run.y[:2, -1] - problem.reference(20.0)[:2]).max()
-    # Far too long at the pericentre: not to be told so here.
+    # The steps are far too long at the pericentre, which is not reported here.
     fixed = integrate(problem, method=EIPDOP853, h=20.0 / run.nfev * 12, check=False)
     assert error < 1e-9
     assert not np.abs(fixed.y[:2, -1] - problem.reference(20.0)[:2]).max() < 1e-2

@@ -167,7 +167,7 @@ class TestReference:
             e, m = energy_and_angular_momentum(data.gm, y)
             assert_allclose(e, energy, rtol=2e-15)
             assert_allclose(m, momentum, rtol=0, atol=1e-15 * np.linalg.norm(momentum))
-            centre = data.gm @ y[:30].reshape(10, 3) - years * drift  # the momentum is 0 but for rounding
+            centre = data.gm @ y[:30].reshape(10, 3) - years * drift  # the momentum is 0 up to rounding
             assert np.max(np.abs(centre)) < 1e-15 * data.gm[0]
 
     def test_first_year_against_scipy(self):

@@ -155,18 +155,18 @@ BOMBS = [
 TRIED = """
 import json, sys, time
 from eip_scipy import equations, hamiltonian
-told = []
+reported = []
 for text in json.load(sys.stdin):
     begin = time.process_time()
     try:
         hamiltonian(text, "q", "p", params={name: 1.0 for name in ["a", "b", "c", "d", *(f"x{k}" for k in range(90))]})
     except ValueError as error:
-        told.append([str(error), time.process_time() - begin])
+        reported.append([str(error), time.process_time() - begin])
 try:  # its value is a tower, and so are those of its parts
     equations(["p", "-q"], "q p", invariants={"I": "exp(exp(exp(exp(exp(exp(q))))))"})
 except ValueError as error:
-    told.append([str(error), 0.0])
-print(json.dumps(told))
+    reported.append([str(error), 0.0])
+print(json.dumps(reported))
 """
 
 
@@ -334,7 +334,7 @@ def test_names_without_a_partner(H, match):
 
 
 def test_parameters_by_name_in_runs():
-    """Those that are not named keep their values; an ensemble takes one for each member."""
+    """Parameters that are not named keep their values; an ensemble takes one for each member."""
     problem, start = hamiltonian("p**2/(2*m) + k*q**2/2", params={"m": 2.0, "k": 1.0}), [1.0, 0.0]
     options = {"method": EIPDOP853, "rtol": 1e-9, "atol": 1e-9}
     run = integrate(problem, (0, 3), start, params={"k": 4.0}, **options)
@@ -636,7 +636,7 @@ def test_wrong_arguments(call, kind, says):
 
 
 def test_states_and_parameters_of_another_length():
-    """Compiled code would read what lies beside them."""
+    """Compiled code would read memory behind them."""
     problem = hamiltonian(KEPLER, params={"eps": 0.005})
     for y0, params in (([1.0, 0.0, 0.0], None), (np.ones(6), None), (np.ones(4), [1.0, 2.0]), (np.ones(4), [])):
         with pytest.raises(ValueError, match="must hold as many numbers as there are in"):

@@ -32,7 +32,7 @@ def test_constraints_hold_where_all_of_them_do(pendulum):
     assert [item.target for item in pendulum.invariants] == [0, 0, None]
     again = pickle.loads(pickle.dumps(pendulum))
     assert [item.target for item in again.invariants] == [0, 0, None]
-    # The same motion from the masses and the rod alone.
+    # The masses and the rod alone give the same motion.
     other = mechanism([1, 1], [0, -9.81], lambda t, q: [q[0] ** 2 + q[1] ** 2 - 1], q0=[0.6, -0.8], u0=[0.8, 0.6])
     np.testing.assert_allclose(pendulum.fun(0.0, other.y0), other.motion_at(0.0, other.y0), rtol=1e-14)
 

@@ -93,7 +93,7 @@ def test_solitons_go_around_the_ring(t):
 
 
 def test_energies_are_those_of_the_closed_forms():
-    """Of integrals that the literature gives: two kinks 16 / sqrt(1 - v^2), a breather 16 sqrt(1 - w^2)."""
+    """The integrals are in the literature: two kinks 16 / sqrt(1 - v^2), a breather 16 sqrt(1 - w^2)."""
     kinks, beats = sine_gordon_kinks(velocity=0.5), sine_gordon_breather(frequency=0.6)
     assert kinks.equation.energy(kinks.y0) == pytest.approx(16 / np.sqrt(0.75), rel=1e-12)
     assert beats.equation.energy(beats.y0) == pytest.approx(16 * 0.8, rel=1e-12)
@@ -144,7 +144,7 @@ def test_invariants_of_the_equations_on_the_grid(made):
 
 @pytest.mark.parametrize("made", NEAR)
 def test_momenta_are_none_of_the_equations_on_the_grid(made):
-    """What the documentation says: of a field that the grid does not resolve they are not kept."""
+    """Momenta of a field that the grid does not resolve are not kept, as the documentation says."""
     equation, items, y = NEAR[made]()
     for item in items:
         found, size = rate(item, equation.fun, y)
@@ -336,7 +336,7 @@ def test_lawson_is_exact_for_linear_waves():
     assert np.abs(err).max() < 100 * small**2
 
 
-# What is refused.
+# Refused arguments.
 
 
 @pytest.mark.parametrize(

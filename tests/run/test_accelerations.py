@@ -127,7 +127,7 @@ def test_ensembles_recommendations_and_checkpoints(tmp_path):
 @pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12, EIPGJ12, EIPGJ14])
 @pytest.mark.parametrize("fun", [spring, spring_of_two, JITTED[spring], lambda t, q: -4 * q[:2]], ids=range(4))
 def test_the_old_call_names_the_new_one(method, fun):
-    """Whether the acceleration of q, called with y, gives n/2 values, n of them, or raises."""
+    """The acceleration of q, called with y, gives n/2 values, n of them, or raises."""
     steps = {"h": 0.01} if method in (EIPGJ12, EIPGJ14) else {"rtol": 1e-8}
     for run in (integrate, ensemble):
         with pytest.raises(ValueError, match=r"integrate\(acceleration=fun, t_span=\.\.\., y0=\.\.\., \.\.\.\)"):

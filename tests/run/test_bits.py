@@ -347,7 +347,7 @@ def test_solve_ivp_is_the_same_complex_step(case):
 
 
 def test_results_do_not_depend_on_what_is_saved():
-    """The same steps whatever is saved, interpolated or called back, and again in a second run."""
+    """The steps are the same whatever is saved, interpolated or called back, and again in a second run."""
     options = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "compiled": True}
     end = integrate(fun, (0, 6), Y0, **options).y[:, -1]
     for more in ({"save_every": 1}, {"t_eval": [0.5, 6.0], "callback": lambda t, y, d: None}):

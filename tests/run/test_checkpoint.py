@@ -207,7 +207,7 @@ def fine(monkeypatch):
 
 @contextlib.contextmanager
 def broken_off(monkeypatch, calls):
-    """Let the run be broken off before its so many-th chunk."""
+    """Stop the run before the chunk of this number."""
     advance, left = longrun.Driver.advance, [calls]
 
     def stop(driver, k_end):
@@ -465,7 +465,7 @@ def test_a_problem(tmp_path, monkeypatch):
 
 
 def times_written(monkeypatch, path, every, seconds=0.0, **options):
-    """How often a run of 200 chunks of 10 ms of a clock of its own writes, each in so many seconds."""
+    """Return the times of writing in a run of 200 chunks of 10 ms of a simulated clock, with `seconds` for each."""
     now, written, advance, write = [0.0], [], longrun.Driver.advance, checkpoint.write
 
     def tick(driver, k_end):
@@ -898,7 +898,7 @@ def test_mutations(data, tmp_path):
 
 
 def forged(path, name, member, header=None):
-    """A file with one member of given bytes beside the header."""
+    """Write a file with the given bytes of one member and the header."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(
             "header.json",
@@ -986,7 +986,7 @@ def test_foreign_archives(tmp_path):
 
 
 class FullDisk(io.FileIO):
-    """A file whose so many-th write finds the disk full, half of it done."""
+    """File whose write of a given number finds the disk full after half of it."""
 
     def __init__(self, path, mode, room):
         super().__init__(path, mode)
@@ -1002,7 +1002,7 @@ class FullDisk(io.FileIO):
 
 
 def fill_disk(patch, writes):
-    """From now on the disk is full at the so many-th write."""
+    """From now on, fill the disk at the write of this number."""
     room = [writes]
     patch.setattr(
         checkpoint, "open", lambda path, mode: io.BufferedWriter(FullDisk(path, mode, room), 16), raising=False

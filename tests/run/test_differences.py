@@ -180,7 +180,7 @@ def test_nystrom(c):
     assert (run.max_defect < 1e-14).all()
 
 
-# What differences cost.
+# Cost of differences.
 
 
 def chain(t, y):
@@ -205,7 +205,7 @@ def pulse(m):
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_gradients_of_a_large_grid_by_its_values_are_told(compiled):
-    """Once, with the line that mends it, which is right; a small state is not told."""
+    """The warning appears once, with a correct line of code that fixes it; a small state is not reported."""
     m = LARGE // 2
     fun, energy = (njit(chain), njit(chain_energy)) if compiled else (chain, chain_energy)
     told = pytest.warns(UserWarning, match=rf"no grad is given for 'H': .* {2 * m} evaluations .* w \* np.concatenate")

@@ -47,7 +47,7 @@ def run(t_span=(0, 1), y0=Y0, fun=oscillator, **options):
     return integrate(fun, t_span, y0, **{"method": EIPRK4, "h": 0.1, **options})
 
 
-# What is saved.
+# Saved states.
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,7 @@ FORMULAS = [
     # Each Newton step takes a gradient (with f there) and a factorisation.
     (EIPRK2, {"invariants": SQUARE, "iterations": 2}, 2, 2, 2),
     (EIPRK2, {"invariants": F_SQUARE, "iterations": 2}, 3, 2, 2),
-    # Other directions: a gradient more, and the small Newton system besides the directions' factorisation.
+    # Other directions need one more gradient, and a small Newton system in addition to their factorisation.
     (EIPRK4, {"invariants": SQUARE, "direction": "old"}, 4, 2, 2),
     (EIPRK4, {"invariants": SQUARE, "direction": "midpoint"}, 4, 2, 2),
     (EIPRK4, {"invariants": F_SQUARE, "direction": "midpoint"}, 5, 2, 2),
@@ -412,7 +412,7 @@ def test_nfev_is_the_number_of_calls(options, through):
 
 
 def test_reuse_f_costs_little_accuracy():
-    """It differs by O(h^(p+1)) in the first stage: the same order, nearly the same error."""
+    """The step differs by O(h^(p+1)) in the first stage: the same order, nearly the same error."""
     problem = kepler(0.3, 0.0)
 
     def error(h, reuse):
@@ -461,7 +461,7 @@ def test_empty_diagnostics():
 
 
 def test_max_defect_is_that_of_the_steps():
-    """Every step counts, saved or not; interpolated states are no steps."""
+    """Every step counts, saved or not; interpolated states are not steps."""
     options = {"h": 0.25, "invariants": SQUARE, "method": EIPRK2}
     every, ends = run(save_every=1, **options), run(**options)
     assert every.max_defect == ends.max_defect == np.abs(every.invariants - 5.0).max()

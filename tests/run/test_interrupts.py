@@ -29,7 +29,7 @@ def press(*_):
 
 @pytest.fixture(autouse=True)
 def handler():
-    """What Python installs, there before and after each run."""
+    """Return the handler that Python installs, which is set before and after each run."""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     yield
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

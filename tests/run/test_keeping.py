@@ -1,4 +1,4 @@
-"""What a run owns: its files, wherever it is, against other runs, files and functions, signals and full disks."""
+"""Exclusive use of files, functions, signals and disks by a run, against other runs."""
 
 import errno
 import fcntl
@@ -95,7 +95,7 @@ def at_once(action):
     return callback
 
 
-# Where a file is.
+# Location of a file.
 
 
 @keeping
@@ -229,7 +229,7 @@ HOLDER = """
 @posix
 @keeping
 def test_another_process(keep, tmp_path, forker):
-    """It is named, and its lock goes with it, by kill -9 too."""
+    """Another process is named in the message, and its lock ends with it, by kill -9 too."""
     place = tmp_path / "kept"
     process = forker.start(HOLDER, keep=keep.__name__, place=str(place))
     try:
@@ -550,7 +550,7 @@ def terminated(forker):
     ],
 )
 def test_sigterm_waits_for_the_checkpoint(keep, tmp_path, terminated):
-    """The process ends by it, as whoever sent it expects, and what was done is there."""
+    """The process ends by the signal, as its sender expects, and the completed part is saved."""
     place, ran = tmp_path / "kept", []
     code, out, err = terminated(place, keep)
     assert (code, out) == (-signal.SIGTERM, "")

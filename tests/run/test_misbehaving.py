@@ -47,7 +47,7 @@ def interpreted(fun=oscillator, invariants=(), **options):
 
 
 def compiled(fun=oscillator, invariants=(), events=None, **options):
-    """The same of the same functions, jitted."""
+    """Return the same run of the same functions, jitted."""
     items = [invariants] if isinstance(invariants, Invariant) else invariants
     kept = [
         Invariant(njit(i.fun), njit(i.grad), name=i.name, in_place=i.in_place, uses_f=i.uses_f, target=i.target)
@@ -299,7 +299,7 @@ def test_functions_that_fill_and_return_it(how):
 
 @both
 def test_functions_whose_values_are_not_finite_at_the_start(how):
-    """What is not finite is not mistaken for what is not filled."""
+    """Values that are not finite are not mistaken for values that were not filled in."""
 
     def fun(t, y, out):
         out[0] = y[1]
@@ -385,7 +385,7 @@ def late(good, change):
 
 
 def check_error(how, info):
-    """It names the time, and what had been computed is kept."""
+    """Check that the error names the time, and that computed results are kept."""
     assert re.search(r"at t=0\.5\b", str(info.value))
     if how is interpreted:
         assert info.value.partial.t[-1] == 0.4

@@ -55,7 +55,7 @@ def c(library):
     return Functions()
 
 
-# The same functions in Python, with the same arithmetic.
+# Functions in Python with the same arithmetic.
 
 
 def orbit(t, y, p):
@@ -182,7 +182,7 @@ def test_complex_states(c):
 
 @both
 def test_invariants_of_several_values(c, options):
-    """By one C function, with two rows of gradients, or by two."""
+    """The invariants come from one C function, with two rows of gradients, or from two."""
     options = {"method": EIPRK4} | options
     together = [Invariant(c.kept, c.kept_gradient, size=2, name="HL")]
     one = integrate(c.kepler, (0, 30), Y0, params=MU, invariants=together, **options)
@@ -346,7 +346,7 @@ def test_no_value(c, k, status, compiled):
 
 @native_or_not
 def test_a_negative_status_between_the_steps(compiled):
-    """Of a function that is called when dense output is evaluated, after the run."""
+    """The function is called when dense output is evaluated, after the run."""
     status = 0
 
     def circle(t, y, out, params):
@@ -383,11 +383,11 @@ def test_a_gradient_without_uses_f_has_no_f(c):
         integrate(c.ending, (0, 1), [1, 2], invariants=Invariant(c.ending_square, c.reads_f, name="S"), **options)
 
 
-# What is refused.
+# Refused functions.
 
 
 def refused(c):
-    """What is given as fun, and what the error says."""
+    """Return functions given as fun, with the text of the error."""
     arrays = [NUMBERS] * 3
     bare = ctypes.CDLL(None).sin
     double = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double, *arrays)(lambda *arguments: 0.0)
@@ -478,7 +478,7 @@ def test_events_carry_their_attributes(c):
 
 @pytest.mark.needs_jit  # else the JIT is to blame
 @both
-@pytest.mark.parametrize("alone", [True, False], ids=["alone", "beside one in C"])
+@pytest.mark.parametrize("alone", [True, False], ids=["alone", "next to one in C"])
 def test_events_in_python_beside_native_functions(c, options, alone):
     options = {"method": EIPRK4, "dense_output": True} | options
     events = [turn] if alone else [c.turn, turn]

@@ -1,4 +1,4 @@
-"""What the caller gives wins over what a problem brings."""
+"""Arguments of the caller take precedence over those of a problem."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""`recommend`: the run that it recommends has the error that was wanted, and whatever speaks against it is told."""
+"""`recommend`: the recommended run has the wanted error, and reasons against it are reported."""
 
 import math
 import pickle

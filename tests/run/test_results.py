@@ -1,4 +1,4 @@
-"""What is done with a result: tables, files, figures, a run that goes on; of integrate, solve_ivp and ensembles."""
+"""Uses of a result: tables, files, figures, continued runs; for integrate, solve_ivp and ensembles."""
 
 import pickle
 import sys

@@ -96,7 +96,7 @@ def run(method, events=None, span=(0.0, 30.0), **options):
 
 
 def assert_same(one, other):
-    """The same bits, everywhere; nfev too."""
+    """Check that all bits agree, and nfev too."""
     np.testing.assert_array_equal(one.t, other.t)
     np.testing.assert_array_equal(one.y, other.y)
     for name in ("t_events", "y_events"):
@@ -356,7 +356,7 @@ def test_a_checkpoint_keeps_no_solution(tmp_path):
 
 
 def test_roots_and_times_of_a_resumed_run(tmp_path):
-    """What the loop has found and counted goes on from a checkpoint."""
+    """Roots and counts of the loop continue from a checkpoint."""
     event = njit(lambda t, y, params: y[1])
     event.terminal = 7
     options = {"h": 0.01, "t_eval": np.linspace(0, 30, 4000), "events": [event, clock]}
@@ -377,7 +377,7 @@ def test_roots_and_times_of_a_resumed_run(tmp_path):
 
 
 def test_an_unprojected_state_is_told():
-    """A level that no state near the interpolant meets: told once, the state given as it is."""
+    """A level that no state near the interpolant meets is reported once, and the state is returned unchanged."""
 
     @njit
     def turn(t, y):
@@ -417,7 +417,7 @@ def test_a_callback_stops_at_the_time_it_sees(steps):
 
 
 def test_threads_may_ask_at_once():
-    """Of compiled functions, without the GIL, and of Python's."""
+    """Threads evaluate solutions of compiled functions, without the GIL, and of Python's."""
     times = np.linspace(0, 30, 3001)
     for compiled in (None, False):
         found = run(EIPRK4, h=0.05, dense_output=True, compiled=compiled)

@@ -1,4 +1,4 @@
-"""`eip-scipy bench`: errors against closed forms, what peers that fail are told to have said, and the report."""
+"""`eip-scipy bench`: errors against closed forms, reports on failures of packages, and the report."""
 
 from __future__ import annotations
 

@@ -291,14 +291,14 @@ def test_an_interruption_keeps_what_was_done(tmp_path, capsys, no_rebound, monke
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_sigterm_keeps_what_was_done(tmp_path):
-    """As Ctrl-C does; the process ends by it then, as whoever sent it expects."""
+    """SIGTERM keeps the results as Ctrl-C does; the process then ends by it, as its sender expects."""
     code = f"""
         import os, signal, sys
         sys.modules["rebound"] = None
         from eip_scipy_studies import cli
         from eip_scipy_studies.solar import runs
 
-        runs._verlet = lambda scene: os.kill(os.getpid(), signal.SIGTERM)
+        runs._verlet = lambda problem: os.kill(os.getpid(), signal.SIGTERM)
         cli.main(["solar-system", *{SPAN}, "--out", out])
         print("went on")
     """
@@ -597,7 +597,7 @@ def test_a_run_that_ended_early_has_no_error_after_that():
     ],
 )
 def test_the_tightest_run_is_checked_against_the_stored_states(name, offset, passed):
-    """By its positions, to 1e-8 AU for IAS15 and 1e-7 AU for the one without REBOUND."""
+    """The positions are compared, to 1e-8 AU for IAS15 and 1e-7 AU for the run without REBOUND."""
     scene = solar_run.make_scene("de440", 1.0, 0.1)
     y = np.stack([scene.problem.y0, solar_run.stored_state(scene, 1.0)], axis=1)
     y[3:5, 1] += offset  # Mercury

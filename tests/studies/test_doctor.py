@@ -1,4 +1,4 @@
-"""The command that looks at an installation: that it passes here, and tells of what is wrong."""
+"""The command that checks an installation: it passes here, and reports faults."""
 
 import json
 

@@ -124,7 +124,7 @@ def test_stored_states_belong_to_their_epoch(kernel):
 
 
 def test_the_command_at_the_packages_epoch(kernel, tmp_path, nothing_to_time):
-    """The same numbers as from the packaged set, the errors against stored states included."""
+    """The numbers are those of the packaged set, including the errors against stored states."""
     span = ("solar-system", "--years", "1", "--h", "0.01", "--quiet")
     assert main([*span, "--out", str(tmp_path / "a")]) == 0
     assert main([*span, "--out", str(tmp_path / "b"), "--epoch", "2014-02-02T20:18"]) == 0

@@ -127,7 +127,7 @@ SHORT = {
     "reference_step": 5e-3,
     "saved": 0.05,
     "snapshots": (0.0, 0.1, 0.2, 7.0),
-    "sense": -1,  # two vortices near the centre are no ring
+    "sense": -1,  # two vortices near the centre do not form a ring
 }
 
 
@@ -199,7 +199,7 @@ def test_another_end(tmp_path, start, capsys):
 @pytest.mark.usefixtures("no_plotting")
 @pytest.mark.parametrize("end", ["0.05", "0.005"])
 def test_an_end_before_the_vortices_have_turned(end, tmp_path, start, capsys):
-    """What cannot be checked is said, and fails nothing."""
+    """Checks that cannot be made are reported, and do not fail."""
     assert main(["gpe", "ring", "--start", str(start), "--t-end", end, "--out", str(tmp_path / "out")], **SHORT) == 0
     text = capsys.readouterr().out
     assert "-      not checked: in which sense the vortices turn, for the run ends before t = 0.1\n" in text

@@ -123,7 +123,7 @@ def outcome(error=1e-8, drift=1e-13, failure=""):
 
 
 def made_up(**projected):
-    """35 comparisons in which projection gains 100, but for one."""
+    """Return 35 comparisons in which projection gains 100, except for one."""
     good = [command.Comparison(case, outcome(1e-6), outcome()) for case in CASES]
     return [command.Comparison(CASES[0], outcome(1e-8), outcome(**projected)), *good[1:]]
 

@@ -14,7 +14,7 @@ TOL = 1e-12
 
 
 def modulated(shape=(16, 16), beta=1.0, potential=None):
-    """A plane wave with bumps, which is no stationary state, and its equation on a box of sides 2 pi."""
+    """Return a plane wave with bumps, which is not a stationary state, and its equation on a box of sides 2 pi."""
     gpe = GrossPitaevskii(Grid(shape, 0, 2 * np.pi), potential, beta=beta)
     axes = gpe.grid.mesh()
     return gpe, (np.exp(1j * sum(axes)) * (1 + 0.25 * sum(np.cos(a + k) for k, a in enumerate(axes)))).ravel()
@@ -116,7 +116,7 @@ def test_order_two_in_a_rotating_trap(scheme):
 
 
 def test_linearly_implicit_solves_the_papers_equation():
-    """Its second step is a dense linear system; the first is one of Crank-Nicolson."""
+    """The second step is a dense linear system; the first is one of Crank-Nicolson."""
     gpe, psi0 = modulated((6, 4), beta=2.0, potential=lattice)
     K, h = kinetic_matrix(gpe.grid), 0.05
     run = linearly_implicit(gpe, (0, 2 * h), psi0, h, save_every=1)
@@ -157,7 +157,7 @@ def test_sav_solves_its_equations():
     np.testing.assert_allclose(run.y[:, 2], psi2, rtol=0, atol=1e-11)
 
 
-# What is kept.
+# Preserved quantities.
 
 
 @pytest.mark.parametrize("potential", [None, lattice], ids=["free", "lattice"])

@@ -197,7 +197,7 @@ def test_the_papers_claims(full):
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_what_the_documentation_says_of_the_peers(full):
-    """The picture is right, the phase is not; and Boris is as good or better in the tokamak, at a sixth of the time."""
+    """The picture is right, the phase is not; and Boris is as good or better in the tokamak, in 1/6 of the time."""
     got = full.numbers
     if full.scene == "uniform":
         assert got["EIP-HL"]["phase_error"] == pytest.approx(6.8, abs=0.1)

@@ -152,7 +152,7 @@ def test_a_c_function_by_pointer():
 
 @pytest.mark.needs_jit
 def test_an_interrupt_ends_a_long_run():
-    """Of compiled functions, whose loop does not come back to Python."""
+    """The loop of compiled functions does not return to Python, and still an interrupt ends it."""
     timer = threading.Timer(0.3, signal.raise_signal, (signal.SIGINT,))
     timer.start()
     with pytest.raises(KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""What all commands have in common: the runner of studies, the table of commands, the reading of options."""
+"""Common parts of all commands: the runner of studies, the table of commands, the reading of options."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Sums(Study):
-    """Adds numbers, and does what it is told to do wrong."""
+    """Add numbers, and fail on request."""
 
     upto: int = option(3, "the last number", type=int)
     ends: dict
@@ -153,7 +153,7 @@ def test_old_spellings_answer_with_the_new_one(name, flag, capsys):
 
 
 def test_help_is_quick():
-    """It imports neither SciPy nor NumPy nor what draws."""
+    """The help imports neither SciPy nor NumPy nor matplotlib."""
     code = "import sys; from eip_scipy_studies.cli import main; main(['--help']); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = {name.split(".")[0] for name in done.stdout.split()}

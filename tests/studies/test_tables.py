@@ -1,4 +1,4 @@
-"""The paper's tables: every cell's agreement as measured, tables 1-4 also beside the same computation in 50 digits."""
+"""The paper's tables: agreement of every cell as measured, tables 1-4 also against the computation in 50 digits."""
 
 import csv
 import json
@@ -207,7 +207,7 @@ def test_value(paper, ours, digits, status):
 
 
 def test_round_off_of_the_paper():
-    """A number that the paper's own round-off keeps from agreeing counts only with the 50-digit value beside it."""
+    """A number that disagrees by the paper's own round-off counts only with the 50-digit value next to it."""
     assert Value("6.8501e-14", 6.8430e-14, 6.8425e-14, roundoff=EPS).status == "round-off"
     assert Value("6.8501e-12", 6.8425e-12, 6.8425e-12, roundoff=EPS).status == "round-off"
     assert Value("6.8501e-12", 6.8430e-12, 6.8425e-12, roundoff=EPS).status == "differs"
