@@ -1,4 +1,4 @@
-"""Processes for tests to kill: forked from one that has imported the package already, which takes seconds.
+"""Processes for tests to kill: forked from one that has already imported the package, which takes seconds.
 
 As a script it reads a job in JSON from each line, ``{"code": ..., "out": ..., "err": ...}``, forks a process for it,
 and prints its number; a line with a number waits for that process, and prints how it ended.
@@ -14,7 +14,7 @@ from pathlib import Path
 
 
 class Forker:
-    """The process that forks, and those that it has forked."""
+    """The process that forks, and its children."""
 
     def __init__(self, folder):
         self._folder, self._count = folder, 0
@@ -24,7 +24,7 @@ class Forker:
         )  # fmt: skip
 
     def start(self, code, **names):
-        """A process that runs `code`, in which `names` are known."""
+        """Start a process that runs `code`, in which `names` are known."""
         self._count += 1
         out, err = (self._folder / f"{self._count}.{name}" for name in ("out", "err"))
         job = {"code": textwrap.dedent(code), "out": str(out), "err": str(err), "names": names}
@@ -40,13 +40,13 @@ class Forker:
 
 
 class Forked:
-    """One of them: its number, and what it has printed."""
+    """One of the children: its number, and its output."""
 
     def __init__(self, forker, pid, out, err):
         self._forker, self.pid, self._out, self._err = forker, pid, out, err
 
     def wait(self):
-        """How it ended, minus the signal that ended it, and what it printed."""
+        """Return how it ended, minus the signal that ended it, and its output."""
         code = int(self._forker.ask(self.pid))
         return code, self._out.read_text(), self._err.read_text()
 

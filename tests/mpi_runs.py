@@ -15,7 +15,7 @@ OPTIONS = {"plain": {}, "twice": {"iterations": 2}, "seldom": {"every": 3, "reus
 
 
 def step(method, fun, y0, h, n, **options):
-    """The solver after n steps, its last message, and what the projection did."""
+    """Return the solver after n steps, its last message, and the numbers of the projection."""
     diagnostics = Diagnostics()
     solver = method(fun, 0.0, y0, n * h, h=h, metric="euclidean", diagnostics=diagnostics, **options)
     message = None
@@ -31,7 +31,7 @@ def vortex(gpe):
 
 
 def fields(make, method, whole):
-    """The equation's parts and its steps, with and without rotation."""
+    """Return the equation's parts and its steps, with and without rotation."""
     for name, grid in GRIDS.items():
         for Omega in (0.0, 0.6):
             gpe = make(grid, harmonic_trap(*(1, 1, 0.9)[: grid.dim]), Omega=Omega, beta=BETA[name])
@@ -51,7 +51,7 @@ def fields(make, method, whole):
 
 
 def stationary(make, method, whole):
-    """A plane wave: the gradients of mass and energy are parallel."""
+    """Run a plane wave, whose gradients of mass and energy are parallel."""
     gpe = make(Grid((16, 16), -np.pi, np.pi), beta=1.0)
     x, y = gpe.grid.mesh()
     wave = np.exp(1j * (x + 2 * y)).ravel()
@@ -62,7 +62,7 @@ def stationary(make, method, whole):
 
 
 def overflow(make, method, whole):
-    """The last stage of the first step overflows where the peak is, which is on one rank."""
+    """Run a field whose last stage of the first step overflows at the peak, which is on one rank."""
     gpe = make(Grid((16, 16), -np.pi, np.pi), beta=1e4)
     x, y = gpe.grid.mesh()
     peak = np.where((x > 2.5) & (y > 2.5), 1e3 + 0j, np.cos(x + y))
@@ -101,7 +101,7 @@ def orbit(method, rank=0, ranks=1, join=lambda part: part):
 
 
 def everything(make, method, whole, **ranks):
-    """Results by name, whole ones on rank 0."""
+    """Return results by name, complete ones on rank 0."""
     runs = (fields(make, method, whole), stationary(make, method, whole), overflow(make, method, whole))
     return dict(item for run in (*runs, orbit(method, **ranks)) for item in run)
 

@@ -83,7 +83,7 @@ def rk_step(f, method, y, h):
 
 
 def shifted(y, h, weights, slopes):
-    """The state y + h sum_j weights[j] slopes[j]."""
+    """Return the state y + h sum_j weights[j] slopes[j]."""
     return tuple(
         x + h * mpmath.fsum(w * k[i] for w, k in zip(weights, slopes[: len(weights)], strict=True))
         for i, x in enumerate(y)
@@ -91,7 +91,7 @@ def shifted(y, h, weights, slopes):
 
 
 def project(problem, names, target, y_hat, iterations):
-    """The paper's Newton iteration (2.4): the state and the multipliers after `iterations` steps."""
+    """Return state and multipliers of the paper's Newton iteration (2.4) after `iterations` steps."""
     directions = [getattr(problem, f"grad_{name}")(y_hat) for name in names]
     multipliers, y = [mpf(0)] * len(names), y_hat
     for _ in range(iterations):
@@ -105,7 +105,7 @@ def project(problem, names, target, y_hat, iterations):
 
 
 def last_step(problem, series, h, names):
-    """The state after round(1/h) steps, with the last raw state and the last multipliers."""
+    """Return the state after round(1/h) steps, with the last raw state and the last multipliers."""
     y = problem.start
     target = [getattr(problem, name)(y) for name in names]
     for _ in range(round(1 / h)):
@@ -115,7 +115,7 @@ def last_step(problem, series, h, names):
 
 
 def multiplier_error(series, h):
-    """Table 1, with lambda_star of eq. (2.5)."""
+    """Return table 1, with lambda_star of eq. (2.5)."""
     problem = Harmonic()
     _, y_hat, (multiplier,) = last_step(problem, series, h, ["H"])
     length = mpmath.sqrt(inner(y_hat, y_hat))
@@ -123,7 +123,7 @@ def multiplier_error(series, h):
 
 
 def defect(series, h):
-    """Tables 2 and 4: the last defect of the first invariant that is kept."""
+    """Return tables 2 and 4: the last residual of the first preserved invariant."""
     problem = Harmonic() if series["table"] == 2 else Kepler()
     names = list(series["invariants"])
     y, _, _ = last_step(problem, series, h, names)
@@ -136,7 +136,7 @@ def end_state(series, h):
 
 
 def evaluate(series):
-    """The series' errors in 50 digits."""
+    """Return the series' errors in 50 digits."""
     with mpmath.workdps(DIGITS):
         steps = [Fraction(series["h"]) / d for d in series["divisors"]]
         if series["table"] == 3:
@@ -146,7 +146,7 @@ def evaluate(series):
 
 
 def write(data):
-    """Write the data, each list of a series on a line of its own."""
+    """Write the data, each list of a series on its own line."""
     series = [",\n".join(f'   "{key}": {json.dumps(value)}' for key, value in s.items()) for s in data["series"]]
     head = json.dumps({**data, "series": []}, indent=1)
     body = "\n  },\n  {\n".join(series)

@@ -16,7 +16,7 @@ SQUARE = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="S")
 
 
 class Verlet:
-    """Position Verlet for the unit oscillator, in place: a one-step method of a user's own."""
+    """Take a step of position Verlet for the unit oscillator, in place: a user-defined one-step method."""
 
     order = 2
 
@@ -43,7 +43,7 @@ def pendulum_gradient(t, y):
 
 
 def pericentre(e):
-    """The state there, on an orbit of semi-major axis 1."""
+    """Return the state there, on an orbit of semi-major axis 1."""
     return np.array([1 - e, 0.0, 0.0, math.sqrt((1 + e) / (1 - e))])
 
 

@@ -156,7 +156,7 @@ def test_fun_that_returns_its_buffer(driver, invariants):
 @both
 @pytest.mark.parametrize("invariants", [(), SQUARE])
 def test_fun_that_keeps_or_overwrites_its_argument(driver, invariants):
-    """SciPy hands out fresh arrays; so must this."""
+    """Each call returns fresh arrays, as SciPy does."""
     kept = []
 
     def careless(t, y):
@@ -430,7 +430,7 @@ def test_h_with_options_of_adaptive_steps(driver, option):
     ],
 )
 def test_steps_end_on_t_bound(driver, span, h, n):
-    """All of nominal length but the last; none of round-off's length."""
+    """All steps have the nominal length except the last one; none has the length of round-off."""
     run = driver(t_span=span, h=h, **({"save_every": 1} if driver is by_integrate else {}))
     assert len(run.t) == n + 1
     assert (run.t[0], run.t[-1]) == span
@@ -452,7 +452,7 @@ def test_backward_is_the_inverse(driver):
 @both
 @pytest.mark.parametrize("h", [1e-30, 0.1, 1e9])
 def test_zero_length_interval(driver, h):
-    """Any h; no step is made, nothing projected."""
+    """Any h is accepted, because no step is made and nothing is projected."""
     run = driver(t_span=(2, 2), h=h, invariants=SQUARE)
     assert run.status == 0
     assert set(run.t.tolist()) == {2.0}
@@ -501,7 +501,7 @@ def test_tolerances_finite(driver, name, value, step):
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
 @pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
 def test_tolerances_without_a_scale(driver, method, invariants):
-    """An error has no scale if both the start and atol are 0; the message says so, and mentions no overflow and no h."""
+    """An error has no scale if both the start and atol are 0; the message says so and does not mention h."""
     options = {"h": None, "method": method, "atol": [1e-6, 0.0], "invariants": invariants}
     with pytest.raises(ValueError, match="tolerances of component 1 are 0: y0 is 0 there, and so is `atol`"):
         driver(y0=[1.0, 0.0], **options)
@@ -524,7 +524,7 @@ def test_component_that_stays_without_a_scale(driver, method, invariants):
 
 
 def test_estimate_that_is_not_finite_is_named():
-    """f at the new point alone: neither a stage nor the sum of them."""
+    """f is evaluated at the new point alone: neither a stage nor their sum is."""
     run = by_integrate(lambda t, y: np.array([1.0, 1.0]) if t < 1 else np.array([np.nan, 1.0]), h=None, first_step=1.0)
     assert run.status == -1
     assert run.message.startswith("fun returned a non-finite value at t=1")
@@ -604,7 +604,7 @@ def test_unknown_option_like_no_other():
 
 @pytest.mark.parametrize("names", [("jac",), ("jac", "lband"), ("uband", "jac", "jac_sparsity")])
 def test_options_of_other_solvers_warn_as_scipy_s(names):
-    """Word for word, so that what filters SciPy's warning filters this one."""
+    """The text is SciPy's word for word, so that a filter of SciPy's warning filters this one."""
     options = dict.fromkeys(names)
     with pytest.warns(UserWarning, match="chosen solver") as theirs:
         solve_ivp(oscillator, (0, 1), Y0, method=RK45, **options)
@@ -681,7 +681,7 @@ def test_wrong_arguments_of_runs(driver, name, value, error, match):
 @pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
 @all_of_them
 def test_wrong_bounds_of_steps(driver, invariants, name, value):
-    """At once; SciPy itself hangs on some of them."""
+    """The error is raised at once; SciPy itself hangs on some of them."""
     with pytest.raises(ValueError, match=f"`{name}` must be positive. Got .*; give a real number > 0"):
         driver(h=None, method=EIPRK45, invariants=invariants, **{name: value})
 
@@ -989,7 +989,7 @@ def test_wrong_gradients(driver, grad, match):
 
 @both
 def test_value_and_gradient_must_fit(driver):
-    """Three values, a gradient of one."""
+    """The invariant has three values, but the gradient of one."""
     with pytest.raises(ValueError, match=r"gradient of invariant 'H' has shape \(2,\), expected \(3, 2\)"):
         driver(invariants=Invariant(lambda t, y: np.full(3, y @ y), square_gradient, name="H"))
 
@@ -1007,7 +1007,7 @@ LATE_MISTAKES = {
 @both
 @pytest.mark.parametrize("mistake", LATE_MISTAKES)
 def test_shapes_that_change_on_the_way(driver, mistake):
-    """Named, and never spread over the components silently."""
+    """The argument is named in an error, and never spread over the components silently."""
     value, grad = LATE_MISTAKES[mistake]
     with pytest.raises(ValueError, match=r"'H'.*shape"):
         driver(invariants=Invariant(value, grad, name="H"), check=False)
@@ -1296,7 +1296,7 @@ def test_progress_bar_is_closed_when_the_run_fails(capsys):
 
 
 def test_no_estimate_no_error_metric():
-    """RK1 has none: metric="error" is then the euclidean one, and the largest correction is unknown."""
+    """RK1 has no error estimate: metric="error" is then the euclidean one, and the largest correction is unknown."""
     one, other = (by_integrate(method=EIPRK1, metric=m, invariants=SQUARE) for m in ("error", "euclidean"))
     np.testing.assert_array_equal(one.y, other.y)
     assert math.isnan(one.diagnostics.max_correction)

@@ -1,4 +1,4 @@
-"""The examples of the documentation in C and Cython are built and run as it says, and print what stands there."""
+"""The examples of the documentation in C and Cython are built and run as described, and print the printed output."""
 
 import os
 import re

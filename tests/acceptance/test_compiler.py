@@ -1,4 +1,4 @@
-"""Which compiler builds the engine, and for what."""
+"""Choice of the compiler that builds the engine, and of its target."""
 
 import importlib
 import sys
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def compiler(monkeypatch):
-    """The module as a build finds it, with no variable set."""
+    """Return the module as a build finds it, with no variable set."""
     for name in ("EIP_SCIPY_COMPILER", "EIP_SCIPY_TARGET", "CXX"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.syspath_prepend(ROOT)
@@ -80,7 +80,7 @@ def test_the_compiler_of_python_is_left_to_setuptools(compiler):
     ],
 )
 def test_wheels_of_other_platforms(compiler, monkeypatch, tmp_path, tag, triple, suffix):
-    """The compiler's platform, and the names that Python looks for there (importlib.machinery.EXTENSION_SUFFIXES)."""
+    """The compiler is that of the platform, and names are Python's there (importlib.machinery.EXTENSION_SUFFIXES)."""
     monkeypatch.setenv("EIP_SCIPY_TARGET", tag)
     monkeypatch.setenv("EIP_SCIPY_HEADERS", str(tmp_path))
     command = compiler.chosen().command

@@ -1,4 +1,4 @@
-"""The Python code of the documentation runs as printed, and prints what stands below it."""
+"""The Python code of the documentation runs as printed, and prints the output below it."""
 
 import math
 import re
@@ -15,7 +15,7 @@ ROUND_OFF = 1e-9
 
 
 def agree(found, printed):
-    """Numbers within a tenth, or both at the level of round-off, which differs from machine to machine."""
+    """Compare numbers to 10 %, or both at the level of round-off, which differs from machine to machine."""
     return math.isclose(found, printed, rel_tol=0.1) or max(abs(found), abs(printed)) < ROUND_OFF
 
 
@@ -49,7 +49,7 @@ NIGHTLY = (
     ],
 )
 def test_page(page, capsys, tmp_path, monkeypatch):
-    """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
+    """Run all blocks of a page in turn, in one namespace; a block of text is the output of the code before it."""
     for package in NEEDED.get(page, ()):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)  # where pages write their files
@@ -75,14 +75,14 @@ def test_a_wrong_output_is_seen():
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
 def test_links_lead_somewhere(page):
-    """Sphinx looks at the links between its own pages."""
+    """Sphinx checks the links between its own pages."""
     text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
 def test_links_have_a_text():
-    """Without one Sphinx fills in the title, and who reads the file itself sees no link."""
+    """Sphinx fills in the title of a link without one, and readers of the file itself see no link."""
     pages = [page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts]
     assert pages
     assert [page.name for page in pages if "[](" in page.read_text(encoding="utf-8")] == []

@@ -1,4 +1,4 @@
-"""Published examples of solve_ivp run with the method's name changed, and keep what they could not keep before.
+"""Published examples of solve_ivp run with only the method's name changed, and keep their invariants.
 
 Lotka-Volterra, with args and dense output, is in the documentation of `scipy.integrate.solve_ivp`; the double pendulum
 is that of Matplotlib's gallery with its equations (masses and lengths 1), where a user would watch the energy.

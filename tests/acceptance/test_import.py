@@ -19,7 +19,7 @@ def python(code, *arguments):
 
 
 def loaded(code, names):
-    """Return those of the modules that are there in a fresh process after `code`."""
+    """Return the modules that are loaded in a fresh process after `code`."""
     return python(f"{code}\nimport sys\nprint(*(name for name in {names} if name in sys.modules))").split()
 
 
@@ -31,7 +31,7 @@ def test_the_package_alone_is_light():
 
 
 def test_names_bring_no_more_than_they_need():
-    """Nor Numba; whatever one of them brought would be there at the end."""
+    """Numba is not loaded either; a module that another one loads would be there at the end."""
     names = "EIPRK4, EIPDOP853, Invariant, Diagnostics, project, integrate, ensemble, problems"
     assert loaded(f"from eip_scipy import {names}", [*HEAVY_FOR_STEPS, "llvmlite", "numba"]) == []
 
@@ -42,7 +42,7 @@ def test_steps_bring_no_ensembles_and_no_problems():
 
 
 def test_no_name_brings_the_studies():
-    """Neither the public names nor the public modules load them; `python -m eip_scipy` does."""
+    """Neither the public names nor the public modules load the studies; `python -m eip_scipy` does."""
     modules = "checkpoint, integrations, methods, native_kernels, plotting, problems, results, solvers"
     assert loaded(f"from eip_scipy import *\nfrom eip_scipy import {modules}", ["eip_scipy_studies"]) == []
     assert loaded("import eip_scipy.__main__", ["eip_scipy_studies", "numpy"]) == ["eip_scipy_studies"]
@@ -113,7 +113,7 @@ for code in sys.argv[1:]:
 
 
 def test_moved_names_are_found_and_say_where_they_are_now():
-    """All in one fresh process, each with one warning that names the importing file."""
+    """All old names are imported in one fresh process, each with one warning that names the importing file."""
     for (code, new), found in zip(MOVED_NAMES.items(), python(IMPORTS, *MOVED_NAMES).splitlines(), strict=True):
         callable_, warning = found.split("|")
         assert callable_ == "True", code

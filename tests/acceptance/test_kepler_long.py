@@ -35,7 +35,7 @@ def run(method, setting, iterations=1, kept="HL"):
 
 
 def values(result):
-    """H and L at the saved states, also where they are not kept, and the sum of the sizes of their terms."""
+    """Return H and L at the saved states, also if they are not kept, and the sum of the sizes of their terms."""
     q1, q2, p1, p2 = result.y
     r = np.hypot(q1, q2)
     kinetic, potential = 0.5 * (p1**2 + p2**2), 1 / r + 0.0025 / r**3
@@ -45,7 +45,7 @@ def values(result):
 
 
 def check_no_drift(t, defects):
-    """No slope within 3 standard errors, and what it could add up to in the run is below the defects' spread."""
+    """There is no slope within 3 standard errors, and its possible sum over the run is below the residuals' spread."""
     fits = [linregress(t, row) for row in defects]
     slope, stderr = (np.array([getattr(fit, name) for fit in fits]) for name in ("slope", "stderr"))
     assert (np.abs(slope) < 3 * stderr).all()

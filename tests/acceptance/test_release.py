@@ -38,7 +38,7 @@ def forbidden(tree):
 
 
 def test_no_data_is_run():
-    """As SECURITY.md promises."""
+    """The package keeps the promise of SECURITY.md."""
     found = {str(path): [*forbidden(ast.parse(path.read_text(encoding="utf-8")))] for path in SOURCES}
     assert {path: names for path, names in found.items() if names} == {}
 

@@ -88,7 +88,7 @@ def source():
 
 
 class OneMethod(ast.NodeTransformer):
-    """Lists of methods cut down to one; decorators that only SciPy's test runner knows left out."""
+    """Reduce lists of methods to one; leave out decorators that only SciPy's test runner knows."""
 
     def __init__(self, name):
         self.name = name
@@ -107,7 +107,7 @@ class OneMethod(ast.NodeTransformer):
 
 
 def module_of(name):
-    """SciPy's module with its lists of methods cut down to one, or with all of them where the name is empty."""
+    """Return SciPy's module with its lists of methods reduced to one, or with all of them if the name is empty."""
     text, path = SOURCE
     tree = ast.fix_missing_locations(OneMethod(name).visit(ast.parse(text)))
     module = types.ModuleType("scipy_suite_" + name)
@@ -162,7 +162,7 @@ def call(module, key, name, case):
 
 
 def cases_of(function):
-    """Arguments of a parametrised test, the method and SciPy's own fixture left out."""
+    """Return the arguments of a parametrised test, without the method and SciPy's own fixture."""
     marks = [m.args for m in getattr(function, "pytestmark", []) if m.args[0] != "method"]
     assert len(marks) <= 1
     return [{marks[0][0]: value} for value in marks[0][1]] if marks else [{}]
@@ -188,7 +188,7 @@ CASES = [
     ids=lambda m: m.__name__,
 )
 def test_as_shipped(method):
-    """All of them, for each class; the only allowances are the name, and two private functions of SciPy's."""
+    """All tests run for each class; only the name differs, and two private functions of SciPy's."""
     name = method._SCIPY.__name__
     module, used = suite(name, method, as_shipped=True)
     passed = []

@@ -1,4 +1,4 @@
-"""The main job: the solar system keeps H and L, and the error metric makes the orbits better, not worse."""
+"""The main application: the solar system keeps H and L, and the error metric improves the orbits."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.needs_jit
 
 
 def longitudes(y):
-    """Unwrapped heliocentric longitudes (9, m) in the plane of the ICRF axes."""
+    """Return unwrapped heliocentric longitudes (9, m) in the plane of the ICRF axes."""
     q = y[:30].reshape(10, 3, -1)
     q = q[1:] - q[:1]
     return np.unwrap(np.arctan2(q[:, 1], q[:, 0]), axis=1)
@@ -81,7 +81,7 @@ def test_frame_keeps_momentum_and_centre_of_mass():
 
 
 def test_energy_and_momentum_are_those_of_the_problem():
-    """H and L from their definitions, on NumPy arrays."""
+    """Return H and L from their definitions, on NumPy arrays."""
     problem = solar_system()
     q, v = problem.y0.reshape(2, 10, 3)
     gm = problem.params

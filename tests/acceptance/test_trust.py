@@ -99,7 +99,7 @@ def test_an_invariant_whose_rate_is_zero_at_the_start(driver, method):
 @pytest.mark.parametrize("method", EVERY_CLASS)
 @pytest.mark.parametrize("metric", ["error", "euclidean"])
 def test_every_class_tells(driver, method, metric):
-    """A quantity that is none, with fixed steps; the euclidean metric needs no estimate, and takes one all the same."""
+    """A quantity that is not an invariant is reported with fixed steps, in the euclidean metric too."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         run, record = driver(stiffer, (0, 10), [1.0, 0.3], method=method, h=0.02, metric=metric, invariants=SQUARE)
@@ -122,7 +122,7 @@ def test_every_class_trusts(driver, method, metric):
 
 
 def test_a_leak_below_the_eye_of_the_start_check():
-    """Friction of a thousandth, at a tolerance of 1e-6, and a start where the energy's rate is as good as zero."""
+    """Friction of 0.001 is detected at a tolerance of 1e-6, from a start at which the energy's rate is almost zero."""
     for method in (EIPRK23, EIPRK45, EIPDOP853):
         with pytest.warns(ProjectionWarning, match="energy"):
             run = integrate(pendulum(1e-3), (0, 30), [2.0, 0.0], method=method, rtol=1e-6, invariants=ENERGY)
@@ -131,7 +131,7 @@ def test_a_leak_below_the_eye_of_the_start_check():
 
 @both
 def test_a_step_that_is_far_too_long(driver):
-    """The projection leaves more than the energy itself: a failure, with what there was before."""
+    """The projection leaves more than the energy itself: the run fails, and keeps its states."""
     options = {"method": EIPRK4, "h": 3.0, "invariants": SQUARE}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProjectionWarning)  # solve_ivp warns at the first step, before the run fails

@@ -1,4 +1,4 @@
-"""Adaptive steps with invariants: every option in both drivers, what they buy, and how runs fail."""
+"""Adaptive steps with invariants: every option in both drivers, gains, and failures of runs."""
 
 import math
 import warnings
@@ -54,7 +54,7 @@ both = pytest.mark.parametrize("driver", [by_scipy, by_integrate], ids=["solve_i
 @methods
 @pytest.mark.parametrize("t_span", [(0.0, 10.0), (10.0, 0.0)], ids=["forward", "backward"])
 def test_invariants_are_kept(driver, method, t_span):
-    """No h needed; defects O(h^(2p + 2)) below the local error, so far below the tolerance."""
+    """No h is needed; residuals of O(h^(2p + 2)) are below the local error, far below the tolerance."""
     options = {"method": method, "rtol": 1e-6, "atol": 1e-9}
     run = driver(orbit, t_span, Y0, invariants=[H, L], **options)
     assert run.status == 0
@@ -71,7 +71,7 @@ def test_invariants_are_kept(driver, method, t_span):
 
 @methods
 def test_error_goes_with_the_tolerance(method):
-    """A tenth of rtol costs steps by 10^(1 / (p_hat + 1)) and buys accuracy."""
+    """A tolerance of 0.1 rtol needs 10^(1 / (p_hat + 1)) times the steps and reduces the error."""
     exact = solve_ivp(orbit, (0, 10), Y0, method="DOP853", rtol=3e-14, atol=1e-16).y[:, -1]
     errors, steps = [], []
     # DOP853 needs small tolerances to leave its first steps behind.
@@ -179,7 +179,7 @@ def test_every_projects_each_kth_accepted_step_and_the_last(driver):
     ("method", "step"), [(EIPRK45, {"rtol": 1e-6, "atol": 1e-9}), (EIPRK4, {"h": 0.02}), (EIPRKN12, {"h": 0.2})]
 )
 def test_every_hands_out_copies_on_the_manifold(driver, method, step):
-    """Rows, samples, events and dense output between two projections."""
+    """Rows, samples, events and dense output between two projections satisfy the invariants."""
     every = {"method": method, "invariants": [H, L], "every": 4, **step}
     times = np.linspace(0, 6, 43)
 
@@ -250,7 +250,7 @@ def test_rtol_too_small_warns_as_scipy_s(driver, rtol):
 
 @both
 def test_invariants_from_an_iterator(driver):
-    """Read once, not first for whether there are any and then for what they are."""
+    """Invariants are read once, not first for their presence and then for their values."""
     run, same = (driver(orbit, (0, 1), Y0, invariants=given) for given in (iter([H, L]), [H, L]))
     assert run.diagnostics.names == ("energy", "momentum")
     np.testing.assert_array_equal(run.y, same.y)
@@ -290,7 +290,7 @@ def test_endless_interval_without_one():
 @pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")  # nor is it
 @pytest.mark.parametrize("method", [EIPRK2, EIPRK23, EIPRK4, EIPRK45], ids=lambda m: m.__name__)
 def test_invariant_nan_after_a_trial_step_is_mended_by_shorter_ones(driver, method):
-    """A first step of 2 at a loose tolerance takes Lotka-Volterra to u < 0: rejected, h x 0.25, and on it goes."""
+    """A loose first step of 2 takes Lotka-Volterra to u < 0: it is rejected, h x 0.25, and the run continues."""
     options = {"rtol": 0.5, "atol": 5.0, "first_step": 2.0, "invariants": VOLTERRA, "metric": "euclidean"}
     run = driver(lotka_volterra, (0, 20), [4.0, 2.0], method=method, **options)
     assert run.status == 0
@@ -328,7 +328,7 @@ def test_shorter_and_shorter_at_most_ten_times(driver):
 
 @both
 def test_impossible_manifold(driver):
-    """A circle that shrinks from t = 0.45 on and is gone at t = 0.7: a clean end, and no silence about it."""
+    """A circle that shrinks from t = 0.45 on and vanishes at t = 0.7 ends the run with a report."""
     shrinking = Invariant(lambda t, y: y @ y + 20 * max(t - 0.45, 0.0), lambda t, y: 2 * y, name="shrinking")
     run = driver(turn, (0, 1), [1.0, 2.0], max_step=0.1, invariants=shrinking, check=False)
     assert run.status == -1
@@ -347,7 +347,7 @@ def test_impossible_manifold(driver):
 
 @both
 def test_first_projection_fails(driver):
-    """At the very first step: one state, the start, and eleven rejections."""
+    """A failure in the very first step leaves one state, the start, and eleven rejections."""
     wrong = Invariant(lambda t, y: y @ y, lambda t, y: -2 * y, name="wrong")
     options = {"invariants": wrong, "check": False, "first_step": 0.5, "rtol": 1e-2, "atol": 1.0}
     # A constant push off the sphere, so that the defect is large at any step.

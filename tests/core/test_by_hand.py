@@ -1,4 +1,4 @@
-"""Solvers stepped by hand, as public code steps SciPy's: what is set between two steps has its effect, or raises."""
+"""Solvers stepped by hand, as public code steps SciPy's: changes between two steps take effect, or raise."""
 
 import copy
 import pickle
@@ -47,7 +47,7 @@ KEPT = Invariant(energy, energy_gradient, name="energy")
 
 
 def stepped(solver, most=3000):
-    """Times and states of the next steps."""
+    """Return times and states of the next steps."""
     rows = []
     while solver.status == "running" and most > 0:
         solver.step()
@@ -177,7 +177,7 @@ def reference(t0, y0, t):
 @pytest.mark.parametrize("idiom", [moved_bound, nearer_bound, backward])
 @pytest.mark.parametrize("case", CASES)
 def test_other_intervals_with_invariants(case, idiom):
-    """One run to the last bound, by SciPy's DOP853 at 1e-13."""
+    """Return one run to the last bound, by SciPy's DOP853 at 1e-13."""
     method, options = CASES[case]
     solver = method(pendulum, 0, Y0, 5.0, **{"invariants": KEPT} | options)
     assert stepped(solver) if idiom is None else idiom(solver)
@@ -301,7 +301,7 @@ def test_another_fixed_step():
 
 
 class Verlet:
-    """A one-step method of a user's own."""
+    """A user-defined one-step method."""
 
     order = 2
 
@@ -313,7 +313,7 @@ class Verlet:
 
 
 class Counting(EIPRK45):
-    """A subclass with an attribute of its own."""
+    """A subclass with an additional attribute."""
 
     seen = 0
 

@@ -1,4 +1,4 @@
-"""Coefficients of solver classes, as SciPy's Runge-Kutta classes have them, and classes made of such classes."""
+"""Coefficients of solver classes, as in SciPy's Runge-Kutta classes, and classes made of such classes."""
 
 from fractions import Fraction
 

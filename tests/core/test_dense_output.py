@@ -88,12 +88,12 @@ def solve(method, **options):
 
 @functools.cache
 def solved(method, variant):
-    """A run whose dense output several tests look at."""
+    """Return a run whose dense output several tests use."""
     return solve(method, **VARIANTS[variant], dense_output=True)
 
 
 def levels(invariants, sol):
-    """Values of the invariants at the steps (l, m)."""
+    """Return values of the invariants at the steps (l, m)."""
     items = invariants if isinstance(invariants, (list, tuple)) else [invariants]
     return np.array([[item.fun(t, y) for t, y in zip(sol.t, sol.y.T, strict=True)] for item in items])
 
@@ -122,7 +122,7 @@ def test_exactly_the_steps(method, variant):
 @every_class
 @pytest.mark.parametrize("variant", [name for name, options in VARIANTS.items() if options.get("invariants")])
 def test_on_the_level_between_the_ends(method, variant):
-    """The level is linear between the defects of a step's ends, whatever they are."""
+    """The level is linear between the residuals at a step's ends, whatever they are."""
     options, sol = VARIANTS[variant], solved(method, variant)
     items = options["invariants"] if isinstance(options["invariants"], list) else [options["invariants"]]
     values = levels(items, sol)
@@ -203,7 +203,7 @@ def test_late_calls_do_not_disturb_a_running_solver(method, invariants):
 
 
 def interpolation_errors(method, h, t_span=(0.0, 1.0), **options):
-    """Largest error anywhere, and at the steps, of fixed steps of size h."""
+    """Return the largest error anywhere, and at the steps, of fixed steps of size h."""
     problem = {"fun": orbit, "y0": Y0, **options}
     sol = solve(method, t_span=t_span, h=h, dense_output=True, **problem)
     t = np.unique(np.concatenate([np.linspace(*t_span, 400), sol.t]))[:: np.sign(t_span[1] - t_span[0]).astype(int)]
@@ -263,7 +263,7 @@ def test_interpolation_is_as_good_as_scipy_s(method):
 
 
 def piece_errors(piece, y):
-    """Largest error inside a step, and that at its end, of the flow from its start."""
+    """Return the largest error inside a step, and that at its end, of the flow from its start."""
     t = np.linspace(piece.t_old, piece.t, 9)
     exact = solve_ivp(orbit, (t[0], t[-1]), y, method="DOP853", rtol=1e-12, atol=1e-14, t_eval=t).y
     errors = np.abs(piece(t) - exact).max(axis=0)

@@ -1,4 +1,4 @@
-"""EIPRadau and EIPBDF: SciPy's steps, projected; what they take, hand out and refuse."""
+"""EIPRadau and EIPBDF: SciPy's steps, projected; their options, results and errors."""
 
 import copy
 import pickle
@@ -275,7 +275,7 @@ def test_shifts_of_cyclic_coordinates_are_bounded(method):
 
 
 def test_private_names_of_scipy(monkeypatch):
-    """All that is used exists, and a version of SciPy that lacks one is named."""
+    """All used attributes exist, and a version of SciPy that lacks one is named."""
     for method in METHODS:
         inner = method.TABLEAU.solver
         solver = inner(relaxing, 0.0, START, 1.0)

@@ -37,7 +37,7 @@ PENDULUM_ENERGY = Invariant(
 
 
 def by_scipy(fun, t_span, y0, **options):
-    """Through solve_ivp, with the defects of `integrate`'s result."""
+    """Run solve_ivp, and add the residuals of `integrate`'s result."""
     diagnostics = Diagnostics()
     sol = solve_ivp(fun, t_span, y0, method=EIPRK4, diagnostics=diagnostics, **options)
     sol.max_defect, sol.diagnostics = diagnostics.max_defect, diagnostics
@@ -405,7 +405,7 @@ def test_project_duplicates():
 
 
 def test_duplicates_hide_no_other_invariant():
-    """The independent row is found behind the two that are one."""
+    """The independent row is found behind two equal ones."""
     tilted = Invariant(lambda t, y: y[0] + 0.5 * y[1], lambda t, y: np.array([1.0, 0.5]))
     for order in ([SQUARE, SQUARE, tilted], [tilted, SQUARE, SQUARE], [SQUARE, tilted, SQUARE]):
         result = project([0.6, 0.81], order, target=[1.0 if item is SQUARE else 1.05 for item in order], iterations=8)
@@ -539,7 +539,7 @@ def not_finite_at_call(number, component):
 @pytest.mark.parametrize("component", [0, 1, slice(None)], ids=["first", "second", "both"])
 @pytest.mark.parametrize("call", range(3, 12))
 def test_rhs_not_finite_at_any_stage(driver, call, component):
-    """Whichever evaluation it is, the one at the new point (for the error estimate) included."""
+    """The evaluation may be any, including the one at the new point (for the error estimate)."""
     run = driver(not_finite_at_call(call, component), (0, 1), [1.0, 2.0], h=0.1, invariants=SQUARE)
     assert run.status == -1
     assert run.message.startswith("fun returned a non-finite value at t=0.")

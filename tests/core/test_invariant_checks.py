@@ -1,4 +1,4 @@
-"""Gradients that are not given, and the checks of invariants: what they find, and whom they leave alone."""
+"""Gradients that are not given, and the checks of invariants: detected faults, and correct runs without reports."""
 
 import warnings
 
@@ -32,7 +32,7 @@ def square(t, y):
 
 
 def said(call):
-    """The result of a call, or its error, and the texts of its warnings."""
+    """Return the result of a call, or its error, and the texts of its warnings."""
     with warnings.catch_warnings(record=True) as record:
         warnings.simplefilter("always")
         result = call()
@@ -250,7 +250,7 @@ def test_single_precision_is_named(kind):
 @pytest.mark.parametrize("grad", [None, lambda t, y: y])
 @pytest.mark.parametrize("method", [EIPRK4, EIPDOP853])
 def test_a_field_in_single_precision_is_named_from_every_start(method, grad, y0):
-    """Also if a rate of change is 0 by chance."""
+    """The field is named even if a rate of change is 0 by chance."""
     kept = Invariant(lambda t, y: 0.5 * (y[0] ** 2 + y[1] ** 2), grad, name="E")
     step = {"h": 0.05} if method is EIPRK4 else {"rtol": 1e-9}
     oscillator = in_single(lambda t, y: np.array([y[1], -y[0]]))
@@ -476,7 +476,7 @@ MISSING = {
 
 @pytest.mark.parametrize("name", MISSING)
 def test_a_missing_constraint_is_named_as_the_cause(name):
-    """Friction is not what to look for."""
+    """The message does not suggest friction as the cause."""
     fun, y0, kept = MISSING[name]
     run, texts = said(lambda: integrate(fun, (0, 10), y0, method=EIPRK4, h=0.05, invariants=kept))
     assert "is kept only where its rate of change is 0" in run.message

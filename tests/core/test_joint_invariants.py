@@ -1,4 +1,4 @@
-"""Joint invariants: the same steps as with the items one by one, in fewer passes."""
+"""Joint invariants: the same steps as with separate items, in fewer passes."""
 
 import numpy as np
 import pytest
@@ -100,7 +100,7 @@ def test_other_options_take_the_items(options):
 
 
 def test_parallel_gradients_take_the_items():
-    """A stationary state: rank 1, as ever."""
+    """A stationary state still has rank 1."""
     values, states = np.linalg.eigh(MATRIX)
     start = np.ascontiguousarray(states[:, -1])
     counted = Counted()

@@ -31,7 +31,7 @@ def local_invariants():
 
 
 def assert_same_states(found, expected, times):
-    """Equal to 1e-12 of each component's largest value, and exactly at the steps."""
+    """Compare to 1e-12 of each component's largest value, and exactly at the steps."""
     states, other = expected(times), found(times)
     assert np.all(np.abs(other - states).max(axis=1) <= 1e-12 * np.abs(states).max(axis=1))
     np.testing.assert_array_equal(found(expected.ts), expected(expected.ts))

@@ -1,4 +1,4 @@
-"""Multistep methods through integrate and solve_ivp: orders, what lies between steps, bits, and what they refuse."""
+"""Multistep methods through integrate and solve_ivp: orders, values between steps, bits, and refused arguments."""
 
 import ctypes
 import math
@@ -58,7 +58,7 @@ KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 
 def exact(times, y0=Y0):
-    """States of Kepler's problem from the pericentre of this start, in 30 digits."""
+    """Return states of Kepler's problem from the pericentre of this start, in 30 digits."""
     out = []
     with mpmath.workdps(30):
         q, v = (mpmath.mpf(float(x)) for x in (y0[0], y0[3]))
@@ -187,7 +187,7 @@ def test_intervals_far_below_the_step(method, end):
 
 @both
 def test_few_steps(method):
-    """Runs shorter than a history are those of the method that starts."""
+    """Runs shorter than a history use the starting method."""
     for count in (1, 2, 5, 11, 12, 13, 14, 15, 16, 17, 20, 27):
         for extra in (0.0, 0.3):
             end = (count + extra) * STEP
@@ -276,7 +276,7 @@ def test_c_functions(tmp_path):
 
 
 def test_events():
-    """Passages through the pericentre, and an end at one."""
+    """The events are passages through the pericentre, and one ends a run."""
 
     def pericentre(t, y):
         return y[0] * y[2] + y[1] * y[3]
@@ -293,7 +293,7 @@ def test_events():
 
 @both
 def test_a_resumed_run_has_the_same_bits(method, tmp_path):
-    """Broken off in the start, early, and late."""
+    """The run is stopped in the start, early, and late."""
     problem = solar_system(years=12)
     given = {"method": method, "h": 1 / 600, "save_every": 200}
     whole = integrate(problem, **given)
@@ -323,7 +323,7 @@ def test_evaluations_do_not_depend_on_how_fast_the_machine_is(monkeypatch):
 
 
 def test_members_have_the_bits_of_single_runs():
-    """In an ensemble; more of them in tests/ensembles/test_side_by_side.py."""
+    """Multistep methods run in an ensemble; tests/ensembles/test_side_by_side.py has more of these tests."""
     problem = solar_system(years=3)
     starts = problem.y0 * (1 + 1e-6 * np.arange(3)[:, None])
     result = ensemble(problem, None, starts, method=EIPGJ14, h=1 / 500)
@@ -386,7 +386,7 @@ def test_solve_ivp():
 
 
 def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
-    """At the start, from the orbits or from the accelerations alone."""
+    """The step is refused at the start, from the orbits or from the accelerations alone."""
     problem = solar_system(years=10)
     with pytest.raises(ValueError, match=r"EIPGJ12: h = 0\.004 is not stable .* Take h <= (0\.00\d+)") as error:
         integrate(problem, method=EIPGJ12, h=0.004)
@@ -467,7 +467,7 @@ def test_a_force_that_jumps_is_told():
 
 
 def test_a_false_invariant_is_told():
-    """As of other methods."""
+    """A false invariant is reported as by other methods."""
     false = Invariant(lambda t, y: y[0] ** 2 + y[3], lambda t, y: np.array([2 * y[0], 0, 0, 1.0]))
     with pytest.warns(ProjectionWarning, match="is not an invariant of this system"):
         assert not run(30, method=EIPGJ12, invariants=false).trusted
@@ -490,7 +490,7 @@ def test_bad_options(options, error, message):
 
 
 def test_states_that_are_none():
-    """Not (q, v), or an odd number of components."""
+    """The state is not (q, v), or has an odd number of components."""
     with pytest.raises(ValueError, match="first 2 components of fun must be v"):
         solve_ivp(lambda t, y: -y, (0, 1), np.ones(4), method=EIPGJ12, h=0.01)
     with pytest.raises(ValueError, match="an even number of components"):

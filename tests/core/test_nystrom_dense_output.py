@@ -50,7 +50,7 @@ GALACTIC = {"y0": np.array([1.0, 0.0, 0.1, 0.8]), "invariants": [Invariant(galac
 
 @pytest.fixture(scope="module")
 def exact_galactic():
-    """The galactic orbit by steps so short that both methods and their interpolants agree to 1e-13."""
+    """Return the galactic orbit by steps so short that both methods and their interpolants agree to 1e-13."""
     fine = {"h": 0.025, "compensated": True, "dense_output": True, **GALACTIC}
     return integrate(acceleration=logarithmic, t_span=(0, END), method=EIPRKN12, **fine).sol
 

@@ -1,4 +1,4 @@
-"""Runge-Kutta-Nystrom methods through solve_ivp and integrate: orders, dense output, bits, what they refuse."""
+"""Runge-Kutta-Nystrom methods through solve_ivp and integrate: orders, dense output, bits, and refused arguments."""
 
 from fractions import Fraction
 
@@ -40,7 +40,7 @@ KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 @pytest.fixture(scope="module")
 def exact():
-    """The state at t = 2, from Kepler's equation between two points of an orbit, in 40 digits."""
+    """Return the state at t = 2, from Kepler's equation between two points of an orbit, in 40 digits."""
     with mpmath.workdps(40):
         q, v, t = mpmath.matrix(Y0[:2].tolist()), mpmath.matrix(Y0[2:].tolist()), 2
         r = mpmath.norm(q)
@@ -82,7 +82,7 @@ def accelerations(tableau, h):
 
 @both
 def test_one_step_is_the_tableau(method):
-    """Against a step written from the definition, in fractions' own floats."""
+    """The step agrees with one written from the definition, in fractions' own floats."""
     tableau, h = method.TABLEAU, 0.1
     q, v, k = Y0[:2], Y0[2:], accelerations(tableau, h)
     expected = np.concatenate([q + h * v + h * h * tableau.b @ k, v + h * tableau.b_prime @ k])
@@ -93,7 +93,7 @@ def test_one_step_is_the_tableau(method):
 
 @both
 def test_local_error_is_the_difference_of_the_tableau_s_weights(method):
-    """h^2 e . a in q, h e' . a in v, which the metric is made of."""
+    """The metric consists of h^2 e . a in q and h e' . a in v."""
     h, tableau = 0.5, method.TABLEAU
     solver = method(orbit, 0, Y0, h, h=h, **KEPT)
     solver.step()
@@ -199,7 +199,7 @@ def test_dense_output(method, options):
 
 @both
 def test_what_is_no_second_order_system(method):
-    """The wrong order of the state, an acceleration that sees the velocity, an odd number of components."""
+    """The order of the state is wrong, an acceleration depends on the velocity, or the number of components is odd."""
     with pytest.raises(ValueError, match="the first 2 components of fun must be v"):
         solve_ivp(lambda t, y: np.concatenate([acceleration(t, y[2:]), y[:2]]), (0, 1), Y0, method=method, h=0.1)
     with pytest.raises(ValueError, match="accelerations change with the velocity; take a Runge-Kutta"):
@@ -215,7 +215,7 @@ def test_what_is_no_second_order_system(method):
 
 
 def test_events_and_samples():
-    """The pericentre by an event on the radial velocity, through both drivers."""
+    """The pericentre is found by an event on the radial velocity, through both drivers."""
 
     def radial(t, y):
         return y[0] * y[2] + y[1] * y[3]

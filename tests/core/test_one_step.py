@@ -1,4 +1,4 @@
-"""One-step methods of a user's own: the same projection as for tableaux, and what is refused."""
+"""User-defined one-step methods: the same projection as for tableaux, and refused methods."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def closed(t):
 
 
 def runs(method, **options):
-    """States at the end of both drivers."""
+    """Return states at the end of both drivers."""
     sol = solve_ivp(oscillator, (0, 10), [1.0, 0.0], method=method, **options)
     run = integrate(oscillator, (0, 10), [1.0, 0.0], method=method, save_every=1, **options)
     assert sol.success
@@ -131,7 +131,7 @@ def test_fun_is_called_only_where_someone_asks():
 
 
 def test_a_method_says_what_it_evaluates():
-    """In fixed steps and adaptive ones, those rejected too."""
+    """The counts are right in fixed steps and adaptive ones, including rejected steps."""
 
     class Counted(RK43):
         evaluations = 5

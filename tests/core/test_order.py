@@ -117,7 +117,7 @@ DEFECT_STEPS = {(1, 1): 0.02, (2, 1): 0.05, (3, 1): 0.075, (4, 1): 0.19, (1, 2):
 
 
 def one_step(y, method, h, options):
-    """The raw and the projected state after one step of h r^(3/2), h in units of the local time scale."""
+    """Return the raw and the projected state after one step of h r^(3/2), h in units of the local time scale."""
     seen = []
 
     class Recorder(method):
@@ -161,7 +161,7 @@ def test_corrections_are_of_the_size_of_the_local_error(method, options):
 @pytest.mark.parametrize("options", LOCAL)
 @pytest.mark.parametrize("method", METHODS)
 def test_defects_are_the_quadratic_term_of_the_correction(method, options):
-    """The other half, for every order: what one Newton step leaves is x H x / 2 with x the correction."""
+    """The other half, for every order: one Newton step leaves x H x / 2, where x is the correction."""
     left, quadratic = [], []
     for y in STATES:
         y_hat, y_new = one_step(y, method, QUADRATIC_STEPS[method.TABLEAU.order], OPTIONS[options])

@@ -1,4 +1,4 @@
-"""A state in parts: on two threads that hand each other numbers, as processes do by messages."""
+"""A state in parts: on two threads that exchange numbers, as processes do by messages."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -120,7 +120,7 @@ def test_parts_step_as_the_whole_does(kept, options):
 
 
 def test_a_part_that_is_not_finite_fails_all():
-    """One process sees it, and both say so; none waits for the other in a sum."""
+    """One process detects the failure, and both report it; neither waits for the other in a sum."""
 
     def overflowing(y):
         f = fun(y)

@@ -78,7 +78,7 @@ def test_powers_of_two_in_the_invariants_change_no_bit(seed, size, iterations, d
 @given(seeds, sizes, st.integers(1, 2))
 @few
 def test_any_factors_of_the_invariants(seed, size, iterations):
-    """Over 24 decades; only round-off may depend on them."""
+    """The result depends on the unit by round-off only, over 24 decades."""
     q = Quadratics(seed, *size)
     assume(q.well_conditioned())
     factors = 10.0 ** q.rng.uniform(-12, 12, size[1]) * q.rng.choice([-1, 1], size[1])
@@ -125,7 +125,7 @@ def random_frame(rng, n, k):
 @given(seeds, st.integers(2, 9), st.integers(1, 3), st.integers(0, 2))
 @few
 def test_least_norm_in_the_metric_and_neutral_to_the_frame(seed, n, rows, k):
-    """Against numpy's pseudo-inverse: move = P sigma x, x of least norm with (G P sigma) x = -g."""
+    """The correction agrees with numpy's pseudo-inverse: move = P sigma x, x of least norm with (G P sigma) x = -g."""
     assume(rows + k < n)
     rng = np.random.default_rng(seed)
     G, y_hat, sigma = rng.standard_normal((rows, n)), rng.standard_normal(n), 10.0 ** rng.uniform(-3, 0, n)
@@ -150,7 +150,7 @@ def test_least_norm_in_the_metric_and_neutral_to_the_frame(seed, n, rows, k):
 @given(seeds, st.integers(2, 8), st.integers(1, 3))
 @few
 def test_least_norm_by_the_kkt_system(seed, n, rows):
-    """Minimise |d / sigma|^2 / 2 with G d = -g, multipliers and all."""
+    """The correction minimises |d / sigma|^2 / 2 with G d = -g, with all multipliers."""
     assume(rows < n)
     rng = np.random.default_rng(seed)
     G, y_hat, sigma = rng.standard_normal((rows, n)), rng.standard_normal(n), rng.uniform(0.2, 1, n)
@@ -378,7 +378,7 @@ def test_rotation_of_n_bodies(seed, metric, framed):
 
 
 def test_rotation_needs_blocks():
-    """With each component weighed by itself the result depends on the axes: the test above can fail."""
+    """With separate weights of the components the result depends on the axes: the test above is able to fail."""
     gm, q, v = three_bodies(3)
     turn = Rotation.random(random_state=np.random.default_rng(4)).as_matrix()
     run, turned = n_body_run(gm, q, v, blocks=None), n_body_run(gm, q @ turn.T, v @ turn.T, blocks=None)
@@ -418,7 +418,7 @@ def test_units_of_the_state_with_the_error_metric(seed, blocks):
 
 @pytest.mark.parametrize("options", [{"metric": "euclidean"}, {"atol": 1e-6}])
 def test_units_matter_without_it(options):
-    """The euclidean metric, or an atol, ties the result to the units: the test above can fail."""
+    """The euclidean metric, or an atol, ties the result to the units: the test above is able to fail."""
     unit = np.array([1e6, 1e3, 1e-3, 1e-6])
     plain, scaled = kepler_in_units(np.ones(4), **options), kepler_in_units(unit, **options)
     assert np.abs(scaled.y[:, -1] / unit - plain.y[:, -1]).max() > 1e-9

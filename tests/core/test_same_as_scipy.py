@@ -62,7 +62,7 @@ ROOTS = 256 * EPS
 
 
 def assert_close(ours, theirs, rtol):
-    """To rtol of the largest size that a component takes."""
+    """Compare to rtol of the largest size that a component takes."""
     ours, theirs = np.asarray(ours), np.asarray(theirs)
     assert ours.shape == theirs.shape
     assert ours.dtype == theirs.dtype
@@ -88,7 +88,7 @@ def assert_same(ours, theirs, rtol=1e-12):
 
 
 def both(method, name, fun, t_span, y0, **options):
-    """Our result and SciPy's."""
+    """Return our result and SciPy's."""
     return (solve_ivp(fun, t_span, y0, method=m, **options) for m in (method, SCIPY[name]))
 
 
@@ -211,7 +211,7 @@ def test_buffer_that_fun_reuses(name, method):
 
 @pairs
 def test_failures(name, method):
-    """Step size below the spacing of t, at the same place."""
+    """A step size below the spacing of t fails at the same place."""
     with np.errstate(all="ignore"):
         ours, theirs = both(method, name, lambda t, y: y * y, (0.0, 2.0), [1.0])
     assert theirs.status == ours.status == -1
@@ -310,7 +310,7 @@ own = pytest.mark.parametrize("method", [*OWN.values(), EIPRK4], ids=lambda m: m
 
 
 def compare(run, sol, *, counts=True):
-    """Bit for bit."""
+    """Results agree bit for bit."""
     assert run.status == sol.status
     np.testing.assert_array_equal(run.t, sol.t)
     np.testing.assert_array_equal(run.y, sol.y)

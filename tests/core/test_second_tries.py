@@ -1,4 +1,4 @@
-"""Corrections that are not believed or fail: softer weights, try by try, then one direction less."""
+"""Corrections that are refused or fail: softer weights, try by try, then one direction less."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ class Case:
         return known + [[i] for i in range(self.y.size) if i not in used]
 
     def tries(self):
-        """The corrected states, one for each try."""
+        """Return the corrected states, one for each try."""
         lists, alone = self.lists(), self.blocks is None
         scale = np.array([RTOL * np.linalg.norm(self.y[b]) for b in lists])
         estimate = np.array([np.linalg.norm(self.err[b]) for b in lists])

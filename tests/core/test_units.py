@@ -13,7 +13,7 @@ SI = np.repeat([METRE_PER_AU, METRE_PER_AU / (YEAR_D * DAY_S)], 30)
 
 
 def in_au(years, units="AU, yr", **options):
-    """Final state of the solar system in AU and AU/yr, run in either units."""
+    """Return the final state of the solar system in AU and AU/yr, run in either units."""
     problem = solar_system(units=units, years=years)
     run = integrate(problem, method=EIPRK4, h=problem.h, compiled=True, **options)
     assert run.status == 0
@@ -21,13 +21,13 @@ def in_au(years, units="AU, yr", **options):
 
 
 def planets(difference):
-    """Largest difference of position of each body [AU]."""
+    """Return the largest difference of position of each body [AU]."""
     return np.abs(difference[:30]).reshape(10, 3).max(axis=1)
 
 
 @pytest.mark.needs_jit
 def test_solar_system_in_si_and_in_au():
-    """Ten years: apart by no more than what rounding errors of the state grow to."""
+    """After ten years the runs differ by no more than the growth of rounding errors."""
     there, si = in_au(10.0, atol=0), in_au(10.0, "SI", atol=0)
     problem = solar_system(years=10.0)
     signs = np.random.default_rng(0).choice([-1, 1], (8, 60))
@@ -73,5 +73,5 @@ def test_units_of_powers_of_two_change_no_bit(length, time):
 
 @pytest.mark.parametrize("options", [{"metric": "euclidean"}, {"atol": 1e-6}])
 def test_units_of_powers_of_two_matter_without_it(options):
-    """Neither the euclidean metric nor an atol is free of units: the test above can fail."""
+    """Neither the euclidean metric nor an atol is independent of units: the test above is able to fail."""
     assert (scaled_run(0, 0, 10, **options) != scaled_run(37, 25, 10, **options)).any()

@@ -1,4 +1,4 @@
-"""First runs of an installation: nothing of ours is compiled, kept on disk, or loaded for that."""
+"""First runs of an installation: the package compiles nothing, stores nothing on disk, and loads nothing for it."""
 
 import os
 import shutil

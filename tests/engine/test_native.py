@@ -1,4 +1,4 @@
-"""The engine's binding: what it refuses, and that both of its builds give the same bits."""
+"""The engine's binding: refused arguments, and the same bits from both of its builds."""
 
 import ctypes
 import gc
@@ -34,7 +34,7 @@ H = Invariant(
 
 
 def parts(method=EIPRK4, **options):
-    """Arguments of an engine that is ready to step."""
+    """Return arguments of an engine that is ready to step."""
     fun, y0 = pull, Y0
     if options.pop("dtype", None):
         fun, y0 = lambda t, y: -1j * y, np.ones(3, complex)
@@ -50,7 +50,7 @@ def parts(method=EIPRK4, **options):
 
 
 def arrays(record, path=()):
-    """Paths of all arrays in records of records."""
+    """Yield paths of all arrays in records of records."""
     for name, value in record._asdict().items():
         if isinstance(value, np.ndarray):
             yield (*path, name)
@@ -59,7 +59,7 @@ def arrays(record, path=()):
 
 
 def replaced(record, path, value):
-    """The record with another array at that path."""
+    """Return the record with another array at that path."""
     name, *rest = path
     return record._replace(**{name: replaced(getattr(record, name), rest, value) if rest else value})
 
@@ -182,7 +182,7 @@ def test_buffers_outlive_their_owner_and_are_copied(dtype):
 
 
 def dense_parts(**case):
-    """An engine, and what its dense output is made with."""
+    """Return an engine, and the data of its dense output."""
     engine, method = Engine(**parts(**case)), case.pop("method", EIPRK4)
     ready = prepared(Request.of(fun=pull, t_span=(0, 1), y0=Y0, method=method, **case))
     return engine, Interpolants(ready.run, engine).record

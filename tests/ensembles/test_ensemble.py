@@ -68,7 +68,7 @@ def same_members(run, single):
 
 
 def same(one, other):
-    """Two ensembles, number for number."""
+    """Compare two ensembles, number for number."""
     for name in ("y", "t", "status", "message", "max_defect", "max_correction", "nfev", "njev", "nlu", "times"):
         equal_nan = name != "message"
         assert np.array_equal(one[name], other[name], equal_nan=equal_nan), name
@@ -213,7 +213,7 @@ _second_height.terminal, _second_height.direction = 2, -1
 @needs_jit
 @pytest.mark.parametrize("more", [{"t_eval": np.linspace(0.5, 16.0, 9)}, {"save_every": 7}, {"h": None, "rtol": 1e-6}])
 def test_events_that_end_members_at_the_second_time(more):
-    """The first time goes by within the engine's loop; rows beyond the end are nan."""
+    """The first time passes within the engine's loop; rows beyond the end are nan."""
     y0s, options = starts(4), {"method": EIPRK45, "h": 0.03, "invariants": HL, "events": _second_height, **more}
     run = ensemble(jit_orbit, (0, 16), y0s, compiled=True, **options)
     for k in range(4):
@@ -254,7 +254,7 @@ def test_interpreted_members():
 @needs_jit
 @pytest.mark.parametrize("options", [{}, {"compensated": True, "every": 3}, {"direction": "old", "iterations": 2}])
 def test_no_member_leaves_a_trace(options):
-    """Whatever the buffers held before."""
+    """The result does not depend on the contents of the buffers."""
     y0s = starts(6)
     shared = {"method": EIPRK4, "h": 0.03, "invariants": HL, **options}
     plan = Plan(Task(Request.of(fun=jit_orbit, t_span=SPAN, y0=y0s[0], **shared))).compile()
@@ -563,7 +563,7 @@ def ends_its_process(t, y):
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
 def test_a_process_that_dies(tmp_path):
-    """The executor is beyond repair then; what came back is kept, and the rest runs on another one."""
+    """The executor is broken then; the returned results are kept, and the rest runs on another one."""
     y0s = np.ones((12, 2))
     y0s[7] = [99.9, 10.0]  # dies after its start, which is tried here too
     options = {"h": 0.1, "chunk": 3, "checkpoint": tmp_path / "kept", "compiled": False}
@@ -711,7 +711,7 @@ def test_what_is_no_store(where, tmp_path):
 
 
 def test_a_chunk_without_its_status_runs_again(tmp_path):
-    """As after a kill between the arrays of a chunk."""
+    """Imitate a kill between the arrays of a chunk."""
     zarr = pytest.importorskip("zarr", reason="needs zarr")
     path = tmp_path / "run.zarr"
     whole = stored(out=path)
@@ -724,14 +724,14 @@ def test_a_chunk_without_its_status_runs_again(tmp_path):
 
 
 def test_a_store_that_was_not_begun_yet(tmp_path):
-    """As after a kill between the making of the group and that of its arrays."""
+    """Imitate a kill between the creation of the group and that of its arrays."""
     zarr = pytest.importorskip("zarr", reason="needs zarr")
     zarr.open_group(tmp_path / "run.zarr", mode="w", attributes={"eip_scipy_ensemble": None})
     same(stored(), stored(out=tmp_path / "run.zarr", resume=True))
 
 
 class Trap:
-    """Makes a folder where it is unpickled."""
+    """Object that makes a folder when it is unpickled."""
 
     def __init__(self, path):
         self._path = path
@@ -866,7 +866,7 @@ def test_checkpoints_in_time(tmp_path):
 
 
 def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
-    """The result is there all the same, and so is the former file."""
+    """The result exists all the same, and so does the former file."""
     path, write = tmp_path / "kept", checkpoint.write
 
     def full(*arguments):

@@ -36,7 +36,7 @@ def _small_ensembles_too(monkeypatch):
 
 
 def check_bits(problem, t_span, starts, *, params=None, members=None, **options):
-    """An ensemble, some of its members compared with runs of their own."""
+    """Run an ensemble, and compare some of its members with single runs."""
     run = ensemble(problem, t_span, starts, params=params, executor=1, **options)
     saved = run.times.size > 0
     for k in range(len(starts)) if members is None else members:
@@ -88,7 +88,7 @@ def test_options(options, span):
 )
 @pytest.mark.parametrize("start", [0.0, 0.02])
 def test_times_between_steps(options, start):
-    """From the start or not, several in one step, at the end of one, at the end of all."""
+    """Times are at the start or later, several in one step, at the end of a step, and at the end of the run."""
     times = np.array([start, 0.11, 0.12, 0.5, 1.234, 6.1])
     run = check_bits(kepler(), (0, 6.1), spread_starts(kepler().y0, 11), h=0.05, t_eval=times, **options)
     assert run.side_by_side.all()

@@ -1,1 +1,1 @@
-"""Random systems with random options, and runs that are killed: looked at for as long as one likes."""
+"""Random systems with random options, and runs that are killed, for any length of time."""

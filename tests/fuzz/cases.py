@@ -1,4 +1,4 @@
-"""Random systems with random options, by a number each: what a run is given, and what is known of its result."""
+"""Random systems with random options, one for each number: arguments of a run, and known properties of its result."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NEARBY, REGULAR = 1e-6, 1e3
 
 
 class TooManyCallsError(Exception):
-    """A run takes far more evaluations than any that ends."""
+    """Error of a run that takes far more evaluations than any that ends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,11 +80,11 @@ class Case:
         return any(event.terminal for event in self.events)  # type: ignore[attr-defined]
 
     def error(self, y: Array) -> float:
-        """Largest error of the states (n, SAMPLES), in units of the components' sizes."""
+        """Return the largest error of the states (n, SAMPLES), in units of the components' sizes."""
         return float(np.max(np.abs(y - self.truth) / self.size[:, None]))
 
     def solve_ivp(self, **options: Any) -> Any:
-        """The run by SciPy."""
+        """Return the run by SciPy."""
         fun = counted(self.system.fun)
         given = {"invariants": self.invariants, **self.steps, **self.projection}
         if self.params is not None and not self.native:
@@ -95,7 +95,7 @@ class Case:
 
     @property
     def fun(self) -> Callable[..., Any]:
-        """The right-hand side, or the acceleration, as `integrate` and `ensemble` take it."""
+        """Return the right-hand side, or the acceleration, as `integrate` and `ensemble` take it."""
         if self.native:
             return jitted.acceleration if self.method in NYSTROM else jitted.motion
         fun = self.system.acc if self.method in NYSTROM else self.system.fun
@@ -107,12 +107,12 @@ class Case:
 
     @property
     def takes(self) -> str:
-        """The argument that `fun` is given as."""
+        """Return the name of the argument for `fun`."""
         return "acceleration" if self.method in NYSTROM else "fun"
 
     @property
     def options(self) -> dict[str, Any]:
-        """The options of both."""
+        """Return the options of both."""
         given = {
             "method": method(self.method),
             "invariants": self.invariants,
@@ -129,7 +129,7 @@ class Case:
         return given
 
     def integrate(self, **options: Any) -> Any:
-        """The run by `integrate`."""
+        """Return the run by `integrate`."""
         given = {self.takes: options.pop("fun", None) or self.fun, "t_span": self.t_span}
         return eip_scipy.integrate(**given, y0=self.system.y0.copy(), **self.options | options)
 
@@ -147,7 +147,7 @@ class Case:
 
 
 def method(name: str) -> Any:
-    """The class of that name."""
+    """Return the class of that name."""
     return getattr(eip_scipy, name)
 
 
@@ -180,7 +180,7 @@ def filling(fun: Callable[..., Any]) -> Callable[..., None]:
 
 
 def random_case(seed: int) -> Case:
-    """The case of that number."""
+    """Return the case of that number."""
     rng = np.random.default_rng(seed)
     params, in_place, sick = None, False, False
     if rng.random() < 0.15:
@@ -230,7 +230,7 @@ def random_case(seed: int) -> Case:
 
 
 def _chosen(rng: np.random.Generator, system: System) -> tuple[Quantity, ...]:
-    """Some that it keeps, in any order, maybe with one that depends on them, maybe two of them as one vector."""
+    """Return some preserved quantities, in any order, perhaps with a dependent one, or two of them as one vector."""
     kept = system.kept
     if rng.random() < 0.05:
         return ()
@@ -285,7 +285,7 @@ def _leaking(rng: np.random.Generator, system: System, a: Quantity) -> Quantity:
 
 
 def _formed(rng: np.random.Generator, a: Quantity, system: System, params: Array | None) -> Invariant:
-    """As an `Invariant`, with or without a gradient, in place or not, by f or not."""
+    """Return an `Invariant`, with or without a gradient, in place or not, by f or not."""
 
     def factor(args: tuple[Any, ...]) -> float:
         return args[0][1] if args else 1.0
@@ -297,7 +297,7 @@ def _formed(rng: np.random.Generator, a: Quantity, system: System, params: Array
     in_place = bool(rng.random() < 0.3)
 
     def value(*arguments: Any) -> Array:
-        """The gradient for (t, y, [f], *args)."""
+        """Return the gradient for (t, y, [f], *args)."""
         if by_f is None:
             t, y, *args = arguments
             return a.grad(t, y) * factor(tuple(args))
@@ -390,7 +390,7 @@ def _event(rng: np.random.Generator, k: int, size: Array) -> Callable[..., float
 
 
 def _rate(system: System, sign: float) -> float:
-    """The fastest rate along the motion: that of the linearised equations, or of the state as a whole."""
+    """Return the fastest rate along the motion: that of the linearised equations, or of the state as a whole."""
 
     def at(t: float, y: Array) -> float:
         x, unit = _floats(y), np.repeat(np.broadcast_to(system.unit, y.size), 2 if y.dtype.kind == "c" else 1)
@@ -417,7 +417,7 @@ def _floats(y: Array) -> Array:
 
 
 def _truth(rng: np.random.Generator, system: System, times: Array) -> tuple[Array, float]:
-    """The states (n, SAMPLES) at `times`, and how far neighbours go apart."""
+    """Return the states (n, SAMPLES) at `times`, and the separation of neighbours."""
     if system.exact is not None:
         return np.column_stack([system.exact(t) for t in times]), 1.0
     scale = np.max(np.abs(system.y0 * system.unit)) / system.unit

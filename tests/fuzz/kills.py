@@ -1,4 +1,4 @@
-"""Kill runs that write checkpoints, at random instants and again and again, and look whether they go on as if not.
+"""Kill runs that write checkpoints, at random instants and repeatedly, and check that they resume as if not killed.
 
     python -m tests.fuzz.kills --kills 300
 
@@ -51,7 +51,7 @@ def differences(kind: str, run: Any) -> Iterator[str]:
 
 
 def done(kind: str, path: Path) -> int:
-    """Steps or members that a checkpoint holds; -1 without one."""
+    """Return the number of steps or members in a checkpoint; -1 without one."""
     if kind == "trajectories" or not path.exists():
         return -1
     header, _ = checkpoint.read(path)
@@ -59,7 +59,7 @@ def done(kind: str, path: Path) -> int:
 
 
 def chain(seed: int, folder: Path, context: Any, most: int, killed: Counter[str]) -> Iterator[str]:
-    """Kill one run up to `most` times, then let it end; yields what is wrong."""
+    """Kill one run up to `most` times, then let it end; yield the faults."""
     rng = np.random.default_rng(seed)
     kind = list(KINDS)[seed % len(KINDS)]
     path, before = folder / f"{kind}-{seed}", -1
@@ -114,7 +114,7 @@ def kill(kills: int, seed: int, seconds: float = math.inf) -> tuple[Counter[str]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The script; returns its exit status."""
+    """Run the script; return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.kills", description=__doc__.partition("\n")[0])
     parser.add_argument("--kills", type=int, default=60, help="stop after this number")
     parser.add_argument("--seed", type=int, default=0, help="the number of the first chain of kills")

@@ -35,31 +35,31 @@ ending.terminal = True  # type: ignore[attr-defined]
 
 
 def fixed(**options: Any) -> Any:
-    """Fixed steps that save much."""
+    """Run fixed steps with many saved states."""
     given = {"method": EIPRK4, "h": 0.01, "every": "auto", "invariants": KEPT, "save_every": 5}
     return integrate(ORBIT.fun, (0, 60), ORBIT.y0, **given | options)
 
 
 def adaptive(**options: Any) -> Any:
-    """Adaptive steps with events and samples."""
+    """Run adaptive steps with events and samples."""
     given = {"method": EIPDOP853, "rtol": 1e-8, "invariants": KEPT, "events": crossing}
     return integrate(ORBIT.fun, (0, 120), ORBIT.y0, t_eval=np.arange(0, 120, 0.5), **given | options)
 
 
 def nystrom(**options: Any) -> Any:
-    """Compensated steps that are projected now and then."""
+    """Run compensated steps that are projected now and then."""
     given = {"method": EIPRKN12, "h": 0.05, "every": 7, "compensated": True, "invariants": KEPT, "save_every": 10}
     return integrate(acceleration=ORBIT.acc, t_span=(0, 200), y0=ORBIT.y0, **given | options)
 
 
 def members(**options: Any) -> Any:
-    """An ensemble, a few members at a time."""
+    """Run an ensemble, a few members at a time."""
     given = {"method": EIPRK4, "h": 0.02, "invariants": KEPT, "chunk": 2, "save_every": 20, "reduce": "state"}
     return ensemble(ORBIT.fun, (0, 3), STARTS, **given | options)
 
 
 def trajectories(**options: Any) -> Any:
-    """An ensemble that writes to a Zarr group."""
+    """Run an ensemble that writes to a Zarr group."""
     given = {"method": EIPRK4, "rtol": 1e-6, "invariants": KEPT, "chunk": 2, "events": ending}
     return ensemble(ORBIT.fun, (0, 3), STARTS, t_eval=[0.0, 1.0, 2.5], **given | options)
 
@@ -69,7 +69,7 @@ KINDS: dict[str, Callable[..., Any]] = SINGLE | {run.__name__: run for run in (m
 
 
 def kept_in(kind: str, path: Path) -> dict[str, Any]:
-    """The options that keep a run of that kind in `path`."""
+    """Return the options that keep a run of that kind in `path`."""
     if kind == "trajectories":
         return {"out": path, "resume": True, "compiled": False}
     return {"checkpoint": path, "checkpoint_every": OFTEN, "resume": True, "compiled": False}
@@ -84,5 +84,5 @@ def work(kind: str, path: Path) -> None:
 
 @cache
 def whole(kind: str) -> Any:
-    """The run that nobody kills."""
+    """Return the run without kills."""
     return KINDS[kind](compiled=False)

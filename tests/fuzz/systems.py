@@ -1,4 +1,4 @@
-"""Run random systems with random options for a while, and look whether what must hold for every run does.
+"""Run random systems with random options for a while, and check the conditions that hold for every run.
 
     python -m tests.fuzz.systems --seconds 60
 
@@ -41,11 +41,11 @@ MOST_BREAKS = 3
 
 
 class BrokenOffError(Exception):
-    """In the place of a crash."""
+    """Exception that replaces a crash."""
 
 
 class Runs:
-    """The runs of a case, each made when it is first looked at, with the warnings that it gave."""
+    """The runs of a case, each made on first use, with its warnings."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
@@ -67,13 +67,13 @@ class Runs:
 
     @cached_property
     def plain(self) -> Any:
-        """Without invariants, at the times of the truth."""
+        """Return the run without invariants, at the times of the truth."""
         options = {"invariants": (), "t_eval": self.case.times, "events": None, "project_initial": False}
         return observed(lambda: self.case.integrate(**options))[0]
 
     @cached_property
     def sampled(self) -> Any:
-        """With them, at the same times."""
+        """Return the run with invariants, at the same times."""
         return observed(lambda: self.case.integrate(t_eval=self.case.times, events=None))[0]
 
     @cached_property
@@ -86,7 +86,7 @@ class Runs:
 
     @cached_property
     def allowed(self) -> float:
-        """The error that a trusted run may have; endless where there is nothing to compare with."""
+        """Return the allowed error of a reliable run; infinite if there is no reference."""
         case = self.case
         if not case.regular or self.plain.status != 0:
             return math.inf
@@ -105,7 +105,7 @@ class Runs:
 
 
 def observed(call: Callable[[], Any]) -> tuple[Any, list[warnings.WarningMessage]]:
-    """The result of a call, and its warnings."""
+    """Return the result of a call, and its warnings."""
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         return call(), warned
@@ -117,7 +117,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def different(one: Any, other: Any, *names: str) -> Iterator[str]:
-    """The names of those numbers of two results that are not the same bits."""
+    """Return the names of the numbers of two results that differ in bits."""
     for name in names:
         a, b = getattr(one, name), getattr(other, name)
         if not (same(a, b) if a is not None and b is not None else a is b):
@@ -149,7 +149,7 @@ def different_events(run: Any, other: Any) -> Iterator[str]:
 
 
 def finite(runs: Runs) -> Iterator[str]:
-    """Success means numbers, times in order, and the end that was asked for."""
+    """Check that success means finite numbers, times in order, and the requested end."""
     for name, run in (("saved", runs.whole), ("sampled", runs.sampled), ("solve_ivp", runs.scipy)):
         if not run.success:
             continue
@@ -190,7 +190,7 @@ def survives(runs: Runs) -> Iterator[str]:
 
 
 def kept(runs: Runs) -> Iterator[str]:
-    """The invariants of saved states are what `max_defect` says."""
+    """Check that the invariants of saved states agree with `max_defect`."""
     run, case = runs.whole, runs.case
     if not run.success or not run.max_defect.size or case.compensated:
         return
@@ -210,7 +210,7 @@ def quiet(runs: Runs) -> Iterator[str]:
 
 
 def told(runs: Runs) -> Iterator[str]:
-    """`trusted`, the warning, the message and the diagnostics say the same."""
+    """Check that `trusted`, the warning, the message and the diagnostics agree."""
     for name, run, warned in (("integrate", runs.whole, runs.warned), ("solve_ivp", runs.scipy, runs.scipy.warned)):
         record = run.diagnostics
         doubts = [str(w.message) for w in warned if issubclass(w.category, ProjectionWarning)]
@@ -234,7 +234,7 @@ def told(runs: Runs) -> Iterator[str]:
 
 
 def through_scipy(runs: Runs) -> Iterator[str]:
-    """`solve_ivp` takes the steps of `integrate`, with the same bits; SciPy's own where nothing is kept."""
+    """Check that `solve_ivp` takes the steps of `integrate`, with the same bits; SciPy's own if nothing is kept."""
     case, run, other = runs.case, runs.whole, runs.scipy
     if case.compensated:
         return
@@ -258,7 +258,7 @@ def through_scipy(runs: Runs) -> Iterator[str]:
 
 
 def dense(runs: Runs) -> Iterator[str]:
-    """Dense output meets the states at the ends of steps, and `t_eval` is dense output."""
+    """Check that dense output meets the states at the ends of steps, and that `t_eval` is dense output."""
     run, case = runs.scipy, runs.case
     if run.t.size < 2:  # no step was taken: nothing in between
         return
@@ -277,7 +277,7 @@ def dense(runs: Runs) -> Iterator[str]:
 
 
 def resumed(runs: Runs, *, compiled: bool = False) -> Iterator[str]:
-    """A run that is broken off again and again, and resumed, is the whole one."""
+    """Check that a run that is stopped repeatedly and resumed equals the whole one."""
     whole, case = runs.whole, runs.case
     broken, kinds = 0, [_at_a_row] if compiled else [_at_a_row, _at_a_call]
     with tempfile.TemporaryDirectory() as folder, mock.patch("time.perf_counter", _hasty_clock()):
@@ -307,13 +307,13 @@ COUNTS = ("n_projections", "n_skipped", "n_rank_reduced", "n_softened", "n_rejec
 
 
 def _hasty_clock() -> Callable[[], float]:
-    """A clock that goes on by much each time it is read: checkpoints are due between any two steps."""
+    """Clock that advances by a large step each time it is read: checkpoints are due between any two steps."""
     read = itertools.count()
     return lambda: CLOCK_STEP * next(read)
 
 
 def _at_a_row(runs: Runs) -> dict[str, Any]:
-    """Broken off at a saved state."""
+    """Return options that stop the run at a saved state."""
     left = int(runs.rng.integers(runs.whole.t.size + 1))
 
     def stop(t: float, y: np.ndarray, defects: np.ndarray) -> None:
@@ -326,7 +326,7 @@ def _at_a_row(runs: Runs) -> dict[str, Any]:
 
 
 def _at_a_call(runs: Runs) -> dict[str, Any]:
-    """Broken off inside a step."""
+    """Return options that stop the run inside a step."""
     left, fun = int(runs.rng.integers(1, runs.whole.nfev + 5)), runs.case.fun
 
     def failing(*arguments: Any) -> Any:
@@ -340,7 +340,7 @@ def _at_a_call(runs: Runs) -> dict[str, Any]:
 
 
 def members(runs: Runs, **options: Any) -> Iterator[str]:
-    """A member of an ensemble is the single run."""
+    """Check that a member of an ensemble equals the single run."""
     case = runs.case
     if any(not event.terminal for event in case.events):  # type: ignore[attr-defined]
         return
@@ -367,7 +367,7 @@ def members(runs: Runs, **options: Any) -> Iterator[str]:
 
 
 def native(runs: Runs) -> Iterator[str]:
-    """Compiled runs have the bits of interpreted ones; broken off or as members too."""
+    """Check that compiled runs have the bits of interpreted ones, also stopped or as members."""
     case, whole = runs.case, runs.whole
     if not case.native or numba.config.DISABLE_JIT:
         return
@@ -403,7 +403,7 @@ def look_at(seed: int) -> tuple[Runs | None, list[tuple[str, str]]]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The script; returns its exit status."""
+    """Run the script; return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.systems", description=__doc__.partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this number of seconds")
     parser.add_argument("--count", type=int, default=None, help="stop after this number of systems")

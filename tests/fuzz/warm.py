@@ -1,4 +1,4 @@
-"""Imported once by the server that forks the runs to be killed, so that they need not import and compile anything."""
+"""Modules that the server imports once, so that its forked runs need not import and compile anything."""
 
 import tqdm
 import zarr  # noqa: F401

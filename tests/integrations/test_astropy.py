@@ -1,4 +1,4 @@
-"""Quantities and times of astropy, in and out: converted where units are known, refused elsewhere."""
+"""Quantities and times of astropy as input and output: converted if units are known, refused elsewhere."""
 
 import importlib
 import sys
@@ -109,7 +109,7 @@ def test_what_does_not_fit(changes, error, message):
 
 
 def test_spans_and_steps():
-    """In units and as dates the same bits as in plain numbers of the problem's unit."""
+    """Values with units and dates give the same bits as plain numbers in the problem's units."""
     plain = solar((0, 2), save_every=10)
     dates = EPOCH + [0, 2] * YR
     for span in ((0 * YR, 2 * YR), [0, 2] * YR, (0, 2 * YR), (0, TimeDelta(2 * YR)), tuple(dates), dates):

@@ -1,4 +1,4 @@
-"""Ensembles on Dask: the same bits on any number of workers, lost workers, poisonous members, who may connect."""
+"""Ensembles on Dask: the same bits on any number of workers, lost workers, members that kill workers, permissions."""
 
 import itertools
 import os
@@ -50,7 +50,7 @@ def workers(request):
 
 
 def listening():
-    """Addresses on which this process and its children listen."""
+    """Return addresses on which this process and its children listen."""
     me = psutil.Process()
     connections = [c for p in (me, *me.children(recursive=True)) for c in p.net_connections("inet")]
     return {c.laddr for c in connections if c.status == psutil.CONN_LISTEN}
@@ -58,13 +58,13 @@ def listening():
 
 @pytest.fixture(scope="module")
 def others():
-    """Who listened before: MPI does where it has been imported."""
+    """Return addresses that were open before: MPI opens some when it is imported."""
     return listening()
 
 
 @pytest.fixture(scope="module")
 def pair(others):
-    """Here a chunk whose worker died is given up by Dask at once: to be run again is left to this package."""
+    """Let Dask give up at once a chunk whose worker died: this package has to run it again."""
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
         client = local_client(2)
         yield client
@@ -101,7 +101,7 @@ def test_functions_without_a_module(pair):
 @slow
 @pytest.mark.parametrize("allowed_failures", [0, 3])
 def test_a_killed_worker_loses_nothing(allowed_failures):
-    """One of two workers gets SIGKILL while it computes; its chunks run again, by Dask or, given up by it, by us."""
+    """One of two workers gets SIGKILL while it computes; its chunks run again, by Dask or, if it gives up, by us."""
     y0s = starts(400)
     here = ensemble(kepler(), SPAN, y0s, chunk=8)
     victims = []
@@ -144,7 +144,7 @@ def test_a_member_that_kills_its_workers_is_found(pair):
 @pytest.mark.nightly
 @slow
 def test_a_member_that_kills_its_workers_as_dask_is_set_up():
-    """Three tries of the chunk, and of each of its parts; the workers are new each time."""
+    """The chunk and each of its parts are tried three times; the workers are new each time."""
     y0s = np.ones((4, 2))
     y0s[2] = [99.9, 10.0]
     client = local_client(1)
@@ -270,7 +270,7 @@ class Asked:
 
 
 class Lost:
-    """A client whose workers die of the member 13, and of nothing else; results come at the second asking."""
+    """A client whose workers die of the member 13 only; results arrive at the second request."""
 
     cluster, status = None, "running"
 
@@ -309,7 +309,7 @@ def test_halves_of_halves(monkeypatch):
 
 
 class Cluster:
-    """A local cluster whose workers are gone, and do not come back; it counts how often they were asked to."""
+    """A local cluster whose workers are gone for good; it counts how often they were requested."""
 
     worker_spec, workers = (0, 1), ()
 
@@ -321,7 +321,7 @@ class Cluster:
 
 
 class Deserted:
-    """A client without workers, whose results do not come for a while."""
+    """A client without workers, whose results take a while."""
 
     status = "running"
 

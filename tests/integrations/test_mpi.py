@@ -79,7 +79,7 @@ def test_results_are_the_serial_ones(ranks, serial, tmp_path):
 @pytest.mark.slow
 @needs_mpirun
 def test_the_page(tmp_path):
-    """The script of the documentation's page, on two ranks."""
+    """The script of the documentation's page runs on two ranks."""
     code, printed = (
         text for _, text in BLOCK.findall((TESTS.parent / "docs/developers/mpi.md").read_text(encoding="utf-8"))
     )
@@ -91,7 +91,7 @@ def test_the_page(tmp_path):
 @pytest.mark.slow
 @needs_mpirun
 def test_a_sum_that_is_missing(tmp_path):
-    """Ranks that know different values would decide differently, and wait for each other."""
+    """Ranks with different values would decide differently, and wait for each other."""
     code = """
         import numpy as np
         from eip_scipy import EIPRK4, Invariant
@@ -184,7 +184,7 @@ FAILING = """
 @needs_mpirun
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_a_rank_that_raises(ranks, tmp_path):
-    """Wherever it is: the others end with its message, nobody waits, and the communicator is as good as before."""
+    """An error anywhere ends the other ranks with its message; nobody waits, and the communicator remains usable."""
     (tmp_path / "run.py").write_text(textwrap.dedent(FAILING), encoding="utf-8")
     *lines, last = on_ranks(ranks, "run.py", cwd=tmp_path).strip().split("\n")
     assert len(lines) > 20
@@ -219,7 +219,7 @@ def test_values_are_those_of_the_equation():
 
 @pytest.mark.parametrize("iterations", [1, 2])
 def test_a_run_through_solve_ivp(iterations):
-    """The gradients by numbers and vectors, in place and not."""
+    """Gradients are computed by numbers and vectors, in place and not."""
 
     def both(t, y):
         return np.array([total(MPI.COMM_SELF, np.vdot(y, y).real), 2 * total(MPI.COMM_SELF, np.vdot(y, y).real)])
@@ -264,7 +264,7 @@ def test_a_quench_stays_on_the_ranks():
 
 
 def test_parts_cover_the_grid():
-    """Every point on one rank, along x and along y, with the coordinates of the whole grid."""
+    """Every point is on one rank, along x and along y, with the coordinates of the whole grid."""
     whole = Grid((11, 7, 5), -1, (1, 2, 3))
     ways = [Transposition(whole, SimpleNamespace(rank=rank, size=3)) for rank in range(3)]
     np.testing.assert_array_equal(np.concatenate([way.slab.points(0) for way in ways]), whole.points(0))

@@ -1,4 +1,4 @@
-"""REBOUND as a judge: against the packaged reference states, and the rules that keep a comparison fair."""
+"""REBOUND as a reference: against the packaged reference states, and the rules that keep a comparison fair."""
 
 import importlib
 import sys
@@ -74,7 +74,7 @@ def test_truncation_error_after_a_century(integrator, h, expected):
 
 
 def test_saba_is_at_round_off_after_a_century():
-    """Other types of its family miss it: (8,6,4) has 1e-8, (10,4) 4e-10."""
+    """Other types of its family miss the value: (8,6,4) has 1e-8, (10,4) 4e-10."""
     assert position_errors(run("saba(10,6,4)", h=7.305, t_end=100 * YEAR), 100.0).max() < 2e-10
 
 
@@ -335,7 +335,7 @@ def test_wrong_options_of_ias15(integrator, options, message):
 
 
 def test_what_prepare_adds_is_in_the_run():
-    """A force that cancels gravity: straight lines."""
+    """Return a force that cancels gravity: bodies move on straight lines."""
 
     def cancel(sim):
         def force(_):

@@ -23,7 +23,7 @@ UNITS = {
 
 
 def planets(units=None, *, test_mass=0.0):
-    """A star, two planets of which one has no name, and a test particle."""
+    """Return a star, two planets of which one has no name, and a test particle."""
     sim = rebound.Simulation()
     if units:
         sim.units = units
@@ -141,7 +141,7 @@ def test_names_may_be_given():
 
 
 def test_orbits_as_balances_against_ias15():
-    """The orbits keep their energies at known rates, and the bodies come nearer to where IAS15 has them."""
+    """The orbits keep their energies at known rates, and the bodies come nearer to the positions of IAS15."""
     sim = planets(test_mass=0.0)
     problem = exchange.problem_from_simulation(sim, names=["star", "b", "c", "dust"], balances="kepler")
     assert [name for item in problem.invariants for name in item.value_names] == [
@@ -197,7 +197,7 @@ def test_a_template_gives_all_but_state_and_time():
 
 
 def test_the_solar_system():
-    """Units that REBOUND knows: solar masses, and G m as it was to a rounding."""
+    """Units that REBOUND knows give solar masses, and G m to a rounding."""
     problem = solar_system()
     sim = exchange.to_simulation(problem)
     assert sim.units == {"length": "au", "time": "yr", "mass": "msun"}

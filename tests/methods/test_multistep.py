@@ -23,7 +23,7 @@ ORDERS = (4, 7, 10, 12, 14, 16)
 
 
 def test_published_coefficients():
-    """Henrici (1962), tables 5.1, 6.1 and 6.2, and Berry and Healy (2004): of Stoermer, Cowell and Adams-Moulton."""
+    """Coefficients agree with Henrici (1962), tables 5.1, 6.1 and 6.2, and Berry and Healy (2004)."""
     stormer = ["1/12", "1/12", "19/240", "3/40", "863/12096", "275/4032", "33953/518400", "8183/129600"]
     cowell = ["1/12", "0", "-1/240", "-1/240", "-221/60480", "-19/6048", "-9829/3628800", "-407/172800"]
     moulton = ["-1/2", "-1/12", "-1/24", "-19/720", "-3/160", "-863/60480", "-275/24192", "-33953/3628800"]
@@ -66,7 +66,7 @@ def test_exact_for_polynomials_up_to_the_order(order):
 
 @pytest.mark.parametrize("order", [8, 12, 14])
 def test_correction_is_a_difference(order):
-    """Corrector less predictor is a multiple of the difference of the accelerations of that order."""
+    """Corrector minus predictor is a multiple of the difference of the accelerations of that order."""
     found = correction_weights(order)
     assert found[0] != 0
     assert found == [found[0] * (-1) ** j * comb(order, j) for j in range(order + 1)]
@@ -74,7 +74,7 @@ def test_correction_is_a_difference(order):
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_rounded_weights_keep_their_moments(order):
-    """Each rounded up or down, all together miss their moments by far less than the nearest floats would."""
+    """Coefficients are rounded such that together they miss their moments by far less than the nearest floats."""
     exact = position_weights(-1, order)[::-1]
     rounded = weights(order).predict_q
 
@@ -137,7 +137,7 @@ def test_stability_limit(order, corrected):
 
 
 def test_limits_fall_with_the_order():
-    """Higher orders are less stable; the corrected ones far more than those that are not."""
+    """Higher orders are less stable; corrected ones are far more stable than uncorrected ones."""
     plain = np.array([stability_limit(order, False) for order in range(8, 17)])
     corrected = np.array([stability_limit(order, True) for order in range(8, 17)])
     assert np.all(np.diff(plain) < 0)
@@ -153,6 +153,6 @@ def test_orders(order):
 
 
 def test_names():
-    """A class of any order."""
+    """Return a class of any order."""
     assert eip_method(GaussJackson(order=10)).__name__ == "EIP_GJ10"
     assert repr(GaussJackson(order=14, corrected=True)) == "<GaussJackson GJ14: order 14, corrected by the Jacobian>"

@@ -39,7 +39,7 @@ def name(tableau):
 # Trees as nested tuples of their branches; accelerations at even height, velocities, with one branch at most, at odd.
 @cache
 def special_trees(order):
-    """Each is one with a vertex less plus a leaf somewhere."""
+    """Return all trees: each is one with a vertex less plus a leaf somewhere."""
     return {()} if order == 1 else {grown for tree in special_trees(order - 1) for grown in graft(tree)}
 
 
@@ -61,7 +61,7 @@ def density(tree):
 
 
 def from_package(tree):
-    """A tree of the package in the form above."""
+    """Return a tree of the package in the form above."""
     return tuple(sorted([()] * tree.leaves + [(from_package(sub),) for sub in tree.subtrees]))
 
 
@@ -120,7 +120,7 @@ WEIGHTS = [
 
 
 def test_number_of_special_trees():
-    """Hairer, Norsett & Wanner I, section II.14."""
+    """The numbers of trees are those of Hairer, Norsett & Wanner I, section II.14."""
     counts = [1, 1, 2, 3, 6, 10, 20, 36, 72, 137, 275]
     assert [len(special_trees(k)) for k in range(1, 12)] == counts
     assert [len(nystrom_trees(k)) for k in range(1, 12)] == counts
@@ -156,13 +156,13 @@ def test_order_of_nystrom4_in_fractions(key):
 
 @pytest.mark.parametrize("tableau", HIGH, ids=name)
 def test_stage_positions_are_of_second_order(tableau):
-    """Sum_j A_ij = c_i^2 / 2, which the constructor does not ask for."""
+    """The pair satisfies Sum_j A_ij = c_i^2 / 2, which the constructor does not require."""
     for row, node in zip(tableau.exact["A"], tableau.exact["c"], strict=True):
         assert abs(sum(row) - node**2 / 2) < Fraction(1, 10**50)
 
 
 def test_the_package_s_residuals_agree_with_the_sums():
-    """With weights that are nobody's, so that the residuals are large."""
+    """The weights are arbitrary, so that the residuals are large."""
     A, c = RKN86.exact["A"], RKN86.exact["c"]
     weights = np.array([Fraction(i + 1, 7) for i in range(9)], dtype=object)
     conditions = Conditions(A.tolist(), c.tolist(), b=weights.tolist(), b_prime=weights.tolist())
@@ -288,7 +288,7 @@ def test_e_is_the_difference_of_the_weights(tableau, key):
 @pytest.mark.parametrize("tableau", METHODS[:2], ids=name)
 @pytest.mark.parametrize("driver", ["integrate", "solve_ivp"])
 def test_a_step_uses_all_weights(tableau, driver):
-    """Also those of a last stage at the new position; the step is written out in NumPy."""
+    """A step uses also the weights of a last stage at the new position; the reference is written out in NumPy."""
     h, y0 = 0.1, np.array([0.4, -0.2])
 
     def acceleration(q):
@@ -308,7 +308,7 @@ def test_a_step_uses_all_weights(tableau, driver):
 
 @pytest.mark.parametrize("tableau", METHODS[:2], ids=name)
 def test_small_methods_have_their_order(tableau):
-    """The errors of the pendulum are taken against twice as many steps."""
+    """Errors of the pendulum are relative to a run with twice as many steps."""
 
     def end(n):
         options = {"method": eip_method(tableau), "h": 2.0 / n}
@@ -384,7 +384,7 @@ ECCENTRICITY = Fraction(1, 10)
 
 
 def kepler(t):
-    """Position and velocity on the ellipse with unit period / 2 pi, from its pericentre."""
+    """Return position and velocity on the ellipse with unit period / 2 pi, from its pericentre."""
     e = mpf(ECCENTRICITY.numerator) / ECCENTRICITY.denominator
     E = mpmath.findroot(lambda x: x - e * mpmath.sin(x) - t, t)
     root, rate = mpmath.sqrt(1 - e**2), 1 / (1 - e * mpmath.cos(E))
@@ -398,7 +398,7 @@ def acceleration(q):
 
 
 def step(method, q, v, h):
-    """The new position and velocity, and the estimates."""
+    """Return the new position and velocity, and the estimates."""
     K = []
     for row, node in zip(method.A, method.c, strict=True):
         drift = [sum(a * k[i] for a, k in zip(row, K, strict=False)) for i in range(2)]

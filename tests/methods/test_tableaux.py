@@ -1,4 +1,4 @@
-"""Tableaux: order conditions in fractions by independent trees and sums, wrong tableaux, low parts of the weights."""
+"""Tableaux: order conditions in fractions by independent trees and sums, refused tableaux, low parts of the weights."""
 
 import math
 from fractions import Fraction
@@ -39,7 +39,7 @@ def name(tableau):
 
 
 def grafted(order):
-    """All rooted trees as sorted nested tuples: each is one with a vertex less plus a leaf somewhere."""
+    """Return all rooted trees as sorted nested tuples: each is one with a vertex less plus a leaf somewhere."""
 
     def graft(tree):
         yield tuple(sorted((*tree, ())))
@@ -66,14 +66,14 @@ def density(tree):
 
 
 def exact(values):
-    """The fractions behind an array of doubles, which must round to them."""
+    """Return the fractions behind an array of doubles, which must round to them."""
     fractions = [Fraction(float(x)).limit_denominator(10**5) for x in np.ravel(values)]
     assert [float(x) for x in fractions] == list(np.ravel(values))
     return np.array(fractions, dtype=object).reshape(np.shape(values))
 
 
 def residual(tree, A, b):
-    """Sum_i b_i Phi_i(tree) - 1/density, written out with sums."""
+    """Return Sum_i b_i Phi_i(tree) - 1/density, written out with sums."""
 
     def weight(tree, i):
         return math.prod((sum(A[i][j] * weight(sub, j) for j in range(len(b))) for sub in tree), start=Fraction(1))
@@ -82,7 +82,7 @@ def residual(tree, A, b):
 
 
 def with_row_b(tableau):
-    """The stage matrix with f at the new point as one more stage."""
+    """Return the stage matrix with f at the new point as one more stage."""
     s = tableau.n_stages
     A = np.full((s + 1, s + 1), Fraction(0), dtype=object)
     A[:s, :s], A[s, :s] = exact(tableau.A), exact(tableau.b)
@@ -102,7 +102,7 @@ def test_trees_are_those_of_another_algorithm(order):
 
 @pytest.mark.parametrize("tableau", [RK23, RK45, DOP853], ids=name)
 def test_order_of_scipy_s_pairs(tableau):
-    """The package's own are not checked when they are made, a user's are."""
+    """The package's own tableaux are not checked when they are made, a user's are."""
     options = {key: getattr(tableau, key) for key in ("b_hat", "error_estimator_order", "c")}
     paired = {"e_low": tableau.e_low} if tableau.paired else {}
     same = Tableau(tableau.name, tableau.A.tolist(), tableau.b.tolist(), tableau.order, **options, **paired)

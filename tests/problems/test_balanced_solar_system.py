@@ -10,7 +10,7 @@ ALL = ("energy", "momentum", "laplace")
 
 
 def errors(problem, run, years):
-    """Distances of Mercury, and of the worst of the other bodies, from the stored state [AU]."""
+    """Return distances of Mercury, and of the worst of the other bodies, from the stored state [AU]."""
     apart = np.linalg.norm((run.y[:, -1] - problem.reference(years))[:30].reshape(10, 3), axis=1)
     return apart[1], apart[2:].max()
 
@@ -43,7 +43,7 @@ def test_totals_stay_at_rounding_though_nothing_projects_them():
 
 @pytest.mark.parametrize("forces", ["1pn", ("j2", "gr-potential")])
 def test_further_forces(forces):
-    """The rates are those of all forces, here against steps sixteen times shorter."""
+    """The rates are those of all forces; the reference has steps sixteen times shorter."""
     problem = solar_system(years=5.0, forces=forces, balances="kepler")
     truth = integrate(problem, method=EIPDOP853, h=1 / 4096, invariants=(), compensated=True).y[3:6, -1]
     kept, plain = (

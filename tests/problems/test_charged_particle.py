@@ -20,7 +20,7 @@ POINTS = [(1.05, 0.0, 0.0), (0.3, -0.9, 0.07), (-0.8, 0.7, -0.2), (1.3, 0.2, 0.5
 
 
 def paper_uniform(x, y, z):
-    """A and phi as printed."""
+    """Return A and phi as printed."""
     return (-y / 2, x / 2, mp.mpf(0)), mp.mpf("1e-2") / mp.sqrt(x**2 + y**2)
 
 
@@ -39,7 +39,7 @@ FIELDS = [(UNIFORM, paper_uniform), (TOKAMAK, paper_tokamak)]
 
 
 def exact_jacobian(paper, point):
-    """Rows dA_i/dx_j, and grad phi."""
+    """Return rows dA_i/dx_j, and grad phi."""
 
     def slope(value, j):
         return mp.diff(value, point, tuple(int(k == j) for k in range(3)))
@@ -487,7 +487,7 @@ def test_a_field_with_a_divergence_is_refused(field):
     ],
 )
 def test_a_small_divergence_is_told(field, value):
-    """As a table may have it; the run goes on, for the energy is kept all the same."""
+    """The field is given as by a table; the run continues, because the energy is kept all the same."""
     with pytest.warns(UserWarning, match=f"divergence of magnetic is {value} at") as told:
         start(field=ParticleField(magnetic=field), form="velocity")
     assert len(told) == 1
@@ -506,7 +506,7 @@ def test_energy_and_momentum_need_their_potentials():
 
 @pytest.mark.slow
 def test_further_invariants_can_be_added():
-    """p_z in the uniform field, which the problem does not list: RK keeps it."""
+    """RK keeps p_z in the uniform field, which the problem does not list."""
     problem = charged_particle(UNIFORM, [1, 0, 0], [0.1, 0, 0.2], t_span=(0, 20), h=math.pi / 10)
     p_z = Invariant(lambda t, y, params: y[5], lambda t, y, params: np.eye(6)[5], args=(problem.params,), name="p_z")
     run = integrate(problem, method=EIPRK4, invariants=[*problem.invariants, p_z])
@@ -597,7 +597,7 @@ def test_a_cycloid():
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_the_total_energy_keeps_a_place():
-    """Against DOP853 of SciPy with rtol=1e-13; nothing depends on z, so that v_z has to be kept as well."""
+    """The run agrees with DOP853 of SciPy at rtol=1e-13; nothing depends on z, so that v_z is kept as well."""
     problem = moving(ring(potential=ring_phi), "energy", t_end=1000.0, h=0.4, mass=1.0, charge=1.0)
     exact = solve_ivp(problem.fun, problem.t_span, problem.y0, method="DOP853", rtol=1e-13, atol=1e-15).y[:3, -1]
     along = Invariant(lambda t, y, params: y[5], name="v_z")

@@ -1,4 +1,4 @@
-"""Condensates and waves with damping: rates against sums and closed forms, and what their balances gain."""
+"""Condensates and waves with damping: rates against sums and closed forms, and the gain by their balances."""
 
 import pickle
 
@@ -159,7 +159,7 @@ def soliton(damping=DAMPING):
 
 
 def written_again(t, u):
-    """-6 u u_x - u_xxx - damping u at the points alone, by NumPy."""
+    """Return -6 u u_x - u_xxx - damping u at the points, by NumPy."""
     k = 2j * np.pi * np.fft.rfftfreq(64, 0.5)
     return np.fft.irfft(-3 * k * np.fft.rfft(u * u) - k**3 * np.fft.rfft(u)) - DAMPING * u
 

@@ -53,7 +53,7 @@ def value_and_gradient(invariant, given, y):
 
 
 def rate(invariant, given, y=None):
-    """|dI/dt| in units of its terms."""
+    """Return |dI/dt| in units of its terms."""
     y = given.y0 if y is None else y
     _, G = value_and_gradient(invariant, given, y)
     f = given.fun(0.0, y)
@@ -73,7 +73,7 @@ def test_newton_alone_is_untouched():
 
 
 def potential(name, q):
-    """The potential energies times G, in mpmath."""
+    """Return the potential energies times G, in mpmath."""
     total = mpmath.mpf(0)
     for i in range(1, 4):
         x = [q[3 * i + c] - q[c] for c in range(3)]
@@ -105,7 +105,7 @@ def test_accelerations_come_from_the_potential(name):
 
 
 def test_the_suns_post_newtonian_pull():
-    """The formula of the IERS conventions (10.12) with beta = gamma = 1, and the reaction on the Sun."""
+    """Return the formula of the IERS conventions (10.12) with beta = gamma = 1, and the reaction on the Sun."""
     expected = np.zeros((4, 3))
     for i in (1, 2, 3):
         r, v = POSITION[i] - POSITION[0], VELOCITY[i] - VELOCITY[0]
@@ -154,7 +154,7 @@ def rows(flat):
 
 
 def linear_momentum(y, params):
-    """From the energy: its derivative by a velocity is the body's momentum and G m v^2 v / c^2."""
+    """Return momenta from the energy: its derivative by a velocity is the body's momentum and G m v^2 v / c^2."""
     by_state, n = np.empty_like(y), y.size // 6
     library["eih.energy_gradient"](0.0, y, by_state, params)
     by_v, v, gm = by_state[3 * n :].reshape(-1, 3), y[3 * n :].reshape(-1, 3), params[:n, None]
@@ -301,7 +301,7 @@ def test_rotations(forces):
 
 
 def mercury(forces, mass=0.0, h=0.001, years=10.0):
-    """Mercury alone around the Sun, from its perihelion."""
+    """Return Mercury alone around the Sun, from its perihelion."""
     a, e = MERCURY["a"], MERCURY["e"]
     q, v = [a * (1 - e), 0, 0], [0, math.sqrt(GM_SUN * (1 + e) / (a * (1 - e))), 0]
     return nbody(
@@ -506,7 +506,7 @@ def test_test_particles_are_moved_by_no_correction():
 
 
 def test_a_particle_around_one_mass():
-    """No invariant knows anything of it: H and L are those of a Sun at rest, 0."""
+    """No invariant depends on the body: H and L are those of a Sun at rest, 0."""
     given = nbody([1.0, 0.0], np.eye(2, 3), [[0, 0, 0], [0, 0, 0.7]], t_span=(0.0, 10.0), h=0.01)
     run = integrate(given, method=EIPRK4)
     assert run.success
@@ -559,7 +559,7 @@ def two_bodies(eccentricity, apocentre=False, mass=1e-3):
 
 
 def flyby(speed):
-    """So many times the escape speed, far from the other body."""
+    """Return a flyby with this multiple of the escape speed, far from the other body."""
     return [1.0, 1.0], [[0, 0, 0], [10.0, 3.0, 0]], [[0, 0, 0], [-speed * math.sqrt(0.4 / 1.044), 0, 0]]
 
 

@@ -70,7 +70,7 @@ def test_linear_flow_is_free_motion_seen_from_a_rotating_frame(Omega, time):
 
 
 def test_linear_flow_in_three_dimensions():
-    """Along z the motion is free, and the rest does not see it."""
+    """The motion along z is free, and does not affect the other axes."""
     grid = Grid((48, 48, 24), (-9, -9, -8), (9, 9, 8))
     gpe = GrossPitaevskii(grid, Omega=0.5)
     x, y, z = grid.mesh()
@@ -136,7 +136,7 @@ METHODS = {
 
 
 def assert_order(found, method):
-    """That of the method; of "rkn6", whose errors of order 5 are tiny here, at least that."""
+    """The order is that of the method; for "rkn6", whose errors of order 5 are tiny here, at least that."""
     assert found > method.order - 0.25
     assert found < method.order + 0.25 or method.name == "splitting-rkn6"
 
@@ -144,7 +144,7 @@ def assert_order(found, method):
 @pytest.mark.parametrize("kept", [(), KEPT], ids=["raw", "EIP"])
 @pytest.mark.parametrize("method", METHODS)
 def test_soliton(method, kept):
-    """Against the closed form: the order of the method, projected or not; mass and energy to round-off if projected."""
+    """The error has the order of the method, projected or not; mass and energy are kept to round-off if projected."""
     scene = soliton(length=60.0, t_end=2.0)
     make, steps = METHODS[method]
     made = make(scene.equation)
@@ -161,7 +161,7 @@ def test_soliton(method, kept):
 
 @pytest.fixture(scope="module")
 def condensate():
-    """Two vortices off the centre of a rotating trap, well resolved, and the field at t = 0.5."""
+    """Return two vortices off the centre of a rotating trap, well resolved, and the field at t = 0.5."""
     grid = Grid((96, 96), -8, 8)
     gpe = GrossPitaevskii(grid, harmonic_trap(1, 1), Omega=0.6, beta=20.0)
     x, y = grid.mesh()

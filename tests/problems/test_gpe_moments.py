@@ -1,4 +1,4 @@
-"""Moments, which stand in for transforms in the projection of the Gross-Pitaevskii equation."""
+"""Moments, which replace transforms in the projection of the Gross-Pitaevskii equation."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def noise(grid, seed=7):
 
 
 def by_numpy(gpe, psi):
-    """The linear part by NumPy's transforms, each term by itself."""
+    """Return the linear part by NumPy's transforms, each term by itself."""
     grid = gpe.grid
     out = np.zeros_like(psi)
     x, y, *_ = grid.mesh()

@@ -1,4 +1,4 @@
-"""Surfaces of equal density: against shapes whose surface is known, and which part of them is around a vortex."""
+"""Surfaces of equal density: against known surfaces, and the part of them around a vortex."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The sums over pairs of N point masses: accuracy, symmetry, and the same bits however they are called."""
+"""The sums over pairs of N point masses: accuracy, symmetry, and the same bits by all ways to call them."""
 
 import os
 import pickle
@@ -25,7 +25,7 @@ SIZES = [1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 16, 17, 30, 100]
 
 
 def bodies(n, seed=0):
-    """Random masses, over six powers of ten, and a random state."""
+    """Return random masses, over six powers of ten, and a random state."""
     rng = np.random.default_rng([n, seed])
     return 10.0 ** rng.uniform(-6, 0, n), rng.standard_normal(6 * n)
 
@@ -38,7 +38,7 @@ def accelerations(gm, y):
 
 
 def exact_sums(gm, y):
-    """Accelerations, the sums of their terms' sizes, and the energy with that of its terms, in 40 digits."""
+    """Return accelerations, the sums of their terms' sizes, and the energy with that of its terms, in 40 digits."""
     n = gm.size
     with mpmath.workdps(40):
         m = [mpmath.mpf(x) for x in gm]
@@ -183,7 +183,7 @@ def test_bodies_at_one_place_are_not_finite(n):
 
 @njit
 def _repeated(y, gm, times):
-    """Inlined in a loop, and into a larger function."""
+    """Add up the results of the function, inlined in a loop and in a larger function."""
     out, total = np.empty(y.size), 0.0
     for _ in range(times):
         rhs(0.0, y, out, gm)
@@ -282,14 +282,14 @@ def test_frequencies_of_orbits_and_of_a_moon():
 
 
 def falling(t_span):
-    """Two bodies that fall from rest; they collide at pi / sqrt(8 G m) = 0.907."""
+    """Return two bodies that fall from rest; they collide at pi / sqrt(8 G m) = 0.907."""
     return nbody([1.0, 0.5], [[0, 0, 0], [1, 0, 0]], np.zeros((2, 3)), t_span=t_span, G=1.0)
 
 
 @pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
 @pytest.mark.parametrize("end", [0.3, -0.3])
 def test_a_pericentre_behind_the_end_of_a_run_does_not_bound_its_steps(method, end):
-    """The distance of bodies that fall from rest, by its closed form."""
+    """Return the distance of bodies that fall from rest, by its closed form."""
     run = integrate(falling((0, end)), method=method, h=0.003)
     r = run.y[3, -1] - run.y[0, -1]
     time = (np.sqrt(r * (1 - r)) + np.arccos(np.sqrt(r))) / np.sqrt(2 * 1.5)

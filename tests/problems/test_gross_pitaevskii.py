@@ -26,7 +26,7 @@ def noise(grid):
 
 
 def first_derivative(n, length):
-    """Matrix of the spectral first derivative on n (even) points (Trefethen, Spectral methods in MATLAB, eq. 3.10)."""
+    """Return the spectral first derivative on n (even) points (Trefethen, Spectral methods in MATLAB, eq. 3.10)."""
     j = np.arange(n)
     d = j[:, None] - j
     with np.errstate(divide="ignore"):
@@ -36,7 +36,7 @@ def first_derivative(n, length):
 
 
 def second_derivative(n, length):
-    """Matrix of the spectral second derivative with the Nyquist mode's own factor (the same, eq. 3.12)."""
+    """Return the spectral second derivative with the Nyquist mode's own factor (the same book, eq. 3.12)."""
     j = np.arange(n)
     d = j[:, None] - j
     with np.errstate(divide="ignore"):
@@ -51,7 +51,7 @@ def second_derivative(n, length):
 @pytest.mark.parametrize("nyquist", ["true", "zero"])
 @pytest.mark.parametrize("Omega", [0.0, 0.7])
 def test_two_dimensions_are_the_papers_dense_matrices(Omega, nyquist):
-    """Equation (3.10) with D1 of the y axis transposed; the paper's D2 is D1 applied twice."""
+    """Return equation (3.10) with D1 of the y axis transposed; the paper's D2 is D1 applied twice."""
     grid = Grid((12, 16), (-2, -3), (2, 4))
     gpe = GrossPitaevskii(grid, quartic_trap(1.2, 0.3, 1, 2), Omega=Omega, beta=1.5, nyquist=nyquist)
     psi, (x, y) = noise(grid), grid.mesh()

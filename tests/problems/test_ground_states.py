@@ -28,7 +28,7 @@ def trap(Omega=0.0, points=64, half=8.0, beta=100.0):
 
 
 def radial_energy(beta):
-    """Energy of the vortex-free state of V = r^2 / 2, from its radial equation as a boundary value problem.
+    """Return the energy of the vortex-free state of V = r^2 / 2, from its radial equation as a boundary value problem.
 
     With the norm N(r) as third component: u'' + u'/r = 2 (r^2 / 2 + beta u^2 - mu) u, N' = 2 pi r u^2.
     """

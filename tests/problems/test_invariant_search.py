@@ -1,4 +1,4 @@
-"""`find_invariants`: all of what is kept, nothing of what is not."""
+"""`find_invariants` finds all invariants, and nothing else."""
 
 import numpy as np
 import pytest
@@ -159,7 +159,7 @@ def test_tops_with_a_further_invariant():
     g1, g2 = np.array([0, 0, 0, 1.0, 0, 0]), np.array([0, 0, 0, 0, 1.0, 0])
 
     def quartic(y):
-        """Gradient of ((m1^2 - m2^2) / 4 - g1)^2 + (m1 m2 / 2 - g2)^2."""
+        """Return the gradient of ((m1^2 - m2^2) / 4 - g1)^2 + (m1 m2 / 2 - g2)^2."""
         a, b = (y[0] ** 2 - y[1] ** 2) / 4 - y[3], y[0] * y[1] / 2 - y[4]
         return 2 * a * ((y[0] * m1 - y[1] * m2) / 2 - g1) + 2 * b * ((y[1] * m1 + y[0] * m2) / 2 - g2)
 
@@ -222,7 +222,7 @@ def test_terms_of_time_and_state_jitted():
 
 
 def test_what_depends_on_time():
-    """Angular momentum of a trap that breathes; the energy of the same at one time is none."""
+    """The angular momentum of a trap that breathes is found; its energy at one time is not an invariant."""
 
     def trap(t, y):
         k = 1 + 0.3 * np.cos(t)
@@ -341,7 +341,7 @@ def test_the_slightest_damping_is_seen(damping):
 
 
 def test_friction_beyond_a_speed():
-    """Near the start all is kept."""
+    """Everything is conserved near the start."""
 
     def f(t, y):
         return np.array([y[1], -y[0] - 0.1 * y[1] * (abs(y[1]) > 1.3)])
@@ -372,7 +372,7 @@ def test_high_degrees(degree):
 
 
 def test_a_jump_along_the_trajectory():
-    """Points drawn around the start see nothing of it."""
+    """Points drawn around the start do not show it."""
 
     def f(t, y):
         return np.array([0.0, 1.0]) if y[1] < 1000.0 else np.array([1.0, 1.0])
@@ -424,7 +424,7 @@ def dissipative_system(seed):
 
 
 def kept_for(k):
-    """A ninth of the systems for the fast tests, as many again for the gate, the others for the nights."""
+    """The fast tests take 1/9 of the systems, the gate takes as many again, and the nights take the rest."""
     marks = {0: [], 4: [pytest.mark.slow]}.get(k % 9, [pytest.mark.slow, pytest.mark.nightly])
     return pytest.param(k, marks=marks)
 

@@ -254,7 +254,7 @@ def test_momenta_of_speeds_that_are_combinations_of_rates():
 
 @pytest.fixture(scope="module")
 def top():
-    """A free rigid body, by a quaternion and the speeds of its centre."""
+    """Return a free rigid body, by a quaternion and the speeds of its centre."""
     e, w = me.dynamicsymbols("e0:4"), me.dynamicsymbols("w1:4")
     place, velocity = me.dynamicsymbols("x y z"), me.dynamicsymbols("v1:4")
     N, B, C = me.ReferenceFrame("N"), me.ReferenceFrame("B"), me.Point("C")

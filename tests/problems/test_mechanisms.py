@@ -418,7 +418,7 @@ def _speed_gradient(problem, y):
 
 
 def particle(constrained_speeds):
-    """A particle on the parabola y = x^2, with or without the velocity constraint."""
+    """Return a particle on the parabola y = x^2, with or without the velocity constraint."""
     x, y, u, v = me.dynamicsymbols("x y u v")
     m, g = sympy.symbols("m g")
     N, origin = me.ReferenceFrame("N"), me.Point("O")
@@ -498,7 +498,7 @@ def test_a_system_of_sympy_gives_the_same_motion(by_speeds):
 
 
 def test_joints_of_a_system_of_sympy():
-    """Two rods on pins; the end of the second one slides along the line of x through the first pin."""
+    """The model has two rods on pins; the end of the second one slides along the line of x through the first pin."""
     m, g = sympy.symbols("m g")
     ground, rods = me.RigidBody("ground"), [me.RigidBody(f"rod{k}", mass=m) for k in range(2)]
     for rod in rods:

@@ -1,4 +1,4 @@
-"""Osculating elements: against REBOUND's own, at what is degenerate, and of whole runs."""
+"""Osculating elements: against REBOUND's own, in degenerate cases, and of whole runs."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ EPS = np.finfo(float).eps
 
 
 def turned(difference):
-    """A difference of angles, without whole turns."""
+    """Return a difference of angles, without whole turns."""
     return np.abs((difference + np.pi) % (2 * np.pi) - np.pi)
 
 
@@ -23,7 +23,7 @@ def state(sim):
 
 
 def both(sim, primary="heliocentric"):
-    """Our elements of a simulation and REBOUND's, the latter by name."""
+    """Return our elements of a simulation and REBOUND's, the latter by name."""
     own = orbital_elements(state(sim), [sim.G * p.m for p in sim.particles], primary=primary)
     theirs = sim.orbits(primary=sim.particles[0]) if primary == "heliocentric" else sim.orbits()
     return own, {name: np.array([getattr(orbit, name) for orbit in theirs]) for name in (*ANGLES, *LENGTHS)}

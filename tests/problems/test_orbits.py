@@ -1,4 +1,4 @@
-"""Orbits in systems of N bodies: their balances against mpmath, which body moves about which, and wrong input."""
+"""Orbits in systems of N bodies: their balances against mpmath, the choice of centres, and wrong input."""
 
 import copy
 import pickle
@@ -53,7 +53,7 @@ def groups(gm, y0):
 
 
 def accelerations(gm, q):
-    """Newton's, in mpmath; q (N, 3) of mpmath numbers."""
+    """Return Newton's accelerations, in mpmath; q (N, 3) of mpmath numbers."""
     n, out = len(gm), np.array([[MP.mpf(0)] * 3 for _ in gm])
     for i in range(n):
         for j in range(n):
@@ -143,7 +143,7 @@ def test_values_gradients_and_rates_are_those_of_mpmath(n, seed, moons):
 
 
 def spread(y, r, u):
-    """How much of the digits the difference of two places and velocities loses."""
+    """Return the loss of digits in the difference of two positions and velocities."""
     q, v = y.reshape(2, -1)
     return np.abs(q).max() / float(MP.sqrt(r @ r)) + np.abs(v).max() / float(MP.sqrt(u @ u))
 
@@ -284,7 +284,7 @@ ORBIT = [0.0, 2.0, 0.0, -1.0, 1.0, 1.0]
 
 
 def forged():
-    """Parameters of three bodies whose second orbit is none."""
+    """Return parameters of three bodies whose second orbit is not an orbit."""
     gm, wrong = [39.0, 1.0, 0.5], []
     for place, value in [(1, 1.0), (1, 4.0), (1, np.nan), (1, np.inf), (1, -3.0), (1, 1e300), (2, -1.0), (2, 3.0)]:
         wrong.append((place, value))

@@ -17,7 +17,7 @@ START = [0.8, 0.0, 0.0, 1.5**0.5]
 
 
 def error(problem, y0, t_end, truth, **options):
-    """Distance from the truth in all components."""
+    """Return the distance from the reference in all components."""
     run = integrate(problem, (0, t_end), y0, **options)
     return np.linalg.norm(run.y[:, -1] - truth), run
 

@@ -1,4 +1,4 @@
-"""Problems written as expressions: the reader, the functions, the brackets, runs against other ways to the same."""
+"""Problems written as expressions: the reader, the functions, the brackets, runs against other implementations."""
 
 import copy
 import dataclasses
@@ -173,7 +173,7 @@ print(json.dumps(reported))
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, pytest.param(len(BOMBS), marks=pytest.mark.nightly)])
 def test_what_would_take_hours_is_refused_in_seconds(count):
-    """In a process of its own, which is ended after a minute; seconds are those of the processor."""
+    """The script runs in its own process, which is ended after a minute; seconds are those of the processor."""
     done = subprocess.run(
         [sys.executable, "-c", TRIED],
         input=json.dumps(BOMBS[:count]),
@@ -233,7 +233,7 @@ TREES = st.recursive(
 
 @given(TREES)
 def test_functions_compute_what_the_text_says(text):
-    """Against Python's own arithmetic of the text, which is one of ours; not compiled, for there are many."""
+    """The expression agrees with Python's own arithmetic of the text; it is not compiled, because there are many."""
     from eip_scipy.problems.symbolic import program
 
     try:
@@ -727,7 +727,7 @@ def test_members_side_by_side_and_in_other_processes(monkeypatch):
 
 @pytest.mark.slow
 def test_code_is_the_same_in_every_process():
-    """Whatever the order of sets; this process has a seed of its own."""
+    """The result does not depend on the order of sets; this process has its own seed."""
     code = (
         "from eip_scipy import hamiltonian\n"
         f"rhs = hamiltonian({DOUBLE_PENDULUM!r}, 'th1 th2', 'p1 p2', params={PENDULUM_PARAMS!r}).rhs\n"

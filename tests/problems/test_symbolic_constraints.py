@@ -1,4 +1,4 @@
-"""`equations` with functions of time, and with constraints that are kept only where all of them hold."""
+"""`equations` with functions of time, and with constraints that are kept only if all of them hold."""
 
 import pickle
 

@@ -49,7 +49,7 @@ SYMBOLIC = {
 
 
 def difference(fun, x, along):
-    """The derivative of fun(x) along a direction."""
+    """Return the derivative of fun(x) along a direction."""
     steps = STEP / np.abs(along).max()
     return sum(w * (fun(x + k * steps * along) - fun(x - k * steps * along)) for k, w in WEIGHTS.items()) / steps
 
@@ -159,7 +159,7 @@ def test_kepler_and_harmonic(problem, parameters):
 
 
 def bodies(rng, n, test_particles=False):
-    """Random bodies that are not close to each other."""
+    """Return random bodies that are not close to each other."""
     gm = rng.uniform(0.1, 1.0, n)
     if test_particles:
         gm[1::2] = 0.0
@@ -184,7 +184,7 @@ AIR = {"drag": 0.2, "drag_radius": 0.9, "scale_height": 1.1, "spin": 0.3}
 @pytest.mark.parametrize("relativity", RELATIVITY, ids="+".join)
 @pytest.mark.parametrize("n", [2, 4, 10])
 def test_forces(relativity, others, n):
-    """With constants that make all of them as large as Newton's."""
+    """The constants make all forces as large as Newton's."""
     constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=n - 1, moon=0.3, **AIR)
     rng = np.random.default_rng(n)
     for particles in (False, True):
@@ -216,7 +216,7 @@ def test_newton_has_no_derivatives_by_masses():
 
 
 def test_columns_do_not_depend_on_each_other():
-    """So that a column has the bits that it has alone."""
+    """A column has the bits that it has alone."""
     rng = np.random.default_rng(4)
     problem = nbody(*bodies(rng, 10), t_span=(0.0, 1.0))
     columns = rng.standard_normal((19, 60))
@@ -252,7 +252,7 @@ def induced(t, x, y, z):
 
 
 def table(x, y, z):
-    """A field that numbers alone do: no dual numbers, no complex steps."""
+    """Return a field of plain numbers: no dual numbers, no complex steps."""
     return math.fsum((0.1, y * y)), math.fsum((0.2, x * z)), 1.0 + 0.2 * math.fsum((x, y)) ** 2
 
 

@@ -1,4 +1,4 @@
-"""Waves by lines: closed forms, invariants of the equations on the grid, and the methods that the problems bring."""
+"""Waves by lines: closed forms, invariants of the equations on the grid, and the methods of the problems."""
 
 import pickle
 
@@ -44,7 +44,7 @@ def scene(request):
 
 
 def rough(n, dtype=float, seed=1):
-    """A field with all of its modes, which no grid resolves."""
+    """Return a field with all of its modes, which no grid resolves."""
     parts = np.random.default_rng(seed).standard_normal((2, n))
     return parts[0] + 1j * parts[1] if dtype is complex else parts[0]
 
@@ -54,7 +54,7 @@ def slope_in_time(closed, t, d=2e-3):
 
 
 def rate(item, fun, y):
-    """The rate of an invariant, and its bound, the product of the gradient's norm and that of f."""
+    """Return the rate of an invariant, and its bound, the product of the gradient's norm and that of f."""
     f, gradient = fun(0.0, y), np.empty_like(y)
     item.grad(0.0, y, *((f,) if item.uses_f else ()), gradient)
     return abs(np.vdot(gradient, f).real), np.linalg.norm(gradient) * np.linalg.norm(f)
@@ -135,7 +135,7 @@ NEAR = {
 
 @pytest.mark.parametrize("made", EXACT)
 def test_invariants_of_the_equations_on_the_grid(made):
-    """For any field, however rough: to rounding."""
+    """The invariants are kept for any field, however rough, to rounding."""
     equation, items, y = EXACT[made]()
     for item in items:
         found, size = rate(item, equation.fun, y)
@@ -163,7 +163,7 @@ ALL = EXACT | {f"{name}, momenta": make for name, make in NEAR.items()}
 
 @pytest.mark.parametrize("made", ALL)
 def test_gradients(made):
-    """Against differences of the values."""
+    """Gradients agree with differences of the values."""
     equation, items, y = ALL[made]()
     for item in items:
 

@@ -1,4 +1,4 @@
-"""One meaning of `fun` for all methods: the derivative of y = (q, v); accelerations have an argument of their own."""
+"""One meaning of `fun` for all methods: the derivative of y = (q, v); accelerations have a separate argument."""
 
 import ctypes
 import math
@@ -65,7 +65,7 @@ JITTED = {fun: njit(fun) for fun in (spring, spring_in_place, field)}
 
 
 def exact(t):
-    """q'' = -4 q in closed form."""
+    """Return the closed form of q'' = -4 q."""
     q, v = Y0[:2], Y0[2:]
     return np.append(q * np.cos(2 * t) + v / 2 * np.sin(2 * t), v * np.cos(2 * t) - 2 * q * np.sin(2 * t))
 
@@ -99,7 +99,7 @@ def test_accelerations_and_fields_of_second_order_methods(method, how):
 
 
 def test_every_method_takes_accelerations(tmp_path):
-    """Runge-Kutta methods have the bits of the field made of them; C functions work by their address."""
+    """Runge-Kutta methods have the bits of the field derived from accelerations; C functions work by their address."""
     run = integrate(acceleration=spring, t_span=(0, 3), y0=Y0, method=EIPRK4, h=0.01)
     np.testing.assert_array_equal(run.y, integrate(field, (0, 3), Y0, method=EIPRK4, h=0.01).y)
     given = {"t_span": (0, 3), "y0": Y0, "method": EIPRKN12, "rtol": 1e-10}
@@ -147,7 +147,7 @@ def test_the_old_call_in_place_and_by_pointer(tmp_path):
 
 
 def test_what_is_neither():
-    """No first-order field of (q, v); what the user's own function raises is passed on."""
+    """The function is not a first-order field of (q, v); errors of the user's own function are passed on."""
     with pytest.raises(ValueError, match="acceleration=fun"):
         integrate(lambda t, y: -y, (0, 1), [1.0, 0.0], method=EIPRKN12, rtol=1e-8)
     with pytest.raises(ValueError, match=r"first 1 components of fun must be v.*or eip_scipy\.solve_ivp"):
@@ -166,14 +166,14 @@ def test_what_is_neither():
 
 
 def test_accelerations_that_depend_on_velocities():
-    """They are the second half of fun: q'' = -q - v/50, whose solution decays as exp(-t/100)."""
+    """Accelerations are the second half of fun: q'' = -q - v/50, whose solution decays as exp(-t/100)."""
     rate = math.sqrt(1 - 1e-4)
     run = integrate(lambda t, y: np.array([y[1], -y[0] - y[1] / 50]), (0, 10), [1.0, -0.01], method=EIPGJ12, h=0.01)
     np.testing.assert_allclose(run.y[0, -1], math.exp(-0.1) * math.cos(10 * rate), rtol=0, atol=1e-12)
 
 
 def test_a_field_made_of_accelerations():
-    """As the function of a Problem and in solve_ivp; it pickles where the acceleration does."""
+    """Accelerations work as the function of a Problem and in solve_ivp; the field pickles if the acceleration does."""
     made = AccelerationField(spring)
     np.testing.assert_array_equal(made(0.0, Y0), field(0.0, Y0))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(made))(0.0, Y0), field(0.0, Y0))

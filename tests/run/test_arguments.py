@@ -1,4 +1,4 @@
-"""`args` of integrate and ensemble: as SciPy hands them on, natively where they are numbers."""
+"""`args` of integrate and ensemble: passed on as SciPy does, natively if they are numbers."""
 
 import ctypes
 from pathlib import Path

@@ -248,7 +248,7 @@ def test_a_checkpoint_belongs_to_its_rates(tmp_path):
 
 @pytest.mark.parametrize("options", RUNS)
 def test_a_run_is_continued(options):
-    """Q goes on from its value at the end, and begins again in a state between two steps."""
+    """Q continues from its value at the end, and starts again in a state between two steps."""
 
     def third_zero(t, y, p):
         return y[0]
@@ -350,7 +350,7 @@ def stiffness(t, q, dq, out):
     [(EIPGJ12, 150, 5e-9, 5e-11), (EIPGJ14, 110, 5e-10, 5e-11)],
 )
 def test_a_perturbed_planet_by_multistep_methods(method, parts, plain_error, error):
-    """Against a Nystrom method with shorter steps that carries its rounding, right to 5e-12."""
+    """The reference is a Nystrom method with shorter steps and compensated sums, accurate to 5e-12."""
     period = 2 * np.pi
     y0, t_span = [0.8, 0.0, 0.0, 1.5**0.5], (0, 300.37 * period)
     right = integrate(perturbed, t_span, y0, method=EIPRKN12, h=period / 120, compensated=True).y[:, -1]
@@ -365,7 +365,7 @@ def test_a_perturbed_planet_by_multistep_methods(method, parts, plain_error, err
 
 
 def test_a_failed_step_leaves_the_value_alone():
-    """The last state is handed out on the value that belongs to it, not to the step that failed."""
+    """The last state is returned on its own value, not on that of the failed step."""
 
     def failing(t, y):
         return swinging(t, y, PARAMS) if t < 3.05 else np.full(2, np.nan)

@@ -118,7 +118,7 @@ FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]
 
 
 def same(one, other):
-    """Every number of two results."""
+    """Compare every number of two results."""
     assert other.message.startswith(one.message)
     for key in ("t", "y", "invariants", "max_defect"):
         np.testing.assert_array_equal(one[key], other[key], err_msg=key)
@@ -212,7 +212,7 @@ def test_time_dependent_functions():
 
 
 def test_n_bodies():
-    """A vector-valued invariant in place, blocks and a frame."""
+    """Return a vector-valued invariant in place, blocks and a frame."""
     rng = np.random.default_rng(1)
     gm, q = np.array([1.0, 1e-3, 2e-4]), np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0.1]])
     v = np.array([[0.0, 0, 0], [0, 1.0, 0.1], [-0.7, 0, 0]]) + 1e-3 * rng.standard_normal((3, 3))

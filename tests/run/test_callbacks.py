@@ -1,4 +1,4 @@
-"""Runs with a callback at every step: as long as one likes, whatever stops them, and endless intervals."""
+"""Runs with a callback at every step: of any length, with any end, and on endless intervals."""
 
 import itertools
 import math
@@ -52,7 +52,7 @@ def run(steps, how="interpreted", n=MANY, **options):
 
 
 def many(steps, how, n, tmp_path, **options):
-    """A run of n steps with a callback at each, whole and resumed half way; returns the number of calls in each."""
+    """Run n steps with a callback at each, at once and resumed half way; return the number of calls in each."""
     calls = itertools.count()
     plain = run(steps, how, n, callback=lambda t, y, d: next(calls) and None, **options)
     assert plain.status == 0

@@ -1,4 +1,4 @@
-"""Checkpoint files and runs that are broken off and resumed: bit for bit, whatever happens to process, disk or file."""
+"""Checkpoint files and runs that are stopped and resumed: bit for bit, after any fault of process, disk or file."""
 
 import contextlib
 import errno
@@ -170,7 +170,7 @@ AT_ONCE = ("compensated, every auto", "events", "Nystrom")
 
 
 def same(one, other):
-    """Every number of two results."""
+    """Compare every number of two results."""
     for key in ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "method", "h"):
         np.testing.assert_array_equal(one[key], other[key], err_msg=key)
     for key in ("t_events", "y_events"):
@@ -186,7 +186,7 @@ def same(one, other):
 
 @pytest.fixture
 def fine(monkeypatch):
-    """Short chunks, and a snapshot after each; what a checkpoint does not hold is NaN in a run that is resumed."""
+    """Return short chunks with a snapshot after each; values that are not in a checkpoint are NaN in a resumed run."""
     monkeypatch.setattr(longrun, "FIRST_CHUNK", 5)
     monkeypatch.setattr(longrun, "CHUNK_SECONDS", 0.0)
     monkeypatch.setattr(resume, "SNAPSHOT_SECONDS", 0.0)
@@ -222,7 +222,7 @@ def broken_off(monkeypatch, calls):
 
 
 def resumed(case, path, monkeypatch, first=7, more=9):
-    """A run broken off again and again; the result, and how often it was."""
+    """Stop a run repeatedly; return the result, and the number of stops."""
     fun, y0, options = case
     for k in range(1000):
         with contextlib.suppress(BrokenOffError), broken_off(monkeypatch, first if k == 0 else more):
@@ -272,7 +272,7 @@ def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
     "error", [BrokenOffError, pytest.param(KeyboardInterrupt, marks=[pytest.mark.nightly, pytest.mark.slow])]
 )
 def test_broken_off_inside_a_step(name, error, tmp_path):
-    """Wherever a step is left, its half-filled buffers are not what is kept."""
+    """A step may be left anywhere: its half-filled buffers are not kept."""
     fun, y0, options = CASES[name]
     whole = integrate(fun, SPAN, y0, **options)
     for last in (9, *range(150, 158), whole.nfev - 10):
@@ -332,7 +332,7 @@ def test_the_progress_bar_goes_on(name, total, tmp_path, monkeypatch):
 
 
 def checkpoint_step(error):
-    """The step that the note of an exception names."""
+    """Return the step that the note of an exception names."""
     (note,) = error.__notes__
     return int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True continues", note)[1])
 
@@ -365,7 +365,7 @@ def test_a_result_is_there_at_once(tmp_path):
 
 @pytest.mark.usefixtures("fine")
 def test_a_callback_that_stops_may_be_asked_again(tmp_path):
-    """A run that was stopped for lack of time goes on; one that was stopped for what it saw ends there again."""
+    """A run that was stopped for lack of time continues; one that was stopped by its states ends there again."""
     whole = integrate(orbit, SPAN, Y0, **FIXED)
     path = tmp_path / "run"
     late = integrate(orbit, SPAN, Y0, checkpoint=path, callback=lambda t, y, defects: t > 3.0, **FIXED)
@@ -378,7 +378,7 @@ def test_a_callback_that_stops_may_be_asked_again(tmp_path):
 
 @pytest.mark.usefixtures("fine")
 def test_a_run_in_portions(tmp_path):
-    """Each stopped by its callback: every portion is kept, though all end alike."""
+    """Each part is stopped by its callback: every part is kept, though all end alike."""
     whole, path, steps = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", []
     for portion in range(1, 6):
         found = integrate(
@@ -400,7 +400,7 @@ def test_a_callback_may_stop_at_the_start(tmp_path):
 
 @pytest.mark.usefixtures("fine")
 def test_each_saved_point_reaches_a_callback(tmp_path, monkeypatch):
-    """At least once: what came after the last snapshot is done again."""
+    """Each point reaches the callback at least once: those after the last snapshot are computed again."""
     whole, path, seen = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", []
     case = (orbit, Y0, FIXED | {"callback": lambda t, y, defects: seen.append(t)})
     found, times = resumed(case, path, monkeypatch)
@@ -597,7 +597,7 @@ OTHERS = {
 
 @pytest.fixture(scope="module")
 def old_run(tmp_path_factory):
-    """A finished run of FIXED, and its file."""
+    """Return a finished run of FIXED, and its file."""
     path = tmp_path_factory.mktemp("checkpoint") / "run"
     return integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED), path
 
@@ -643,7 +643,7 @@ def test_another_function_is_seen_by_its_value_at_the_start(old_run):
 
 @pytest.mark.usefixtures("fine")
 def test_functions_may_differ_by_rounding(tmp_path, monkeypatch):
-    """As on another processor: the run goes on, and its targets stay what they were."""
+    """The run continues, as on another processor, and its targets remain unchanged."""
     path = tmp_path / "run"
     with pytest.raises(BrokenOffError), broken_off(monkeypatch, 9):
         integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
@@ -835,7 +835,7 @@ def small_file(path):
 
 
 def outcome(path):
-    """Return what is read, or that the file is refused by the one kind of error."""
+    """Return the contents, or check that the file is refused by the one kind of error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
@@ -1103,7 +1103,7 @@ def test_interrupted_with_a_full_disk(reason, tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("fine")
 def test_interrupted_while_the_result_is_written(tmp_path, monkeypatch):
-    """The run is done: all of it is in the partial result, and in the file after all."""
+    """The run is complete: all of it is in the partial result, and in the file as well."""
     whole, path, write = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", checkpoint.write
 
     def interrupt_once(path, header, arrays):

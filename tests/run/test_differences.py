@@ -1,4 +1,4 @@
-"""C functions without gradients: what the differences are worth, and the bits of both ways to compute them."""
+"""C functions without gradients: accuracy of the differences, and the bits of both ways to compute them."""
 
 import ctypes
 
@@ -60,7 +60,7 @@ int logarithm(double t, const double *y, double *out, const double *p) {
 
 @pytest.fixture(scope="module")
 def c(tmp_path_factory):
-    """The C functions by their names; a new pointer each time."""
+    """Return the C functions by their names, with a new pointer each time."""
     folder = tmp_path_factory.mktemp("differences")
     text = "int {}(double t, const double *y, double *out, const double *p) {{ out[0] = {}; return 0; }}\n"
     source = SYSTEM + "".join(text.format(name, given) for name, (given, _) in FUNCTIONS.items())

@@ -215,7 +215,7 @@ def test_backward_in_time():
 
 
 def test_one_step_methods_look_inside_too():
-    """Their steps leave no derivative; the event's rate takes one evaluation more."""
+    """Steps of these methods leave no derivative; the event's rate takes one evaluation more."""
     method = eip_method(Verlet())
     run = integrate(oscillator, (0, SPAN), START, method=method, h=0.3, events=reaching(0.97))
     assert run.t_events[0].size == passages(0.97).size
@@ -256,7 +256,7 @@ def test_counts_go_on_in_a_continued_run(as_compiled):
 
 @pytest.mark.parametrize("phase", np.linspace(0.1, 0.7, 7))
 def test_an_event_that_ended_a_run_does_not_happen_again_at_once(phase):
-    """Whatever the sign of the rounding error there: it next happens at the next passage, and ends the run again."""
+    """The event next happens at the next passage, whatever the sign of the rounding error, and ends the run again."""
     event, times = reaching(0.9 * math.cos(phase), terminal=True), passages(0.9 * math.cos(phase))
     run = integrate(oscillator, (0, SPAN), START, method=EIPDOP853, h=0.1, events=event)
     for count in range(1, 6):

@@ -28,7 +28,7 @@ def run():
 
 @pytest.fixture
 def windows():
-    """A backend whose figures have windows, of which nothing is seen."""
+    """Use a backend whose figures have invisible windows."""
     from matplotlib.backend_bases import FigureManagerBase
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -63,7 +63,7 @@ def test_pyplot_shows_the_figure_in_a_window(run, windows):
 
 
 def test_windows_do_not_add_up(run, windows, tmp_path, monkeypatch):
-    """As many are open at most as matplotlib allows before it warns, which is an error in these tests."""
+    """At most as many figures are open as matplotlib allows before it warns, which is an error in these tests."""
     monkeypatch.setitem(windows.rcParams, "figure.max_open_warning", 4)
     own = windows.figure()
     figures = [run.plot() for _ in range(6)]
@@ -122,7 +122,7 @@ CELLS = {
 
 @pytest.mark.slow
 def test_a_notebook_shows_the_figure_once(monkeypatch):
-    """Without the magic of IPython, and then with it."""
+    """The figure is shown without the magic of IPython, and with it."""
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     monkeypatch.delenv("MPLBACKEND")  # that of these tests

@@ -1,4 +1,4 @@
-"""`integrate`: what it saves and returns, counts, interpolation, compensation, computed gradients, and checks."""
+"""`integrate`: saved and returned values, counts, interpolation, compensation, computed gradients, and checks."""
 
 import math
 from fractions import Fraction
@@ -165,7 +165,7 @@ def test_t_eval_without_the_ends():
 
 
 def test_interpolation_is_of_order_four():
-    """Between steps of a method whose own error is far smaller."""
+    """Interpolation is between steps of a method whose own error is far smaller."""
 
     def error(h):
         times = np.linspace(0, 2, 337)
@@ -176,7 +176,7 @@ def test_interpolation_is_of_order_four():
 
 
 def test_interpolation_is_hermite_s():
-    """Cubic with the slopes of both ends, and that of solve_ivp's dense output."""
+    """Interpolation is cubic with the slopes of both ends, as the dense output of solve_ivp."""
     times = np.linspace(0.0, 1.0, 41)
     ours = run(t_eval=times, invariants=SQUARE).y
     options = {"method": EIPRK4, "h": 0.1, "invariants": SQUARE}
@@ -207,7 +207,7 @@ def test_callback_sees_the_saved_points():
     "options", [{"save_every": 2}, {"t_eval": np.linspace(0, 1, 21)}, {"t_eval": [0.0, 0.37, 0.41, 0.9]}]
 )
 def test_callback_stops_the_run(options):
-    """The point at which it said so is the last one."""
+    """The last point is the one at which the callback stopped the run."""
     seen = []
 
     def callback(t, y, defects):
@@ -312,7 +312,7 @@ def test_options_override_the_problem():
 
 
 def test_params_override_the_problem_s_everywhere():
-    """In the equations and in the invariants, or H would not be kept."""
+    """The parameters are replaced in the equations and in the invariants; otherwise H would not be kept."""
     problem = kepler(0.6, 0.0)
     stronger = integrate(problem, (0, 5), method=EIPRK4, params=[0.05], h=0.01)
     same = integrate(kepler(0.6, 0.05), (0, 5), method=EIPRK4, h=0.01)
@@ -469,7 +469,7 @@ def test_max_defect_is_that_of_the_steps():
 
 
 def test_diagnostics_of_spaced_projections_are_those_after_projections():
-    """Whatever is saved in between."""
+    """The defect does not depend on the saved states."""
     options = {"h": 0.25, "invariants": SQUARE, "every": 2}
     assert run(save_every=1, **options).diagnostics.max_defect == run(**options).diagnostics.max_defect
 
@@ -739,7 +739,7 @@ def test_project_initial_on_the_targets_changes_nothing():
 
 
 def test_targets():
-    """Given, by default the value at the start; one number for several values too."""
+    """A target is given, or is the value at the start by default; one number holds for several values too."""
     given = Invariant(SQUARE.fun, SQUARE.grad, target=5.0)
     np.testing.assert_array_equal(run(invariants=given).y, run(invariants=SQUARE).y)
     near = Invariant(SQUARE.fun, SQUARE.grad, target=5.0 * (1 + 5e-9))

@@ -1,4 +1,4 @@
-"""Ctrl-C where Python drops it, in a destructor: a run ends all the same, with what it had."""
+"""Ctrl-C in a destructor, where Python drops it: a run ends nevertheless, with its results."""
 
 import signal
 import subprocess
@@ -94,7 +94,7 @@ def test_a_handler_of_ones_own_stays():
 
 
 def test_other_threads():
-    """They cannot install a handler, and what the main thread keeps is not theirs to raise."""
+    """Other threads cannot install a handler, and must not raise an interrupt of the main thread."""
     found = []
 
     def run():

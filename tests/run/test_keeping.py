@@ -64,7 +64,7 @@ def same(one, other):
 
 @pytest.fixture
 def often(monkeypatch):
-    """Checkpoints after each step or so."""
+    """Return options of checkpoints after about every step."""
     from eip_scipy.run import integrate as longrun
 
     monkeypatch.setattr(longrun, "FIRST_CHUNK", 5)
@@ -85,7 +85,7 @@ def forker(tmp_path_factory):
 
 
 def at_once(action):
-    """A callback that acts at its first call."""
+    """Return a callback that acts at its first call."""
     calls = []
 
     def callback(*_):
@@ -158,7 +158,7 @@ IN_USE = rf"in use by another run, of process {os.getpid()} on \S+, this one\. W
 
 @keeping
 def test_a_second_call_is_refused(keep, tmp_path, monkeypatch):
-    """Also by another way to the same file; the first one is not disturbed, and leaves nothing behind."""
+    """The file is refused by another path as well; the first run is not disturbed, and leaves no files."""
     place, seen = tmp_path / "kept", []
     link = tmp_path / "link"
     monkeypatch.chdir(tmp_path)
@@ -293,7 +293,7 @@ def test_where_locks_do_not_work(number, keep, tmp_path, monkeypatch):
 
 @posix
 def test_a_folder_that_cannot_be_written_to(tmp_path, monkeypatch):
-    """A finished run is read there."""
+    """A finished run can be read there."""
     whole, place = run(tmp_path / "kept"), tmp_path / "kept"
     opened = os.open
 
@@ -308,7 +308,7 @@ def test_a_folder_that_cannot_be_written_to(tmp_path, monkeypatch):
 
 @posix
 def test_a_link_in_the_place_of_the_lock(tmp_path):
-    """Planted by another user of the folder: it is not followed."""
+    """A link planted by another user of the folder is not followed."""
     (tmp_path / "precious").write_bytes(b"precious")
     (tmp_path / ".kept.eip_scipy-lock").symlink_to(tmp_path / "precious")
     with pytest.raises(CheckpointError, match="cannot write"):
@@ -318,7 +318,7 @@ def test_a_link_in_the_place_of_the_lock(tmp_path):
 
 @pytest.mark.slow
 def test_one_holder_at_any_time(tmp_path):
-    """Though each removes the lock's file when it goes: those who have it open already find that out."""
+    """Each run removes the lock's file when it ends: others that have it open detect that."""
     inside, most, taken, end = [0], [0], [0], time.monotonic() + 2.0
 
     def compete():
@@ -356,7 +356,7 @@ def test_a_file_that_is_taken_away_comes_back(tmp_path):
 
 @pytest.mark.parametrize("keep", [kept_by_integrate, kept_by_ensemble])
 def test_a_folder_in_the_place_of_the_file(keep, tmp_path):
-    """The run ends all the same."""
+    """The run ends nevertheless."""
     place = tmp_path / "kept"
 
     def change():
@@ -475,7 +475,7 @@ def test_evaluations_for_it_are_not_counted(tmp_path):
 
 
 def test_a_function_that_no_longer_answers(tmp_path):
-    """The one that breaks the run off cannot be asked again; the run is kept all the same."""
+    """The exception that stops the run cannot be inspected again; the run is kept nevertheless."""
     gone = []
 
     def fun(t, y):
@@ -597,7 +597,7 @@ def test_a_handler_of_the_user_s_stays(handler, tmp_path, terminated):
 
 @posix
 def test_sigterm_in_a_thread(tmp_path, forker):
-    """No handler can be installed from there: the process ends at once, with the checkpoint that there is."""
+    """No handler can be installed from there: the process ends at once, with the existing checkpoint."""
     code = """
         import os, signal, threading, time
         from test_keeping import run
@@ -619,7 +619,7 @@ def test_sigterm_in_a_thread(tmp_path, forker):
 
 @posix
 def test_sigterm_without_a_checkpoint(forker):
-    """There is nothing to keep: it does what it always does."""
+    """There is nothing to keep: the signal has its usual effect."""
     code = """
         import os, signal
         from test_keeping import orbit, Y0
@@ -672,7 +672,7 @@ def test_sigterm_inside_a_compiled_run(tmp_path, forker):
 
 @pytest.fixture(params=["512k"])
 def small_disk(tmp_path, request):
-    """A file system of 512 kB, unless the test wants another."""
+    """Return a file system of 512 kB, unless the test asks for another."""
     place = tmp_path / "disk"
     place.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={request.param}", "tmpfs", str(place)]
@@ -687,7 +687,7 @@ def small_disk(tmp_path, request):
 
 
 def fill(folder):
-    """All that is left."""
+    """Fill the remaining space."""
     with open(folder / "filler", "wb", buffering=0) as stream:
         while True:
             try:
@@ -698,7 +698,7 @@ def fill(folder):
 
 @pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
 def test_a_disk_fills_up_while_the_run_grows(small_disk):
-    """No room for the former checkpoint and the next one: the run ends all the same, and the former one is whole."""
+    """There is no room for the former checkpoint and the next one: the run ends, and the former one is intact."""
     place, options = small_disk / "kept", {"save_every": 1, "h": 0.003}
     whole = integrate(orbit, SPAN, Y0, **OPTIONS | options)
     match = r"no space left on device; it still holds step .* The result is complete"

@@ -1,4 +1,4 @@
-"""Functions that do what they should not: compiled runs, interpreted ones and solve_ivp give one answer.
+"""Functions with faults: compiled runs, interpreted ones and solve_ivp give one answer.
 
 They write to the states they are given, leave `out` as it was, or return something else on the way than at the start.
 """
@@ -37,7 +37,7 @@ def filling_gradient(t, y, out):
 
 
 def as_given(fun, options):
-    """The function, which is an acceleration where the method is Nystrom's, the interval and the start."""
+    """Return the function, which is an acceleration if the method is Nystrom's, the interval and the start."""
     return {"acceleration" if options["method"] is EIPRKN8 else "fun": fun, "t_span": (0, 1), "y0": Y0}
 
 
@@ -142,7 +142,7 @@ def test_right_hand_sides_that_write(how, fun, method):
 
 
 def test_scipy_s_class_is_changed_by_them():
-    """So the test above can fail."""
+    """The test above is able to fail."""
     plain, written = (solve_ivp(f, (0, 1), Y0, method=RK45).y[:, -1] for f in (oscillator, writing))
     assert np.abs(plain - written).max() > 1
 
@@ -217,7 +217,7 @@ def test_invariants_without_gradients_that_write():
 
 @compiled_at_night
 def test_events_that_write(how):
-    """Neither the state nor what the next event sees."""
+    """Neither the state nor the input of the next event changes."""
     events = [event_that_writes, lambda t, y: y[1] - 1.0]
     found, plain = (how(invariants=KEPT, events=e) for e in (events, [lambda t, y: y[0], events[1]]))
     np.testing.assert_array_equal(found.y, plain.y)
@@ -431,7 +431,7 @@ def test_events_that_change(value, start):
     ["fun", *(pytest.param(part, marks=[pytest.mark.nightly, pytest.mark.slow]) for part in ("value", "gradient"))],
 )
 def test_compiled_functions_that_return_none(part):
-    """Such a function does not enter compiled code, and what is interpreted says what is wrong."""
+    """Such a function does not enter compiled code, and the interpreted error says what is wrong."""
 
     def fun(t, y):
         return np.array([y[1], -y[0]]) if t < 0.5 or part != "fun" else None
@@ -455,7 +455,7 @@ def test_compiled_functions_that_return_none(part):
 @pytest.mark.parametrize("part", ["fun", "value", "gradient"])
 @pytest.mark.parametrize("late", [1, 3])
 def test_compiled_shapes_that_change(part, late):
-    """Neither spread over the components, nor written or read beyond an array's end."""
+    """Values are neither spread over the components, nor written or read beyond an array's end."""
     number = ["fun", "value", "gradient"].index(part)
 
     @njit

@@ -1,4 +1,4 @@
-"""C functions by pointer: the bits of the same functions in Python and Numba, their statuses, what is refused."""
+"""C functions by pointer: the bits of the same functions in Python and Numba, their statuses, refused functions."""
 
 import ctypes
 import gc
@@ -36,13 +36,13 @@ def twice(t, y, f, out, params):
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    """The name of the C functions' library."""
+    """Return the name of the C functions' library."""
     return str(shared_library(tmp_path_factory.mktemp("pointers") / "functions.so", HERE / "pointers.c", KEPLER))
 
 
 @pytest.fixture(scope="module")
 def c(library):
-    """The C functions, by ctypes; gradients are known by their names."""
+    """Return the C functions, by ctypes; gradients are known by their names."""
     found = ctypes.CDLL(library)
 
     class Functions:
@@ -109,7 +109,7 @@ def mass_gradient(t, y):
 
 
 def kepler_s(fun, H, dH, L, dL, event):
-    """Arguments of `integrate`: Kepler's problem by these functions."""
+    """Return arguments of `integrate`: Kepler's problem by these functions."""
     invariants = [Invariant(H, dH, name="H", uses_f=True), Invariant(L, dL, name="L")]
     return {"fun": fun, "t_span": (0, 30), "y0": Y0, "params": MU, "invariants": invariants, "events": event}
 
@@ -240,7 +240,7 @@ def test_all_kinds_of_pointers(c, library):
 
 
 def test_the_run_holds_the_only_reference():
-    """To a function that is gone with its ctypes object, or with that of cffi."""
+    """The user's references to the function are gone with its ctypes object, or with that of cffi."""
 
     def circle(t, y, out, params):
         out[0], out[1] = y[1], -y[0]
@@ -292,7 +292,7 @@ native_or_not = pytest.mark.parametrize("compiled", [True, False], ids=["native"
 
 
 def ending(c, k, status, **options):
-    """The oscillator to t = 3, the k-th of its functions with a status after t = 1 (99: it fills nothing)."""
+    """Return the oscillator to t = 3, the k-th of its functions with a status after t = 1 (99: it fills nothing)."""
     params = np.zeros(5)
     params[[0, 1 + k]] = 1.0, status
     kept = Invariant(c.ending_square, c.ending_gradient, name="S")
@@ -567,7 +567,7 @@ def test_members_end_by_an_event_within_the_loop(c, more):
 
 
 def of_eight(c):
-    """Kepler's problem for one member and for eight."""
+    """Return Kepler's problem for one member and for eight."""
     kept = Invariant(
         CFunctions(c.kept, c.kept_of_eight), CFunctions(c.kept_gradient, c.kept_of_eight_gradient), size=2, name="H L"
     )

@@ -54,7 +54,7 @@ def test_adaptive_where_it_is_asked_for(how, method, options):
     "options", [{}, {"first_step": None}, {"max_step": np.inf}, {"first_step": None, "max_step": np.inf}]
 )
 def test_a_problem_s_own_step_otherwise(how, options):
-    """None and inf are what first_step and max_step are anyway: they ask for nothing."""
+    """None and inf are the defaults of first_step and max_step: they request nothing."""
     h, *found = how(PROBLEM, method=EIPRK4, **options)
     assert h == PROBLEM.h
     _, *expected = how(BARE, method=EIPRK4, h=PROBLEM.h)
@@ -93,7 +93,7 @@ def test_a_step_and_bounds_of_adaptive_ones_contradict(how):
 
 
 def test_rtol_is_obeyed():
-    """Not dropped in favour of the problem's own step."""
+    """The argument is not dropped in favour of the problem's own step."""
     coarse, fine = (
         integrate(PROBLEM, method=EIPDOP853, rtol=rtol, atol=1e-3 * rtol, compiled=False) for rtol in (1e-4, 1e-12)
     )
@@ -105,7 +105,7 @@ def test_rtol_is_obeyed():
 
 @pytest.mark.needs_jit
 def test_compiled_runs_and_their_checkpoints(tmp_path):
-    """Resumed by the same arguments, not by those of the other kind of steps."""
+    """A run is resumed by the same arguments, not by those of the other kind of steps."""
     options = {"method": EIPRK45, "rtol": 1e-6, "checkpoint": tmp_path / "a.npz"}
     first = integrate(PROBLEM, **options)
     again = integrate(PROBLEM, **options, resume=True)

@@ -18,7 +18,7 @@ FACTOR = 10.0
 
 
 def error(y, exact):
-    """As `recommend` means it."""
+    """Return the error as `recommend` defines it."""
     return np.abs(y - exact).max() / np.abs(exact).max()
 
 

@@ -46,7 +46,7 @@ def of_solve_ivp(**options):
 
 
 def failed_run():
-    """A step that fails, at t = 1."""
+    """Return a run with a step that fails, at t = 1."""
     return integrate(lambda t, y: y if t < 1 else np.full(2, np.nan), (0, 2), Y0, method=EIPRK4, h=0.1)
 
 
@@ -125,7 +125,7 @@ def test_tables_of_named_sensitivities():
 
 
 def test_errors_are_from_the_target():
-    """Which the first saved row need not show."""
+    """The first saved row need not have this value."""
     energy = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=5.0, name="S")
     run = integrate(oscillator, (0, 2), Y0, method=EIPRK4, h=0.1, invariants=energy, t_eval=[1.0, 2.0])
     np.testing.assert_array_equal(run.target, [5.0])

@@ -88,7 +88,7 @@ def upright(t, y):
 
 
 def run(method, events=None, span=(0.0, 30.0), **options):
-    """Kepler by Numba functions; a Nystrom method gets its acceleration."""
+    """Return Kepler's problem by Numba functions; a Nystrom method gets its acceleration."""
     if method in NYSTROM:
         given = {"y0": PROBLEM.y0, "params": PROBLEM.params, "invariants": PROBLEM.invariants, "blocks": 2}
         return integrate(acceleration=acceleration, t_span=span, method=method, events=events, **given, **options)
@@ -108,7 +108,7 @@ def assert_same(one, other):
 @methods
 @pytest.mark.parametrize("span", [(0.0, 30.0), (30.0, 0.0)], ids=["forward", "backward"])
 def test_roots_and_samples_of_compiled_and_interpreted_runs(method, steps, span):
-    """Return the same bits."""
+    """Compiled and interpreted runs give the same bits."""
     times = np.linspace(*span, 500)
     options = {"t_eval": times, "events": EVENTS, "span": span, "dense_output": True, **steps}
     compiled, interpreted = run(method, **options), run(method, compiled=False, **options)
@@ -131,7 +131,7 @@ def test_roots_of_a_complex_state():
 
 @pytest.mark.parametrize(("method", "steps"), [STEPS["RK4"], STEPS["RK45"], STEPS["DOP853"]])
 def test_integrate_and_solve_ivp_agree(method, steps):
-    """Values at t_eval, roots and states there: SciPy's loop and this one, with the same functions in Python."""
+    """Values at t_eval, roots and states there agree: SciPy's loop and this one, with the same functions in Python."""
     p = PROBLEM.params
     events = [lambda t, y, f=event: f(t, y, p) for event in EVENTS]
     events[1].direction = 1.0
@@ -235,7 +235,7 @@ NYSTROM4 = NystromTableau(
 
 @pytest.mark.parametrize("method", [EIPRK4, eip_method(NYSTROM4)])
 def test_interpolants_are_hermite_s(method):
-    """SciPy's, through values and slopes at both ends; positions of a Nystrom method through accelerations too."""
+    """Interpolation is SciPy's, by values and slopes at both ends; for Nystrom methods by accelerations too."""
     y0, params = PROBLEM.y0, PROBLEM.params
     given = {"fun": PROBLEM.fun} if method is EIPRK4 else {"acceleration": acceleration, "params": params}
     found = integrate(**given, t_span=(0, 1), y0=y0, method=method, h=0.1, save_every=1, dense_output=True)
@@ -301,7 +301,7 @@ def test_output_between_projections_lies_on_the_manifold(method, steps, compiled
 
 
 def test_unprojected_states_are_off_the_manifold():
-    """The test above can see it: the steps go on from states off the manifold, which are near those handed out."""
+    """The test above is able to fail: steps continue from states off the manifold, near those that are returned."""
     problem = kepler(0.6, relativistic=0.0)
     solver = EIPRK4(problem.fun, 0, problem.y0, 30, h=0.05, every=3, invariants=problem.invariants, blocks=2)
     kept = [item.fun(0, problem.y0, *item.args) for item in problem.invariants]
@@ -398,7 +398,7 @@ def test_an_unprojected_state_is_told():
 
 @pytest.mark.parametrize("steps", [{"h": 0.01}, {"rtol": 1e-6}], ids=["fixed", "adaptive"])
 def test_a_callback_stops_at_the_time_it_sees(steps):
-    """Nothing is done beyond: no event noted, no step counted."""
+    """Nothing happens after the end: no event is recorded, no step counted."""
     seen = []
 
     def stop(t, y, defects):
@@ -428,7 +428,7 @@ def test_threads_may_ask_at_once():
 
 
 def test_events_of_long_states():
-    """More numbers than the loop has room for among its roots."""
+    """The state has more numbers than the loop has room for among its roots."""
 
     @njit
     def decay(t, y):

@@ -224,7 +224,7 @@ def test_warnings_name_the_line_of_the_call():
 
 
 def test_arguments_of_invariants():
-    """They come after the invariant's own; equal ones are not given twice; a function that takes none is an error."""
+    """Arguments come after the invariant's own; equal ones are not given twice; a function without any is an error."""
 
     def scaled(t, y, factor, k):
         return factor * energy(t, y, k)
@@ -262,7 +262,7 @@ def test_the_projected_start_is_the_first_state(sampled, y0):
 
 @pytest.mark.parametrize("solve", [solve_ivp, integrate], ids=lambda solve: solve.__name__)
 def test_a_start_that_was_moved_is_reported(solve):
-    """A start off by 0.1 is, one that is off by less than a target may be missed by is not."""
+    """A start off by 0.1 is reported; one that is off by less than a target may be missed by is not."""
     given = {"t_span": (0, 1), "args": (K,), "invariants": TARGET, "project_initial": True, "method": EIPRK45}
     sol = solve(spring, y0=[1.0, 0.0], **given)
     moved = "project_initial moved 1 of 2 components of y0, most of all y0[0], from 1 to 1.1"

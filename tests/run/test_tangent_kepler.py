@@ -47,7 +47,7 @@ KEPT = [Invariant(energy, name="H"), Invariant(momentum, name="L")]
 
 
 def flow(start, t):
-    """The state after a time t, by Lagrange's coefficients and Kepler's equation in differences (Battin 1987, 4.41)."""
+    """Return the state after a time t, by Lagrange's coefficients and Kepler's equation (Battin 1987, 4.41)."""
     x, y, u, v = start
     r0 = mpmath.hypot(x, y)
     a = 1 / (2 / r0 - u * u - v * v)

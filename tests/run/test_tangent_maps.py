@@ -190,7 +190,7 @@ STEP, STEPS = 0.0625, 16
 
 
 def written(name, arguments, texts):
-    """A function of the system's components and parameters as arrays."""
+    """Return a function of the system's components and parameters as arrays."""
     rates, params, *_ = SYSTEMS[name]
     lines = [f"{item} = Y[{k}]" for k, item in enumerate(rates)] + [f"{item} = P[{k}]" for k, item in enumerate(params)]
     lines += [f"d{k} = dY[{k}]" for k in range(len(rates)) if "dY" in arguments]
@@ -213,13 +213,13 @@ def product_with_jacobian(name):
 
 @lru_cache(maxsize=2)
 def steps_of(name, h, steps):
-    """Derivatives (n, n + p) of the state after some steps, by complex steps through the steps themselves."""
+    """Return derivatives (n, n + p) of the state after some steps, by complex steps through the steps themselves."""
     rates, params, _, y0 = SYSTEMS[name]
     return through_steps(written(name, "t, Y, P", rates.values()), y0, list(params.values()), h, steps)
 
 
 def through_steps(f, y0, params, h, steps):
-    """The same of a function f(t, y, p) of complex arrays."""
+    """Return such derivatives for a function f(t, y, p) of complex arrays."""
     A, b, c = (np.asarray(getattr(EIPDOP853.TABLEAU, item)) for item in "Abc")
     columns = []
     for k in range(len(y0) + len(params)):
@@ -370,7 +370,7 @@ def test_spectrum_of_a_hamiltonian_system(henon_heiles):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_spectrum_of_lorenz():
-    """The literature's 0.9056, 0, -14.5723 (Sprott, Chaos and Time-Series Analysis, 2003)."""
+    """The exponents are 0.9056, 0, -14.5723 in the literature (Sprott, Chaos and Time-Series Analysis, 2003)."""
     lorenz = equations(SYSTEMS["Lorenz"][0], params={"s": 10, "r": 28, "b": 8 / 3})
     run = lyapunov_spectrum(lorenz, (0, 2000), [1.0, 1.0, 20.0], method=EIPDOP853, h=0.02, every=1.0)
     assert run.exponents == pytest.approx([0.9056, 0.0, -14.5723], abs=0.02)
@@ -386,7 +386,7 @@ def test_megno_of_a_regular_orbit(pendulum):
 
 
 def test_megno_by_its_definition(pendulum):
-    """Against the integral itself, by the trapezoidal rule over small steps."""
+    """MEGNO agrees with the integral itself, by the trapezoidal rule over small steps."""
     run = megno(pendulum, (0, 20), [0.5, 1.0], deviation=[1.0, 2.0], method=EIPDOP853, h=0.1, every=5.0)
     fine = integrate(pendulum, (0, 20), [0.5, 1.0], method=EIPDOP853, h=0.0025, save_every=1,
                      variations=np.array([[1.0], [2.0]]))  # fmt: skip
@@ -492,7 +492,7 @@ def planets_energy(t, y, m):
 
 
 def two_planets(a, e_outer):
-    """Masses and the state of two planets at their pericentres, on opposite sides."""
+    """Return masses and the state of two planets at their pericentres, on opposite sides."""
     m, q, v = np.array([1.0, 1e-3, 1e-3]), np.zeros((3, 3)), np.zeros((3, 3))
     for k, (axis, e, side) in enumerate(((1.0, 0.02, 1), (a, e_outer, -1)), 1):
         q[k, 0], v[k, 1] = side * axis * (1 - e), side * np.sqrt((1 + e) / (axis * (1 - e)))

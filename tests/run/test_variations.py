@@ -142,7 +142,7 @@ def test_columns_are_saved(tmp_path):
 
 
 def broken_off(tmp_path, **options):
-    """A checkpoint of a run that ended in its middle."""
+    """Return a checkpoint of a run that ended in its middle."""
 
     def stop(t, y, values):
         if t > 1:

@@ -1,4 +1,4 @@
-"""The page that plays a run: what it holds, and, where there is a Chromium, what it shows."""
+"""The page that plays a run: its content and, if a Chromium is installed, its display."""
 
 import json
 import re
@@ -54,7 +54,7 @@ def test_orbit_with_its_errors(tmp_path):
 
 
 def test_a_reference_is_of_the_same_problem():
-    """Nothing is known of another start, of other parameters, of the run's own numbers alone."""
+    """Errors are not known for another start, for other parameters, or from the run's own numbers alone."""
     same = {"method": EIPRK4, "h": 0.1, "save_every": 1}
     problem = kepler(0.6, relativistic=0.0)
     for run in (
@@ -104,7 +104,7 @@ def test_long_runs_are_thinned_and_peaks_stay(monkeypatch):
 
 
 class Addresses(HTMLParser):
-    """All that a page could load."""
+    """Addresses of all resources that a page could load."""
 
     def __init__(self):
         super().__init__()

@@ -1,4 +1,4 @@
-"""The command line: what it prints and writes, its exit statuses, and one clear line for every wrong input."""
+"""The command line: output and files, exit statuses, and one clear line for every wrong input."""
 
 import csv
 import json
@@ -42,7 +42,7 @@ SPAN = ("--years", "0.1", "--h", "0.005")  # quick in plain Python, too; four ti
 
 
 def leapfrog_only(scene, method, metric, judge):
-    """Less to time than the command would."""
+    """Return fewer timings than the command's."""
     return {"SV": (lambda step: (1.0, scene.problem.y0), [scene.h, scene.h / 2])}
 
 
@@ -77,7 +77,7 @@ def lines(text):
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
-    """A short run with everything on; REBOUND where it is installed."""
+    """Return a short run with everything on; with REBOUND if it is installed."""
     pytest.importorskip("rebound")
     folder = tmp_path_factory.mktemp("short")
     command = ["solar-system", *SPAN, "--out", str(folder / "out"), "--json", str(folder / "run.json"), "--quiet"]
@@ -247,7 +247,7 @@ def test_a_failed_check_changes_the_status(tmp_path, capsys, no_rebound, monkeyp
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_a_run_that_is_not_to_be_trusted_is_told(tmp_path, capsys, no_rebound, monkeypatch):
-    """At the end, once, by its name; in the JSON and the exit status too. Other warnings are shown as usual."""
+    """Each run is named once, at the end; in the JSON and the exit status too. Other warnings are shown as usual."""
 
     def doubtful(problem, **options):
         if options.get("metric") == "error":
@@ -328,7 +328,7 @@ def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebou
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatch):
-    """With --checkpoint, runs that were done are not done again; the numbers are those of an uninterrupted command."""
+    """With --checkpoint, completed runs are not repeated; the numbers are those of an uninterrupted command."""
     folder = tmp_path / "kept"
     command = ["solar-system", *SPAN, "--checkpoint", str(folder)]
     assert main(["solar-system", *SPAN, "--out", str(tmp_path / "whole"), "--quiet"], **LITTLE) == 0
@@ -552,7 +552,7 @@ def test_report_times():
 
 
 def turning_pair(rate):
-    """A run whose planets gain `rate` rad/yr on those of another, both on circles."""
+    """Return a run whose planets gain `rate` rad/yr on those of another, both on circles."""
     scene = solar_run.make_scene("paper", 100.0, 1.0)
     t = np.linspace(0.0, 100.0, 201)
     runs = []

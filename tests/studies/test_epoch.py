@@ -1,4 +1,4 @@
-"""``eip-scipy solar-system --epoch``: what can be written, what comes out, one clear line for what cannot be had."""
+"""``eip-scipy solar-system --epoch``: accepted text, results, one clear line for each error."""
 
 import csv
 import json
@@ -28,7 +28,7 @@ def kernel():
 
 @pytest.fixture
 def nothing_to_time(monkeypatch):
-    """Less to run than the command would: no timings, no REBOUND."""
+    """Run less than the command would: no timings, no REBOUND."""
     monkeypatch.setattr(SolarSystem, "refine", lambda *args: False)
     monkeypatch.setattr(SolarSystem, "figures", lambda *args: ())
     monkeypatch.setattr(Session, "peer", lambda *args: None)

@@ -17,7 +17,7 @@ from eip_scipy_studies.study import Session
 
 @pytest.fixture
 def two_methods(monkeypatch):
-    """Less to time than the command would: the reference itself, moved by 1e-7 AU, and a run that fails."""
+    """Time less than the command would: the reference itself, moved by 1e-7 AU, and a run that fails."""
     everything = solar_frontier.methods
 
     def few(problem, years, judge, heyoka):
@@ -114,7 +114,7 @@ def test_heyoka_refuses(y0, options):
 
 
 def test_heyoka_says_where_it_stopped():
-    """Two bodies that fall into each other."""
+    """Two bodies fall into each other, which stops heyoka."""
     heyoka = pytest.importorskip("eip_scipy.integrations.heyoka", exc_type=ImportError)
     problem = nbody([1.0, 1.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]], t_span=(0, 3))
     with pytest.raises(ValueError, match="heyoka stopped at"):

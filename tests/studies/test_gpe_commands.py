@@ -1,4 +1,4 @@
-"""`eip-scipy gpe` in small: numbers, files, figures, exit statuses, and what a user may get wrong."""
+"""`eip-scipy gpe` on small grids: numbers, files, figures, exit statuses, and mistakes of users."""
 
 import csv
 import json
@@ -114,7 +114,7 @@ def test_cropping_keeps_the_condensate():
 
 
 def small_ring(kappa=0.3, points=32):
-    """Two vortices in a trap that a coarse grid resolves."""
+    """Return two vortices in a trap that a coarse grid resolves."""
     grid = Grid((points, points), -4, 4)
     return GrossPitaevskii(grid, quartic_trap(0.0, kappa, 1, 1), Omega=1.0, beta=50.0)
 
@@ -138,7 +138,7 @@ def no_plotting(monkeypatch):
 
 @pytest.fixture
 def start(tmp_path):
-    """A stationary state in a file as `ground-state` writes it."""
+    """Write a stationary state to a file as `ground-state` does."""
     gpe = small_ring()
     state = ground_state(gpe, imprint(gpe, [[0.8, 0.1], [-0.8, 0.0]]), tol=1e-4)
     return gpe_states.save_state(tmp_path / "start.npz", gpe_states.Found("", gpe, state))
@@ -235,7 +235,7 @@ def test_a_stationary_state(start, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(("run", "evaluation", "done"), [(0, 207, []), (2, 93, ["EIP-M"])])
 def test_an_interrupted_command_goes_on(run, evaluation, done, tmp_path, start, capsys, monkeypatch):
-    """In the reference or a method's run; the numbers are then those of an uninterrupted command, bit for bit."""
+    """The interruption is in the reference or a method's run; the numbers are those of an uninterrupted command."""
     folder = tmp_path / "kept"
     command = ["gpe", "ring", "--start", str(start), "--checkpoint", str(folder)]
     assert main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path / "whole"), "--quiet"], **SHORT) == 0

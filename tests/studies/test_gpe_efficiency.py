@@ -1,4 +1,4 @@
-"""`eip-scipy reproduce fig-efficiency` on a small grid: what is run, what is checked, what is written."""
+"""`eip-scipy reproduce fig-efficiency` on a small grid: runs, checks, and files."""
 
 import csv
 import json

@@ -25,7 +25,7 @@ FEW = ("euler_detest", "kepler_e00", "three_wave")
 
 
 def states(case):
-    """On the solution and off it."""
+    """Return states on the solution and off it."""
     rng = np.random.default_rng(7)
     y = case.problem.y0
     noise = 0.01 * (np.abs(y) + 0.01 * np.abs(y).max()) * rng.standard_normal(y.size)
@@ -88,7 +88,7 @@ def test_end_lies_on_the_manifold(case):
 
 @named([case for case in CASES if case.growth < 100])
 def test_end_is_the_solutions(case):
-    """SciPy's DOP853 at a tight tolerance, without anything of ours, ends there."""
+    """SciPy's DOP853 at a tight tolerance, without any code of the package, reaches the same end."""
     sol = solve_ivp(case.problem.fun, case.problem.t_span, case.problem.y0, method="DOP853", rtol=1e-11, atol=1e-13)
     assert case.error(sol.y[:, -1]) < 1e-7
 
@@ -263,7 +263,7 @@ def test_a_known_value_can_differ():
 
 @dataclass(frozen=True, kw_only=True)
 class Noted(Study):
-    """In place of what takes long; tells where it ran."""
+    """Study in place of a long one; it records where it ran."""
 
     seen: list
     passed: bool = True

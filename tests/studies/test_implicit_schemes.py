@@ -70,7 +70,7 @@ def test_three_dimensions(scheme):
 
 
 def kinetic_matrix(grid):
-    """-Laplace / 2 as a dense matrix, with NumPy's transforms."""
+    """Return -Laplace / 2 as a dense matrix, with NumPy's transforms."""
     total = 0.0
     for axis, n in enumerate(grid.shape):
         k = 2 * np.pi * np.fft.fftfreq(n, grid.spacing[axis])
@@ -86,7 +86,7 @@ def both_parts(psi):
 
 
 def test_crank_nicolson_solves_the_papers_equation():
-    """A step of the fully implicit scheme from dense matrices and SciPy's root finder."""
+    """Return a step of the fully implicit scheme from dense matrices and SciPy's root finder."""
     gpe, psi0 = modulated((6, 4), beta=2.0, potential=lattice)
     K, h = kinetic_matrix(gpe.grid), 0.1
 
@@ -128,7 +128,7 @@ def test_linearly_implicit_solves_the_papers_equation():
 
 
 def test_sav_solves_its_equations():
-    """The coupled system for (psi', r') as a dense one, real and imaginary parts apart."""
+    """The scheme solves the coupled system for (psi', r'), here a dense one with separate real and imaginary parts."""
     gpe, psi0 = modulated((6, 4), beta=2.0, potential=lattice)
     K, h, w, V, shift = kinetic_matrix(gpe.grid), 0.05, gpe.grid.cell, gpe.V.ravel(), 3.0
 

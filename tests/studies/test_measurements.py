@@ -1,4 +1,4 @@
-"""Every measurement, ``eip-scipy study NAME``, tells what it takes, and runs through with small settings."""
+"""Every measurement, ``eip-scipy study NAME``, says what it takes, and runs through with small settings."""
 
 import os
 import shlex
@@ -63,7 +63,7 @@ def test_every_study_is_listed():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_help(name, capsys):
-    """Or how to install what it cannot do without."""
+    """The help is printed, or the way to install a required package."""
     status = main(["study", name, "--help"])
     shown = capsys.readouterr()
     if status == 0:

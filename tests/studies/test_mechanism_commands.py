@@ -1,4 +1,4 @@
-"""``eip-scipy mechanisms``: its runs, what it compares, its files, and its checks."""
+"""``eip-scipy mechanisms``: its runs, its comparisons, its files, and its checks."""
 
 import csv
 import json

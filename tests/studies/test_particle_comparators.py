@@ -76,7 +76,7 @@ def test_boris_drifts_across_the_electric_field():
 
 
 def flow_jacobian(step, y, size=1e-5):
-    """Derivatives of one step's result by its start, by central differences."""
+    """Return derivatives of one step's result by its start, by central differences."""
     columns = [(step(y + d) - step(y - d)) / (2 * size) for d in size * np.eye(y.size)]
     return np.array(columns).T
 

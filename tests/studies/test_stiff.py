@@ -1,4 +1,4 @@
-"""The stiff problems of the study: two formulations agree, and the projection pays."""
+"""The stiff problems of the study: two formulations agree, and the projection reduces the error."""
 
 import numpy as np
 import pytest

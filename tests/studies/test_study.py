@@ -16,7 +16,7 @@ from eip_scipy_studies.study import Check, Command, PartlyDone, Session, Study, 
 
 
 class Figure:
-    """In place of matplotlib's."""
+    """Replacement of matplotlib's figure."""
 
     def savefig(self, path):
         path.write_text("drawn")
@@ -64,7 +64,7 @@ class Sums(Study):
 
 
 def outcome(tmp_path, capsys, **settings):
-    """Exit status, lines printed, lines of errors, and names of files."""
+    """Return exit status, lines printed, lines of errors, and names of files."""
     out = tmp_path / "out"
     study = Sums(**{"ends": {}, **settings})
     status = study.run(Session("sums", out, tmp_path / "sums.json"))
@@ -119,7 +119,7 @@ def test_what_the_memory_does_not_hold(tmp_path):
 
 
 def test_progress_is_for_terminals(monkeypatch, capsys):
-    """A file, which stderr is here, would fill with it."""
+    """Progress is not shown in a file, which stderr is here, because it would fill it."""
     with Session("sums").bar(2, "adding") as bar:
         bar.update()
     assert capsys.readouterr().err == ""

@@ -1,4 +1,4 @@
-"""``eip-scipy solar-system truth``: force models against the ephemeris, and what is said when that cannot be."""
+"""``eip-scipy solar-system truth``: force models against the ephemeris, and its error messages."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ def _needs_the_kernel():
 
 
 def command(tmp_path, *arguments):
-    """Exit status and the numbers of a run, km by (model, years, body)."""
+    """Return exit status and the numbers of a run, km by (model, years, body)."""
     file = tmp_path / "truth.json"
     status = main(["solar-system", "truth", *arguments, "--out", str(tmp_path), "--json", str(file), "--quiet"])
     content = json.loads(file.read_text())
@@ -34,7 +34,7 @@ def command(tmp_path, *arguments):
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_what_each_force_is_worth_after_a_century(tmp_path):
-    """The figures of the documentation's table, which a program of its own measured before this one."""
+    """The documentation's table has these figures, which an independent earlier program measured."""
     status, rows = command(tmp_path)
     assert status == 0
     expected = {

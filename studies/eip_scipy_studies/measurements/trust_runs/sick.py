@@ -550,7 +550,7 @@ def visible() -> Iterator[Run]:
     yield from seen("Toda lattice, harmonic energy", partial(s.toda, True, moving=True), "DOP853 1e-6")
     yield from seen("epidemic, another ratio", other_ratio, "RK45 1e-6")
     yield from seen("attitude, another norm", other_norm, "RK45 1e-6")
-    yield from seen("spins, S_x near an axis", spin_sum, "RK45 1e-6")
+    yield from seen("spins, S_x across the axis", spin_sum, "RK45 1e-6")
     yield from seen("condensate, half the interaction", partial(half_beta, moving_packet), "RK45 1e-6")
 
 
