@@ -37,8 +37,8 @@ class HeyokaRun:
         The end.
     y : ndarray, shape (6 N,)
         The state (q, v) at the end.
-    Seconds spent in the integration, without making and compiling the integrator.
-        Seconds spent in the integration; making and compiling the integrator is not in it.
+    wall_time : float
+        Seconds spent in the integration, without making and compiling the integrator.
     steps : int
     """
 

@@ -52,7 +52,7 @@ _EARTH_AND_MOON = {"Earth": ([(0, 3), (3, 399)], "GM3"), "Moon": ([(0, 3), (3, 3
 _J2000_JD = 2451545.0
 # Two parts: a single float64 is up to 20 microseconds off, 1 m on Mercury's orbit.
 _PAPER_EPOCH = (2456690.5, 20.3 / 24)
-# name: (epoch, with the Moon as a body of its own)
+# name: (epoch, with the Moon as a separate body)
 _EMBEDDED = {
     "de440": (_PAPER_EPOCH, False),
     "de440-j2000": ((_J2000_JD, 0.0), False),

@@ -57,7 +57,7 @@ class Step:
         sigma = self.weights(y, y_hat, err)
         if not g.any():
             return y_hat
-        # Newton's matrix has the gradients where the defects are taken; corrections go along those of the direction.
+        # Newton's matrix has the gradients at the residuals' state; corrections go along those of the direction.
         along = {"new": (t, y_hat), "old": (t_old, y), "midpoint": ((t_old + t) / 2, (y + y_hat) / 2)}[self.direction]
         Q = sigma * self.neutral(floats(self.gradients(*along)))
         mu, now = np.zeros(len(g)), y_hat
@@ -167,7 +167,7 @@ def local_error(tableau: Any, K: Array, h: float) -> Array | None:
 
 
 def floats(a: Array) -> Array:
-    """Numbers as floats, real and imaginary parts side by side."""
+    """Return numbers as floats, real and imaginary parts next to each other."""
     return np.ascontiguousarray(a).view(float)
 
 

@@ -40,8 +40,8 @@ def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
     ----------
     argv : sequence of str, optional
         Arguments; default: those of the process.
-    Settings of the command, in place of its defaults.
-        Of the command, in place of its own defaults.
+    **settings
+        Settings of the command, in place of its own defaults.
 
     Returns
     -------

@@ -175,8 +175,8 @@ def table(head: Sequence[Sequence[str]], rows: Iterable[tuple[str, Sequence[str]
     ----------
     head : sequence of sequences of str
         The lines of each column's head, one sequence for each column.
-    Label and cells; a row without cells is a heading.
-        Label and cells; a row without cells is a heading of its own.
+    rows : iterable of (str, sequence of str)
+        Label and cells; a row without cells is a heading.
 
     Returns
     -------

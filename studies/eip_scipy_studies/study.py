@@ -108,7 +108,7 @@ def some_of(what: str, known: Collection[str]) -> Any:
     Returns
     -------
     dataclasses.Field
-        A field; None stands for all.
+        A field; its value None means all.
     """
     text = f"one {what}, may be repeated; default: all ({', '.join(known)})"
     return option(None, text, action="append", type=one_of(what, known), metavar="NAME")

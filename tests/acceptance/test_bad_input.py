@@ -232,7 +232,7 @@ def test_partial_ends_with_the_last_accepted_state():
 @pytest.mark.parametrize("part", ["fun", "grad", "callback"])
 @pytest.mark.parametrize("error", [MineError, KeyboardInterrupt])
 def test_partial_whoever_raises(part, error):
-    """From the invariants and the callback too, and although they go on raising when the result is made."""
+    """Errors come from the invariants and the callback too, which continue to raise them when the result is made."""
     broken = False
 
     def raising(t, ok):

@@ -52,7 +52,7 @@ def check_no_drift(t, defects):
     assert ((np.abs(slope) + 3 * stderr) * T < 0.5 * defects.std(axis=1)).all()
 
 
-# Largest defects of H and L over all steps. RK4's are the truncation error O(h^10) at the pericentre, and as such
+# Largest residuals of H and L over all steps. RK4's are the truncation error O(h^10) at the pericentre, and as such
 # reproducible; RK5's in the paper's metric are round-off. The first and the third line are the figures to be met.
 @pytest.mark.parametrize(
     ("method", "setting", "largest"),
@@ -77,7 +77,7 @@ def test_two_newton_steps_reach_round_off(setting):
     """1e-15 of the invariants in the mean, and of the size of their terms at worst.
 
     At the pericentre H = -0.54 is the difference of terms whose sizes add up to 4.5, so that its rounding there is 8
-    times as large, relative to H itself. A defect up to 4 eps times the terms of G y, 6e-15 there, is left alone.
+    times as large, relative to H itself. A residual up to 4 eps times the terms of G y, 6e-15 there, is not corrected.
     """
     result = run(EIPRK4, setting, iterations=2)
     defects = result.invariants - result.invariants[:, :1]

@@ -105,7 +105,8 @@ def test_every_class_tells(driver, method, metric):
         run, record = driver(stiffer, (0, 10), [1.0, 0.3], method=method, h=0.02, metric=metric, invariants=SQUARE)
     assert run.success
     assert not record.trusted
-    # Local errors of orders 1 and 2 are nearly as large as what the quantity changes by; the check at the start tells.
+    # Local errors of orders 1 and 2 are nearly as large as the changes of the quantity; the check at the start reports
+    # it.
     low = method in (EIPRK1, EIPRK2)
     assert [w.category for w in caught] == ([UserWarning] if low else [UserWarning, ProjectionWarning])
 

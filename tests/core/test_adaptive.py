@@ -350,7 +350,7 @@ def test_first_projection_fails(driver):
     """A failure in the very first step leaves one state, the start, and eleven rejections."""
     wrong = Invariant(lambda t, y: y @ y, lambda t, y: -2 * y, name="wrong")
     options = {"invariants": wrong, "check": False, "first_step": 0.5, "rtol": 1e-2, "atol": 1.0}
-    # A constant push off the sphere, so that the defect is large at any step.
+    # A constant push off the sphere makes the residual large at any step.
     run = driver(lambda t, y: y * 1.0, (0, 1), [1.0, 2.0], **options)
     assert run.status == -1
     assert run.message.startswith("projection failed at t=")

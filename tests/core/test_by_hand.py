@@ -141,7 +141,7 @@ def test_the_same_as_scipy(idiom, ours, scipy_s):
     assert solver.h_abs == theirs.h_abs
     if idiom is not other_function:  # SciPy counts calls of the first function only
         assert solver.nfev == theirs.nfev
-    if ours is EIPDOP853:  # its estimate, a quotient, tells the roundings of two engines apart
+    if ours is EIPDOP853:  # the quotient in its estimate depends on the roundings of each engine
         return
     own = type("Own", (ours,), {"_SCIPY": None})(driven, 0, Y0, 5.0, **given)
     np.testing.assert_allclose(idiom(own)[-1], expected[-1], rtol=0, atol=1e-11)

@@ -182,7 +182,7 @@ def test_states_given_out_are_copies(method):
 @pairs
 @pytest.mark.parametrize("invariants", [(), [H, L], [H_USES_F]], ids=["plain", "projected", "uses_f"])
 def test_late_calls_do_not_disturb_a_running_solver(method, invariants):
-    """A dense output kept and called while the solver goes on: the same steps, and the same values as at once."""
+    """A dense output that is kept and called while the solver continues gives the same steps, and the same values."""
     quiet, asked = (method(orbit, 0.0, Y0, 8.0, rtol=1e-4, invariants=invariants) for _ in range(2))
     pieces, at_once = [], []
     while asked.status == "running":
@@ -311,7 +311,7 @@ LEVELS = {"default": {}, "backward": {"t_span": (8.0, 0.0)}, "every 3": {"every"
 @pytest.mark.parametrize("kind", LEVELS)
 @pytest.mark.parametrize("rtol", [1e-4, pytest.param(1e-8, marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_adversarial_thresholds(method, kind, rtol):
-    """None raises "f(a) and f(b) must have different signs", none is lost, and all stand on the manifold."""
+    """No event raises "f(a) and f(b) must have different signs", none is lost, and all are on the manifold."""
     options = {"invariants": [H, L], "rtol": rtol, "atol": rtol * 1e-3, **LEVELS[kind]}
     sol = solve(method, **options)
     cases = thresholds(sol)
@@ -329,7 +329,7 @@ def test_adversarial_thresholds(method, kind, rtol):
         crossings = np.count_nonzero(signs[:-1] * signs[1:] <= 0)
         assert len(t) == crossings, f"component {i} passes {value} at step {k}"
         y = y.reshape(-1, 4)
-        # The correction itself carries round-off: defects of eps, divided by gradients that are nearly dependent.
+        # The correction itself carries round-off: residuals of eps, divided by gradients that are nearly dependent.
         assert np.abs(y[:, i] - value).max(initial=0.0) <= 1e-11
         assert defects(y.T).max(initial=0.0) <= max(level, 1e-14) * (1 + 1e-3) + 4e-15
         assert (np.diff(t) * np.sign(sol.t[-1] - sol.t[0]) >= 0).all()

@@ -82,7 +82,7 @@ def test_circular_kepler(driver, metric, eccentricity):
     [pytest.param(EIPRK1, 0.005, marks=pytest.mark.slow), (EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK5, 0.05)],
 )
 def test_circular_kepler_by_other_methods(metric, eccentricity, method, h):
-    """Their truncation errors make parallel gradients nearly so: a poor correction must not end a healthy run."""
+    """Truncation errors make parallel gradients nearly so: a poor correction does not end a correct run."""
     problem = kepler(eccentricity, 0.0)
     options = {"method": method, "h": h, "compiled": False, "blocks": None}
     run = integrate(problem, (0.0, 20.0), metric=metric, **options)
@@ -154,7 +154,7 @@ def test_zero_gradient_drops_the_row_and_counts():
 @both
 @pytest.mark.parametrize("direction", ["new", "old", "midpoint"])
 def test_without_any_gradient_the_raw_state_stays(driver, direction):
-    """A defect that nothing can correct: rank 0, counted, and no failure while it does not grow in the projection."""
+    """A residual that nothing can correct has rank 0 and is counted; it fails only if the projection increases it."""
     square = Invariant(lambda t, y: y[0] ** 2 + 1e-3 * t, lambda t, y: np.array([2 * y[0], 0.0]))
     options = {"h": 0.25, "invariants": square, "direction": direction, "check": False}
     run = driver(lambda t, y: np.array([0.0, 1.0]), (0, 1), [0.0, 3.0], **options)
@@ -351,7 +351,7 @@ def test_width_of_the_dead_band(defect):
 
 
 def test_dead_band_sees_cancelling_terms():
-    """I = y0 - y1 with terms of 1e8 that cancel: a defect of 1e-8 is round-off of the terms."""
+    """I = y0 - y1 with terms of 1e8 that cancel: a residual of 1e-8 is round-off of the terms."""
     gap = Invariant(lambda t, y: y[0] - y[1], lambda t, y: np.array([1.0, -1.0]), target=0.0)
     y = np.array([1e8, 1e8 - 2.0**-26])
     result = project(y, gap)
@@ -362,7 +362,7 @@ def test_dead_band_sees_cancelling_terms():
 
 
 def test_row_inside_the_band_stays():
-    """With one defect outside its band, the correction leaves the invariant that is inside alone."""
+    """If one residual is outside its band, the correction does not change the invariant that is inside."""
     sphere = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=1.01, name="sphere")
     plane = Invariant(lambda t, y: y.sum(), lambda t, y: np.ones(3), target=1.0, name="plane")
     y = np.array([1.0, 0.0, 0.0])
@@ -499,7 +499,7 @@ def test_value_not_finite_at_the_projected_state():
 
 @both
 def test_correction_in_the_wrong_direction(driver):
-    """A gradient of the wrong sign doubles the defect: that is a failure, not a result."""
+    """A gradient of the wrong sign doubles the residual, which is a failure."""
     wrong = Invariant(lambda t, y: y @ y, lambda t, y: -2 * y, name="wrong")
     run = driver(oscillator, (0, 1), [1.0, 2.0], h=0.1, invariants=wrong, check=False)
     assert run.status == -1

@@ -39,7 +39,7 @@ def said(call):
     return result, [str(item.message) for item in record]
 
 
-# A function stands for its invariant.
+# A function represents its invariant.
 
 
 def test_a_function_stands_for_its_invariant_everywhere():
@@ -270,7 +270,7 @@ def test_a_constant_in_single_precision_is_no_field_in_single_precision():
 
 @pytest.mark.parametrize("method", [EIPRK45, EIPDOP853])
 def test_next_to_an_equilibrium_few_digits_are_no_single_precision(method):
-    """Brockett's flow sorts the eigenvalues of a matrix; what is left of its derivative at the end is rounding."""
+    """Brockett's flow sorts the eigenvalues of a matrix; at the end only rounding remains of its derivative."""
     L0, N = np.random.default_rng(0).normal(size=(5, 5)), np.diag(np.arange(5.0))
     L0 = L0 + L0.T
     rows, columns = np.triu_indices(5)
@@ -285,7 +285,7 @@ def test_next_to_an_equilibrium_few_digits_are_no_single_precision(method):
         bracket = L @ N - N @ L
         return (L @ bracket - bracket @ L)[rows, columns]
 
-    once = np.where(rows == columns, 1.0, 2.0)  # how often an entry stands in the matrix
+    once = np.where(rows == columns, 1.0, 2.0)  # number of times that an entry occurs in the matrix
     traces = Invariant(
         lambda t, y: np.array([np.trace(matrix(y)), np.trace(matrix(y) @ matrix(y))]),
         lambda t, y: np.array([rows == columns, 2 * once * y], float),

@@ -67,7 +67,7 @@ def test_pickled_dense_output(name, kept):
 
 
 def work(e):
-    """Run functions of its own in a worker process, and return a solution."""
+    """Run new functions in a worker process, and return a solution."""
     y0 = pericentre(e)
     return solve_ivp(
         lambda t, y: orbit(t, y), (0, 3), y0, method=EIPRK4, h=0.1, dense_output=True, invariants=local_invariants()

@@ -135,7 +135,7 @@ def test_what_is_held_are_the_invariants_of_the_start():
 
 
 def test_roundings_in_a_long_run_are_no_failure():
-    """A defect of some roundings may grow by a rounding when it is projected, here at t = 273."""
+    """A residual of some roundings may grow by a rounding when it is projected, here at t = 273."""
 
     def acceleration(t, q):
         return np.array([-q[0] - 2 * q[0] * q[1], -q[1] - q[0] ** 2 + q[1] ** 2])

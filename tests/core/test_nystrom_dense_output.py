@@ -168,7 +168,7 @@ def test_a_multistep_run_too_short_for_a_history():
 
 
 def test_a_short_multistep_run_whose_accelerations_depend_on_velocities():
-    """The quintic with the slopes at both ends of each step, which DOP853 makes in four of its own."""
+    """The interpolant is the quintic with the slopes at both ends of each step, for which DOP853 needs four steps."""
 
     def damped(t, y):
         return np.concatenate([y[2:], pull(t, y[:2]) - 0.05 * y[2:]])

@@ -1,4 +1,4 @@
-"""Orders on the perturbed Kepler problem: p for the solution, 2 (p + 1) for the defects that a projection leaves."""
+"""Orders on the perturbed Kepler problem: p for the solution, 2 (p + 1) for the residuals after a projection."""
 
 import mpmath
 import numpy as np
@@ -171,7 +171,7 @@ def test_defects_are_the_quadratic_term_of_the_correction(method, options):
 
 
 def mean_defects(method, h, options):
-    """Rms defects of H and L, each the geometric mean of steps h and -h: what remains has even powers of h only."""
+    """Return rms residuals of H and L, each the geometric mean of steps h and -h, which has even powers of h only."""
     both = [[invariants(one_step(y, method, s, options)[1]) - invariants(y) for y in STATES] for s in (h, -h)]
     return rms(np.sqrt(np.abs(both[0]) * np.abs(both[1])))
 

@@ -185,7 +185,7 @@ def test_nearly_parallel_rows(angle):
     for _ in range(20):
         first, other = rng.standard_normal((2, 6))
         G = np.array([first, first + angle * other])
-        # A shift of size one: the second defect holds its angle's worth.
+        # After a shift of size one the second residual is proportional to the angle.
         y_hat, shift = np.zeros(6), rng.standard_normal(6)
         result = project(y_hat, Invariant(lambda t, y, G=G: G @ y, lambda t, y, G=G: G, target=G @ shift))
         assert result.rank == 2
@@ -249,7 +249,7 @@ def test_project_with_a_gradient_by_f(f, iterations):
 @given(seeds, sizes, st.integers(2, 4))
 @few
 def test_more_iterations_are_newton_s(seed, size, iterations):
-    """On the fixed directions G(y_hat)' mu: the defects of Newton's method written with numpy's solver."""
+    """On the fixed directions G(y_hat)' mu the residuals are those of Newton's method written with numpy's solver."""
     q = Quadratics(seed, *size, offset=1e-2)
     assume(q.well_conditioned())
     directions = q.grad(0.0, q.y_hat).T
@@ -387,7 +387,7 @@ def test_rotation_needs_blocks():
 
 
 def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40):
-    """Eccentric Kepler, each component in a unit of its own."""
+    """Return eccentric Kepler, with a different unit for each component."""
     problem = kepler(0.6, 0.005)
 
     def inner(item, t, z):

@@ -297,7 +297,7 @@ RUNS = {
     "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), NORM),
     "complex backward": (jit_spin, (3.0, -9.0), np.array([1.0 + 0j, 0.2j]), NORM),
 }
-# Complex states take a driver of their own.
+# Complex states have a separate driver.
 runs = pytest.mark.parametrize(
     "case",
     [pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow]) if "complex" in name else name for name in RUNS],
@@ -420,7 +420,7 @@ def test_terminal_event_and_t_eval(method, compiled):
 
 @drivers
 def test_adaptive_problem(compiled):
-    """A problem with a step of its own runs adaptively once h is taken out of it or first_step given."""
+    """A problem with a default step runs adaptively once h is removed from it or first_step given."""
     problem = kepler(0.6, 0.0)
     bare = dataclasses.replace(problem, h=None)
     run = integrate(bare, (0, 10), method=EIPRK45, save_every=1, compiled=compiled)

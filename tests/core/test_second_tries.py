@@ -107,7 +107,7 @@ def test_blocks_are_believed():
     ("bend", "tries", "good"), [(0.4, 1, True), (0.55, 2, True), (1e4, 3, True), (1e5, 4, True), (1e10, 4, False)]
 )
 def test_blocks_soften_where_the_correction_fails(bend, tries, good):
-    """A bent invariant leaves a defect above the one before it."""
+    """A curved invariant leaves a residual above the previous one."""
     check(Case([1e-3, 0.0, 1.0], bend, 2e-6, [1e-6, 1e-6, 1e-12], blocks=[[0, 1]]), tries, good)
 
 
@@ -141,7 +141,7 @@ def place(k, bend=0.0):
 @pytest.mark.filterwarnings("ignore:the projection left:eip_scipy.ProjectionWarning")  # what is left out stays
 @pytest.mark.parametrize(("slope", "bend"), [(1e-3, 1.0), (0.2, 1e3)])
 def test_the_last_direction_is_left_out(slope, bend):
-    """A step of 5e-4 / slope along y1 bends the second invariant's defect beyond what it was: y1 stays."""
+    """A step of 5e-4 / slope along y1 increases the second invariant's residual by its curvature: y1 is not moved."""
     nearly = bent([1.0, slope, 0.0], bend, -0.5e-3, along=1)
     result = project([1e-3, 0.0, 0.0], [place(0), nearly])
     assert result.rank == 1

@@ -51,7 +51,7 @@ def starts(members, *, e=0.6, spread=1e-2):
 
 
 def same_members(run, single):
-    """Every number of each member is that of its own run, `single(k)`."""
+    """Check that every number of each member is that of its single run, `single(k)`."""
     for k in range(len(run.y)):
         own = single(k)
         np.testing.assert_array_equal(run.y[k], own.y[:, -1])
@@ -471,7 +471,7 @@ def test_what_was_there_survives_an_exception():
 @needs_jit
 def test_ctrl_c_within_a_second():
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
-    ensemble(kepler(), (0, 4e4), starts(8))  # compiled before, for members side by side too
+    ensemble(kepler(), (0, 4e4), starts(8))  # compiled before, for batches of members too
     timer.start()
     with pytest.raises(KeyboardInterrupt) as info:
         ensemble(kepler(), (0, 3e6), starts(8))

@@ -1,4 +1,4 @@
-"""Members of an ensemble in vectors: each gets the bits of a run of its own, whatever its neighbours do."""
+"""Members of an ensemble in batches: each gets the bits of a single run, whatever the other members do."""
 
 import math
 
@@ -111,7 +111,7 @@ def test_parallel_gradients():
 
 
 def test_members_leave_and_come_back():
-    """Components that stand alone make projections with softened weights: more than a vector does."""
+    """Components that are separate blocks make projections with softened weights: more than a batch does."""
     starts = spread_starts(np.array([1.0, 0.0, 0.0, 0.85]), 16, size=0.03)
     options = {"method": EIPRK5, "h": 0.3, "blocks": None, "save_every": 50, "every": 5}
     run = check_bits(kepler(), (0, 60), starts, **options)

@@ -43,7 +43,7 @@ class TooManyCallsError(Exception):
 class Case:
     """A system and the options of its runs.
 
-    `sick`: one of the invariants is none. `truth` holds the true states at `times`, `size` the largest value of each
+    `sick`: one of the invariants is false. `truth` holds the true states at `times`, `size` the largest value of each
     component, `growth` the factor by which the motion stretches a small change of the start.
     """
 

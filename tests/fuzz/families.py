@@ -535,7 +535,7 @@ FAMILIES = (
 
 
 def random_system(rng: np.random.Generator) -> System:
-    """One of them; some begin at another time, some have each component in a unit of its own."""
+    """Return one of them; some begin at another time, some have a different unit for each component."""
     system = FAMILIES[rng.integers(len(FAMILIES))](rng)
     if rng.random() < 0.3:
         system = begun_at(system, float(rng.choice([1.0, -7.3, 250.0])))

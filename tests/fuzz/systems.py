@@ -390,7 +390,7 @@ def look_at(seed: int) -> tuple[Runs | None, list[tuple[str, str]]]:
     try:
         if runs.plain.status < 0 and "h" not in case.steps:
             return None, []
-        if case.sick:  # each step may be moved off by far more than the tolerance: they get ever shorter
+        if case.sick:  # each step may be moved by far more than the tolerance: steps get ever shorter
             _ = runs.whole, runs.sampled, runs.scipy
     except TooManyCallsError:
         return None, []

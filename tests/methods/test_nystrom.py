@@ -219,7 +219,7 @@ def test_the_sums_of_this_file_find_a_wrong_coefficient(key, place):
 
 
 def moment_residuals(tableau, key):
-    """Sum (b + b_low) c^k less its exact value, in fractions, for the doubles of the step, in units of the least.
+    """Return sum (b + b_low) c^k minus its exact value, in fractions, for the doubles of the step, in least units.
 
     That is half a unit in the last place of each low part, which are the sums' only numbers that can be chosen.
     """

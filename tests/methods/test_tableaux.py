@@ -163,7 +163,7 @@ def test_arrays_are_read_only():
 
 
 def moment_residuals(tableau):
-    """Sum (b + b_low) c^k - 1/(k + 1) in fractions, for the doubles that the step uses, in units of the least possible.
+    """Return sum (b + b_low) c^k - 1/(k + 1) in fractions, for the doubles of the step, in units of the least possible.
 
     That is half a unit in the last place of each low part, which are the sums' only numbers that can be chosen.
     """

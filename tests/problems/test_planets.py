@@ -1,4 +1,4 @@
-"""Planets side by side: derivatives and rates in one pass over the pairs, and in two; wrong input."""
+"""Functions for many planets: derivatives and rates in one pass over the pairs, and in two; wrong input."""
 
 import numpy as np
 import pytest

@@ -83,7 +83,7 @@ def test_closed_forms_are_the_well_known_ones():
 
 @pytest.mark.parametrize("t", [60.0, -40.0])
 def test_solitons_go_around_the_ring(t):
-    """After some turns the same soliton stands elsewhere, as high and as wide."""
+    """After some turns the same soliton is elsewhere, as high and as wide."""
     scene = korteweg_de_vries_solitons(2.0, 0.0, points=350)
     u = scene.reference(t)
     assert u.max() == pytest.approx(1.0, abs=1e-2)
@@ -287,7 +287,7 @@ TABLEAUX = {
 @pytest.mark.parametrize("kept", [False, True], ids=["raw", "EIP"])
 @pytest.mark.parametrize("name", TABLEAUX)
 def test_order_of_lawson(name, kept):
-    """The tableau's, for a smooth field; its highest modes turn by up to 8 in a step."""
+    """The order is the tableau's for a smooth field; its highest modes turn by up to 8 in a step."""
     tableau, steps = TABLEAUX[name]
     equation = KortewegDeVries(Grid(24, 0, 20))
     problem = equation.problem(0.2 * np.cos(2 * np.pi * equation.grid.points(0) / 20), 1.0, h=0.01)

@@ -469,7 +469,7 @@ def test_max_defect_is_that_of_the_steps():
 
 
 def test_diagnostics_of_spaced_projections_are_those_after_projections():
-    """The defect does not depend on the saved states."""
+    """The diagnostics do not depend on the saved states."""
     options = {"h": 0.25, "invariants": SQUARE, "every": 2}
     assert run(save_every=1, **options).diagnostics.max_defect == run(**options).diagnostics.max_defect
 
@@ -760,7 +760,7 @@ def test_a_target_of_zero_is_kept_by_size_of_terms():
 
 
 def test_scale_of_an_invariant():
-    """A defect below four rounding errors of the scale is left alone."""
+    """A residual below four rounding errors of the scale is not corrected."""
     wide = Invariant(SQUARE.fun, SQUARE.grad, scale=1e12)
     result = run(invariants=wide)
     assert result.diagnostics.n_skipped == 10

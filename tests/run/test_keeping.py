@@ -406,7 +406,7 @@ def test_attributes_that_users_add(tmp_path):
     assert zarr.open_group(place, mode="r").attrs["comment"] == "a sweep"
 
 
-# Functions are compared where the checkpoint stands, too.
+# Functions are compared at the step of the checkpoint, too.
 
 
 def broken_off(place, **more):

@@ -366,7 +366,7 @@ def test_results_pickle():
         again.continue_to(10)
 
 
-# Runs that go on.
+# Continued runs.
 
 
 @pytest.mark.parametrize(

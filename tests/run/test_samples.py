@@ -319,7 +319,7 @@ def test_unprojected_states_are_off_the_manifold():
 
 @seldom
 def test_rows_of_members_lie_on_the_manifold(method, steps):
-    """The rows of an ensemble, and the largest defects, are those of single runs, also eight members at a time."""
+    """Rows and largest residuals of an ensemble are those of single runs, also with eight members at a time."""
     problem = kepler(0.6, relativistic=0.0, t_end=3.0)
     starts = problem.y0 * (1 + 0.01 * np.arange(9))[:, None]
     for rows in ({"save_every": 1}, {"t_eval": np.linspace(0, 3, 40)}):

@@ -37,7 +37,7 @@ def test_each_method_keeps_what_it_says(trials):
     wave = trials["modulated wave"]
     for name, kept in {"EIP-M": "mass", "EIP-E": "energy"}.items():
         lost = {"mass": "energy", "energy": "mass"}[kept]
-        # The longest steps leave defects of order 10 in h.
+        # The longest steps leave residuals of order 10 in h.
         assert wave.column(name, f"error_{kept}").max() < 1e-12 < wave.column(name, f"error_{lost}").max()
     fine = slice(2, None)
     for name in ("EIP-ME", "splitting4-EIP"):

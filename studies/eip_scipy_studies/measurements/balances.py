@@ -241,7 +241,7 @@ def rate_about_the_first(t, y, p):
 
 
 def encounter(turned: np.ndarray, turn: int) -> Case:
-    """An asteroid that passes the Earth at 5e-4 AU with 10 km/s after a year, and goes on for another; rtol 1e-9."""
+    """An asteroid that passes the Earth at 5e-4 AU with 10 km/s after a year, and continues for another; rtol 1e-9."""
     gm = 4 * math.pi**2 * np.array([1, 3.003e-6, 0])
     earth, speed = np.array([1.0, 0, 0]), math.sqrt(gm[0] + gm[1])
     q = np.array([[0, 0, 0], earth, earth + [5e-4, 0, 0]])

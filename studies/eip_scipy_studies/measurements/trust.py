@@ -130,7 +130,7 @@ class Trust(Measurement[list[dict[str, Any]]]):
 
     def measure(self, session: Session) -> list[dict[str, Any]]:
         numbers = [k for k, run in enumerate(all_runs()) if self.only in f"{run.group} {run.name} {run.label}"]
-        # Neighbours go together, for they share what their errors are measured against.
+        # Neighbouring runs are processed together, because they share the states that their errors refer to.
         parts = [numbers[k : k + CHUNK] for k in range(0, len(numbers), CHUNK)]
         found = []
         with workers(min(self.processes, len(parts))) as start, session.bar(len(numbers), "trust") as bar:

@@ -32,7 +32,7 @@ G = 9.81  # m/s^2
 FINEST = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
 
 
-# The N-four-bar mechanism: N windows of rods of 1 m and 1 kg. The cranks stand on (i, 0), their ends are B_i.
+# The N-four-bar mechanism: N windows of rods of 1 m and 1 kg. The cranks are fixed at (i, 0), their ends are B_i.
 
 
 def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
