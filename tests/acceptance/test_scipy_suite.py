@@ -5,8 +5,8 @@ other methods. Those of the 25 tests that take the default method, RK45, or Rada
 the place of RK45. ``python -m pytest tests/acceptance/test_scipy_suite.py -k shipped -rP`` prints the count for each
 class.
 
-And more strictly: each of its tests once per class, which it gets too where it takes the default method, or an implicit
-one on the way to something else. The same holds for `eip_scipy.solve_ivp` with the class EIPRK45, and with SciPy's own
+A stricter test runs each of them once per class, which also replaces the default method and implicit methods that are
+not the subject of the test. The same holds for `eip_scipy.solve_ivp` with the class EIPRK45, and with SciPy's own
 methods by name, where all tests run as they are shipped.
 """
 

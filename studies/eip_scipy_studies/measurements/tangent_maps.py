@@ -4,8 +4,8 @@ The state-transition matrix of Kepler's problem against its closed form; periodi
 problem; Lyapunov exponents compared with heyoka's variational equations, from one start and as means over a chaotic
 sea; MEGNO compared with REBOUND's variational particles, and with relativity, which these lack, compared with
 differences of orbits; the cost of columns of derivatives, by the source of the products with the Jacobian, and their
-gain in a fit. The figure is a map of MEGNO over the second of two planets' axis and eccentricity, by both. ``pip
-install "eip_scipy[heyoka,rebound,sympy]"``.
+gain in a fit. The figure is a map of MEGNO over the second of two planets' axis and eccentricity, by both.
+``pip install "eip_scipy[heyoka,rebound,sympy]"``.
 """
 
 from __future__ import annotations
