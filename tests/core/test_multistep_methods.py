@@ -462,7 +462,7 @@ def test_a_force_that_jumps_is_told():
     jumping = lambda t, q: -q * (1.0 if t < 3 else 1.5)  # noqa: E731
     found = run(20, [1.0, 0.0], acceleration=jumping, jacobian=None, method=EIPGJ12, h=0.03)
     assert found.status == -1
-    assert "or forces jump" in found.message
+    assert "or forces that jump" in found.message
     assert 3 <= float(found.message.split("at t=")[1].split(":")[0]) < 6
 
 

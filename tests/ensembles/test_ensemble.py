@@ -483,7 +483,7 @@ def test_memory_is_refused_before_it_is_taken():
     many = np.broadcast_to([1.0, 0.0], (1000, 2))
     with pytest.raises(MemoryError, match=r"1000 members of 2 components need 0\.0162 GB.*save_every.*reduce=.*out="):
         ensemble(oscillator, (0, 1), many, h=0.001, save_every=1, max_bytes=1e7)
-    with pytest.raises(MemoryError, match="run them in parts"):
+    with pytest.raises(MemoryError, match="Run the members in parts"):
         ensemble(oscillator, (0, 1), many, h=0.001, max_bytes=1e4)
 
 
@@ -569,7 +569,9 @@ def test_a_process_that_dies(tmp_path):
     options = {"h": 0.1, "chunk": 3, "checkpoint": tmp_path / "kept", "compiled": False}
     with (
         ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as executor,
-        pytest.raises(BrokenProcessPool, match=r"worker of the executor died before members \d to \d+ came") as info,
+        pytest.raises(
+            BrokenProcessPool, match=r"worker of the executor died before members \d to \d+ finished"
+        ) as info,
     ):
         ensemble(ends_its_process, (0, 1), y0s, executor=executor, **options)
     done = int((info.value.partial.status == 0).sum())

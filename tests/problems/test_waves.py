@@ -242,7 +242,7 @@ def test_methods_that_problems_bring():
 
 
 def test_a_problem_without_a_method_needs_one():
-    with pytest.raises(TypeError, match=r"^integrate: method is missing\. Take EIPDOP853 .*eip_scipy\.recommend"):
+    with pytest.raises(TypeError, match=r"^integrate: method is missing\. Use EIPDOP853 .*eip_scipy\.recommend"):
         integrate(kepler())
 
 

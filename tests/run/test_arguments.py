@@ -200,7 +200,7 @@ def test_what_is_refused():
         integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=K)
     with pytest.raises(TypeError, match="args or params, not both"):
         integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K,), params=[K])
-    with pytest.raises(TypeError, match="give params="):
+    with pytest.raises(TypeError, match="pass params="):
         integrate(kepler(), method=EIPRK4, args=(K,))
     with pytest.raises(TypeError, match=r"fun is called with \(t, y, args\[0\]\): missing a required argument: 'm'"):
         integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K,))

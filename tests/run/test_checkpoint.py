@@ -539,7 +539,7 @@ def test_a_file_that_is_there_is_not_replaced(tmp_path):
     path = tmp_path / "run"
     for content in (b"", b"my only copy"):
         path.write_bytes(content)
-        with pytest.raises(CheckpointError, match=r"exists\. resume=True goes on .* delete this one"):
+        with pytest.raises(CheckpointError, match=r"exists\. Pass resume=True to continue .* delete this one"):
             integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
         with pytest.raises(CheckpointError, match="is damaged, or not a checkpoint of eip_scipy"):
             integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
@@ -556,7 +556,7 @@ def test_no_file_yet(tmp_path):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"resume": True}, ValueError, "resume=True needs a file to resume from: checkpoint=path"),
+        ({"resume": True}, ValueError, "resume=True needs a file to resume from: pass checkpoint=path"),
         ({"resume": "yes", "checkpoint": "a"}, ValueError, "resume must be True or False, got 'yes'"),
         ({"checkpoint": 3}, TypeError, "checkpoint must be the path of a file, got 3"),
         ({"checkpoint": "a", "checkpoint_every": 0}, ValueError, "checkpoint_every must be a number of seconds > 0"),
@@ -613,7 +613,7 @@ def test_other_arguments_are_named(name, old_run):
         CheckpointError, match=rf"belongs to another run: (.*; )?{name} (is .* there and|differs)"
     ) as info:
         integrate(fun, SPAN, Y0, checkpoint=path, resume=True, **options)
-    assert "Resume with the arguments of that run, or name another file" in str(info.value)
+    assert "Resume with the arguments of that run, or use another file" in str(info.value)
 
 
 def test_another_start_end_or_method_of_stepping(old_run, tmp_path):
@@ -723,7 +723,7 @@ CHANGES = {
     "another shape": (lambda h, a: a.update(carry=np.zeros(5)), r"carry is float64 \(5,\), expected float64 \(4,\)"),
     "another type": (lambda h, a: a.update(y=a["y"] * 1j), "y is complex128"),
     "rows are missing": (lambda h, a: a.update(saved_y=a["saved_y"][1:]), r"saved_y is float64 \(29, 4\), expected"),
-    "a negative number of rows": (lambda h, a: a.update(place=np.array([5, -1, 0])), "it stands at step 5, row -1"),
+    "a negative number of rows": (lambda h, a: a.update(place=np.array([5, -1, 0])), "it is at step 5, row -1"),
     "no settings": (lambda h, a: h.pop("settings"), "belongs to another run: method is null there"),
     "settings of another kind": (lambda h, a: h.update(settings=[1]), "belongs to another run"),
     "no time": (lambda h, a: h.update(wall_time="long"), "is not a checkpoint of this run"),
@@ -865,7 +865,9 @@ def test_a_run_does_not_go_on_from_a_damaged_file(old_run, tmp_path):
     data = raw.index(b"header.json") + 11, raw.index(b"PK\x01\x02")  # before the directory of the archive
     for k in np.random.default_rng(1).integers(*data, size=40):
         path.write_bytes(raw[:k])
-        with pytest.raises(CheckpointError, match=r"run' is damaged, or not a checkpoint of eip_scipy: .* Go back to"):
+        with pytest.raises(
+            CheckpointError, match=r"run' is damaged, or not a checkpoint of eip_scipy: .* Restore a copy"
+        ):
             integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
         assert path.read_bytes() == raw[:k]
         path.write_bytes(raw[:k] + bytes([raw[k] ^ 4]) + raw[k + 1 :])

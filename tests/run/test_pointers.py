@@ -339,7 +339,7 @@ def test_no_value(c, k, status, compiled):
     assert 0.9 < run.t[-1] < 1.2
     assert np.isfinite(run.y).all()
     assert "t=1" in run.message
-    assert ("or returns a status above 0" in run.message) == (k == 0)
+    assert ("if it returns a status above 0" in run.message) == (k == 0)
     with_python = ending(c, k, status, compiled=not compiled)
     assert with_python.message.partition(" (")[0] == run.message.partition(" (")[0]
 
@@ -605,7 +605,7 @@ def test_what_has_no_function_of_eight_is_named(c):
     run = ensemble(c.kepler, (0, 1), [Y0, Y0], invariants=kept, **options)
     assert run.one_by_one == "fun is a C function without a form for eight members (CFunctions)"
     run = ensemble(fun, (0, 1), [Y0, Y0], invariants=alone(c), **options)
-    assert run.one_by_one.startswith("invariant 'H L' is a C function of one member")
+    assert run.one_by_one.startswith("invariant 'H L' is a C function without a form for eight members")
     run = ensemble(fun, (0, 1), [Y0, Y0], invariants=kept, **options)
     assert run.side_by_side.all()
 

@@ -166,7 +166,7 @@ def test_stiffness_is_named(name):
     assert choice.stiff
     said = re.search(r"error of (\S+) with (\d+) evaluations.*rtol=(\S+), atol=(\S+), or EIPBDF", choice.reason)
     error, nfev, rtol, atol = map(float, said.groups())
-    assert "The equations are stiff: stability bounds the steps" in choice.reason
+    assert "The equations are stiff: stability limits the steps" in choice.reason
     assert error <= 1e-4
     assert 3 * nfev <= choice.nfev
     if choice.share == 1:
