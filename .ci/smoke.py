@@ -1,4 +1,4 @@
-"""What an installation must do, with its dependencies and nothing else: `.ci/wheel` and cibuildwheel run it.
+"""Tests of an installation with its dependencies only, run by `.ci/wheel`.
 
 By assertions, since there is no pytest where it runs.
 """
@@ -20,7 +20,7 @@ from eip_scipy.problems import kepler, solar_system, soliton
 from eip_scipy.run.view import page
 
 MEGABYTES = 6  # builds by zig contain their C++ library; building/wheels.py limits the size of the wheel itself
-# Of the defects; without projection those of the first example are 9e-5.
+# Bound of the invariant errors; without projection those of the first example are 9e-5.
 BOUND = 1e-11
 
 package = Path(eip_scipy.__file__).parent

@@ -14,7 +14,7 @@ from .inputs import refuse_units
 __all__ = ["frame_rows", "spanned"]
 
 SPANNED = 1e-9
-# Of a run without one.
+# Rows of a run without a frame.
 NO_FRAME = FrameRows(np.zeros((2, 1), INDEX), np.zeros(0, INDEX), np.zeros(0), np.zeros(0), np.zeros((2, 0, 0)))
 
 

@@ -225,7 +225,7 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
 
 
 def _native(fun: Any, kind: Kind, name: str, floats: int, **others: Any) -> Native:
-    """Return a function with its address; it fills so many floats, and takes and gives what `kind` and `others` say."""
+    """Return a function with its address; it fills `floats` floats, and has the signature of `kind` and `others`."""
     if isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)
     if jit_is_off():

@@ -278,7 +278,7 @@ def test_archives_whose_bodies_change(tmp_path):
         (lambda run: exchange.to_simulation(kepler()), TypeError, "expected a problem of bodies"),
         (lambda run: exchange.to_simulation(run, row=99), ValueError, "no row 99, the run has"),
         (lambda run: exchange.to_simulation(run, run.y[:, 0], row=0), ValueError, "y or row, not both"),
-        (lambda run: exchange.to_simulation(run, run.y[:, 0] + 1), ValueError, "no saved state of the run; say"),
+        (lambda run: exchange.to_simulation(run, run.y[:, 0] + 1), ValueError, "not a saved state of the run. Give"),
         (lambda run: exchange.to_simulation(run, run.y[:6, 0], t=0), ValueError, r"4 bodies is \(6 N,\), got \(6,\)"),
         (lambda run: exchange.to_simulation(solar_system(), row=0), ValueError, "row is for runs"),
         (lambda run: exchange.to_archive(solar_system(), "x.bin"), TypeError, "expected a run by integrate"),

@@ -251,7 +251,7 @@ def in_c(name, folder):
 
 
 def system(name, source, folder):
-    """What `integrate` takes: the problem or function, and its options; compiled once for the runs of a test."""
+    """Return the arguments of `integrate`: the problem or function, and its options, compiled once for a test."""
     rates, params, kept, y0 = SYSTEMS[name]
     options = {"t_span": (0, STEP * STEPS), "y0": y0, "method": EIPDOP853}
     if source == "SymPy":

@@ -53,7 +53,7 @@ inline void weigh_packed_rows(const Options &o, const W &w, const double *sigma)
     }
 }
 
-// Of each invariant the correction of a column by which G M = kept is missed by one, into w.B: the least one in the weights
+// Computes for each invariant the correction of a column if G M = kept is missed by one, into w.B: the least one in the weights
 // sigma of the state. The rows of G and of its factorisation are packed.
 template <class W>
 inline void find_corrections(const Options &o, const W &w, int64_t rank, const Matrix &rows, const double *sigma) {

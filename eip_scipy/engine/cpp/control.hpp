@@ -62,14 +62,14 @@ inline bool look_back(const AnyRun &run, const Step &step) {
     return sampled && is_sampled_for_resolution(w);
 }
 
-// The same, and that comparison.
+// Computes what the projection needs, and compares the local errors with the changes in each block.
 template <class AnyRun>
 inline void look_back_and_compare(const AnyRun &run, const Step &step) {
     if (look_back(run, step) && !run.options.adaptive) [[unlikely]]
         note_roughness(step, run.options, run.work);
 }
 
-// The same of a run with columns of derivatives, which nothing of this depends on.
+// Does so for a run with columns of derivatives; nothing of it depends on them.
 [[gnu::noinline]] inline void look_back_at_state(const Run &run, const Step &step) {
     of_state_alone(run, [&](const auto &alone) { look_back_and_compare(alone, step); });
     int64_t &have = run.work.counters[HAVE_F];

@@ -19,7 +19,7 @@ using Rows = StatesOf<const double, 2>;
 using Numbers = ArrayOf<const double, 1>;
 using Buffer = std::vector<double>;
 
-// Whether numbers are of single precision and use more than half of its bits.
+// Detection of numbers of single precision that use more than half of its bits.
 class Single {
   public:
     void add(double value) {
@@ -61,8 +61,8 @@ class InvariantFunctions {
         return out;
     }
 
-    // Whether nothing is wrong with the values' precision, with the gradients G and with the invariance at a state. Of a
-    // run of no duration nothing is known. NaN are not in order.
+    // True if nothing is wrong with the values' precision, with the gradients G and with the invariance at a state. For a
+    // run of no duration it is false, and for NaN too.
     bool is_in_order(double t, State y, State f, Rows G, Numbers here, double tau, std::tuple<double, double> interval,
                      Rows directions) {
         const double *state = checked(y), *slope = checked(f), *gradients = checked_rows(G, l_), *values = known(here);
@@ -184,7 +184,7 @@ class InvariantFunctions {
         return found;
     }
 
-    // Whether no invariant changes along a derivative of double precision.
+    // True if no invariant changes along a derivative of double precision.
     bool are_kept(const double *f, const double *G) const {
         for (int64_t j = 0; j < m_; ++j) {
             Single single;
@@ -204,7 +204,7 @@ class InvariantFunctions {
         return std::equal(values.begin(), values.end(), expected);
     }
 
-    // Whether the values are the same at two other times.
+    // True if the values are the same at two other times.
     bool are_fixed(double t, const double *y, const double *here, double tau,
                    const std::tuple<double, double> &interval) const {
         const auto [low, high] = interval;
@@ -217,7 +217,7 @@ class InvariantFunctions {
         return have_values(far, y, here) && have_values(t + side * std::exp2(step), y, here);
     }
 
-    // Whether the gradients agree with differences along two directions, `ways`, of values that have double precision.
+    // True if the gradients agree with differences along two directions, `ways`, of values that have double precision.
     bool have_right_gradients(double t, const double *y, const double *f, const double *G, const double *here,
                               double tau, const double *ways) const {
         const double moving = largest(f), size = largest(y);

@@ -5,7 +5,7 @@
 namespace eip {
 
 // Gradients are compared with central differences over steps of this length in units of the components' motion, and may
-// differ by this share of the terms and by so many roundings of the values.
+// differ by this fraction of the terms and by this number of roundings of the values.
 constexpr double CHECK_STEP = 6e-6, CHECK_TOLERANCE = 1e-4, CHECK_NOISE = 6.0;
 // The share of its terms by which an invariant may change along the flow.
 constexpr double INVARIANCE_TOLERANCE = 1e-8;

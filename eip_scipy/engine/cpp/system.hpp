@@ -120,7 +120,7 @@ struct System {
         call_rhs(w, t, rhs_pointer.library ? y : copied(y, scratch, w.m), out);
     }
 
-    // The same with the derivatives of all columns, also for the state alone, behind which they are.
+    // The derivative with those of all columns, also for the state alone, behind which the columns are.
     template <class W>
     void rhs_of_whole(const W &w, double t, const double *y, double *out) {
         if (columns) [[unlikely]]
@@ -262,7 +262,7 @@ struct System {
     }
 
   private:
-    // Of the state alone, where m is its length and the function takes it, or of the state with its columns.
+    // Derivative of the state alone if m is its length and the function accepts it, or of the state with its columns.
     void rhs_with_columns(int64_t m, double t, const double *y, double *out) {
         const int64_t wide = columns->wide(), length = takes_state && m == columns->size ? m : wide;
         call_rhs(Length{length}, t, rhs_pointer.library ? y : copied(y, scratch, wide), out);

@@ -130,7 +130,7 @@ def states_near(
         origin = _nearest(y, constraints, time, sizes)
         for share in NEARER:
             moved = _nearest(origin + share * sizes * direction, constraints, time, sizes)
-            # What is nearest is not farther away than the start; Newton's method may end beyond a singular position.
+            # The nearest state is not farther away than the start; Newton's method may end beyond a singular position.
             near = np.linalg.norm((moved - origin) / sizes) <= 2 * share * np.linalg.norm(direction) * (1 + CONSTANT)
             meets = all(_meets(item, time, moved) for item in constraints)
             if near and meets and np.isfinite(derivative(time, moved)).all():
