@@ -417,13 +417,17 @@ def _speed_gradient(problem, y):
     return out[2:, 3:]
 
 
-def particle(constrained_speeds):
-    """Return a particle on the parabola y = x^2, with or without the velocity constraint."""
+def point_in_a_plane():
+    """Return coordinates and speeds, mass and gravity, and the frame with its origin and a point at (x, y)."""
     x, y, u, v = me.dynamicsymbols("x y u v")
-    m, g = sympy.symbols("m g")
     N, origin = me.ReferenceFrame("N"), me.Point("O")
     origin.set_vel(N, 0)
-    P = origin.locatenew("P", x * N.x + y * N.y)
+    return (x, y, u, v), sympy.symbols("m g"), (N, origin, origin.locatenew("P", x * N.x + y * N.y))
+
+
+def particle(constrained_speeds):
+    """Return a particle on the parabola y = x^2, with or without the velocity constraint."""
+    (x, y, u, v), (m, g), (N, _, P) = point_in_a_plane()
     P.set_vel(N, u * N.x + v * N.y)
     dependent = {"u_dependent": [v], "velocity_constraints": [v - 2 * x * u]} if constrained_speeds else {}
     model = me.KanesMethod(
@@ -463,11 +467,7 @@ def test_lagranges_method_and_a_system_give_the_same_motion():
 
 def parabola_as_system(by_speeds):
     """Return the particle as a System of SymPy, whose equations are not formed yet."""
-    x, y, u, v = me.dynamicsymbols("x y u v")
-    m, g = sympy.symbols("m g")
-    N, origin = me.ReferenceFrame("N"), me.Point("O")
-    origin.set_vel(N, 0)
-    P = origin.locatenew("P", x * N.x + y * N.y)
+    (x, y, u, v), (m, g), (N, origin, P) = point_in_a_plane()
     P.set_vel(N, u * N.x + v * N.y if by_speeds else x.diff() * N.x + y.diff() * N.y)
     system = me.System(N, origin)
     system.add_bodies(me.Particle("A", P, m))

@@ -35,7 +35,7 @@ inline void evaluate_raw(const AnyRun &run, const Step &step) {
     ++w.counters[NFEV];
     if constexpr (IS_SINGLE<AnyRun>) {
         auto &system = run.system;
-        system.all_at_raw = system.together && step.project && !system.columns;
+        system.all_at_raw = system.together && step.project;
         if (system.all_at_raw) return system.together->all(w.y_hat, w.last(), w.values, w.G, system.params);
         if (!is_for_projection(run.options, step)) return system.rhs_of_whole(w, step.t_new, w.y_hat, w.last());
     }

@@ -250,25 +250,11 @@ class InvariantFunctions {
     std::vector<PythonCall> inv_, grad_;
 };
 
-int traverse(PyObject *self, visitproc visit, void *arg) {
-    Py_VISIT(Py_TYPE(self));
-    if (nb::inst_ready(self)) Py_VISIT(nb::inst_ptr<InvariantFunctions>(self)->kept().ptr());
-    return 0;
-}
-
-int clear(PyObject *self) {
-    nb::inst_ptr<InvariantFunctions>(self)->clear();
-    return 0;
-}
-
-PyType_Slot slots[] = {
-    {Py_tp_traverse, reinterpret_cast<void *>(traverse)}, {Py_tp_clear, reinterpret_cast<void *>(clear)}, {0, nullptr}};
-
 }  // namespace
 
 void add_examination(nb::module_ &module) {
     using Functions = InvariantFunctions;
-    nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(slots),
+    nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
                           "The invariants of a run and their gradients, each as a `Call`.")
         .def(nb::init<const nb::tuple &, const nb::tuple &, int64_t, bool>(), "values"_a, "gradients"_a, "n"_a,
              "is_complex"_a)

@@ -335,22 +335,8 @@ class Engine {
     bool stepped_ = false;  // by `step`
 };
 
-int traverse(PyObject *self, visitproc visit, void *arg) {
-    Py_VISIT(Py_TYPE(self));
-    if (nb::inst_ready(self)) Py_VISIT(nb::inst_ptr<Engine>(self)->kept().ptr());
-    return 0;
-}
-
-int clear(PyObject *self) {
-    nb::inst_ptr<Engine>(self)->clear();
-    return 0;
-}
-
-PyType_Slot engine_slots[] = {
-    {Py_tp_traverse, reinterpret_cast<void *>(traverse)}, {Py_tp_clear, reinterpret_cast<void *>(clear)}, {0, nullptr}};
-
 void add_engine(nb::module_ &m) {
-    nb::class_<Engine>(m, "Engine", nb::type_slots(engine_slots),
+    nb::class_<Engine>(m, "Engine", nb::type_slots(Collected<Engine>::slots),
                        "The step of one run, on its arrays. `functions` says in `native` whether it holds addresses.")
         .def(nb::init<nb::object, nb::object, nb::object, nb::object, nb::object, nb::object>(), "method"_a,
              "options"_a, "work"_a, "functions"_a, "schedule"_a = nb::none(), "hooks"_a = nb::none(),
