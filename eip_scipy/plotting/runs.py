@@ -62,7 +62,7 @@ def run_figure(
     else:
         _draw_components(figure, grid[0], np.asarray(t), components)
     axes = [figure.add_subplot(grid[k]) for k in range(1, len(widths))]
-    styles = method_styles(errors)
+    styles = method_styles(dict.fromkeys([*errors, *corrections]))
     for name, values in errors.items():
         axes[0].plot(t, _above_zero(np.abs(values)), lw=1.1, **styles[name] | {"marker": None})
     if errors:
@@ -166,9 +166,11 @@ def _above_zero(magnitudes: np.ndarray) -> np.ndarray:
 
 def _draw_corrections(axis: Axes, corrections: Mapping[str, float], styles: Mapping[str, Mapping[str, Any]]) -> None:
     for k, (name, size) in enumerate(corrections.items()):
-        axis.bar(k, max(size, FLOOR), width=0.6, color=styles[name]["color"])
-    axis.set_xticks(range(len(corrections)), list(corrections))
-    axis.axhline(USUAL, color="0.4", lw=1.0, ls=":")
-    text = axis.annotate("most correct runs stay below", (0.02, USUAL), xycoords=("axes fraction", "data"))
-    text.set(va="bottom", fontsize="x-small")
-    log_errors(axis, "", "largest correction [local errors]")
+        axis.barh(k, max(size, FLOOR), height=0.6, color=styles[name]["color"])
+    axis.set(yticks=range(len(corrections)), yticklabels=list(corrections), xscale="log")
+    axis.invert_yaxis()
+    axis.axvline(USUAL, color="0.4", lw=1.0, ls=":")
+    text = axis.annotate("most correct runs stay below", (USUAL, 0.01), xycoords=("data", "axes fraction"), rotation=90)
+    text.set(ha="right", va="bottom", fontsize="x-small")
+    axis.set_xlabel("largest correction [local errors]")
+    axis.grid(alpha=0.3)

@@ -77,7 +77,7 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
         result.t,
         components,
         paths=paths,
-        errors={name: errors for name, (_, errors) in invariants.items()},
+        errors={name: errors for name, (_, errors) in invariants.items() if not np.isnan(errors).all()},  # no balances
         corrections={name: size for name, size in corrections.items() if name in invariants and np.isfinite(size)},
         title=described(result),
     )

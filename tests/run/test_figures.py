@@ -121,6 +121,7 @@ CELLS = {
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_notebook_shows_the_figure_once(monkeypatch):
     """The figure is shown without the magic of IPython, and with it."""
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")

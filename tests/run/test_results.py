@@ -532,8 +532,8 @@ def test_plot_of_an_orbit():
     wanted = np.abs(run.invariants[0] - run.target[0])
     np.testing.assert_array_equal(shown[wanted > 0], wanted[wanted > 0])
     assert np.all(shown > 0)
-    heights = [bar.get_height() for bar in corrections.patches]
-    np.testing.assert_array_equal(heights, run.diagnostics.corrections)
+    sizes = [bar.get_width() for bar in corrections.patches]
+    np.testing.assert_array_equal(sizes, run.diagnostics.corrections)
 
 
 def test_plot_of_components():
