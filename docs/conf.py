@@ -2,11 +2,8 @@
 
 Neither the build nor the pages ask the network for anything: formulas become MathML, names of other projects are looked
 up in ``_inventories``, and the theme's fonts are the reader's.
-
-EIP_NOTEBOOKS names a folder with the notebooks as they were run; without it they are shown without their outputs.
 """
 
-import os
 import shutil
 from pathlib import Path
 
@@ -35,7 +32,7 @@ exclude_patterns = ["_build", "_inventories"]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3
-nb_execution_mode = "off"  # .ci/run runs them
+nb_execution_mode = "off"  # .ci/notebooks executed them
 nb_merge_streams = True
 nb_output_stderr = "remove"  # progress bars
 
@@ -79,14 +76,11 @@ def without_single_names(app, env):
 
 
 def show_notebooks():
-    """Copy the notebooks of examples/ next to their page, and remove older copies."""
+    """Copy the executed notebooks of examples/ next to their page, and remove older copies."""
     shown = Path(__file__).parent / "notebooks"
-    for page in (*shown.glob("*.md"), *shown.glob("*.ipynb")):
-        if page.name != "index.md":
-            page.unlink()
-    executed = os.environ.get("EIP_NOTEBOOKS")
-    sources = Path(executed).glob("*.ipynb") if executed else (shown.parents[1] / "examples").glob("*.md")
-    for source in sources:
+    for page in shown.glob("*.ipynb"):
+        page.unlink()
+    for source in (shown.parents[1] / "examples").glob("*.ipynb"):
         shutil.copy(source, shown)
 
 
