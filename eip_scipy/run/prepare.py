@@ -590,7 +590,7 @@ def _schedule(span: Span, tau: float, request: Request, events: Events) -> Sched
     if t_eval is not None:
         if save_every is not None:
             raise ValueError("give save_every or t_eval, not both.")
-        times = _evaluation_times(t_eval, span)
+        times = evaluation_times(t_eval, span.t0, span.t_bound)
     n_events = len(events.functions)
     return Schedule(
         span=span,
@@ -606,14 +606,15 @@ def _schedule(span: Span, tau: float, request: Request, events: Events) -> Sched
     )
 
 
-def _evaluation_times(t_eval: Any, span: Span) -> np.ndarray:
+def evaluation_times(t_eval: Any, t0: float, t_bound: float) -> np.ndarray:
+    """Return the times of `t_eval`, checked as SciPy does."""
     times = real_array("t_eval", t_eval)
     if times.ndim != 1 or times.size == 0:
         raise ValueError("`t_eval` must be 1-dimensional and not empty.")
     if not np.isfinite(times).all():
         raise ValueError("t_eval must be finite.")
-    if np.any(times < min(span.t0, span.t_bound)) or np.any(times > max(span.t0, span.t_bound)):
+    if np.any(times < min(t0, t_bound)) or np.any(times > max(t0, t_bound)):
         raise ValueError("Values in `t_eval` are not within `t_span`.")
-    if np.any(span.sign * np.diff(times) <= 0):
+    if np.any(np.sign(t_bound - t0) * np.diff(times) <= 0):
         raise ValueError("Values in `t_eval` are not properly sorted.")
     return times

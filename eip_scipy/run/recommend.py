@@ -16,6 +16,7 @@ from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
 from ..core.states import initial_state
 from ..core.stepping import interval
+from .prepare import evaluation_times
 from .recommendation import Recommendation
 from .search import Search
 
@@ -46,6 +47,7 @@ def recommend(
     error: float = 1e-6,
     invariants: Any = None,
     max_nfev: int | None = None,
+    t_eval: Any = None,
     **keywords: Unpack[RecommendKeywords],
 ) -> Recommendation:
     """Find method, step or tolerance, metric and blocks for a wanted error, by trial runs.
@@ -69,6 +71,9 @@ def recommend(
     max_nfev : int, optional
         Approximate bound on the evaluations of one trial; default: 100 000, and 500 000 for compiled functions. A
         longer run is tried on the first part of its interval, and its error is extrapolated.
+    t_eval : array_like, optional
+        Times at which the recommended run saves states, as for `integrate`. Methods are then compared with the
+        evaluations that states between their steps take.
     params, in_place, jacobian, metric, blocks, frame, compiled
         As for `integrate`, for all runs. With `jacobian`, or a problem that has one, `EIPGJ14` is tried.
 
@@ -110,7 +115,8 @@ def recommend(
     options: dict[str, Any] = dict(keywords)
     _check(error, max_nfev, options)
     problem, common = _problem(_right_hand_side(fun, acceleration, options), t_span, y0, invariants, options)
-    return Search(problem, common, float(error), max_nfev).recommendation()
+    output = None if t_eval is None else evaluation_times(t_eval, *problem.t_span)
+    return Search(problem, common, float(error), max_nfev, output).recommendation()
 
 
 def _right_hand_side(fun: Any, acceleration: Any, options: dict[str, Any]) -> Any:
@@ -132,7 +138,7 @@ def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
         if name not in COMMON:
             raise TypeError(
                 f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} It finds method, step and "
-                "tolerances; pass options for saving, events and the like to run()."
+                "tolerances; pass options for events and the like to run()."
             )
     if not is_number(error) or not 0 < error < 1:
         raise ValueError(f"error must be a number between 0 and 1, got {shown(error)}.")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.invariants import as_invariants
 from ..core.problem import Problem
 from ..core.results import ProjectionWarning
 from ..core.runs import Counted
@@ -82,8 +83,10 @@ class Look:
 class Search:
     """The search for one problem: all trials, in the order in which they were run."""
 
-    def __init__(self, problem: Problem, common: Mapping[str, Any], wanted: float, max_nfev: int | None) -> None:
-        self.bench, self.wanted = Bench(problem, common), wanted
+    def __init__(
+        self, problem: Problem, common: Mapping[str, Any], wanted: float, max_nfev: int | None, output: Any = None
+    ) -> None:
+        self.bench, self.wanted = Bench(problem, common, output), wanted
         self.asked = bool(common.get("invariants", problem.invariants))
         self.keeps = self.asked
         self.trials: list[Trial] = []
@@ -112,7 +115,11 @@ class Search:
             warnings.warn(f"recommend: {self.message}", ProjectionWarning, stacklevel=3)
         return Recommendation(
             problem=self.bench.problem,
-            options={**chosen.options, **{k: v for k, v in self.bench.common.items() if k not in chosen.options}},
+            options={
+                **chosen.options,
+                **{k: v for k, v in self.bench.common.items() if k not in chosen.options},
+                **({} if self.bench.output is None else {"t_eval": self.bench.output}),
+            },
             trial=chosen,
             wanted=self.wanted,
             share=self.bench.share,
@@ -235,7 +242,15 @@ class Search:
         tried = tune(kind, value, self.wanted, self._trial, bound)
         for trial in tried:
             self.kinds[id(trial)] = kind
-        return best(tried, self.wanted)
+        chosen = best(tried, self.wanted)
+        return None if chosen is None else self._with_output(chosen)
+
+    def _with_output(self, chosen: Trial) -> Trial:
+        """Return the trial with the evaluations that states at the times of output take, and keep it in the table."""
+        counted = self.bench.with_output(chosen)
+        self.trials[[trial is chosen for trial in self.trials].index(True)] = counted
+        self.kinds[id(counted)] = self.kinds[id(chosen)]
+        return counted
 
     def _trial(self, options: Mapping[str, Any]) -> Trial:
         self.trials.append(self.bench.trial(options))
@@ -259,6 +274,8 @@ class Search:
         problem, n = self.bench.problem, self.bench.problem.y0.size
         if problem.metric is not None or "metric" in self.bench.common:
             return []
+        if any(item.subspaces for item in as_invariants(self.bench.common.get("invariants", problem.invariants))):
+            return []  # these have their own metric
         found: list[dict[str, Any]] = []
         if problem.blocks is None and "blocks" not in self.bench.common and self.look.velocities is not None:
             found += [{"blocks": size} for size in (3, 2) if n % (2 * size) == 0 and n > 2 * size]

@@ -71,11 +71,11 @@ class Bench:
     """A problem, the options that all trials have in common, and the times at which trials are compared.
 
     `truth` holds the reference states at these times; their own error is about `doubt`. `most` is an approximate bound
-    on the evaluations of a trial.
+    on the evaluations of a trial. `output` are the times at which the user wants states, or None.
     """
 
-    def __init__(self, problem: Problem, common: Mapping[str, Any]) -> None:
-        self.problem, self.common = problem, common
+    def __init__(self, problem: Problem, common: Mapping[str, Any], output: np.ndarray | None = None) -> None:
+        self.problem, self.common, self.output = problem, common, output
         self.t0, self.t_end = problem.t_span
         self.times: Sequence[float] = [self.t_end]
         self.truth, self.doubt, self.most = np.zeros(0), 0.0, UNBOUNDED
@@ -140,6 +140,23 @@ class Bench:
         return (
             replace(found, error=max(found.error, self.doubt)) if found.good else found
         )  # it may be the reference run
+
+    def with_output(self, trial: Trial) -> Trial:
+        """Return the trial with the evaluations of a run that saves states at the times of output."""
+        if self.output is None:
+            return trial
+        end = self.times[-1]
+        asked = {
+            **self.common,
+            **trial.options,
+            "t_eval": self.output[np.abs(self.output - self.t0) <= abs(end - self.t0)],
+        }
+        if asked["t_eval"].size == 0:
+            return trial
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            run = integrate(self.problem, (self.t0, end), **asked)
+        return replace(trial, nfev=round(run.nfev / self.share))
 
     def judged(self, options: Mapping[str, Any], done: Outcome, truth: np.ndarray) -> Trial:
         """Return the trial of a run whose states are compared with `truth`."""

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from systems import H, L, orbit, pericentre
 
 from eip_scipy import EIPGJ14, EIPRadau, Invariant, ProjectionWarning, integrate, recommend
-from eip_scipy.problems import kepler, solar_system
+from eip_scipy.problems import kepler, satellite, solar_system
 from eip_scipy_studies.hard_cases import hard_cases
 
 FACTOR = 10.0
@@ -256,3 +256,20 @@ def test_arguments(arguments, kind, message):
     given = {"fun": pendulum, "t_span": (0, 1), "y0": [1.0, 0.0]} | arguments
     with pytest.raises(kind, match=message):
         recommend(**given)
+
+
+def test_states_between_steps_count():
+    """The expected evaluations are those of the run that saves states at the wanted times."""
+    times = np.linspace(0, 50, 501)
+    choice = recommend(kepler(0.3, relativistic=0), (0, 50), error=1e-6, t_eval=times)
+    run = choice.run()
+    np.testing.assert_array_equal(run.t, times)
+    assert run.nfev == choice.nfev > recommend(kepler(0.3, relativistic=0), (0, 50), error=1e-6).nfev
+    with pytest.raises(ValueError, match="not within `t_span`"):
+        recommend(kepler(), (0, 5), t_eval=[1.0, 6.0])
+
+
+def test_the_metric_of_balances_of_components_is_their_own():
+    problem = satellite([7000.0, 0, 0], [0, 7.5, 1.0], mu=398600.4418, radius=6378.137, j2=1.08e-3, t_span=(0, 20_000))
+    choice = recommend(problem, error=1e-6)
+    assert all("metric" not in trial.options for trial in choice.trials)
