@@ -22,8 +22,9 @@ __all__ = ["BOTH", "CONSTRAINTS", "FACTORS", "NEITHER", "Outcome", "Way", "kept"
 
 BOTH, CONSTRAINTS, NEITHER = "constraints and energy", "constraints", "DOP853"
 FACTORS = (1.0, 5.0, 10.0)  # of Baumgarte
-# A run of another method ends with an error after this number of calls.
+# A run ends after this number of calls: at singular positions those without projection need millions of them.
 MOST_CALLS = 150_000
+ROWS = 10  # times that a run by steps of `integrate` is looked at until then
 FREE = 1e10  # absolute tolerance of IDA's multipliers, which are not part of the motion
 
 
@@ -66,18 +67,24 @@ def ways(problem: MechanicsProblem, session: Session) -> dict[str, Way]:
     return found
 
 
-def kept(problem: MechanicsProblem, invariants: Any, tolerance: float) -> Any:
+def kept(problem: MechanicsProblem, invariants: Any, tolerance: float, **options: Any) -> Any:
     """Run by EIPDOP853 with these invariants."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a run that is not reliable is marked
-        return integrate(problem, invariants=invariants, method=EIPDOP853, rtol=tolerance, atol=tolerance)
+        return integrate(problem, invariants=invariants, method=EIPDOP853, rtol=tolerance, atol=tolerance, **options)
 
 
 def _projected(problem: MechanicsProblem, invariants: Any, tolerance: float) -> Outcome:
+    rows = iter(range(ROWS))
+
+    def too_many(t: float, y: np.ndarray, defects: np.ndarray) -> bool:
+        return next(rows, None) is None
+
+    steps = MOST_CALLS // (ROWS * EIPDOP853.TABLEAU.n_stages)
     began = time.process_time()
-    run = kept(problem, invariants, tolerance)
+    run = kept(problem, invariants, tolerance, save_every=steps, callback=too_many)
     seconds = time.process_time() - began
-    return Outcome(seconds, run.y[:, -1] if run.success else np.full(run.y.shape[0], np.nan), run.nfev, run.trusted)
+    return Outcome(seconds, run.y[:, -1] if run.status == 0 else np.full(run.y.shape[0], np.nan), run.nfev, run.trusted)
 
 
 class _Calls:
