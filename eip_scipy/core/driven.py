@@ -1,8 +1,8 @@
-"""SciPy's implicit solvers in the place of the raw step: `EIPRadau` and `EIPBDF` drive them, and project their states.
+"""Use of SciPy's implicit solvers for the unprojected step: `EIPRadau` and `EIPBDF` drive them and project their states.
 
 A solver of SciPy controls its error and the length of its steps. The engine lets it make a step, projects the result,
-and hands the projected state back before the next step. Some attributes that are used here are not public: `PRIVATE`
-lists them, and a run says which one a version of SciPy lacks.
+and returns the projected state to it before the next step. Some attributes that are used here are private: `PRIVATE`
+lists them, and a run raises an error that names those that the installed version of SciPy lacks.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ __all__ = ["DRIVEN_BDF", "DRIVEN_RADAU", "Driven", "Jacobian", "Stepper"]
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
-# The largest share of a component by which SciPy shifts it for a numerical Jacobian. SciPy's own shifts of components
-# that do not occur in the equations grow tenfold with each Jacobian until they overflow; this bound is that of MATLAB's
-# numjac.
+# Largest relative shift of a component in SciPy's numerical Jacobian. Without this bound, which MATLAB's numjac has too,
+# the shifts of components that do not occur in the equations grow tenfold with each Jacobian until they overflow.
 LARGEST_SHIFT = 0.1
-# Exponent of the relative errors in the weights of the projection: the estimates as they are. On a chain with dampers
-# the errors of Radau are 0.03 of those without projection, and 0.09 with weights by the tolerances alone (exponent 0);
-# those of BDF are the same with both, and on the flyball governor ten times larger with the tolerances.
+# Exponent of the relative error estimates in the weights of the projection. On a chain with dampers the errors of Radau
+# are 0.03 of those without projection, and 0.09 with weights from the tolerances alone (exponent 0). The errors of BDF
+# are the same with both exponents there, and ten times larger with exponent 0 on the flyball governor.
 KAPPA = 1.0
 COUNTERS = {"nfev": NFEV, "njev": NJEV, "nlu": NLU}
 # Private attributes of SciPy's solvers.
@@ -41,7 +40,7 @@ PRIVATE = {
     Radau: ("f", "Z", "h_abs", "solve_lu", "LU_real", "LU_complex", "sol"),
     BDF: ("D", "order", "error_const", "h_abs", "LU"),
 }
-# x, x^2, x^3 by the stages of Radau's method, at the nodes C: the polynomial through 0 and the stages.
+# Coefficients of x, x^2 and x^3, in terms of Radau's stages, of the polynomial through 0 and the stages at the nodes C.
 SQRT_6 = 6**0.5
 NODES = np.array([(4 - SQRT_6) / 10, (4 + SQRT_6) / 10, 1.0])
 MOST_ORDER = 5  # of BDF
@@ -55,19 +54,19 @@ class Jacobian(NamedTuple):
 
 
 class Driven(Ordered):
-    """A method whose steps a solver of SciPy makes, in the roles of a tableau.
+    """A method whose steps are made by a solver of SciPy; it takes the place of a tableau.
 
     Parameters
     ----------
     solver : type
-        The class of SciPy.
+        The class of SciPy's solver.
     stepper : type
-        The `Stepper` that knows its inside.
+        The subclass of `Stepper` that accesses the private attributes of this solver.
     order, error_estimator_order : int
     takes_complex : bool
-        Whether it takes complex states.
+        Whether the solver accepts complex states.
     polynomials : ndarray, shape (k, k)
-        Coefficients of x, x^2, ... of the interpolant by what the stepper leaves in work.K.
+        Coefficients of x, x^2, ... of the interpolant, in terms of the rows that the stepper writes to work.K.
 
     Attributes
     ----------
@@ -96,7 +95,7 @@ class Driven(Ordered):
         return f"<Driven {self.name}>"
 
     def stepper(self) -> Stepper:
-        """Return what makes the steps of one run."""
+        """Return a new `Stepper`, which makes the steps of one run."""
         return self._stepper(self)
 
 
@@ -107,9 +106,9 @@ class Stepper:
     ----------
     method : Driven
     solver : OdeSolver
-        That of SciPy; None before the first step.
+        The solver of SciPy; None before the first step.
     b, c, exponent, multistep
-        Of the method as the engine reads it: it leaves as many rows in work.K as a tableau has stages.
+        Attributes of a tableau that the engine reads. The number of entries of `b` is the number of rows in work.K.
     """
 
     multistep = None
@@ -124,7 +123,7 @@ class Stepper:
         self._counted = dict.fromkeys(COUNTERS, 0)
 
     def begin(self, rhs: Derivative, start: Any, stepping: Stepping, jacobian: Jacobian | None) -> None:
-        """Begin at a start (t, y, f, length of the first step).
+        """Prepare the steps of a run that starts at (t, y, f, length of the first step).
 
         Raises
         ------
@@ -134,11 +133,12 @@ class Stepper:
         (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
         if y.dtype.kind == "c" and not self.method.takes_complex:
             raise ValueError(
-                f"y0 is complex, and SciPy's {name} takes real states only. Use EIPBDF, or real components."
+                f"y0 is complex, but SciPy's {name} takes real states only. Use EIPBDF, or write the state in real "
+                "components."
             )
         if rtol.size and np.ptp(rtol) > 0:
             raise ValueError(f"rtol={rtol}: SciPy's {name} takes one number. Give atol by component instead.")
-        known = [f]  # its first call asks for this
+        known = [f]  # the solver's first call asks for this derivative
 
         def fun(t: float, y: Array) -> Array:
             return known.pop() if known else rhs(t, y)
@@ -151,7 +151,7 @@ class Stepper:
         )  # fmt: skip
 
     def _made(self) -> Any:
-        """Return the solver, which evaluates a Jacobian when it is made: these evaluations are not counted."""
+        """Make and return SciPy's solver. It evaluates a Jacobian when it is made, and these evaluations are not counted."""
         solver = self._make()
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
@@ -167,8 +167,8 @@ class Stepper:
     def fill(self, w: Work, t: float, y: Array, again: bool) -> tuple[float, float] | None:
         """Make a step from the state y into the buffers `w`.
 
-        `again`: in place of the last step, whose projection has failed, with half its length. Returns the end of the
-        step and the length of the next one, or None if no step is short enough.
+        `again`: the step replaces the last one, whose projection has failed, and has half its length. The function
+        returns the end of the step and the length of the next one, or None if the solver finds no step short enough.
         """
         if self.solver is None:
             self.solver = self._made()
@@ -205,11 +205,11 @@ class Stepper:
             self._counted[name] = found
 
     def _kept(self) -> dict[str, Any]:
-        """Return what takes the solver back to the state before a step."""
+        """Return the attributes from which `_restore` takes the solver back to the state before a step."""
         return {name: value for name, value in vars(self.solver).items() if name not in (*COUNTERS, "jac_factor")}
 
     def _restore(self) -> None:
-        """Take the solver back to the state before the last step, with its factorisations left out."""
+        """Take the solver back to the state before the last step, without its factorisations."""
         vars(self.solver).update(
             self._before | dict.fromkeys(self._factors(), None) | {"max_step": self.solver.max_step}
         )
@@ -218,7 +218,7 @@ class Stepper:
         return [name for name in vars(self.solver) if name.startswith("LU")]
 
     def state(self) -> dict[str, Any] | None:
-        """Return the values of the solver, from which another one goes on to the same bits; None before a step."""
+        """Return the values from which another solver continues to the same bits; None before the first step."""
         if self.solver is None:
             return None
         values = {
@@ -226,11 +226,11 @@ class Stepper:
             for name, value in vars(self.solver).items()
             if isinstance(value, DenseOutput) or not callable(value)
         }
-        # Sparse factorisations cannot be copied; they are made again.
+        # Sparse factorisations cannot be copied; the solver makes them again.
         return values | {name: None for name in self._factors() if not isinstance(values[name], tuple)}
 
     def resume(self, values: dict[str, Any] | None) -> None:
-        """Go on from the `state` of another stepper, after `begin`."""
+        """Continue from the `state` of another stepper; `begin` must have been called before."""
         if values is None:
             return
         self.solver = self._made()
@@ -238,18 +238,18 @@ class Stepper:
         self._counted = {name: getattr(self.solver, name) for name in COUNTERS}
 
     def _watch(self, solver: Any) -> None:
-        """Have the solver keep what its steps leave nowhere."""
+        """Change the solver so that it keeps values of a step that `_error` needs."""
 
     def _move(self, y: Array) -> None:
         """Put the solver into the projected state y."""
         raise NotImplementedError
 
     def _error(self, h: float) -> Array:
-        """Return the error estimate of each component in the step of length h made last."""
+        """Return the error estimate of each component in the last step, of length h."""
         raise NotImplementedError
 
     def _describe(self, h: float, rows: Array) -> None:
-        """Fill `rows` with what the method's `weights` make the interpolant of."""
+        """Fill `rows` with the vectors that the method's `weights` combine into the interpolant of the last step."""
         raise NotImplementedError
 
     def _slope(self, rows: Array) -> Array:
@@ -258,10 +258,10 @@ class Stepper:
 
 
 class RadauStepper(Stepper):
-    """Knows SciPy's Radau.
+    """Stepper for SciPy's Radau.
 
-    The derivative is evaluated anew at a projected state, because the error estimate takes it. The predictor of the
-    next step continues the polynomial of the last step as it was.
+    The derivative is evaluated again at a projected state, because the error estimate needs it. The predictor of the
+    next step extrapolates the unprojected polynomial of the last step.
     """
 
     _solved: Array
@@ -280,7 +280,7 @@ class RadauStepper(Stepper):
         self.solver.f = self.solver.fun(self.solver.t, y)
 
     def _error(self, h: float) -> Array:
-        return self._solved  # the error estimate is the last system that an accepted step solves
+        return self._solved  # an accepted step ends with the linear system whose solution is the error estimate
 
     def _describe(self, h: float, rows: Array) -> None:
         np.divide(self.solver.Z, h, out=rows)
@@ -290,11 +290,11 @@ class RadauStepper(Stepper):
 
 
 class BDFStepper(Stepper):
-    """Knows SciPy's BDF, whose history are backward differences D of the states at equal distances.
+    """Stepper for SciPy's BDF, whose history consists of backward differences D of states at equal distances in time.
 
-    A projection moves the whole history alike: the differences stay as they are. To move the last state only, and with
-    it all differences, gives the same errors on a chain with dampers: 0.20 of those without projection instead of 0.23,
-    at 1.35 times the calls instead of 1.33.
+    A projection shifts all states of the history by the same vector, so that the differences stay unchanged. Shifting
+    the last state only, and with it all differences, gives about the same errors on a chain with dampers: 0.20 of those
+    without projection instead of 0.23, with 1.35 times the evaluations instead of 1.33.
     """
 
     def _kept(self) -> dict[str, Any]:
@@ -307,12 +307,12 @@ class BDFStepper(Stepper):
     def _error(self, h: float) -> Array:
         solver, order = self.solver, self._before["order"]
         difference = solver.D[order + 1]
-        if solver.order > order:  # it has been scaled to the next step
+        if solver.order > order:  # then this difference has been scaled to the next step's length
             difference = difference / (solver.h_abs / abs(h)) ** (order + 1)
         return solver.error_const[order] * difference
 
     def _describe(self, h: float, rows: Array) -> None:
-        """Turn the differences, of the next step's length, into coefficients of powers of x = (t - t_old) / h."""
+        """Fill `rows` with coefficients of powers of x = (t - t_old) / h, from differences at the next step's length."""
         order = self.solver.order
         ratio = (abs(h) / self.solver.h_abs) ** np.arange(MOST_ORDER + 1)
         powers = (SHIFTED * ratio) @ NEWTON[:, : order + 1]
@@ -323,7 +323,7 @@ class BDFStepper(Stepper):
 
 
 def _newton() -> Array:
-    """Coefficients of powers of s in the columns s (s + 1) ... (s + k - 1) / k!."""
+    """Return the coefficients of powers of s in the polynomials s (s + 1) ... (s + k - 1) / k!, by columns."""
     out = np.zeros((MOST_ORDER + 1, MOST_ORDER + 1))
     out[0, 0] = 1.0
     for k in range(1, MOST_ORDER + 1):
@@ -334,7 +334,7 @@ def _newton() -> Array:
 
 
 def _shifted() -> Array:
-    """Coefficients of powers of x in the columns (x - 1)^j."""
+    """Return the coefficients of powers of x in the polynomials (x - 1)^j, by columns."""
     return np.array(
         [[(-1.0) ** (j - i) * math.comb(j, i) for j in range(MOST_ORDER + 1)] for i in range(MOST_ORDER + 1)]
     )

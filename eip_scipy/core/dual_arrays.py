@@ -1,7 +1,8 @@
-"""A jitted function's source for dual numbers: the arrays that it makes hold duals too.
+"""Copies of jitted functions for dual numbers, in which new arrays hold duals too.
 
-`np.empty(3)` is an array of floats, which no dual fits in, and Numba rewrites `np.array([a, b])` by the name that its
-type has in NumPy. In a copy of the function these names stand for the functions here, in what it calls as well.
+`np.empty(3)` is an array of floats, which cannot hold duals, and Numba replaces `np.array([a, b])` before it looks for
+an overload with duals. In a copy of the user's function, and of the functions that it calls, these names refer to the
+functions of this module.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from .dual_numbers import Dual
 
 __all__ = ["for_duals", "inside"]
 
-# Options of Numba that change what is computed, or how fast.
+# Options of Numba that a copy takes over, because they change its results or its speed.
 KEPT = ("fastmath", "error_model", "boundscheck", "inline", "forceinline")
-# Called from compiled code alone: Python knows no arrays of duals, and Numba no way to hand them to it.
+# Compiles functions that only compiled code calls, because arrays of duals cannot be passed to or from Python.
 inside = partial(njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
@@ -37,7 +38,7 @@ class _NumPy(python_types.ModuleType):
 
 
 def for_duals(fun: Any, dual: Dual) -> Any:
-    """A copy of a jitted function, and of what it calls, that makes arrays of duals where it made arrays of floats."""
+    """Return a copy of a jitted function, and of the functions that it calls, whose new arrays hold duals, not floats."""
     by_name = _array_functions(dual)
     others = {id(getattr(np, name)): function for name, function in by_name.items()}
     return _replaced(fun, others | {id(np): _NumPy(by_name)})
@@ -51,7 +52,7 @@ def _replaced(item: Any, others: dict[int, Any]) -> Any:
     names, cells = source.__globals__.copy(), [python_types.CellType() for _ in source.__closure__ or ()]
     copied = python_types.FunctionType(source.__code__, names, source.__name__, source.__defaults__, tuple(cells))
     others[id(item)] = inside(copied, **{name: item.targetoptions[name] for name in KEPT if name in item.targetoptions})
-    # After that: a function may call itself.
+    # The copy is registered before its names are replaced, because a function may call itself.
     for name in _names(source.__code__) & names.keys():
         names[name] = _replaced(names[name], others)
     for cell, known in zip(cells, source.__closure__ or (), strict=True):
@@ -60,7 +61,7 @@ def _replaced(item: Any, others: dict[int, Any]) -> Any:
 
 
 def _names(code: python_types.CodeType) -> set[str]:
-    """The names in a function's source and in that of the functions inside."""
+    """Return the names in a function's code and in the code of its inner functions."""
     inside = (_names(item) for item in code.co_consts if isinstance(item, python_types.CodeType))
     return set(code.co_names).union(*inside)
 
@@ -74,7 +75,7 @@ def _of_floats(dtype: Any) -> bool:
 
 @cache
 def _array_functions(dual: Dual) -> dict[str, Callable[..., Any]]:
-    """The functions of NumPy that make arrays, by their names, to be called from compiled code alone."""
+    """Return replacements of NumPy's functions that make arrays, by name; only compiled code can call them."""
 
     def empty(shape, dtype=float):
         pass
@@ -110,11 +111,11 @@ def _overload_maker(function: Any, numpy_function: Any, dual: Dual) -> None:
 
 
 def array(object):
-    """In the place of `np.array`; for compiled code alone."""
+    """Replace `np.array` in compiled code."""
 
 
 def cross(a, b):
-    """In the place of `np.cross`; for compiled code alone."""
+    """Replace `np.cross` in compiled code."""
 
 
 @overload(array)

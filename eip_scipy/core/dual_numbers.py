@@ -1,11 +1,11 @@
 """Dual numbers for Numba: a value and its derivatives along several directions, carried through a function at once.
 
-A `Dual` computes as a float does and also applies the chain rule. Numba compiles the source that it compiles for
-floats for arrays of duals too, branches included: duals compare by their values. Loaded only where an invariant is
-jitted and has no gradient.
+A `Dual` computes as a float does and also applies the chain rule. Numba compiles a function of arrays of floats for
+arrays of duals too, including its branches, because duals are compared by their values. The module is imported only if
+an invariant is jitted and has no gradient.
 
-Each function here is one line: its derivative, as a function of its arguments and value. What NumPy does with arrays
-of floats is typed here (expressions, which Numba turns into loops over scalars) or written as loops.
+Each mathematical function is defined by one line: its derivative, as a function of its arguments and value. Operations
+on arrays are either typed here (expressions, which Numba turns into loops over scalars) or written as loops.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ class Dual(types.Type):
         self.vector = ir.VectorType(ir.DoubleType(), lanes)
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """Numbers have no derivatives."""
+        """Allow conversion from plain numbers, whose derivatives are 0."""
         return Conversion.safe if isinstance(other, PLAIN) else None
 
     def unify(self, typingctx: Any, other: Any) -> Any:
-        """Return the type of a variable that is a dual in one branch and a number in another: a dual."""
+        """Return the common type of a dual in one branch and a number in another: the dual type."""
         return self if isinstance(other, PLAIN) or other == self else None
 
 
 @register_model(Dual)
 class _DualModel(models.PrimitiveModel):
-    """A number and a vector, packed in memory: Numba's arrays have not the alignment that the vector would ask for."""
+    """Packed pair of a number and a vector. It is packed because Numba's arrays lack the alignment of the vector type."""
 
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, ir.LiteralStructType([ir.DoubleType(), kind.vector]))
@@ -92,7 +92,7 @@ def _constant(context, builder, kind, number):
 
 @intrinsic
 def value_of(typingctx, x):
-    """The value of a dual, or the number that is none."""
+    """Return the value of a dual; a plain number is returned as a float."""
     if isinstance(x, PLAIN):
         return types.float64(x), lambda context, builder, sig, args: context.cast(builder, args[0], x, types.float64)
     return types.float64(x), lambda context, builder, sig, args: builder.extract_value(args[0], 0)
@@ -100,7 +100,7 @@ def value_of(typingctx, x):
 
 @intrinsic
 def _dual(typingctx, value, slope, x):
-    """The dual of a value, whose derivative in x, a dual, is `slope`."""
+    """Return the dual of `value`, a function of the dual x with the derivative `slope`."""
 
     def emit(context, builder, sig, args):
         value, slope, x = args
@@ -111,7 +111,7 @@ def _dual(typingctx, value, slope, x):
 
 @intrinsic
 def _dual_of_two(typingctx, value, slope, x, other, y):
-    """The dual of a value, whose derivatives in the duals x and y are `slope` and `other`."""
+    """Return the dual of `value`, a function of the duals x and y with the partial derivatives `slope` and `other`."""
 
     def emit(context, builder, sig, args):
         value, slope, x, other, y = args
@@ -129,7 +129,7 @@ def _times(builder: Any, number: Any, vector: Any) -> Any:
 
 @intrinsic
 def seed(typingctx, kind, value, lane):
-    """The dual whose derivative is 1 in one lane, and 0 in the others; 0 in all where there is no such lane."""
+    """Return the dual whose derivative is 1 in one lane and 0 in the others; 0 in all lanes if `lane` does not exist."""
     dual = kind.instance_type
 
     def emit(context, builder, sig, args):
@@ -142,7 +142,7 @@ def seed(typingctx, kind, value, lane):
 
 @intrinsic
 def directed(typingctx, kind, value, slope):
-    """The dual of one lane whose derivative is `slope`."""
+    """Return the dual whose derivative is `slope` in its only lane."""
     dual = kind.instance_type
 
     def emit(context, builder, sig, args):
@@ -154,7 +154,7 @@ def directed(typingctx, kind, value, slope):
 
 @intrinsic
 def put_slope(typingctx, x, lane, number):
-    """The dual with another derivative in one lane."""
+    """Return a copy of the dual x with the derivative `number` in one lane."""
 
     def emit(context, builder, sig, args):
         slopes = builder.insert_element(builder.extract_value(args[0], 1), args[2], args[1])
@@ -165,7 +165,7 @@ def put_slope(typingctx, x, lane, number):
 
 @intrinsic
 def slope(typingctx, x, lane):
-    """The derivative in one lane; of a plain number 0."""
+    """Return the derivative of x in one lane, which is 0 for a plain number."""
     if isinstance(x, Dual):
         return types.float64(x, types.int64), lambda context, builder, sig, args: builder.extract_element(
             builder.extract_value(args[0], 1), args[1]
@@ -175,7 +175,7 @@ def slope(typingctx, x, lane):
 
 @intrinsic(prefer_literal=True)
 def stack_array(typingctx, kind, size):
-    """An array of duals that lasts until the function returns, of a length that is known when it is compiled."""
+    """Return an array of duals on the stack, valid until the function returns; `size` is constant at compilation."""
     array = types.Array(kind.instance_type, 1, "C")
     length = size.literal_value
 
@@ -192,14 +192,14 @@ def stack_array(typingctx, kind, size):
 
 
 def _is_dual(*kinds: Any) -> bool:
-    """Return True if all are scalars and one of them is a dual."""
+    """Return True if all types are scalars and at least one of them is a dual."""
     return any(isinstance(k, Dual) for k in kinds) and all(isinstance(k, Dual | PLAIN) for k in kinds)
 
 
 def _define(emit: Callable[..., Any], *functions: Any, compares: bool = False) -> None:
     """Define frequent operations directly in LLVM, because Numba takes longer to compile those written in Python.
 
-    ``emit(builder, *values)`` gives the value and the derivatives in each argument; of a comparison, the value alone.
+    ``emit(builder, *values)`` returns the value and the derivative by each argument; for a comparison only the value.
     """
 
     def lower(context, builder, sig, args):
@@ -228,7 +228,7 @@ def _define(emit: Callable[..., Any], *functions: Any, compares: bool = False) -
                 found = [k if k == dual else types.float64 for k in args]
                 return signature(types.boolean if compares else dual, *found)
 
-        # Not as a decorator, which asks for the module of each function: those of NumPy 2.0 name none.
+        # The decorator form is not used because it needs the module of each function, which NumPy 2.0 does not give.
         infer_global(function, types.Function(_Template))
         for choice in kinds:
             lower_builtin(function, *choice)(lower)
@@ -264,7 +264,7 @@ for _function, _sign in (
 _define(lambda builder, a, b: builder.fcmp_unordered("!=", a, b), operator.ne, compares=True)
 
 
-# No derivative raises ZeroDivisionError where the function is finite; it is infinite there, as at the root of 0.
+# With this error model a derivative such as that of the square root at 0 is infinite and raises no ZeroDivisionError.
 _overload = partial(overload, jit_options={"error_model": "numpy"})
 _inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -387,7 +387,7 @@ _define_flat(np.ceil, 1)
 
 
 def _power(x, y):
-    """An integer power by products, as Numba's of floats; any other by the logarithm."""
+    """Compute an integer power by products, as Numba does for floats, and any other power by the logarithm."""
     if not _is_dual(x, y):
         return None
     if isinstance(y, types.Integer):
@@ -434,7 +434,7 @@ def _is_array(kind: Any, *ndims: int) -> bool:
 
 
 def _define_for_arrays(function: Any) -> None:
-    """Type an expression of arrays; Numba turns it into a loop over its scalars, which are typed above."""
+    """Define the type of an expression of arrays; Numba turns it into a loop over scalars, which are typed above."""
 
     class _Template(AbstractTemplate):
         key = function
@@ -460,7 +460,7 @@ for _function in ARRAY_FUNCTIONS:
 
 
 def _define_with_scalar(function: Any) -> None:
-    """Write the loops of an expression of an array and one dual, which Numba's expressions do not take."""
+    """Define an operation of an array and one dual by a loop, because Numba's array expressions do not support it."""
 
     def typed(x, y):
         of_first = _is_array(x, 1, 2) and isinstance(y, Dual)
@@ -556,7 +556,7 @@ def _norm(a):
     dual = a.dtype
 
     def scaled(a):
-        # The largest taken out as a number: it cancels in value and derivatives.
+        # Dividing by the largest component avoids overflow. It is a plain number because it cancels in the result.
         largest = 0.0
         for i in range(a.size):
             largest = max(largest, abs(value_of(a[i])))

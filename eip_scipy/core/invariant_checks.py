@@ -29,24 +29,24 @@ __all__ = ["Complaint", "complaints", "listed", "time_derivative"]
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
-# Shorter ones have the last word where the first reaches too far.
+# Lengths of difference steps. Shorter ones decide if the function is not smooth over the first one.
 CHECK_STEPS = (CHECK_STEP, 6e-8, 6e-10)
-# Bound for the rate of a balance, whose error of 1e-3 is 1e-9 of the terms if the rate is 1e-6 of them; right ones
-# differ by 1e-16, those of gradients by differences by 1e-12.
+# Bounds for the error of the rate of a balance, relative to its terms. If a rate is 1e-6 of its terms, an error of 1e-3
+# of the rate is 1e-9 of the terms. Correct rates differ by 1e-16, those from numerical gradients by 1e-12.
 RATE_TOLERANCE, RATE_TOLERANCE_OF_DIFFERENCES = 1e-11, 1e-9
 # Single precision leaves this share of the terms of a rate.
 SINGLE_TOLERANCE = 1e-5
 # Values below this share of their terms have at most half of the bits of single precision, if their terms have it.
 CANCELLED = 2.0**-12
-# Components smaller than this share of the largest one are not looked at for single precision.
+# Components smaller than this share of the largest one are not examined for single precision.
 LEAST_SINGLE = 1e-3
-# A gradient may be rounding and nothing else, as differences find that of a square which is 0: this many roundings of
-# the state, or as many times what those make of it.
+# A gradient may consist of rounding alone, such as a numerical gradient of a square at 0. It is evaluated at states that
+# differ by BLUR roundings, and BLUR times its changes count as its rounding; BLURRED is the number of further states.
 BLUR, BLURRED = 4.0, 3
 # The rounding of a rate, in roundings of the largest derivatives of the same kind. Accelerations that come from a
-# system of linear equations, such as those of constrained bodies, have tens of them.
+# system of linear equations, such as those of constrained bodies, have errors of tens of roundings.
 RATE_ROUNDINGS = 100.0
-# Differences to one side of order 6: weights of 0, 1, ... 6 steps.
+# One-sided differences of order 6: weights of the values at 0, 1, ... 6 steps.
 ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
 DOUBLE = (
@@ -58,19 +58,20 @@ MISSING = "Add that constraint to the invariants, and start on it"
 
 
 class Complaint(NamedTuple):
-    """Result of a check.
+    """A finding of a check.
 
     Attributes
     ----------
     is_error : bool
-        Whether a run must not start with it.
+        Whether the run must not start.
     text : str
+        Description of what is wrong.
     advice : str
-        What follows from it, or what to do about it.
+        Consequence of the finding, or what to do about it.
     dependent : bool
-        Whether it is about an invariant that is kept where others hold.
+        Whether the finding is about an invariant that the system keeps only if other invariants hold.
     category : type
-        The class of the warning that a run begins with.
+        Class of the warning at the start of a run, if the finding is not an error.
     """
 
     is_error: bool
@@ -81,10 +82,10 @@ class Complaint(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """A state, its derivative there, and what is known of the invariants around it.
+    """A state, its derivative, and the invariants at and near the state.
 
-    `directions` are the test directions (2, n), in units of the components' motion; `ends` holds the values (2, 2, l)
-    at the first of `CHECK_STEPS` to both sides.
+    `directions` are the test directions (2, n), scaled by the motion of the components; `ends` holds the values
+    (2, 2, l) at distances of the first of `CHECK_STEPS` to both sides. `G` and `here` are the gradients and values.
     """
 
     t: float
@@ -107,7 +108,7 @@ def complaints(
     rhs: Derivative | None,
     evaluated: tuple[Array, Array] | None = None,
 ) -> Iterator[Complaint]:
-    """Yield what is wrong with the precision of invariants, with gradients, or else with rates of change.
+    """Yield findings about the precision of invariants, or else their gradients, or else their rates of change.
 
     Parameters
     ----------
@@ -118,9 +119,10 @@ def complaints(
     tau : float
         The length of a step.
     rhs : callable or None
-        ``rhs(t, y) -> (n,)``. With it, invariants that hold only together with others are looked at where all hold.
+        ``rhs(t, y) -> (n,)``. If it is given, invariants that hold only together with others are examined at a state
+        where all of them hold.
     evaluated : (ndarray, ndarray), optional
-        The gradients (l, n) and the values (l,) there.
+        The gradients (l, n) and the values (l,) at the state.
     """
     if known.size == 0 or y.size == 0:
         return
@@ -129,8 +131,8 @@ def complaints(
     interval = min(known.t_span), max(known.t_span)
     if not known.balances.items and known.functions.is_in_order(t, y, f, G, here, tau, interval, directions):
         return
-    # No further than the state moves while it changes by its own size: close to a singularity that is far less
-    # than a step.
+    # The test points are no further away than the state moves while it changes by its own size: close to a singularity
+    # this is far less than a step.
     moving, size = np.abs(f).max(), np.abs(y).max()
     span = np.abs(y) + (min(tau, size / moving) if size > 0 and moving > 0 else tau) * np.abs(f)
     directions = directions * span
@@ -156,22 +158,22 @@ def _values_at_ends(known: InvariantSet, t: float, y: Array, directions: Array, 
 
 
 def _blurred(at: _Samples) -> list[Array]:
-    """Return states that differ from this one by roundings."""
+    """Return three states that differ from `at.y` by a few roundings."""
     return [at.y + BLUR * EPS * d for d in (*at.directions, -at.directions[0])]
 
 
 def _rounding(known: InvariantSet, at: _Samples, ways: Array) -> Array:
-    """Return how far derivatives along `ways`, (k, l), change where the state does by roundings."""
+    """Return the changes (k, l) of the derivatives along `ways` when the state changes by roundings."""
     blurred = [known.gradients(at.t, state, at.f) - at.G for state in _blurred(at)]
     return BLUR * np.abs(np.array(blurred)[:, None] * ways[:, None]).sum(axis=3).max(axis=0)
 
 
 def _rounding_of_rates(known: InvariantSet, at: _Samples, unit: float, rhs: Derivative | None) -> Array:
-    """Return how far rates (l,), in this unit, change by the rounding inside gradients and right-hand side."""
+    """Return the rounding errors (l,) of rates, divided by `unit`, from those of gradients and right-hand side."""
     found = _rounding(known, at, at.f[None] / unit)[0]
     if rhs is None:
         return found
-    # More of them: forces that cancel leave the same rounding at many states, and none at others.
+    # The right-hand side is evaluated at more states, because forces that cancel may have no rounding at some of them.
     states = [*_blurred(at), *(at.y * (1.0 + BLUR * EPS * k) for k in range(-BLURRED, BLURRED + 1))]
     changes = [np.abs(at.G) @ np.abs(rhs(at.t, state) / unit - at.f / unit) for state in states]
     return found + BLUR * np.max(changes, axis=0)
@@ -181,7 +183,7 @@ def _rounding_of_rates(known: InvariantSet, at: _Samples, unit: float, rhs: Deri
 
 
 def _are_single(values: Array) -> Array:
-    """Return which columns of values (m, k) hold numbers of single precision that use more than half of its bits."""
+    """Return a mask of the columns of `values` (m, k) in single precision that use more than half of its bits."""
     values = np.ascontiguousarray(values, float)
     with np.errstate(over="ignore", invalid="ignore"):
         exact = values.astype(np.float32).astype(float) == values
@@ -206,7 +208,7 @@ def _single_precision(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
 
 
 def _in_single_precision(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> str:
-    """Return what has single precision, of the right-hand side and the gradients; "" for neither."""
+    """Return a text that names the function in single precision: fun or a gradient; "" if there is none."""
     states = at.y + CHECK_STEPS[0] * at.directions
     if rhs is not None and _vary_in_single([rhs(at.t, state) for state in states]):
         return "fun returns numbers of single precision (float32)"
@@ -218,9 +220,9 @@ def _in_single_precision(known: InvariantSet, at: _Samples, rhs: Derivative | No
 
 
 def _large_and_single(found: list[Array]) -> Array:
-    """Return which components hold numbers of single precision and are not much smaller than the largest one.
+    """Return a mask of the components that are in single precision and not much smaller than the largest one.
 
-    What is left of terms that cancel, as next to an equilibrium, has few digits too.
+    Small components are left out because a sum of terms that cancel, as next to an equilibrium, has few digits too.
     """
     values = np.array(found).view(float)
     sizes = np.abs(values).max(axis=0)
@@ -228,7 +230,7 @@ def _large_and_single(found: list[Array]) -> Array:
 
 
 def _vary_in_single(found: list[Array]) -> bool:
-    """Return whether some component varies by numbers of single precision; constants of such numbers may be meant."""
+    """Return True if a component that varies is in single precision; constant components may be so on purpose."""
     varies = np.ptp(np.array(found).view(float), axis=0) != 0
     return bool((_large_and_single(found) & varies).any())
 
@@ -237,9 +239,9 @@ def _vary_in_single(found: list[Array]) -> bool:
 
 
 def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
-    """Yield those that do not agree with the differences along the first direction in which any does not."""
+    """Yield a finding for each gradient that disagrees with differences, along the first direction with such a one."""
     along, terms = (at.directions @ at.G.conj().T).real, np.abs(at.directions) @ np.abs(at.G).T
-    # An invariant's own terms may be larger than its value and than what its gradient shows.
+    # The terms inside an invariant may be larger than its value and than the products of gradient and state.
     inner = known.norm_products(at.G, at.span)
     wrong, ends = np.array(True), at.ends
     for step in CHECK_STEPS:
@@ -286,9 +288,9 @@ def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, al
 
 
 class _Rates(NamedTuple):
-    """Rates of change (l,), the sums of their terms, the part of them that is explicit in time, and which are wrong.
+    """Rates of change (l,), the sums of their terms, their explicit time derivatives, and a mask of the wrong ones.
 
-    From those of balances their own rates are subtracted, which leaves NaN where none is given.
+    The given rate of a balance is subtracted from its rate of change. Balances without a given rate have NaN.
     """
 
     rate: Array
@@ -302,7 +304,7 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
     if found is None:
         return
     wrong = found.wrong
-    # Only for small rates: single precision does not explain large ones, and differences do not resolve small rates.
+    # Single precision is reported for small rates only, because it does not explain large ones.
     small = wrong & (np.abs(found.rate) <= SINGLE_TOLERANCE * found.terms)
     if (small.any() or _large_and_single([at.f]).any()) and (what := _in_single_precision(known, at, rhs)):
         names = [name for name, hidden in zip(known.names, small | ~wrong, strict=True) if hidden]
@@ -332,7 +334,10 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
 def _complaints_of_rates(
     known: InvariantSet, at: _Samples, found: _Rates, wrong: Array, rhs: Derivative | None
 ) -> Iterator[Complaint]:
-    """Yield one text for all that depend on others, and one for all that are not invariants, the worst first."""
+    """Yield one finding for all quantities that are not invariants, and one for all that depend on other invariants.
+
+    Each text names the quantity with the largest relative rate first.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
     conditional: list[int] = []
@@ -350,7 +355,7 @@ def _complaints_of_rates(
 
 
 def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array) -> Complaint:
-    """Return one text for all balances whose given rates are wrong, the worst first."""
+    """Return one finding for all balances whose given rates are wrong, with the worst balance first."""
     shares = np.where(wrong, np.abs(found.rate) / np.where(found.terms > 0, found.terms, 1.0), 0.0)
     worst = int(np.argmax(shares))
     others = [name for k, name in enumerate(known.names) if wrong[k] and k != worst]
@@ -379,8 +384,8 @@ def _depends_on_others(name: str, t: float, rate: float, terms: float) -> str:
 
 
 def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates | None:
-    """Return the rates of change at a state, or None where the derivative is too small for a rate."""
-    # In units of the largest component of f: large states would overflow otherwise.
+    """Return the rates of change at a state, or None if the derivative is too small to compute them."""
+    # Rates are divided by the largest component of f, because they could overflow for large states otherwise.
     unit = np.abs(at.f).max()
     if 0 < unit < np.finfo(float).tiny / EPS:
         return None
@@ -396,7 +401,7 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     wrong = np.abs(rate) > np.where(carried, of_balances, INVARIANCE_TOLERANCE) * terms + noise
     computed = np.array(known.computed, bool) & (known.by_values | ~carried)
     if (wrong & computed).any():
-        # Gradients that are computed over a kink are wrong, and the rate with them.
+        # A gradient that is computed across a kink is wrong, and so is the rate that follows from it.
         where = at.t, at.y, at.f, at.G, at.here
         by_values = known.functions.rates_by_values(*where, known.target, known.scales) / unit
         near = np.abs(in_time + by_values - own) > ROUNDING_OF_DIFFERENCES * terms
@@ -408,9 +413,11 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
 
 
 def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Array, tau: float) -> tuple[Array, Array]:
-    """Return the partial derivative in time, from times inside the run's interval, and the rounding in it.
+    """Return the partial time derivatives (l,) of the invariants and their rounding errors (l,).
 
-    The rounding is infinite where the interval has no other time, because nothing is known of the derivative then.
+    Only times inside the run's interval are used.
+
+    The rounding is infinite if the interval has no other time, because the derivative is then unknown.
     """
     none = np.zeros(known.size)
     low, high = min(known.t_span), max(known.t_span)
@@ -422,7 +429,7 @@ def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Arr
     with np.errstate(over="ignore"):
         rounding = EPS * known.sizes_of_terms(y, G, here)
         hidden = 4 * rounding / abs(far - t)
-    fixed = known.values(far, y) == here  # as almost always
+    fixed = known.values(far, y) == here  # True for almost all invariants
     step, centred = TIME_SHARE * tau, min(before, after) >= TIME_ROOM * TIME_SHARE * tau
     step = 2.0 ** (round(math.log2(step)) if centred else math.floor(math.log2(min(step, room / 6))))
     if fixed.all() and (known.values(t + side * step, y) == here).all():

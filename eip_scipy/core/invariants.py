@@ -30,14 +30,14 @@ FLOAT = np.dtype(float)
 TARGET_TOLERANCE = 1e-8
 # A value that misses its target by at most this many roundings of the state meets it.
 TARGET_ROUNDINGS = 64.0
-# Components from which on the cost of gradients that take as many evaluations is pointed out. Steps of EIPRK4 of a
-# chain with such a gradient and without: in Python 5 times longer for 64 components, 66 for 256, 640 for 4096; jitted 3
-# for 128, 12 for 256, 110 for 4096.
+# A run warns of the cost of computed gradients for states with at least this many components. A computed gradient makes
+# the steps of EIPRK4 on a chain of 64, 256 and 4096 components 5, 66 and 640 times longer in Python; if the functions
+# are jitted, those of 128, 256 and 4096 components 3, 12 and 110 times longer.
 LARGE = 200
 
 
 class OwnArguments:
-    """A function of an invariant, which takes the invariant's own `args` if a call leaves them out.
+    """A function of an invariant, to which the invariant's own `args` are passed if a call omits them.
 
     Parameters
     ----------
@@ -64,34 +64,36 @@ class Invariant:
     fun : callable
         ``fun(t, y, *args) -> float or (l_i,)``, real. Or, like `grad`, a C function by pointer (see Notes).
     grad : callable, optional
-        ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Without it a function
-        jitted by Numba, of a real state and without `args`, gets a compiled one by dual numbers, exact to rounding.
-        That of a C function comes from central differences of order 6, in the engine; for any other, from a complex
-        step where `fun` allows one, else from such differences (with a warning; not compiled). A complex step takes
-        n + 1 evaluations of `fun`, differences 6 n and more. Where a complex step is wrong for some states only, as
-        that of a norm or an absolute value is, differences replace it there.
+        ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Default: the gradient
+        is computed. If `fun` is jitted by Numba, y is real and there are no `args`, dual numbers give a compiled
+        gradient, exact to rounding. The gradient of a C function comes from central differences of order 6, in the
+        engine. For any other function it comes from a complex step if `fun` allows one, otherwise from such
+        differences (with a warning; not compiled). A complex step takes n + 1 evaluations of `fun`, differences take
+        6 n and more. If a complex step is wrong for some states only, as for a norm or an absolute value, differences
+        replace it at these states.
     target : float or array_like, shape (l_i,), optional
-        The value to keep. Default: the value at the start. A given target is a condition that the start must meet, to
-        1e-8 of its terms; steps meet it to 1e-9, by further Newton steps where one leaves more.
+        The value to keep. Default: the value at the start. If a target is given, the start must meet it to 1e-8 of the
+        terms of the invariant. Steps meet it to 1e-9, with further Newton steps if the first one leaves more.
     args : tuple, optional
-        Further arguments of `fun` and `grad`. The ``args`` of `eip_scipy.solve_ivp` and
-        of `integrate` follow these; those of SciPy's own function do not reach invariants.
+        Further arguments of `fun` and `grad`. The ``args`` of `eip_scipy.solve_ivp` and of `integrate` follow these;
+        SciPy's own solve_ivp does not pass its ``args`` to invariants.
     size : int, optional
-        Number l_i of the values of `fun`, which a C function does not show; without it, a C function gives one number.
+        Number l_i of the values of `fun`. It is needed for a C function that returns more than one value.
     name : str, optional
         Name in messages and diagnostics.
     scale : float or array_like, shape (l_i,), optional
-        Size of the terms that cancel in `fun`, in its own unit: defects below four rounding errors of it are left
-        alone. Needed only where neither the value nor ``sum_k |G_k y_k|`` shows that size.
+        Size of the terms that cancel in `fun`, in the unit of `fun`: residuals below four rounding errors of it are not
+        corrected. Needed only if neither the value nor ``sum_k |G_k y_k|`` has that size.
     in_place : bool, optional
         ``grad(t, y, out, *args)`` fills ``out``, (n,) for a scalar invariant, else (l_i, n).
     uses_f : bool, optional
-        ``grad(t, y, f, *args)`` also receives f = fun(t, y) of the system, which the step often has already.
+        ``grad(t, y, f, *args)`` also receives the derivative f = fun(t, y) of the system, which the step has often
+        evaluated already.
 
     Notes
     -----
-    Linear invariants are kept by every Runge-Kutta method; keep the corrections out of them with the option ``frame``
-    rather than list them here.
+    Every Runge-Kutta method keeps linear invariants. Do not list them as invariants, but pass them as the option
+    ``frame``, so that the corrections do not change them.
 
     C functions are given as `scipy.LowLevelCallable`, ctypes or cffi function pointers, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
@@ -110,10 +112,10 @@ class Invariant:
     rate_function: Callable[..., Any] | None = None
     rate_uses_f = False
     # Components and weights (s, k) of the s directions along which all values are projected, or one such pair for every
-    # value. Invariants without any are projected together, along all components.
+    # value. Invariants without such pairs are projected together, along all components.
     subspaces: tuple[tuple[Array, Array], ...] = ()
     value_names: tuple[str, ...] = ()
-    # A run warns of a balance whose rate is above this share of the terms of its rate: it hardly helps.
+    # A run warns of a balance whose rate is above this share of the terms of the rate, because the balance hardly helps.
     most_slowness = 0.05
 
     def __init__(
@@ -142,7 +144,7 @@ class Invariant:
         if grad is not None and not callable(grad):
             raise TypeError(f"{own}: grad must be callable or None, got {grad!r}{address_hint(grad)}.")
         if grad is None and (in_place or uses_f):
-            raise ValueError(f"{own}: in_place and uses_f describe grad; give grad or leave them out.")
+            raise ValueError(f"{own}: in_place and uses_f describe grad, but grad is missing. Give grad or omit them.")
         refuse_units(target=target, args=args, scale=scale)
         if not isinstance(args, tuple):
             raise TypeError(f"{own}: args must be a tuple, got {shown(args)}; write args=(x,) for a single argument.")
@@ -160,12 +162,12 @@ class Invariant:
 
     @property
     def fun(self) -> Callable[..., Any]:
-        """Return the function, which takes `args` where they are left out."""
+        """Return the function; `args` are passed to it if a call omits them."""
         return OwnArguments(self.function, self.args, 2) if self.args else self.function
 
     @property
     def grad(self) -> Callable[..., Any] | None:
-        """Return the gradient, which takes `args` where they are left out; None if it is computed from the values."""
+        """Return the gradient, to which `args` are passed if a call omits them; None if it is computed from the values."""
         if self.gradient is None or not self.args:
             return self.gradient
         return OwnArguments(self.gradient, self.args, 2 + self.uses_f + self.in_place)
@@ -176,11 +178,12 @@ class Invariant:
 
 
 class JointInvariants(tuple[Invariant, ...]):
-    """Scalar invariants whose projection takes two passes over the state: for fields, whose gradients fill memory.
+    """Tuple of scalar invariants whose projection needs two passes over the state and stores no gradients.
 
-    A tuple of `Invariant`, to be given as ``invariants=`` as it is. Interpreted runs with the euclidean metric,
-    ``direction="new"``, one Newton step and no frame call `moments` and `shift` in place of the invariants'
-    values and gradients; all others, and steps whose gradients are nearly parallel, take those.
+    It is meant for large fields, whose gradients would fill memory. Pass it as ``invariants=``. Interpreted runs with
+    the euclidean metric, ``direction="new"``, one Newton step and no frame call `moments` and `shift` in place of the
+    invariants' values and gradients. All other runs, and steps whose gradients are nearly parallel, call the values
+    and gradients.
 
     Parameters
     ----------
@@ -188,10 +191,10 @@ class JointInvariants(tuple[Invariant, ...]):
     moments : callable
         ``moments(t, y, f, values, gram, terms)`` fills, at the state `y`, the `values` (l,), the lower half of the
         gradients' Gram matrix `gram` (l, l), Re <G_i, G_j>, and `terms` (l,), the sums of ``|G_ik y_k|`` over the
-        floats of the state. `f`, the derivative there, holds nothing unless an item `uses_f`.
+        floats of the state. `f` is the derivative at `y` if an item has `uses_f`, otherwise its content is undefined.
     shift : callable
         ``shift(t, y, f, mu, out, values)`` fills `out` with ``y + sum_i mu_i G_i(y)``, and `values` with the
-        invariants there, not finite where `out` is not.
+        invariants at `out`. The values must not be finite if `out` is not.
     """
 
     moments: Callable[..., None]
@@ -200,7 +203,7 @@ class JointInvariants(tuple[Invariant, ...]):
     def __new__(
         cls, items: Iterable[Invariant], moments: Callable[..., None], shift: Callable[..., None]
     ) -> JointInvariants:
-        """The tuple of the items, with both functions."""
+        """Make the tuple of the items, with both functions."""
         self = super().__new__(cls, items)
         self.moments, self.shift = moments, shift
         return self
@@ -210,14 +213,14 @@ class JointInvariants(tuple[Invariant, ...]):
 
 
 def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
-    """Return an invariant, or a sequence of them, as a tuple; `JointInvariants` stay what they are.
+    """Return an invariant, or a sequence of them, as a tuple; `JointInvariants` are returned unchanged.
 
-    A function f(t, y, *args) stands for ``Invariant(f)`` of its name.
+    A function f(t, y, *args) becomes ``Invariant(f)`` with the name of the function.
 
     Raises
     ------
     TypeError
-        For anything else.
+        If `invariants` is anything else.
     """
     if isinstance(invariants, Invariant | JointInvariants):
         return invariants if isinstance(invariants, JointInvariants) else (invariants,)
@@ -236,7 +239,7 @@ def _as_invariant(item: Any) -> Invariant:
     if isinstance(item, Invariant):
         return item
     if not _is_function(item):
-        raise TypeError(f"invariants: got {shown(item)} among them; expected Invariant objects or functions f(t, y).")
+        raise TypeError(f"invariants: the sequence contains {shown(item)}; expected Invariant objects or functions f(t, y).")
     return _of_function(item)
 
 
@@ -246,7 +249,7 @@ def _is_function(item: Any) -> bool:
 
 
 def with_args(item: Invariant, args: tuple[Any, ...]) -> Invariant:
-    """Return an invariant with other arguments of its own."""
+    """Return a copy of an invariant with `args` as its own arguments."""
     new = copy(item)
     new.args = args
     return new
@@ -258,14 +261,17 @@ def _of_function(fun: Callable[..., Any]) -> Invariant:
 
 
 def _apart(fun: Any, grad: Any, args: Sequence[Any]) -> tuple[Any, Any, Sequence[Any]]:
-    """Return functions of another invariant without its arguments, which stand where none are given."""
+    """Return `fun`, `grad` and `args`, with functions of another invariant freed of its arguments.
+
+    The arguments of the other invariant are used if `args` is empty.
+    """
     functions = [found.function if isinstance(found, OwnArguments) else found for found in (fun, grad)]
     own = next(found.args for found in (fun, grad) if isinstance(found, OwnArguments))
     return functions[0], functions[1], args or own
 
 
 def _lacks_gradient(item: Invariant) -> bool:
-    """Return True if an invariant is jitted, so that a compiled run can use it, except for its gradient."""
+    """Return True if an invariant is jitted and lacks a gradient, which a compiled run needs."""
     return item.gradient is None and not item.args and is_jitted(item.function) and not jit_is_off()
 
 
@@ -277,7 +283,7 @@ def _target(target: Any) -> Array:
 
 
 def _scale(scale: Any) -> Any:
-    """Return a scale as a float, or as an array of one for each value."""
+    """Return a scale as a float, or as an array with one entry for each value of the invariant."""
     found = None if isinstance(scale, bool | np.bool_) else reals(scale)
     if found is None or found.ndim > 1 or found.size == 0 or not ((found >= 0) & (found < np.inf)).all():
         raise ValueError(
@@ -287,7 +293,7 @@ def _scale(scale: Any) -> Any:
 
 
 def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array, extra: tuple) -> Array:
-    """The value at the start, a number or (l_i,), by `fun`, the invariant's own with its arguments."""
+    """Return the value at the start, a number or (l_i,); `fun` is the invariant's function with its arguments bound."""
     try:
         value = fun(t, y.copy())
     except TypeError:
@@ -304,7 +310,7 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
 def _first_gradient(
     invariant: Invariant, gradient: Call, label: str, start: tuple[float, Array, Array], extra: tuple
 ) -> Array:
-    """Return the gradient at the start, a time, a state and its derivative."""
+    """Return the gradient at `start`, which holds a time, a state and its derivative."""
     t, y, f = start
     what, states = f"gradient of invariant {label!r}", (y.copy(), f.copy()) if gradient.takes_f else (y.copy(),)
 
@@ -326,12 +332,12 @@ def _first_gradient(
 
 
 def _for_each_value(of_items: list[bool], sizes: list[int]) -> list[bool]:
-    """Return what is known of each item for each of its values."""
+    """Repeat the flag of each item for each of its values."""
     return [known for known, size in zip(of_items, sizes, strict=True) for _ in range(size)]
 
 
 def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
-    """Return the value of a gradient at t, checked for the expected shape, and real if the state is."""
+    """Return the value of a gradient at t after checks: it has the expected shape, and is real if the state is real."""
     what = f"gradient of invariant {label!r}"
     refuse_units(**{f"{what} returned": value})
     try:
@@ -355,9 +361,9 @@ def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple,
 
 
 class InvariantSet:
-    """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
+    """All invariants of a run together: sizes, names, targets, scales, and the functions that the step calls.
 
-    It is made at the start state, where values and shapes are checked.
+    The values and their shapes are checked at the start state.
 
     Parameters
     ----------
@@ -367,9 +373,9 @@ class InvariantSet:
     extra : tuple
         The run's further arguments (its `params`, if any).
     tell : bool
-        Whether to warn of what gradients cost that are not given.
+        Whether to warn of the cost and the accuracy of gradients that are not given.
     t_bound : float, optional
-        The end of the run. Invariants are evaluated at times between both only. Default: at t0 only.
+        The end of the run. Invariants are evaluated only at times from t0 to t_bound. Default: only at t0.
     rhs : callable, optional
         ``rhs(t, y) -> (n,)``, the system, for checks.
 
@@ -378,7 +384,7 @@ class InvariantSet:
     balances : Carried
         The balances among the invariants. Their entries of `target` are the values that the run carries.
     kinds : Grouping or None
-        Components that have the same unit, see `kinds_of`. None: nothing is known of them.
+        Groups of components that have the same unit, see `kinds_of`. None if the units are unknown.
     given : ndarray of bool, shape (l,)
         Which targets the user gave.
     computed : list of bool
@@ -402,7 +408,7 @@ class InvariantSet:
         self.kinds: Grouping | None = None
         self.items = given = as_invariants(invariants)
         self.extra = extra
-        # Why a jitted invariant has no compiled gradient, by its label.
+        # The reasons why jitted invariants have no compiled gradient, by their labels.
         self.why_not: dict[str, str] = {}
         self._start = y0, f0, tau
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
@@ -453,12 +459,12 @@ class InvariantSet:
 
     @cached_property
     def floors(self) -> Array:
-        """Return the sizes (n,) that stand for those of smaller components, see `typical_sizes`."""
+        """Return the sizes (n,) below which components count as this large, see `typical_sizes`."""
         return typical_sizes(*self._start)
 
     @property
     def by_values(self) -> Array:
-        """Return which gradients come from differences of values, (l,)."""
+        """Return a mask (l,) of the gradients that come from differences of values."""
         found = [
             item.gradient is None and not (isinstance(grad, NumericalGradient) and grad.complex_step)
             for item, grad in zip(self.items, self.grads, strict=True)
@@ -472,8 +478,8 @@ class InvariantSet:
                 continue
             if np.size(item.scale) not in (1, size):
                 raise ValueError(
-                    f"invariant {self.labels[k]!r}: scale has {np.size(item.scale)} entries, its value {size}; give "
-                    "one number, or one for each."
+                    f"invariant {self.labels[k]!r}: scale has {np.size(item.scale)} entries, but fun returns {size} "
+                    "values. Give one number, or one for each value."
                 )
             scales[self.starts[k] : self.starts[k + 1]] = item.scale
         return scales
@@ -493,17 +499,17 @@ class InvariantSet:
                 )
 
     def _tell_of_cost(self, given: Sequence[Invariant], n: int) -> None:
-        """Once for all invariants of a large state whose gradients are computed from their values.
+        """Warn once if a large state has invariants whose gradients are computed from their values.
 
-        Of those that were `given`, for a jitted one has a compiled gradient by now.
+        `given` are the invariants as the user gave them: a jitted one among `items` has a compiled gradient by now.
         """
         slow = ", ".join(repr(label) for item, label in zip(given, self.labels, strict=True) if item.gradient is None)
         if slow and n >= LARGE:
             warnings.warn(
-                f"no grad is given for {slow}: each gradient of these {n} components takes {n} evaluations and more, "
-                "which makes the run 10 to 1000 times slower. Give it; of a sum over a grid it is one line: for "
-                "w * np.sum(y**2) Invariant(fun, grad=lambda t, y: 2 * w * y), for the energy of a Hamiltonian system "
-                "of m coordinates and m momenta, of cells w, Invariant(fun, grad=lambda t, y, f: "
+                f"no grad is given for {slow}: each gradient by the {n} components takes at least {n} evaluations of "
+                "the invariant, which makes the run 10 to 1000 times slower. Give grad. For w * np.sum(y**2) it is "
+                "Invariant(fun, grad=lambda t, y: 2 * w * y). For the energy of a Hamiltonian system of m coordinates "
+                "and m momenta on a grid with cells of size w it is Invariant(fun, grad=lambda t, y, f: "
                 "w * np.concatenate([-f[m:], f[:m]]), uses_f=True).",
                 UserWarning,
                 stacklevel=users_level(),
@@ -511,25 +517,25 @@ class InvariantSet:
 
     @property
     def by_differences(self) -> list[str]:
-        """The C functions by pointer without a gradient, by their labels."""
+        """Return the labels of the invariants that are C functions without a gradient."""
         known = zip(self.items, self.labels, strict=True)
         return [label for item, label in known if item.gradient is None and isinstance(item.function, PointerFunction)]
 
     @property
     def fixed_target(self) -> Array:
-        """Return the values (l,) that are kept throughout; NaN for balances, whose values change."""
+        """Return the target values (l,) of the whole run; NaN for balances, whose values change."""
         return np.where(self.balances.mask, np.nan, self.target)
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the rates of the balances as the engine calls them, by `functions` or in Python."""
+        """Return the rates of the balances in the form that the engine calls: `functions`, or functions of Python."""
         low, high = min(self.t_span), max(self.t_span)
         return self.balances.rates(low, high, time_shift(self.tau, adaptive, self.t_span), functions)
 
     def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
-        """Return the invariants with the values that are kept as their targets.
+        """Return the invariants with the values that the run keeps as their targets, for a run that continues it.
 
-        `at_end`: the run goes on from the end of its last step, where balances have the values that it carries.
-        Elsewhere they begin again.
+        `at_end`: the new run starts at the end of the last step, so that balances continue from the values that this
+        run carries. At any other state they start again from their values there.
         """
         kept = [copy(item) for item in self.items]
         for k, item in enumerate(kept):
@@ -545,7 +551,7 @@ class InvariantSet:
         )
 
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
-        """A jitted invariant with a compiled gradient, where it comes without one; any other, as it is."""
+        """Add a compiled gradient to a jitted invariant that has none; return any other invariant unchanged."""
         numbers = scalars(self.extra)
         if not _lacks_gradient(item) or numbers is None:
             return item
@@ -559,7 +565,7 @@ class InvariantSet:
         return item
 
     def _calls(self, shapes: list[tuple[int, ...]], y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
-        """Values, of these shapes, and gradients, as the engine calls them."""
+        """Return the functions of values, which have these shapes, and of gradients in the form that the engine calls."""
 
         def value(k: int) -> Call:
             label, shape = self.labels[k], shapes[k]
@@ -597,8 +603,8 @@ class InvariantSet:
             part = target[self.starts[k] : self.starts[k + 1]]
             if item.target.ndim > 1 or item.target.size not in (1, part.size):
                 raise ValueError(
-                    f"invariant {self.labels[k]!r}: target has shape {item.target.shape}, its value "
-                    f"{part.size} entries."
+                    f"invariant {self.labels[k]!r}: target has shape {item.target.shape}, but fun returns {part.size} "
+                    "values. Give one number, or one for each value."
                 )
             part[:] = item.target
             self._require_finite_target(k, part)
@@ -609,7 +615,7 @@ class InvariantSet:
             raise ValueError(f"invariant {self.labels[k]!r}: target must be finite, got {part}.")
 
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> Array:
-        """Return all gradients (l, n), after a check of their shapes and of what they fill."""
+        """Return all gradients (l, n) at the start, after a check of their shapes."""
         G = np.empty((self.size, *y.shape), y.dtype)
         for k, (item, label) in enumerate(zip(self.items, self.labels, strict=True)):
             rows = G[self.starts[k] : self.starts[k + 1]]
@@ -619,28 +625,28 @@ class InvariantSet:
         return G
 
     def values(self, t: float, y: Array) -> Array:
-        """All values (l,)."""
+        """Return all values (l,)."""
         found: Array = self.functions.values(t, y)
         return found
 
     def gradients(self, t: float, y: Array, f: Array) -> Array:
-        """All gradients (l, n)."""
+        """Return all gradients (l, n)."""
         found: Array = self.functions.gradients(t, y, f)
         return found
 
     def term_sizes(self, t: float, y: Array, f: Array) -> Array:
-        """Size of the terms in each invariant: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
+        """Return the size of the terms in each invariant: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
         return self.sizes_of_terms(y, self.gradients(t, y, f), self.values(t, y))
 
     def sizes_of_terms(self, y: Array, G: Array, values: Array) -> Array:
-        """Return the same, where the gradients (l, n) and the values (l,) are known."""
+        """Return `term_sizes` from known gradients (l, n) and values (l,)."""
         terms = np.abs(G * y).sum(axis=1)
         return np.maximum(np.maximum(np.abs(values), np.abs(self.target)), np.maximum(terms, self.scales))
 
     def norm_products(self, G: Array, x: Array) -> Array:
         """Return ``sum_b |G_b| |x_b|`` over groups of components with the same unit, (l,), for gradients (l, n).
 
-        Terms ``G_k x_k`` may vanish together by the orientation of the axes; these products do not.
+        The terms ``G_k x_k`` may all vanish for some orientation of the axes; these products do not.
         """
         largest, size = np.abs(G).max(initial=0.0), np.abs(x).max(initial=0.0)
         if not (0 < largest < np.inf and 0 < size < np.inf):
@@ -655,11 +661,11 @@ class InvariantSet:
         return (rows @ vector) * size * largest
 
     def misses(self, t: float, y: Array, f: Array) -> Array:
-        """Return which invariants miss their targets by more than 1e-8 of their terms and rounding, (l,)."""
+        """Return a mask (l,) of the invariants that miss their targets by more than 1e-8 of their terms and rounding."""
         return ~(self._excess(t, y, f) <= 1.0)
 
     def _excess(self, t: float, y: Array, f: Array) -> Array:
-        """Return the distances from the targets as multiples of those that are allowed, (l,)."""
+        """Return the distances (l,) from the targets, as multiples of the distances that are allowed."""
         G, values = self.gradients(t, y, f), self.values(t, y)
         allowed = TARGET_TOLERANCE * self.sizes_of_terms(y, G, values)
         allowed += TARGET_ROUNDINGS * EPS * self.norm_products(G, y)
@@ -668,9 +674,9 @@ class InvariantSet:
             return np.where(residual == 0, 0.0, residual / allowed)
 
     def rate_shares(self, t: float, y: Array, f: Array) -> tuple[Array, Array]:
-        """Return the rates of change along f by gradients and by values, relative to the terms of these rates; (l,).
+        """Return the rates of change (l,) along f by gradients and by values, relative to the terms of these rates.
 
-        From those of balances their own rates are subtracted, which leaves NaN where none is given.
+        The given rate of a balance is subtracted from its rate of change. Balances without a given rate get NaN.
         """
         own = None
         if self.balances.items:
@@ -680,7 +686,7 @@ class InvariantSet:
         return by_gradient, by_values
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
-        """Return what is wrong with the start, where it misses given targets; the worst invariant comes first."""
+        """Return a message if the start misses given targets, with the worst invariant first; otherwise None."""
         if not self.given.any():
             return None
         excess = np.nan_to_num(self._excess(t, y, f), nan=np.inf, posinf=np.inf)
@@ -695,9 +701,9 @@ class InvariantSet:
     def check(
         self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
     ) -> list[str]:
-        """Compare gradients with differences along two directions, and the invariance with the system.
+        """Check gradients against differences along two directions, and that the system keeps the invariants.
 
-        `evaluated`: the gradients and the values there, which are evaluated if they are not given.
+        `evaluated` holds the gradients and the values at the state; default: they are evaluated.
 
         Returns
         -------
@@ -731,12 +737,12 @@ class InvariantSet:
     def complaints(
         self, t: float, y: Array, f: Array, tau: float, rhs: Callable[[float, Array], Array] | None = None
     ) -> Iterator[Complaint]:
-        """Yield what is wrong at a state with the derivative f, by `rhs` or the run's own system."""
+        """Yield findings about the invariants at a state with the derivative f; `rhs` defaults to the run's system."""
         return complaints(self, t, y, f, tau, rhs or self.rhs)
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:
-    """Largest relative difference between an invariant's gradient and central differences of order 6.
+    """Return the largest relative difference between an invariant's gradient and central differences of order 6.
 
     Parameters
     ----------
@@ -750,8 +756,8 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     Returns
     -------
     float
-        max over the components k of ``|grad_k - difference_k| s_k / max_j |grad_j| s_j``, with s the sizes of y's
-        components (of the largest one, for components that are 0): about 1e-12 for a right gradient.
+        Maximum over the components k of ``|grad_k - difference_k| s_k / max_j |grad_j| s_j``, with ``s_k = |y_k|``, or
+        the size of the largest component if ``y_k`` is 0. A correct gradient gives about 1e-12.
 
     Raises
     ------

@@ -25,7 +25,7 @@ FITS = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_int64] * 2)
 
 
 def register() -> None:
-    """Let Numba take a function of the library's for one of its own."""
+    """Make functions of the library, such as ``problem.rhs``, callable from functions that Numba compiles."""
     typeof_impl.register(LibraryFunction)(lambda function, context: types.Dispatcher(_jitted(function)))
 
 

@@ -206,7 +206,7 @@ def _scales(run: Run) -> Array:
 
 
 def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
-    """The start on the targets, by full Newton steps in the euclidean metric."""
+    """Return the start projected onto the targets, by full Newton steps in the euclidean metric."""
     t0, y0, f0, _ = run.begin
     options = run.options._replace(
         metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
@@ -220,7 +220,7 @@ def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
 
 
 def _moved(before: Array, after: Array, floors: Array) -> str:
-    """Return how far a start was moved, or nothing where that is no more than a target may be missed by."""
+    """Return a sentence on how far the projection moved the start; "" if by no more than TARGET_TOLERANCE."""
     share = np.abs(after - before) / np.maximum(np.abs(before), floors)
     count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0
     if not count:

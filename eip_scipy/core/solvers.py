@@ -74,7 +74,7 @@ __all__ = [
 
 # The attributes that a step of SciPy's solver reads.
 HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
-# Attributes of a solver that its copies share, and those that are made again for a copy.
+# SHARED: attributes that a solver and its copies share; MADE: attributes that each copy makes again.
 SHARED = {"_user_fun", "_jacobian"}
 MADE = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_derivative", "_call", "_spec", "_scipy"}
 MADE |= {"_run", "_work", "_schedule", "_engine", "_interpolants", "_left", "_taken", "diagnostics"}
@@ -82,15 +82,15 @@ OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnos
 
 
 class SolverClass(type):
-    """Type of the solver classes: those that `eip_method` makes pickle too."""
+    """Metaclass of the solver classes. It makes the classes that `eip_method` returns picklable."""
 
 
 @takes_projection_options
 class EIPSolver(OdeSolver, metaclass=SolverClass):
     """Explicit invariants-preserving solver: a Runge-Kutta step, then one Newton step of projection.
 
-    Use one of the methods `EIPRK1` ... `EIPRK5`, or `eip_method` for a tableau of your own, with
-    `scipy.integrate.solve_ivp`.
+    This is the base class. Pass a subclass, such as `EIPRK4` or the class that `eip_method` makes from your own
+    tableau, to `scipy.integrate.solve_ivp` as ``method=``.
 
     Parameters
     ----------
@@ -103,16 +103,17 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     t_bound : float
         End; before t0 to integrate backward.
     max_step, rtol, atol, first_step
-        Step control, as in SciPy's own methods; the error estimate sees the step before its projection. `rtol` and
-        `atol` are also the scale of the error metric: ``|atol| + rtol |y|``, norms over a block. The default of `atol`
-        is 1e-6 for adaptive steps and 0 for a fixed step `h`, where the metric then does not depend on units.
+        Step control, as in SciPy's own methods; the error is estimated before the projection. `rtol` and `atol` are
+        also the scale of the error metric: ``|atol| + rtol |y|``, norms over a block. The default of `atol` is 1e-6
+        for adaptive steps and 0 for a fixed step `h`, so that the metric does not depend on units.
     vectorized : bool, optional
         Whether `fun` takes (n, k) arrays, as in SciPy.
     h : float, optional
-        A fixed step instead: its length, > 0 in either direction. The last step ends on `t_bound` and may be shorter.
+        Length of a fixed step, positive in both directions. The last step ends on `t_bound` and may be shorter.
+        Default: the step length is adapted to the tolerances.
     {ProjectionOptions}
     diagnostics : Diagnostics, optional
-        An empty `Diagnostics`, which the run fills.
+        An empty `Diagnostics` object, which the solver fills.
 
     Attributes
     ----------
@@ -120,7 +121,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         As in `scipy.integrate.OdeSolver`; `njev` counts evaluations of the invariants' gradients and `nlu`
         factorisations of the projection.
     order, error_estimator_order, n_stages, A, B, C, E, P
-        Attributes of the classes, as of SciPy's Runge-Kutta classes; NotImplemented where a method has none.
+        Attributes of the classes, as in SciPy's Runge-Kutta classes; NotImplemented if a method has no such attribute.
     diagnostics : Diagnostics
         The record of the projections, the given one or a new one.
 
@@ -128,18 +129,18 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     -----
     Between two steps, ``fun``, ``t``, ``y``, ``f``, ``t_bound`` (with ``status = "running"`` after the end),
     ``direction``, ``max_step``, ``h_abs``, ``rtol``, ``atol`` and, with fixed steps, ``h`` may be set, and the next
-    step takes what was set. A state or a time that was set is a new start: each invariant without a given target takes
-    its value there, given targets must be met, and the figures by which the projection is judged begin anew, while
-    counts and the largest residuals go on. If ``y``, ``t`` or ``fun`` was set and ``f`` was not, the derivative is
+    step uses the new values. Setting the state or the time is a new start: each invariant without a given target takes
+    its value there as target, given targets must be met, and the figures that judge the projection are reset, while
+    counts and the largest residuals continue. If ``y``, ``t`` or ``fun`` was set and ``f`` was not, the derivative is
     evaluated again; only `EIPRK23`, `EIPRK45` and `EIPDOP853` without invariants keep the old one for the first stage,
-    as SciPy's own do. A multistep method starts again after any change. Wrong values raise in the next step. Copies by
-    `copy.deepcopy` and `pickle`, for which the functions must pickle, go on to the same bits.
+    as SciPy's methods do. A multistep method starts again after any change. A wrong value raises an error in the next
+    step. Copies made by `copy.deepcopy` or `pickle` continue to the same bits; pickling needs functions that pickle.
 
-    With ``every=k`` the states between two projections are handed out as projected copies, also by dense output; the
-    steps go on from the states themselves.
+    With ``every=k`` the states between two projections are returned as projected copies, also by dense output; the
+    steps continue from the unprojected states.
 
-    The error estimate sees the step before its projection. Defects of the invariants after it are O(h^(2p + 2)) for a
-    method of order p (theorem 2.1 of [1]_), and the method keeps its order.
+    The residuals of the invariants after the projection are O(h^(2p + 2)) for a method of order p (theorem 2.1 of
+    [1]_), and the method keeps its order.
 
     References
     ----------
@@ -223,7 +224,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._settle()
 
     def __init_subclass__(cls, **keywords: Any) -> None:
-        """Give a class of a method the attributes of SciPy's RungeKutta classes: order, n_stages, A, B, C, E, P ..."""
+        """Give a subclass the attributes of SciPy's RungeKutta classes: order, n_stages, A, B, C, E, P ..."""
         super().__init_subclass__(**keywords)
         if "TABLEAU" in vars(cls):
             for name, value in attributes_of(cls.TABLEAU, cls._SCIPY).items():
@@ -231,20 +232,20 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
                     setattr(cls, name, value)
 
     def _bind(self, fun: Callable[..., Any], calls: list[int]) -> None:
-        """Take a user's function, which is vectorized if that of the start is; `calls` counts."""
+        """Use `fun` as right-hand side from now on; ``calls[0]`` counts its evaluations."""
         self._user_fun, self._bound_fun, self._calls = fun, self.fun, calls
         vectorized = self.vectorized and fun is not self.fun
         self._derivative, self._call = _checked(fun, self.n, self.y.dtype, vectorized, calls)
 
     def _take_stepping(self, stepping: Stepping) -> None:
-        """Take options of the steps that have been checked."""
+        """Store options of the step control that have been checked."""
         self._spec = replace(self._spec, stepping=stepping)
         self.h, self.max_step = stepping.h, stepping.span.max_step
         self._taken = self.fun, self.t_bound, self.direction, self.max_step, self.h
         self.rtol, self.atol = _frozen(stepping.rtol), _frozen(stepping.atol)
 
     def _specified(self, stepping: Stepping, projection: ProjectionOptions) -> RunSpec:
-        """Return what the run is made from, for the present function."""
+        """Return the `RunSpec` of the solver's present function."""
         moved = times(self._jacobian) if callable(self._jacobian) else self._jacobian
         return RunSpec(
             name=type(self).__name__,
@@ -260,26 +261,26 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         )
 
     def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:
-        """Begin at a state, and make the buffers of the run; `check`: see `RunSpec.build`."""
+        """Start a run at a state and make its buffers; `check` is `check_start` of `RunSpec.build`."""
         run = self._spec.build(y0, f0, tau, check_start=check)
         self._run, self._work = run, run.work
         self._spec = replace(self._spec, method=run.tableau, is_known=True)
         run.attach(self.diagnostics)
         self.y, self.f = run.y0, run.start.f
-        # The state that the steps are made from, where `y` is its copy on the manifold.
+        # The steps continue from `_raw`. If it waits for its projection, `y` is its projected copy.
         self._raw = self._raw_old = run.y0
         self._waits = False, False  # whether the states at both ends of the last step wait for a projection
         self._shows = run.shows and not self._in_parts
         self._steps = 0
 
     def _drive(self, *, begins: bool) -> None:
-        """Make the engine for the present interval, options and functions; `begins`: the run starts with it."""
+        """Make the engine for the present interval, options and functions; `begins`: a run starts, rather than continues."""
         self._k, self._interpolants = 0, None
         if self._scipy is not None:
             return
         self._work.K[0] = self.f
         self._schedule = bare_schedule(self._spec.stepping.span, float(self.h_abs or 0.0))
-        self._schedule.place[PENDING] = 1  # what is handed out between two steps is the end of the last one
+        self._schedule.place[PENDING] = 1  # the solver shows the end of the last step
         calls, jacobian = self._run.invariants.calls, None
         if callable(self._jacobian):
             jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
@@ -288,13 +289,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
 
     def _settle(self) -> None:
-        """Note what the attributes are between two steps, so that a change of them shows."""
+        """Store the attributes after a step, so that the next step detects which of them the user has set."""
         self._left = self.t, self.y, self.f, self.h_abs, self.rtol, self.atol, self.nfev
         self._kept = kept_state(self.y) if self._scipy is None else None
 
     @property
     def _untouched(self) -> bool:
-        """Return whether all attributes are as the last step left them."""
+        """Return True if no attribute was set since the last step."""
         t, y, f, h_abs, rtol, atol, nfev = self._left
         return (
             self.y is y
@@ -310,11 +311,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     @property
     def _was(self) -> Settings:
-        """Return the attributes as the last step left them."""
+        """Return the attributes as they were after the last step."""
         return Settings(*self._left, *self._taken)
 
     def _hand_on(self) -> None:
-        """Take what was set between two steps, as the notes of the class say."""
+        """Apply the attributes that were set between two steps, as the notes of `EIPSolver` describe."""
         was, like = self._was, self._run.y0
         stepping = checked_stepping(self, self.TABLEAU, was, stacklevel=5)
         y = self.y if self.y is was.y else checked_vector("y", self.y, like)
@@ -344,14 +345,14 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._drive(begins=moved)
 
     def _hand_to_scipy(self, solver: OdeSolver, refunctioned: bool) -> None:
-        """Set on SciPy's solver what was set on this one."""
+        """Copy the attributes that a step reads to SciPy's solver."""
         if refunctioned:
             solver.fun = self._derivative
         for name in HANDED:
             setattr(solver, name, getattr(self, name))
 
     def _restart(self, here: Start) -> None:
-        """Begin anew at a state that was set; the counts and the largest residuals of the run go on."""
+        """Start a new run at a state that was set; counts and the largest residuals are taken over from the old run."""
         old = self._run
         self._start(*here[1:], check=False)
         new, counters = self._run, self._work.counters
@@ -363,7 +364,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         new.trust.failed = old.trust.failed
 
     def _go_on(self, here: Start) -> None:
-        """Go on from the last state with other tolerances, another interval or another function."""
+        """Continue from the last state with other tolerances, another interval or another function."""
         run, spec = self._run, self._spec
         method, _ = spec.examined(here.y, here.f)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
@@ -377,10 +378,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._spec = replace(spec, method=method, is_known=True)
 
     def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return what a copy shares with this solver, the user's functions, and what it copies."""
+        """Return two mappings for a copy of this solver: values that both share, such as functions, and values to copy."""
         shared = {name: getattr(self, name) for name in SHARED} | {"projection": self._spec.projection}
         was = self._was._asdict()
-        if self.fun is not self._bound_fun:  # it was set since the last step
+        if self.fun is not self._bound_fun:  # `fun` was set since the last step
             shared["fun"] = self.fun
         del was["fun"]
         copied = {
@@ -396,7 +397,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         return shared, copied
 
     def _revive(self, shared: dict[str, Any], copied: dict[str, Any]) -> None:
-        """Become the solver whose `_state` this is."""
+        """Restore the solver from the output of `_state`."""
         begin, user = copied["run"].values["begin"], shared["_user_fun"]
         vectorized = copied["attributes"]["vectorized"]
         super().__init__(user, begin.t, begin.y, begin.t + 1.0, vectorized, support_complex=True)
@@ -445,11 +446,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         return new
 
     def _hooks(self) -> dict[str, Any]:
-        """Parts of the steps that a subclass takes itself, see `Hooks`."""
+        """Return the parts of a step that a subclass computes itself, see `Hooks`."""
         return {}
 
     def _count(self) -> int:
-        """Show the counts of the run; returns how often something stood out in its projections."""
+        """Update nfev, njev and nlu, and return how many projections of the run were conspicuous."""
         counters = self._work.counters.tolist()
         self.nfev, self.njev, self.nlu = counters[NFEV], counters[NJEV], counters[NLU]
         return int(counters[FOUND])
@@ -463,11 +464,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         solver = self._SCIPY(partial(_copied, self._derivative), self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
-        solver.fun = self._derivative  # in place of SciPy's two wrappers, whose work it does
+        solver.fun = self._derivative  # it replaces SciPy's two wrappers, which count and convert as it does
         return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
-        # Not its step(), whose bookkeeping is done for this solver already.
+        # This solver's own step() does the bookkeeping, so that SciPy's step() is not needed.
         success, message = solver._step_impl()
         self.nfev = self._calls[0]
         if not success:
@@ -494,7 +495,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     @property
     def _moved(self) -> bool:
-        """Return whether the state or the time is not the one that the last step left."""
+        """Return True if the state or the time was changed since the last step."""
         t, y = self._left[:2]
         if self.t != t or (self._kept is not None and not is_state(self.y, self._kept)):
             return True
@@ -523,7 +524,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         return True, None
 
     def _watch(self, *, ended: bool = False) -> None:
-        """Look at the run where something stands out, early and at its end; warn once, and at once: it may end here."""
+        """Examine the run, and warn once if it looks faulty.
+
+        The warning comes in the step that finds the fault, because the user may make no further step.
+        """
         run, arrived = self._run, ended or self.t == self.t_bound
         self._noted = self._work.counters[FOUND]
         rhs = partial(_copied, self._derivative)
@@ -532,21 +536,21 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=users_level())
 
     def _sampled(self) -> Interpolants:
-        """Return the interpolants of the run, which hand out states on the manifold."""
+        """Return the interpolants of the run, whose states are projected."""
         if self._interpolants is None:
             self._interpolants = Interpolants(self._run, self._engine)
         self._interpolants.record.waiting[:] = self._waits
         return self._interpolants
 
     def _on_manifold(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the state of a step as it is handed out."""
+        """Return the state of a step for the user: a projected copy if the state waits for its projection."""
         waits = bool(t != self.t_bound if self.TABLEAU.has_history else self._work.counters[WAITED] > 0)
         self._waits = self._waits[1], waits
         return self._sampled().shown(t, y) if waits else y
 
     def _dense_output_impl(self) -> DenseOutput:
         t, y = self._left[:2]
-        if self._kept is not None and not is_state(y, self._kept):  # changed after the step whose output this is
+        if self._kept is not None and not is_state(y, self._kept):  # y was changed in place since the last step
             y = np.frombuffer(self._kept, y.dtype) if isinstance(self._kept, bytes) else self._kept
         if self._scipy is not None:
             out = ExactEnds(self._scipy.dense_output(), self.y_old, y)
@@ -560,14 +564,14 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
 
 def _revived(solver: type[EIPSolver], shared: dict[str, Any], copied: dict[str, Any]) -> EIPSolver:
-    """Return the solver whose `_state` this is, as it comes back from a pickle."""
+    """Return a solver of the class `solver` from the output of `EIPSolver._state`."""
     new = solver.__new__(solver)
     new._revive(shared, copied)
     return new
 
 
 def _reduced_class(made: type) -> Any:
-    """Return what a pickle holds of a class: its name, or what `eip_method` made it of."""
+    """Return how a class is pickled: by its name, or as a call of `eip_method` if that made it."""
     origin = vars(made).get("_ORIGIN")
     return made.__qualname__ if origin is None else (eip_method, (origin,))
 
@@ -576,24 +580,24 @@ copyreg.pickle(SolverClass, _reduced_class)
 
 
 def _copied(derivative: Callable[[float, np.ndarray], np.ndarray], t: float, y: np.ndarray) -> np.ndarray:
-    """The derivative as an array of its own."""
+    """Return the derivative as a new array."""
     return derivative(t, y).copy()
 
 
 def _by_name() -> str:
-    """Return how an acceleration is passed."""
+    """Return the end of an error message that explains how to pass an acceleration."""
     return f". If fun is the acceleration a(t, q), {BY_NAME}"
 
 
 def _frozen(a: np.ndarray) -> np.ndarray:
-    """A copy that cannot be changed in place, which no step would notice."""
+    """Return a read-only copy, because a step would not notice a change in place."""
     a = a.copy()
     a.setflags(write=False)
     return a
 
 
 def _jacobian(method: Any, options: dict[str, Any]) -> Any:
-    """Take the Jacobian out of the options of a solver: as its method takes one."""
+    """Remove the Jacobian from `options` and return it in the form that the method needs; None if there is none."""
     if method.drives:
         return Jacobian(options.pop("jac", None), options.pop("jac_sparsity", None))
     jacobian = options.pop("jacobian", None) if method.has_history else None
@@ -618,10 +622,11 @@ def _without_effect(names: Iterable[str]) -> str:
 def _checked(
     fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
 ) -> tuple[Callable[[float, np.ndarray], np.ndarray], Call]:
-    """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer, and for the engine.
+    """Return the user's right-hand side with checks of its values: as a function of (t, y), and for the engine.
 
-    The first counts in `calls`; the step counts its own. All hand out copies, because a user's function may keep or
-    overwrite what it was given, and test the common case, an array of the right shape and type, first.
+    The function counts its calls in ``calls[0]``, while the engine counts its own calls. Its value may be a buffer of
+    the user. `fun` gets a copy of the state, because it may keep or overwrite its argument. The common case, an array
+    of the right shape and type, is tested first.
     """
     shape = (n,)
 
@@ -649,7 +654,7 @@ def _checked(
 
 
 class EIPRK1(EIPSolver):
-    """EIP method on explicit Euler (order 1); it has no error estimate, so the metric is euclidean.
+    """EIP method on the explicit Euler method (order 1), which has no error estimate; the metric is euclidean.
 
     Options: see `EIPSolver`.
     """
@@ -752,19 +757,19 @@ class EIPGJ12(EIPSolver):
     For smooth motions q'' = a(t, q), with a fixed step `h`, as a first-order system: the state is (q, v), and the
     first half of `fun` must be v. `integrate` also takes the acceleration alone, as ``acceleration=``; accelerations
     that depend on velocities come as the second half of `fun`. Options: see `EIPSolver`; `every` is "auto" and
-    `compensated` True unless given.
+    `compensated` is True by default.
 
     Raises
     ------
     ValueError
-        When `h` is not stable at the start; the message says which step is.
+        If the step `h` is unstable at the start; the message gives a stable one.
 
     Notes
     -----
     The first states come from `EIPRKN12` (from DOP853 where accelerations depend on velocities), with the same step.
-    The projection's corrections go into the sums. `integrate` shows states that are centred on the history, which runs
-    ahead of them by half the order, up to the end of the interval; solve_ivp those at its newest end, which are less
-    accurate by rounding.
+    The corrections of the projection are added to the sums. `integrate` returns states in the middle of the history,
+    which runs ahead of them by half the order, up to the end of the interval. solve_ivp returns the newest state of
+    the history, whose rounding error is larger.
     """
 
     TABLEAU = GaussJackson(order=12)
@@ -773,10 +778,11 @@ class EIPGJ12(EIPSolver):
 class EIPGJ14(EIPSolver):
     """EIP method on the multistep method of Gauss and Jackson of order 14, its accelerations corrected by the Jacobian.
 
-    As `EIPGJ12`, with longer steps: after each evaluation the accelerations are moved by the Jacobian times what the
-    corrector would change of the positions, for the bodies that need it. `nbody` and the problems made of it have the
-    Jacobian of the central body; for others give ``jacobian=fun(t, q, dq, out[, params])``, to `integrate` or
-    solve_ivp. Without one the step is stable only where it is very short.
+    It is used as `EIPGJ12`, with longer steps: after each evaluation the accelerations are corrected by the Jacobian
+    times the change of the positions that a corrector step would make, for the bodies that need it. `nbody` and the
+    problems made from it provide the Jacobian of the central body; for others pass
+    ``jacobian=fun(t, q, dq, out[, params])`` to `integrate` or solve_ivp. Without a Jacobian only very short steps are
+    stable.
     """
 
     TABLEAU = GaussJackson(order=14, corrected=True)
@@ -792,14 +798,14 @@ class EIPRadau(EIPSolver):
 
     Notes
     -----
-    Keep constraints, and not an energy that contains fast, damped oscillations: the method damps these even where the
-    system does not, and the projection of the energy would put what they lose into the slow motion. See
+    Use constraints as invariants, and not an energy that contains fast oscillations: the method damps these even if
+    the system does not, and the projection would put the energy that they lose into the slow motion. See
     :doc:`/how-to/stiff-systems`.
 
     Raises
     ------
     ValueError
-        For a complex `y0`, which SciPy's Radau does not take.
+        If `y0` is complex, because SciPy's Radau needs real states.
 
     Examples
     --------
@@ -829,7 +835,7 @@ class EIPBDF(EIPSolver):
 
 
 def class_named(method: Any) -> str | None:
-    """Return the name of the class that stands in `method` by its name, by SciPy's name of it or as SciPy's class."""
+    """Return the name of the EIP class for `method`: the class's name, SciPy's name of the method or SciPy's class."""
     name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
     return next((known for known in __all__ if known.upper() == name), None)
 
@@ -842,22 +848,22 @@ def eip_method(
     Parameters
     ----------
     method : Tableau, NystromTableau, GaussJackson, OneStepMethod or a class like SciPy's RK45
-        Of a subclass of SciPy's RungeKutta, or a class of another package with the same attributes, the coefficients A,
-        B, C, E and P are read and checked against the order conditions; the step control is the one of this package.
-        SciPy's Radau and BDF give `EIPRadau` and `EIPBDF`.
+        If it is a subclass of SciPy's RungeKutta, or a class of another package with the same attributes, its
+        coefficients A, B, C, E and P are read and checked against the order conditions; the step control is the one of
+        this package. SciPy's Radau and BDF give `EIPRadau` and `EIPBDF`.
         A one-step method is any object with ``one_step(t, y, h) -> y_hat`` and ``order``; see `OneStepMethod`. Its
-        steps are projected like all others; `fun` serves gradients that take f and dense output (a cubic through both
-        ends) only, so that `nfev` does not count what `one_step` evaluates.
+        steps are projected like those of other methods. `fun` is called only for gradients that use f and for dense
+        output (a cubic through both ends), so that `nfev` does not count the evaluations of `one_step`.
 
     Returns
     -------
     type[EIPSolver]
-        To be passed as ``method=`` to `scipy.integrate.solve_ivp` or `integrate`.
+        A class to pass as ``method=`` to `scipy.integrate.solve_ivp` or `integrate`.
 
     Raises
     ------
     TypeError
-        If it is none of them, or a class whose coefficients do not make its steps.
+        If `method` is none of these, or a class whose steps do not follow from its coefficients.
     ValueError
         If the order of a one-step method is not an integer >= 1, or coefficients of a class miss an order condition.
 
@@ -887,7 +893,7 @@ def eip_method(
 
 
 def _on_class(solver: type[OdeSolver]) -> type[EIPSolver]:
-    """Return the class of this package on the method of a solver class."""
+    """Return the EIP class for the method of a solver class of SciPy or another package."""
     if issubclass(solver, EIPSolver):
         return solver
     for own in (EIPRK23, EIPRK45, EIPDOP853):

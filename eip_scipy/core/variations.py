@@ -136,7 +136,7 @@ class Columns:
         return {"variations": self.values, "derivatives by": self.parameters, "symplectic": self.symplectic}
 
     def after(self, wide: Array) -> Columns:
-        """Return those of a run that goes on from a wide state."""
+        """Return the columns at the start of a run that continues from the wide state `wide`."""
         return replace(self, values=wide[self.order[1:]].T.copy())
 
 

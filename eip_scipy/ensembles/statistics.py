@@ -45,7 +45,7 @@ class Statistics:
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviation (k, m)."""
+        """Standard deviation (k, m) of the members; nan if there are none."""
         return np.sqrt(self.var)
 
     def __repr__(self) -> str:

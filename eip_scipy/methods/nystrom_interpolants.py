@@ -79,7 +79,7 @@ def interpolant(tableau: NystromTableau) -> Interpolant:
 
 
 def _extended(A: Array, c: Array, nodes: Array, weights: Array) -> tuple[Array, Array]:
-    """Return the stages followed by others at `nodes`, with the weights (nodes, stages)."""
+    """Return `A` and `c` with further stages at `nodes`, whose rows of `A` are `weights` (nodes, stages)."""
     known = c.size
     longer = np.zeros((known + nodes.size, known + nodes.size))
     longer[:known, :known], longer[known:, :known] = A, weights
@@ -87,7 +87,7 @@ def _extended(A: Array, c: Array, nodes: Array, weights: Array) -> tuple[Array, 
 
 
 def _stages(A: Array, c: Array, nodes: Array, order: int) -> tuple[int, Array]:
-    """Return the power of h that positions within the step err by, at most `order`, and their weights (nodes, stages).
+    """Return the order of the error of positions at `nodes`, at most `order`, and the weights (nodes, stages).
 
     Each row of weights has the smallest norm among those that meet the order conditions of as many vertices as can be
     met at all nodes. The conditions are made orthonormal one after the other, by sums of columns: a library's solver

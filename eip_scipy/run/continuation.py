@@ -59,7 +59,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
 
 
 def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult:
-    """Return the combination of two runs."""
+    """Return one result for a run and its continuation; the state where they meet is stored once."""
     new = slice(1 if one.t.size and two.t.size and two.t[0] == one.t[-1] else 0, None)
     both = IntegrationResult(two)
     for name in ("t", "y", "invariants"):

@@ -312,7 +312,7 @@ def _with_projection(method: Any, given: list[str]) -> Any:
 
 
 def _unpacked(args: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return `args` for SciPy, which says what is wrong with them, and the arguments in them."""
+    """Return `args` as SciPy gets them, and as a tuple; SciPy reports wrong ones."""
     try:
         extra = () if args is None else tuple(args)
     except TypeError:
@@ -321,7 +321,7 @@ def _unpacked(args: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _noting(method: type[EIPSolver], start: np.ndarray | None) -> tuple[type[EIPSolver], list[EIPSolver]]:
-    """Return the class, and a list to which it adds its solver.
+    """Return a subclass of `method`, and a list to which it appends the solver that SciPy makes from it.
 
     The state from which the solver starts is written to `start`, the initial state of SciPy's loop: it is the first of
     the states that are returned, and the one at which the events are evaluated first.

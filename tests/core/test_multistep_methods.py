@@ -476,7 +476,7 @@ def test_a_false_invariant_is_told():
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"direction": "old"}, ValueError, "has no step that starts at a state"),
+        ({"direction": "old"}, ValueError, "projects along the gradients at the"),
         ({"compensated": False}, ValueError, "always uses compensated sums"),
         ({"h": None}, ValueError, "takes fixed steps and needs the step h"),
         ({"rtol": 1e-6, "h": None}, ValueError, "takes fixed steps"),

@@ -90,7 +90,11 @@ def body_names(names: Sequence[str], n: int) -> tuple[str, ...]:
 
 
 def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
-    """The unit of positions and that of t_span, or else of velocities; "" where not all that need one have a unit."""
+    """Return the units of length and time as text, such as "au, d".
+
+    The unit of time is that of t_span, or that of the velocities if t_span has no unit. The text is empty if `gm`,
+    `position` or `velocity` has no unit.
+    """
     given = {name: _first(value) for name, value in (("gm", gm), ("position", position), ("velocity", velocity))}
     if not all(hasattr(value, "unit") and hasattr(value, "to_value") for value in given.values()):
         return ""
@@ -102,7 +106,7 @@ def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
 
 
 def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | None) -> tuple[Any, Any, Any]:
-    """G m, positions and velocities as plain numbers; masses become G m.
+    """Return G m, positions and velocities as plain numbers in the problem's units; masses become G m.
 
     Raises
     ------

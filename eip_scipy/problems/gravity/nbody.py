@@ -23,8 +23,9 @@ from .orbits import balances_beside_frame
 
 __all__ = ["component_names", "nbody"]
 
-# Relative speeds in units of the escape speed beyond which all bodies are said to be in wrong units. AU/day taken for
-# AU/yr is a factor of 365; a close flyby reaches 30, an orbit of eccentricity 0.9999 is at 1/140 in its apocentre.
+# If the relative speeds of all bodies, in units of the escape speed, are beyond these bounds, a warning says that the
+# units may be wrong. AU/day in place of AU/yr is a factor of 365; a close flyby reaches 30, and an orbit of
+# eccentricity 0.9999 has 1/140 in its apocentre.
 TOO_FAST, TOO_SLOW = 80.0, 1 / 150
 
 
@@ -46,20 +47,20 @@ def nbody(
     G: float | None = None,
     balances: str | Sequence[str] | None = None,
 ) -> Problem:
-    """N point masses under Newton's gravitation, with further forces where an accuracy asks for them.
+    """Return the problem of N point masses under Newton's gravitation, with optional further forces.
 
     Parameters
     ----------
     gm : array_like, shape (N,)
-        G times the masses, in the units of length and time of the state, or with `G` the masses; 0 for test particles,
-        which are attracted and do not attract. With units of astropy: G m, or the masses, which are then multiplied by
-        the constant of gravitation.
+        G times the masses, in the units of length and time of the state; if `G` is given, the masses. 0 stands for a
+        test particle, which is attracted and does not attract. Quantities of astropy may be G m, or masses, which are
+        then multiplied by the constant of gravitation.
     position, velocity : array_like, shape (N, 3)
-        Plain numbers, or with units of astropy, then all three of `gm`, `position` and `velocity`.
+        Plain numbers, or quantities of astropy. Either all or none of `gm`, `position` and `velocity` have units.
     t_span : (float, float)
-        Numbers, durations, or moments (Time of astropy, in any scale), where the units are known.
+        Numbers; if the units are known, also durations or moments (Time of astropy, in any scale).
     h : float, optional
-        A number or a duration.
+        Step length, a number or a duration.
     forces : str or sequence of str, optional
         Forces in addition to Newton's gravitation, all from the first body (the Sun) except "eih":
 
@@ -74,54 +75,55 @@ def nbody(
         "j2"
             The Sun's oblateness.
         "moon-quadrupole"
-            The Moon smeared out along a circle around the Earth, for data with one body for the two.
+            The mean effect of a Moon on a circle around the Earth, for data in which one body stands for both.
         "drag"
             Drag on all other bodies in an atmosphere of the first one, see `satellite`.
 
         At most one of the first three.
     constants : ForceConstants, optional
-        The speed of light and what else the forces need, in the units of the state.
+        The speed of light and the other constants of the forces, in the units of the state.
     name, source : str, optional
     units : str, optional
-        Of length and time, such as "AU, yr" (see `Problem`). Default where there are quantities: the unit of
-        `position`, and that of `t_span`, days for moments, or else that of `velocity`.
+        Units of length and time, such as "AU, yr" (see `Problem`). Default for quantities: the unit of length is that
+        of `position`; the unit of time is that of `t_span` (days for moments), or else that of `velocity`.
     reference : callable, optional
     bodies : sequence of str, optional
-        Names of the bodies: components are then x_Sun, y_Sun, ...; default: x_0, y_0, ...
+        Names of the bodies, which become part of the components' names: x_Sun, y_Sun, ... Default: x_0, y_0, ...
     epoch : Time or float or (float, float), optional
-        When t is 0: a Time of astropy in any scale, or a Julian date in TDB, in one or two numbers. Default: the start
-        of a `t_span` of moments.
+        The moment of t = 0: a Time of astropy in any scale, or a Julian date in TDB, as one or two numbers. Default:
+        the start of `t_span` if it consists of moments.
     G : float, optional
         The constant of gravitation. If it is given, the first argument holds the masses, which are multiplied by it:
-        ``nbody([1, 1e-6], ..., G=4 * np.pi**2)`` in AU, years and solar masses. `Problem.G` keeps it, so that a
+        ``nbody([1, 1e-6], ..., G=4 * np.pi**2)`` in AU, years and solar masses. `Problem.G` stores it, so that a
         simulation of REBOUND gets the same masses.
     balances : str or sequence of str, optional
-        Keep what each orbit would keep without all other pulls, in place of the totals: "kepler" or "energy",
-        "momentum", "laplace", see `orbital_balances`. For planetary systems without close encounters, over long times.
+        Use the quantities that each orbit conserves without the pulls of other bodies, as balances, instead of the
+        totals: "kepler" or "energy", "momentum", "laplace", see `orbital_balances`. They are made for planetary systems
+        without close encounters over long times.
 
     Returns
     -------
     Problem
         State (q_1, ..., q_N, v_1, ..., v_N), each with 3 components. Invariants: "H", the energy times G, and "L", the
-        angular momentum times G. Momentum and centre of mass are in the `frame`; `blocks` are the bodies'
-        positions and velocities.
+        angular momentum times G. Momentum and centre of mass are linear constraints in `frame`; `blocks` are the
+        bodies' positions and velocities.
 
     Raises
     ------
     ValueError
-        When shapes disagree, a mass is negative, all are 0, two bodies are in one place, `G` is not positive, or for
-        unknown forces.
+        If shapes disagree, a mass is negative, all masses are 0, two bodies have the same position, `G` is not
+        positive, or a force is unknown.
 
     Warns
     -----
     UserWarning
-        When all relative speeds are far from orbital ones, as with units mixed up.
+        If all relative speeds are far from orbital speeds, which suggests inconsistent units.
 
     Notes
     -----
-    A test particle's motion enters none of the invariants: their gradients are 0 there, and no correction moves it.
+    The invariants do not depend on test particles: their gradients are 0 there, and no correction moves these.
 
-    An invariant is given only where the equations have it:
+    The problem has those invariants that the equations conserve:
 
     ================================  ======================================================================
     forces                            invariants
@@ -130,16 +132,16 @@ def nbody(
     "moon-quadrupole"
     "j2", also with these two         "H" and "L_pole", the component of L along the Sun's pole, exact
     "1pn" alone, two bodies           "H" and "L" of the relative motion, per reduced mass, exact
-    "1pn" otherwise                   none: no more bodies have an exact energy with it
+    "1pn" otherwise                   none, because no exact energy is known for three or more bodies
     "drag"                            none
-    "eih"                             "H" and "L" ("L_pole" with "j2") with their terms in 1/c^2. What is left
-                                      is of the order of 1/c^4; they are given where that is below 1e-13 at
-                                      the start, as in the solar system, and otherwise left out
+    "eih"                             "H" and "L" ("L_pole" with "j2") with their terms in 1/c^2. Their error
+                                      is of the order of 1/c^4. They are omitted unless it is below 1e-13 at
+                                      the start, as in the solar system
     ================================  ======================================================================
 
-    Momentum and centre of mass are Newton's, exact, with all but "eih", whose own momentum differs in 1/c^2; there the
-    frame only keeps corrections from moving the centre of mass. With "1pn", "eih" and "drag" accelerations depend
-    on velocities: `acc` is None, and Nystrom methods do not apply.
+    Newton's momentum and centre of mass are exact invariants of all forces except "eih", whose momentum has further
+    terms in 1/c^2; there the frame only keeps corrections from moving the centre of mass. With "1pn", "eih" and "drag"
+    the accelerations depend on velocities: `acc` is None, and Nystrom methods do not apply.
     """
     t_span = apart(t_span)
     units = units or default_units(gm, position, velocity, t_span)
@@ -183,7 +185,7 @@ def nbody(
 
 
 def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:
-    """x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ..., or with the bodies' names."""
+    """Return x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ..., with the bodies' names if they are given."""
     names = tuple(map(str, range(n))) if bodies is None else body_names(bodies, n)
     return tuple(f"{axis}_{body}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for body in names for axis in axes)
 
@@ -202,8 +204,8 @@ def _gravitational(masses: Any, G: Any) -> Any:
         raise ValueError(f"nbody: G must be a positive finite number, got {shown(G)}.")
     if any(has_unit(item) for item in (masses, *np.atleast_1d(np.asarray(masses, dtype=object)))):
         raise TypeError(
-            "nbody: G multiplies masses that are plain numbers, but the first argument has a unit. Leave out G: masses "
-            "with a unit are multiplied by the constant of gravitation, and G m is taken as it is."
+            "nbody: G multiplies masses that are plain numbers, but the first argument has a unit. Omit G: masses with "
+            "a unit are multiplied by the constant of gravitation, and values of G m are used unchanged."
         )
     return G * np.asarray(masses, dtype=float)
 
@@ -217,13 +219,14 @@ def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndar
     n = masses.size
     if masses.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
         raise ValueError(
-            f"nbody: gm {masses.shape}, position {q.shape}, velocity {v.shape}; expected (N,), (N, 3), (N, 3)."
+            f"nbody: gm, position and velocity have the shapes {masses.shape}, {q.shape} and {v.shape}; expected (N,), "
+            "(N, 3) and (N, 3)."
         )
     if not (np.all(masses >= 0) and np.isfinite(masses).all()):
         k = int(np.argmax(~(np.isfinite(masses) & (masses >= 0))))
         raise ValueError(f"nbody: every G m must be positive, or 0 for a test particle; gm[{k}] is {masses[k]}.")
     if not masses.any():
-        raise ValueError("nbody: every G m is 0, so nothing attracts; at least one must be positive.")
+        raise ValueError("nbody: every G m is 0; at least one must be positive.")
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise ValueError("nbody: position and velocity must be finite.")
     _check_speeds(_relative_speeds(masses, q, v))
@@ -231,15 +234,18 @@ def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndar
 
 
 def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Speeds relative to the body that binds each most, in units of the escape speed; those at rest are left out."""
+    """Return each body's speed relative to the body that binds it most, in units of the escape speed.
+
+    Bodies at rest relative to that body are left out.
+    """
     found = []
-    for i in range(gm.size):  # row by row: all pairs at once would take the memory of N^2 distances
+    for i in range(gm.size):  # one row of distances at a time, because N^2 distances may not fit in memory
         distance = np.linalg.norm(q - q[i], axis=1)
         distance[i] = np.inf
         if (distance == 0).any():
             j = int(np.argmin(distance))
             raise ValueError(
-                f"nbody: bodies {i} and {j} are at the same place, {q[i]}; move one, or make them one body."
+                f"nbody: bodies {i} and {j} are at the same place, {q[i]}. Move one of them, or replace both by one body."
             )
         pair = (gm + gm[i]) / distance
         j = int(np.argmax(pair))
@@ -250,7 +256,7 @@ def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray
 
 
 def _check_speeds(ratio: np.ndarray) -> None:
-    """Warn when every body is far too fast, or too slow: units that do not go together."""
+    """Warn if every body is far too fast, or every body far too slow, which suggests inconsistent units."""
     if ratio.size and (ratio.min() > TOO_FAST or ratio.max() < TOO_SLOW):
         warnings.warn(
             f"nbody: relative speeds are {ratio.min():.2g} to {ratio.max():.2g} times the escape speed; check that "
@@ -262,9 +268,10 @@ def _check_speeds(ratio: np.ndarray) -> None:
 
 
 def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The frame (C, S): centre of mass and momentum, kept by shifts of the bodies in proportion to their masses.
+    """Return the frame (C, S) of centre of mass and momentum, with shifts of bodies in proportion to their masses.
 
-    So the recoil of a planet's correction goes to its star. A common shift would move the outer planets as far.
+    With these shifts the recoil from the correction of a planet goes to its star. `common_shift` would move the outer
+    planets by the same distance as the star.
     """
     axes = np.eye(3)
     share = gm / gm.sum()
@@ -274,6 +281,6 @@ def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The frame (C, S): centre of mass and momentum, kept by a shift of all bodies, which changes no orbit."""
+    """Return the frame (C, S) of centre of mass and momentum, with a common shift of all bodies, which keeps orbits."""
     C, _ = recoil(gm)
     return C, np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), np.eye(3)))

@@ -109,7 +109,7 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _singular(self, columns: Any) -> tuple[Array, Array, Array]:
-        """Return columns that do not move, and the singular values of the others, the largest first, with the rows."""
+        """Return the columns that are constant, and the singular values of the others, largest first, with their rows."""
         A, columns = self.sample.rates[:, columns], np.asarray(columns)
         weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
         still, moving = columns[weights == 0], columns[weights > 0]
@@ -119,7 +119,7 @@ class Search:
         return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
-        """Return True if the rate is 0 at new points, relative to its products and to the terms of dI/dy . f."""
+        """Return True if the rate of a candidate vanishes at new points, relative to the sizes of its terms."""
         rate = np.abs(self.fresh.rates @ row)
         if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
             return False
@@ -127,7 +127,7 @@ class Search:
         return bool(np.all(rate <= self.rtol * np.abs(gradients * self.fresh.slopes).sum(axis=1)))
 
     def _gradients(self, row: Array, points: Array, part: Callable[[Array], Array] = np.positive) -> Array:
-        """dI/dz at points z (m, n); with `part` np.abs the sizes of what it is the sum of."""
+        """Return dI/dz at points z (m, n); with ``part=np.abs`` the sum of the sizes of its terms."""
         out = np.zeros_like(points)
         for k in np.flatnonzero(row[: len(self.basis)]):
             item = self.basis[k]
@@ -140,7 +140,7 @@ class Search:
         return out
 
     def _products(self, columns: list[int]) -> Iterator[Polynomial]:
-        """Polynomials of those accepted, up to the degree of the columns."""
+        """Yield products of the accepted polynomials, up to the largest degree in `columns`."""
         degree = max(len(self.basis[k]) for k in columns if k < len(self.basis))
         polynomials = [self._polynomial(row) for row in self.accepted if not row[len(self.basis) :].any()]
         stack: list[tuple[int, Polynomial]] = [(0, {(): 1.0})]
@@ -162,7 +162,7 @@ class Search:
         return row / np.linalg.norm(row)
 
     def _reduced(self, known: Array, null: Array) -> list[Array]:
-        """Rows of the null space beyond what is known, with as many zeros as elimination makes."""
+        """Return the rows of `null` that are independent of `known`, with as many zeros as elimination produces."""
         # Products of several variables are eliminated first: what is left are squares, as in an energy.
         free = sorted(range(self._width), key=self._mixed)
         reduced: list[tuple[Array, int]] = []
@@ -186,7 +186,10 @@ class Search:
         return [row / np.max(np.abs(row)) for row, _ in reduced[count_known:]]
 
     def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
-        """How many terms a row has, how many are differences, as in angular momenta, how many mixed, and which."""
+        """Return the sort key of a row: number of terms, minus the number of differences, number of mixed terms, places.
+
+        Angular momenta are examples of differences; a mixed term is a product of different variables.
+        """
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0]).tolist()
         negative = sum(row[k] < 0 for k in support)
         mixed = sum(k < len(self.basis) and len(set(self.basis[k])) > 1 for k in support)

@@ -166,7 +166,7 @@ def _as_functions(given: Given) -> Given:
 
 
 def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> dict[str, Callable[..., Any]]:
-    """Return the functions of the outputs by name."""
+    """Return the functions of the outputs by name, checked at the start."""
     found = required_outputs("mechanism", outputs, names.state)
     for name, item in found.items():
         if not callable(item):

@@ -124,8 +124,9 @@ def equations(
     params, invariants, name
         As for `hamiltonian`. An invariant may depend on t; it is checked by its rate along the equations.
     constraints : mapping, optional
-        Expressions by name that are 0 at the start, and are kept so, such as ``{"length": "x**2 + y**2 - 1"}`` and the
-        velocity constraint that belongs to it. They and the invariants may be kept only where all of them are 0.
+        Expressions by name that are 0 at the start and are kept at 0, such as ``{"length": "x**2 + y**2 - 1"}`` and the
+        velocity constraint that belongs to it. The equations need to conserve the constraints and the invariants only
+        at states where all constraints are 0.
 
     Returns
     -------

@@ -213,7 +213,7 @@ def _functions_of_time(found: _Equations) -> dict[str, Any]:
 
 
 def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, float]) -> Constrained:
-    """Return the equations without parameters, which are not known before all expressions are."""
+    """Return the equations without values of parameters, whose names are known once all expressions are converted."""
     names = converted.names
     system = Constrained(
         tuple(names[item] for item in found.coordinates),

@@ -82,7 +82,7 @@ class Number:
         return Number(sympy.Abs(self.expression), self.size + 1)
 
     def conjugate(self) -> Number:
-        """The number itself: all are real."""
+        """Return the number itself, because traced numbers are real."""
         return self
 
     def arctan2(self, other: Any) -> Number:
@@ -90,7 +90,7 @@ class Number:
         return self._with(other, sympy.atan2)
 
     def hypot(self, other: Any) -> Number:
-        """The distance of the point (self, other) from the origin."""
+        """Return the distance of the point (self, other) from the origin."""
         return self._with(other, lambda a, b: sympy.sqrt(a**2 + b**2))
 
     def __getattr__(self, name: str) -> Any:  # NumPy calls the method of each element

@@ -86,25 +86,25 @@ class KortewegDeVries:
     # In modes: what `Lawson` takes.
 
     def modes(self, u: np.ndarray) -> np.ndarray:
-        """The modes with k >= 0 that take part, the means of ``u_j exp(-i k x_j)``."""
+        """Return the modes with k >= 0 that the equation keeps, the means of ``u_j exp(-i k x_j)``."""
         return scipy.fft.rfft(u, norm="forward")[: self._kept]
 
     def field(self, modes: np.ndarray) -> np.ndarray:
-        """The field with these modes."""
+        """Return the field with these modes."""
         return scipy.fft.irfft(modes, self._n, norm="forward")
 
     def nonlinear(self, modes: np.ndarray) -> np.ndarray:
-        """The modes of ``-3 (u^2)_x``."""
+        """Return the modes of ``-3 (u^2)_x``."""
         return self._flux * self._square(modes)
 
     def _square(self, modes: np.ndarray) -> np.ndarray:
-        """The modes of u^2."""
+        """Return the modes of u^2."""
         u = self._finer(modes)
         u *= u
         return scipy.fft.rfft(u, norm="forward")[: self._kept]
 
     def _finer(self, modes: np.ndarray) -> np.ndarray:
-        """The field on the finer grid."""
+        """Return the field on the finer grid."""
         return scipy.fft.irfft(modes, self._fine, norm="forward")
 
     # In points.
@@ -121,15 +121,15 @@ class KortewegDeVries:
         return out
 
     def mass(self, u: np.ndarray) -> float:
-        """``w sum u``."""
+        """Return the mass ``w sum u``, where w is the length of a cell."""
         return float(self.grid.cell * np.sum(u))
 
     def momentum(self, u: np.ndarray) -> float:
-        """``w sum u^2``."""
+        """Return the momentum ``w sum u^2``, where w is the length of a cell."""
         return float(self.grid.cell * (u @ u))
 
     def energy(self, u: np.ndarray) -> float:
-        """The integral of u_x^2 / 2 - u^3, exact for the modes that take part."""
+        """Return the energy, the integral of u_x^2 / 2 - u^3, exact for the modes that the equation keeps."""
         modes = self.modes(u)
         fine = self._finer(modes)
         slope = self.field(1j * self._k * modes)

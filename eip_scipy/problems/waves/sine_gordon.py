@@ -69,7 +69,7 @@ class SineGordon:
         return f"SineGordon({self.grid!r}{f', damping={self.damping:g}' if self.damping else ''})"
 
     def acceleration(self, q: np.ndarray) -> np.ndarray:
-        """Laplace q - sin q, flat; without damping."""
+        """Return Laplace q - sin q, the acceleration without damping, at the points of the grid as a flat array."""
         modes = self._modes.forward(q)
         modes *= -self._square
         out = self._modes.backward(modes)

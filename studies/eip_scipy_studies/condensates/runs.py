@@ -160,12 +160,15 @@ class Motion:
     angle: np.ndarray
 
     def off(self, k: int, x: Any, y: Any) -> Any:
-        """Return the angles of points from one vortex, the rightmost at the start, in the state k, in (-pi, pi]."""
+        """Return the polar angles of points (x, y) relative to a reference vortex in the k-th state, in (-pi, pi].
+
+        The reference is the vortex with the largest x at the start, turned by the mean angle of all vortices.
+        """
         a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
         return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
 
     def followed(self, k: int) -> int | None:
-        """Return the index of that vortex in the state k; None if it is not there."""
+        """Return the index of the vortex closest to the reference of `off` in the k-th state; None without vortices."""
         if not (self.vortices[0].charges.size and self.vortices[k].charges.size):
             return None
         return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())

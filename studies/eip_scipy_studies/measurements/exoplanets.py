@@ -73,7 +73,7 @@ def planets(
 
 
 def chain(share: float) -> System:
-    """Seven planets near 8:5, 5:3, 3:2, 3:2, 4:3 and 3:2."""
+    """Return a system of seven planets with period ratios near 8:5, 5:3, 3:2, 3:2, 4:3, 3:2; `share` of 6 years."""
     star = 0.0898
     days = np.array([1.510826, 2.421937, 4.049219, 6.101013, 9.207540, 12.352446, 18.772866])
     transits = np.array([7.55044, 8.58728, 7.06768, 7.82771, 7.07426, 7.71462, -0.39324])
@@ -86,14 +86,14 @@ def chain(share: float) -> System:
 
 
 def eccentric(share: float) -> System:
-    """A planet of eccentricity 0.6 within 0.5 AU, and a heavier one outside."""
+    """Return a system of two planets, one at 0.5 AU with eccentricity 0.6, the other at 5 AU; `share` of 300 years."""
     elements = [(1e-3, 0.5, 0.6, 0.1, 0.3, 1.0), (2e-3, 5.0, 0.1, 0.0, 2.0, 4.0)]
     problem = planets(1.0, elements, 300.0 * share)
     return System(problem, 0.5**1.5, False, (240, 280, 320, 400), (32, 40, 50, 64), (30, 60, 120, 240, 480))
 
 
 def hot_jupiter(share: float) -> System:
-    """A planet of mass 1e-3 with a period of 2.9 days, with relativity; a light one beyond it, and a distant one."""
+    """Return a system of three planets with relativity, the innermost at 0.04 AU; `share` of 10 years."""
     elements = [
         (1e-3, 0.04, 0.02, 0.0, 1.0, 0.0), (3e-5, 0.09, 0.01, 0.02, 2.0, 2.0), (3e-3, 1.4, 0.1, 0.05, 0.0, 4.0),
     ]  # fmt: skip
@@ -105,7 +105,7 @@ SYSTEMS = {"resonant chain": chain, "e = .6": eccentric, "hot Jupiter": hot_jupi
 
 
 def methods(system: System) -> Methods:
-    """A row for each method and number of steps in the innermost period."""
+    """Return a row for each method and each number of steps in the innermost period."""
     problem, period, force = system.problem, system.period, {"prepare": potential} if system.relativity else {}
 
     def some(name: str, run: Any, counts: tuple[int, ...]) -> Methods:

@@ -52,7 +52,7 @@ class Reference(Study[Found]):
         return "\n".join(found.lines)
 
     def figures(self, found: Found) -> Figures:
-        """Write the file of the states: a file that is not CSV is written as figures are."""
+        """Yield the JSON file of the states. It is written with the figures, because tables are CSV files."""
         text = json.dumps({"about": found.about, "states": found.states}, indent=1) + "\n"
         yield self.file, lambda path: path.write_text(text, encoding="utf-8")
 
