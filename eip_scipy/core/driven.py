@@ -1,4 +1,4 @@
-"""Use of SciPy's implicit solvers for the unprojected step: `EIPRadau` and `EIPBDF` drive them and project their states.
+"""SciPy's implicit solvers as makers of the unprojected step: `EIPRadau` and `EIPBDF` drive them and project.
 
 A solver of SciPy controls its error and the length of its steps. The engine lets it make a step, projects the result,
 and returns the projected state to it before the next step. Some attributes that are used here are private: `PRIVATE`
@@ -27,8 +27,8 @@ __all__ = ["DRIVEN_BDF", "DRIVEN_RADAU", "Driven", "Jacobian", "Stepper"]
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
-# Largest relative shift of a component in SciPy's numerical Jacobian. Without this bound, which MATLAB's numjac has too,
-# the shifts of components that do not occur in the equations grow tenfold with each Jacobian until they overflow.
+# Largest relative shift of a component in SciPy's numerical Jacobian, as in MATLAB's numjac. Without it the shifts
+# of components that do not occur in the equations grow tenfold with each Jacobian until they overflow.
 LARGEST_SHIFT = 0.1
 # Exponent of the relative error estimates in the weights of the projection. On a chain with dampers the errors of Radau
 # are 0.03 of those without projection, and 0.09 with weights from the tolerances alone (exponent 0). The errors of BDF
@@ -133,8 +133,8 @@ class Stepper:
         (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
         if y.dtype.kind == "c" and not self.method.takes_complex:
             raise ValueError(
-                f"y0 is complex, but SciPy's {name} takes real states only. Use EIPBDF, or write the state in real "
-                "components."
+                f"y0 is complex, but SciPy's {name} takes real states only. Use EIPBDF, or write the state in real and "
+                "imaginary parts."
             )
         if rtol.size and np.ptp(rtol) > 0:
             raise ValueError(f"rtol={rtol}: SciPy's {name} takes one number. Give atol by component instead.")
@@ -151,7 +151,7 @@ class Stepper:
         )  # fmt: skip
 
     def _made(self) -> Any:
-        """Make and return SciPy's solver. It evaluates a Jacobian when it is made, and these evaluations are not counted."""
+        """Make and return SciPy's solver. The Jacobian that it evaluates when it is made is not counted."""
         solver = self._make()
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
@@ -312,7 +312,7 @@ class BDFStepper(Stepper):
         return solver.error_const[order] * difference
 
     def _describe(self, h: float, rows: Array) -> None:
-        """Fill `rows` with coefficients of powers of x = (t - t_old) / h, from differences at the next step's length."""
+        """Fill `rows` with coefficients of powers of x = (t - t_old) / h; D is scaled to the next step's length."""
         order = self.solver.order
         ratio = (abs(h) / self.solver.h_abs) ** np.arange(MOST_ORDER + 1)
         powers = (SHIFTED * ratio) @ NEWTON[:, : order + 1]

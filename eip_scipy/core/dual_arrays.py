@@ -38,7 +38,7 @@ class _NumPy(python_types.ModuleType):
 
 
 def for_duals(fun: Any, dual: Dual) -> Any:
-    """Return a copy of a jitted function, and of the functions that it calls, whose new arrays hold duals, not floats."""
+    """Return a copy of a jitted function, and of the functions that it calls, in which new arrays hold duals."""
     by_name = _array_functions(dual)
     others = {id(getattr(np, name)): function for name, function in by_name.items()}
     return _replaced(fun, others | {id(np): _NumPy(by_name)})

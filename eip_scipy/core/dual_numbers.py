@@ -50,7 +50,7 @@ class Dual(types.Type):
 
 @register_model(Dual)
 class _DualModel(models.PrimitiveModel):
-    """Packed pair of a number and a vector. It is packed because Numba's arrays lack the alignment of the vector type."""
+    """Pair of a number and a vector, packed because Numba's arrays do not have the alignment of the vector type."""
 
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, ir.LiteralStructType([ir.DoubleType(), kind.vector]))
@@ -129,7 +129,7 @@ def _times(builder: Any, number: Any, vector: Any) -> Any:
 
 @intrinsic
 def seed(typingctx, kind, value, lane):
-    """Return the dual whose derivative is 1 in one lane and 0 in the others; 0 in all lanes if `lane` does not exist."""
+    """Return the dual whose derivative is 1 in `lane` and 0 in the others; 0 everywhere if there is no such lane."""
     dual = kind.instance_type
 
     def emit(context, builder, sig, args):

@@ -40,8 +40,8 @@ SINGLE_TOLERANCE = 1e-5
 CANCELLED = 2.0**-12
 # Components smaller than this share of the largest one are not examined for single precision.
 LEAST_SINGLE = 1e-3
-# A gradient may consist of rounding alone, such as a numerical gradient of a square at 0. It is evaluated at states that
-# differ by BLUR roundings, and BLUR times its changes count as its rounding; BLURRED is the number of further states.
+# A gradient may consist of rounding alone, such as a numerical gradient of a square at 0. It is evaluated at states
+# that differ by BLUR roundings, and BLUR times its changes count as its rounding; BLURRED is for right-hand sides.
 BLUR, BLURRED = 4.0, 3
 # The rounding of a rate, in roundings of the largest derivatives of the same kind. Accelerations that come from a
 # system of linear equations, such as those of constrained bodies, have errors of tens of roundings.
@@ -131,8 +131,8 @@ def complaints(
     interval = min(known.t_span), max(known.t_span)
     if not known.balances.items and known.functions.is_in_order(t, y, f, G, here, tau, interval, directions):
         return
-    # The test points are no further away than the state moves while it changes by its own size: close to a singularity
-    # this is far less than a step.
+    # The test points are at most as far away as the state moves while it changes by its own size, which is far less
+    # than a step close to a singularity.
     moving, size = np.abs(f).max(), np.abs(y).max()
     span = np.abs(y) + (min(tau, size / moving) if size > 0 and moving > 0 else tau) * np.abs(f)
     directions = directions * span

@@ -115,7 +115,7 @@ class Invariant:
     # value. Invariants without such pairs are projected together, along all components.
     subspaces: tuple[tuple[Array, Array], ...] = ()
     value_names: tuple[str, ...] = ()
-    # A run warns of a balance whose rate is above this share of the terms of the rate, because the balance hardly helps.
+    # A run warns that a balance hardly helps if its rate is above this share of the terms of the rate.
     most_slowness = 0.05
 
     def __init__(
@@ -167,7 +167,7 @@ class Invariant:
 
     @property
     def grad(self) -> Callable[..., Any] | None:
-        """Return the gradient, to which `args` are passed if a call omits them; None if it is computed from the values."""
+        """Return the gradient, to which `args` are passed if a call omits them; None if the gradient is computed."""
         if self.gradient is None or not self.args:
             return self.gradient
         return OwnArguments(self.gradient, self.args, 2 + self.uses_f + self.in_place)
@@ -239,7 +239,9 @@ def _as_invariant(item: Any) -> Invariant:
     if isinstance(item, Invariant):
         return item
     if not _is_function(item):
-        raise TypeError(f"invariants: the sequence contains {shown(item)}; expected Invariant objects or functions f(t, y).")
+        raise TypeError(
+            f"invariants: the sequence contains {shown(item)}; expected Invariant objects or functions f(t, y)."
+        )
     return _of_function(item)
 
 
@@ -565,7 +567,7 @@ class InvariantSet:
         return item
 
     def _calls(self, shapes: list[tuple[int, ...]], y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
-        """Return the functions of values, which have these shapes, and of gradients in the form that the engine calls."""
+        """Return the functions of values, of the given shapes, and of gradients in the form that the engine calls."""
 
         def value(k: int) -> Call:
             label, shape = self.labels[k], shapes[k]
@@ -661,7 +663,7 @@ class InvariantSet:
         return (rows @ vector) * size * largest
 
     def misses(self, t: float, y: Array, f: Array) -> Array:
-        """Return a mask (l,) of the invariants that miss their targets by more than 1e-8 of their terms and rounding."""
+        """Return a mask (l,) of invariants that miss their targets by more than 1e-8 of their terms, plus rounding."""
         return ~(self._excess(t, y, f) <= 1.0)
 
     def _excess(self, t: float, y: Array, f: Array) -> Array:

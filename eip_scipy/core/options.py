@@ -235,7 +235,7 @@ class ProjectionOptions:
         if method.has_history and self.direction != "new":
             raise ValueError(
                 f"direction={self.direction!r}: the multistep method {method.name} projects along the gradients at the "
-                "new state only. Omit direction."
+                "new state only; omit direction."
             )
         compensated = self._compensated(method)
         rtol, atol = stepping.rtol, stepping.atol
@@ -396,7 +396,10 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
             "none; an invariant of the whole state cannot be combined with balances of components."
         )
     if width == 2:
-        raise ValueError("invariants: a balance has components=, but the state is complex. Write the state in real and imaginary parts.")
+        raise ValueError(
+            "invariants: a balance has components=, but the state is complex. Write the state in real and imaginary "
+            "parts."
+        )
     groups: dict[Any, tuple[np.ndarray, np.ndarray, list[int]]] = {}
     for k, item in enumerate(known.items):
         values = range(known.starts[k], known.starts[k + 1])

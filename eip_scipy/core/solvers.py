@@ -274,7 +274,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._steps = 0
 
     def _drive(self, *, begins: bool) -> None:
-        """Make the engine for the present interval, options and functions; `begins`: a run starts, rather than continues."""
+        """Make the engine for the present interval, options and functions; `begins` is False if a run continues."""
         self._k, self._interpolants = 0, None
         if self._scipy is not None:
             return
@@ -378,7 +378,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._spec = replace(spec, method=method, is_known=True)
 
     def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return two mappings for a copy of this solver: values that both share, such as functions, and values to copy."""
+        """Return two mappings for a copy of this solver: values to share, such as functions, and values to copy."""
         shared = {name: getattr(self, name) for name in SHARED} | {"projection": self._spec.projection}
         was = self._was._asdict()
         if self.fun is not self._bound_fun:  # `fun` was set since the last step

@@ -347,7 +347,7 @@ def test_complex_states():
 
     size = Invariant(lambda t, z: abs(z[0]) ** 2, lambda t, z: np.array([2 * z[0], 0]), name="size")
     start = np.array([1.0 + 0j, 1.0 + 0j])
-    with pytest.raises(ValueError, match=r"y0 is complex, and SciPy's Radau takes real states only\. Use EIPBDF"):
+    with pytest.raises(ValueError, match=r"y0 is complex, but SciPy's Radau takes real states only\. Use EIPBDF"):
         scipy.integrate.solve_ivp(turning, (0, 3), start, method=EIPRadau)
     sol = scipy.integrate.solve_ivp(turning, (0, 3), start, method=EIPBDF, invariants=size, dense_output=True, **TIGHT)
     assert abs(abs(sol.sol(np.linspace(0, 3, 40))[0]) - 1).max() < 1e-14

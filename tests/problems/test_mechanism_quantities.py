@@ -279,7 +279,7 @@ def test_norms_of_quaternions_are_kept(top):
     assert problem.norms[0].function.py_func(0.0, state) == 30
     problem.norms[0].gradient.py_func(0.0, state, gradient)
     assert gradient.tolist() == [2, 4, 6, 8, *[0] * 9]
-    with pytest.raises(ValueError, match="expected 1, which the components of a quaternion"):
+    with pytest.raises(ValueError, match="expected 1, because the quaternion of a rotation"):
         mechanics(top, {}, [1, 0.1, 0, 0, 0, 0, 0], speeds)
 
 

@@ -77,7 +77,7 @@ def test_a_poisson_matrix():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"balances": {"H": KEPLER}}, "balances belong to a perturbation or dissipation"),
+        ({"balances": {"H": KEPLER}}, "balances are given without a perturbation or dissipation"),
         ({"perturbation": "x", "extended": True}, "extended=True keeps"),
         ({"perturbation": "x*z"}, "perturbation contains z"),
         ({"dissipation": {"z": "-x"}}, "z is not a component of the state"),
@@ -91,5 +91,5 @@ def test_what_is_refused(options, match):
 
 
 def test_a_hamiltonian_in_time_is_no_integral():
-    with pytest.raises(ValueError, match="move what depends on t to perturbation="):
+    with pytest.raises(ValueError, match="move such terms to perturbation="):
         hamiltonian("p**2/2 + q**2*(1 + t)/2", perturbation="q**3")

@@ -78,7 +78,7 @@ def test_constraints_may_depend_on_time():
             {"constraints": CONSTRAINTS, "invariants": {"E": u**2 + g * y}},
             "'E' is not an invariant .* even where the con",
         ),
-        ({"invariants": ENERGY}, "If it is kept only where constraints hold, give them as constraints="),
+        ({"invariants": ENERGY}, "If it is conserved only if constraints hold, pass them as constraints="),
         ({"constraints": CONSTRAINTS, "invariants": {"rate": x}}, "'rate' is a constraint and an invariant"),
         ({"constraints": {"length": sympy.Integer(1)}}, "does not depend on x, y, u, v"),
     ],

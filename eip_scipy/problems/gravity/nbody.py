@@ -245,7 +245,7 @@ def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray
         if (distance == 0).any():
             j = int(np.argmin(distance))
             raise ValueError(
-                f"nbody: bodies {i} and {j} are at the same place, {q[i]}. Move one of them, or replace both by one body."
+                f"nbody: bodies {i} and {j} are at the same place, {q[i]}. Move one of them, or replace both by one."
             )
         pair = (gm + gm[i]) / distance
         j = int(np.argmax(pair))

@@ -109,7 +109,7 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _singular(self, columns: Any) -> tuple[Array, Array, Array]:
-        """Return the columns that are constant, and the singular values of the others, largest first, with their rows."""
+        """Return the constant columns, and the singular values of the others, largest first, with their rows."""
         A, columns = self.sample.rates[:, columns], np.asarray(columns)
         weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
         still, moving = columns[weights == 0], columns[weights > 0]
@@ -186,9 +186,9 @@ class Search:
         return [row / np.max(np.abs(row)) for row, _ in reduced[count_known:]]
 
     def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
-        """Return the sort key of a row: number of terms, minus the number of differences, number of mixed terms, places.
+        """Return the key by which rows are sorted: number of terms, minus that of differences, mixed terms, places.
 
-        Angular momenta are examples of differences; a mixed term is a product of different variables.
+        Angular momenta contain differences; a mixed term is a product of different variables.
         """
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0]).tolist()
         negative = sum(row[k] < 0 for k in support)

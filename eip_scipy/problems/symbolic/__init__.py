@@ -1,6 +1,6 @@
 """Problems written as expressions: `hamiltonian` from H alone, `equations` from y' = f(t, y).
 
-SymPy is loaded when one of them is called, and nowhere else in the package.
+SymPy is imported when one of these functions is called, and nowhere else in the package.
 """
 
 from __future__ import annotations
@@ -33,57 +33,58 @@ def hamiltonian(
     dissipation: Mapping[str, Any] | None = None,
     balances: Mapping[str, Any] | None = None,
 ) -> SymbolicProblem:
-    """The problem of a Hamiltonian: equations of motion, energy, gradients, from one expression.
+    """Return the problem of a Hamiltonian: equations of motion, energy and gradients from one expression.
 
     Parameters
     ----------
     H : str or sympy.Expr
         The Hamiltonian. Text is read as Python's arithmetic of numbers, names, pi and functions such as sqrt and cos,
-        by a parser that does not execute it. All names except t, the time, are free, including E, I, S, N, beta and
-        gamma. Declared names of coordinates, momenta or parameters have precedence over everything else: then pi is
-        not a number.
+        by a parser that does not execute it. You can use every name except t, the time, including E, I, S, N, beta and
+        gamma. Names of coordinates, momenta or parameters that you declare have precedence: if pi is declared, it is
+        not the number.
     q, p : str or sequence, optional
-        Names of coordinates and momenta, ``"q1 q2"``, a list of them, or SymPy symbols. The state is (q, p). Default:
-        the names in `H` that are not parameters, x with px, q1 with p1, theta with p_theta and so on; the result's repr
-        shows the pairs.
+        Names of coordinates and momenta, as text such as ``"q1 q2"`` or a list, or SymPy symbols. The state is (q, p).
+        Default: the names in `H` that are not parameters, paired as x with px, q1 with p1, theta with p_theta and so
+        on; the repr of the result shows the pairs.
     params : mapping, optional
-        Values of the constants by their names. ``problem.params`` holds them in this order, and so do the rows that
-        `ensemble` takes.
+        Values of the constants by name. ``problem.params`` and the rows of ``params`` for `ensemble` have the order of
+        this mapping.
     invariants : mapping, optional
         Expressions of further invariants by name; each is checked by its Poisson bracket with H.
     name : str, optional
     poisson : sequence of sequences or sympy.Matrix, optional
-        Of a non-canonical system: the matrix B of ``y' = B(y) grad H(y)``, antisymmetric, its entries expressions. `q`
-        then names the whole state y, and `p` is left out. Casimirs are given as `invariants`.
+        Antisymmetric matrix B of a non-canonical system ``y' = B(y) grad H(y)``, whose entries are expressions. `q`
+        then names the whole state y, and `p` is omitted. Give Casimirs as `invariants`.
     extended : bool, optional
-        For an H that depends on t: add a component p_t to the state, with p_t' = -dH/dt, so that H + p_t is kept. Start
-        it at 0.
+        Whether to add a component p_t to the state, for an H that depends on t. With p_t' = -dH/dt and the start
+        p_t = 0, H + p_t is an invariant.
     perturbation : str or sympy.Expr, optional
         A second Hamiltonian, which may depend on t: the equations are those of the sum of both.
     dissipation : mapping, optional
-        What is added to the derivatives of components, by their names: ``{"p": "-c*p"}`` for friction.
+        Expressions that are added to the derivatives of components, by the components' names: ``{"p": "-c*p"}`` for
+        friction.
     balances : mapping, optional
         Expressions, by name, of integrals of `H` alone, each checked by its Poisson bracket with H. With a perturbation
-        or dissipation they are kept as balances. Their rates are the brackets with the perturbation and what the
-        dissipation changes, without the bracket with H, which is 0. Default: H itself.
+        or dissipation they become balances. Their rates consist of the bracket with the perturbation and the change by
+        the dissipation; the bracket with H is 0. Default: H itself.
 
     Returns
     -------
     SymbolicProblem
-        A `Problem` with the invariant "H" first, without start and interval, which a run is given:
+        A `Problem` whose first invariant is "H". It has no start and no interval; pass these to the run:
         ``integrate(problem, t_span, y0, method=EIPDOP853, rtol=1e-10)``.
 
     Warns
     -----
     UserWarning
-        When H depends on t, and is not an invariant then.
+        If H depends on t, so that it is not an invariant.
 
     Raises
     ------
     ValueError, TypeError
-        For what cannot be read, paired or computed, and for an invariant that is none.
+        If an expression cannot be read or computed, names cannot be paired, or a given invariant is not conserved.
     ImportError
-        Without SymPy.
+        If SymPy is not installed.
 
     Examples
     --------
@@ -110,17 +111,17 @@ def equations(
     constraints: Mapping[str, Any] | None = None,
     name: str | None = None,
 ) -> SymbolicProblem:
-    """The problem y' = f(t, y), written as expressions, with its invariants.
+    """Return the problem y' = f(t, y), written as expressions, with its invariants.
 
     Parameters
     ----------
     f : sequence or mapping
-        The derivatives as text or SymPy expressions, in the order of `y`; or a mapping of each component to its own.
+        The derivatives as text or SymPy expressions, in the order of `y`, or a mapping of components to derivatives.
     y : str or sequence, optional
-        Names of the components, ``"x v"``, a list of them, or SymPy symbols. Default: the mapping's keys.
+        Names of the components, as text such as ``"x v"`` or a list, or SymPy symbols. Default: the keys of `f`.
         Components may be functions of time, `dynamicsymbols` of sympy.physics.mechanics. The keys may then be their
-        derivatives, and derivatives in expressions stand for what they are equal to. If both x and x' are components,
-        the latter is called ``v_x``.
+        derivatives, and a derivative in an expression is replaced by the right-hand side. If both x and x' are
+        components, the latter is called ``v_x``.
     params, invariants, name
         As for `hamiltonian`. An invariant may depend on t; it is checked by its rate along the equations.
     constraints : mapping, optional
@@ -135,7 +136,7 @@ def equations(
     Raises
     ------
     ValueError, TypeError, ImportError
-        As by `hamiltonian`.
+        As for `hamiltonian`.
 
     Examples
     --------
@@ -180,36 +181,37 @@ def mechanics(
     """Return the problem of a model of sympy.physics.mechanics.
 
     Its state is (q, u). A run keeps the constraints on positions and velocities, the norms of quaternions, the momenta
-    of cyclic coordinates, and the energy where it is constant or changes slowly; the problem's repr shows which.
+    of cyclic coordinates, and the energy if it is constant or changes slowly. The problem's repr lists these
+    quantities.
 
     Parameters
     ----------
     model : KanesMethod, LagrangesMethod or System
         The model, or any object with the attribute ``eom_method``, which is one of the first two.
     params : mapping, optional
-        Values of the constants, by SymPy's symbols or by name. Those that are left out are taken from
+        Values of the constants, by SymPy's symbols or by name. Values that are omitted are taken from
         ``model.constants``, which a System of PyDy has.
     q0, u0 : mapping or array_like, optional
-        Coordinates and speeds at the start, by dynamicsymbols or by name, or in the order of ``model.q`` and
-        ``model.u``, which has dependent speeds last. The speeds of a LagrangesMethod are the derivatives of the
+        Coordinates and speeds at the start: mappings by dynamicsymbols or names, or arrays in the order of ``model.q``
+        and ``model.u``, which has dependent speeds last. The speeds of a LagrangesMethod are the derivatives of the
         coordinates, called ``v_x`` for a coordinate ``x``. Default: ``model.initial_conditions``.
     t_span : tuple of float, optional
-        Start and end of the interval. Without one the start is at 0.
+        Start and end of the interval. If it is omitted, the start is at t = 0.
     inputs : mapping, optional
-        Functions of time in the model that are neither coordinates nor speeds, by themselves or by name: numbers,
-        expressions of t and the state, or functions ``f(t, y)`` of the state y = (q, u). A tuple of them takes a
-        function that returns as many numbers. A function is written as an expression if it does not branch; otherwise
-        it is called as it is, and may occur in forces only. Default: ``model.specifieds``, whose functions take
-        (y, t), as PyDy has them.
+        Values of the functions of time in the model that are neither coordinates nor speeds. The keys are these
+        functions, their names, or tuples of them. The values are numbers, expressions of t and the state, or functions
+        ``f(t, y)`` of the state y = (q, u), which return one number for each function in the key. A function that does
+        not branch is converted into an expression; any other is called by the right-hand side, and may occur in forces
+        only. Default: ``model.specifieds`` of PyDy, whose functions have the arguments (y, t).
     energy : sympy.Expr, optional
-        The total energy. Default: that of the bodies, or of the Lagrangian, to which the potential of conservative
-        loads is added if the energy is constant with it.
+        The total energy. Default: the energy of the bodies, or that of the Lagrangian, plus the potential of
+        conservative loads if the sum is constant.
     outputs : mapping, optional
-        Expressions, which may contain derivatives of coordinates and speeds, of quantities that are computed at saved
-        states, by name; see ``run.outputs``.
+        Expressions, by name, of quantities that are computed at saved states; see ``run.outputs``. They may contain
+        derivatives of coordinates and speeds.
     independent : iterable, optional
-        Coordinates and speeds that stay as they are given; all others are guesses, from which the start is found.
-        Default: those that a KanesMethod does not call dependent; all of a LagrangesMethod.
+        Coordinates and speeds whose given values are kept; all others are guesses, from which the start is computed.
+        Default: those that a KanesMethod does not call dependent; for a LagrangesMethod all of them.
     rank_tolerance, name, **others
         As for `mechanism`.
 
@@ -223,14 +225,15 @@ def mechanics(
         If a parameter or an input is missing, the start does not meet the constraints, the mass matrix is singular for
         motions that the constraints allow, or the model has auxiliary speeds.
     ImportError
-        Without SymPy.
+        If SymPy is not installed.
 
     Notes
     -----
     Dependent speeds of a KanesMethod are not eliminated: its equations are formed again with all speeds independent,
-    and the constraints get Lagrange's multipliers. This avoids poles where the choice of dependent speeds is singular,
-    and gives the forces of the constraints, see ``problem.multipliers``. A configuration constraint whose velocity
-    constraint the model lacks, which KanesMethod ignores, gets one, and a note in the repr.
+    and the constraints get Lagrange multipliers. This avoids poles at states where the choice of dependent speeds is
+    singular, and gives the forces of the constraints, see ``problem.multipliers``. KanesMethod ignores a configuration
+    constraint without its velocity constraint. If the model lacks such a velocity constraint, it is added, and the repr
+    has a note about it.
 
     Examples
     --------
@@ -266,12 +269,12 @@ def mechanics(
 
 @contextmanager
 def _nested(what: str) -> Iterator[None]:
-    """Name the reason where SymPy reaches the limit of Python's stack."""
+    """Replace a RecursionError of SymPy by a ValueError that names the reason."""
     try:
         yield
     except RecursionError:
         raise ValueError(
-            f"{what}: the expressions, or their derivatives, nest too deep for SymPy; write the functions by hand."
+            f"{what}: the expressions or their derivatives nest too deep for SymPy; write the functions by hand."
         ) from None
 
 

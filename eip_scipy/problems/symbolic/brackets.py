@@ -16,8 +16,8 @@ __all__ = ["NotKeptError", "Rate", "how_kept", "shortened", "vanishes"]
 POINTS, TRIES = 8, 200
 DIGITS = 50
 LARGEST = sympy.Integer(10) ** 300
-ROUND_OFF = 1e-20  # of a rate that is 0, to its terms, when computed with DIGITS
-# Operations beyond which `simplify` may take minutes where numbers take milliseconds.
+ROUND_OFF = 1e-20  # bound for the rounding of a rate that is 0, relative to its terms, when computed with DIGITS
+# Beyond this number of operations `simplify` may take minutes, while an evaluation at points takes milliseconds.
 SIMPLIFIED_OPERATIONS = 120
 
 
@@ -26,17 +26,17 @@ class NotKeptError(ValueError):
 
 
 class Rate(NamedTuple):
-    """The rate of a quantity, and the terms that it is the sum of."""
+    """Rate of change of a quantity, as the terms of a sum."""
 
     terms: list[Any]
 
     @property
     def total(self) -> Any:
-        """Their sum."""
+        """Return the sum of the terms."""
         return sympy.Add(*self.terms)
 
     def at(self, point: Mapping[Any, Any]) -> tuple[Any, Any] | None:
-        """The sum, and that of the absolute values, at a point; None where they are not all finite and real."""
+        """Return the sum of the terms and of their absolute values at a point; None unless all are finite and real."""
         known = {item: value.evalf(DIGITS) for item, value in point.items()}
         values = [_value(term, known) for term in self.terms]
         if any(value is None for value in values):
@@ -47,7 +47,7 @@ class Rate(NamedTuple):
 def how_kept(
     name: str, quantity: Any, variables: Sequence[Any], rates: Sequence[Any], parameters: Mapping[Any, float]
 ) -> str:
-    """Say how it is known that a quantity is kept.
+    """Return how it was shown that a quantity is conserved: "symbolically" or "numerically, at 8 points".
 
     Parameters
     ----------
@@ -61,9 +61,9 @@ def how_kept(
     Raises
     ------
     NotKeptError
-        When it is not, naming a point and the rate there.
+        If the quantity is not conserved. The message names a point and the rate there.
     ValueError
-        When the rate is finite at no point that was tried.
+        If the rate is not finite at any point that was tried.
     """
     time = sympy.Symbol("t", real=True)
     terms = [sympy.diff(quantity, variable) * f for variable, f in zip(variables, rates, strict=True)]
@@ -71,18 +71,20 @@ def how_kept(
     if not rate.terms or _expands_to_zero(rate.total):
         return "symbolically"
     points = list(_points([*variables, time], rate, parameters))
-    _require_kept(name, rate, points)  # numbers take milliseconds, and `simplify` may take minutes
+    _require_kept(name, rate, points)  # this takes milliseconds, while `simplify` may take minutes
     if _simplifies_to_zero(rate.total):
         return "symbolically"
     try:
         points += _beside_switches([quantity, *rates, *rate.terms], [*variables, time], rate, parameters)
     except ValueError as error:
         raise ValueError(
-            f"invariant {name!r}: {error}, so that it cannot be checked in all branches. Give the invariant of each "
-            "branch, or a run without it."
+            f"invariant {name!r}: {error}, so that it cannot be checked in all branches. Give each branch as a problem "
+            "of its own, or omit this invariant."
         ) from None
     if not points:
-        raise ValueError(f"invariant {name!r}: its rate {shortened(rate.total)} is finite and real at no point tried.")
+        raise ValueError(
+            f"invariant {name!r}: its rate {shortened(rate.total)} is not finite and real at any point that was tried."
+        )
     _require_kept(name, rate, points)
     return f"numerically, at {len(points)} points" + (" with the parameters given" if parameters else "")
 
@@ -98,10 +100,10 @@ def _require_kept(name: str, rate: Rate, points: Sequence[Any]) -> None:
 
 
 def _value(expression: Any, known: dict[Any, Any]) -> Any:
-    """The value of an expression, from the parts up; None where a part is not finite and real.
+    """Return the value of an expression, computed from its parts; None if a part is not finite and real.
 
-    `known` has the symbols' values and receives those of the parts. SymPy's own evaluation takes a part as large as it
-    is: a tower of exponentials then asks for more digits than there is memory.
+    `known` holds the values of the symbols, and the values of the parts are added to it. SymPy's own evaluation has no
+    bound for the size of a part: a tower of exponentials would need more digits than there is memory.
     """
     if expression not in known:
         known[expression] = None
@@ -115,7 +117,7 @@ def _value(expression: Any, known: dict[Any, Any]) -> Any:
 
 
 def vanishes(expression: Any) -> bool:
-    """Return whether an expression is 0, by algebra if that is quick, else at random points."""
+    """Return True if an expression is 0, by algebra if that is quick, otherwise at random points."""
     if _expands_to_zero(expression):
         return True
     rate = Rate([expression])
@@ -128,14 +130,14 @@ def _expands_to_zero(expression: Any) -> bool:
 
 
 def _simplifies_to_zero(expression: Any) -> bool:
-    """Return whether algebra shows that an expression is 0, where that is quick."""
+    """Return True if algebra shows quickly that an expression is 0."""
     if expanded_terms(expression) > EXPANDED_TERMS or expression.count_ops() > SIMPLIFIED_OPERATIONS:
         return False
     return bool(sympy.simplify(sympy.expand(expression)) == 0)
 
 
 def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]) -> Iterator[tuple[Any, Any]]:
-    """Random points where the rate is finite and real; of both signs, or positive where roots and logarithms ask."""
+    """Yield random points at which the rate is finite and real; only positive ones if roots or logarithms need that."""
     draw = random.Random(20220)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}
     found = 0
@@ -152,7 +154,7 @@ def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float
 def _beside_switches(
     expressions: Sequence[Any], variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield points next to the places at which max, min, abs and the like change their branches."""
+    """Yield points on both sides of the places at which max, min, abs and similar functions change their branches."""
     switches = Switches(expressions, variables)
     draw = random.Random(20221)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}

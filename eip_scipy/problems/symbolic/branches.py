@@ -11,10 +11,10 @@ import sympy
 __all__ = ["Switches"]
 
 KINDS = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside)
-MOST = 60  # differences whose sign chooses a branch
-LINES = 4  # along which a change of sign is looked for, for each of them
-POWERS = range(-40, 101, 4)  # of 2: the places on a line
-BISECTIONS = 40  # which leave a relative distance of 1e-11
+MOST = 60  # largest number of differences whose signs choose branches
+LINES = 4  # number of lines on which a change of sign is searched for each difference
+POWERS = range(-40, 101, 4)  # the places on a line are these powers of 2
+BISECTIONS = 40  # after them the relative distance is 1e-11
 
 
 class Switches:
@@ -41,14 +41,14 @@ class Switches:
         Parameters
         ----------
         draw : callable
-            A random point.
+            ``draw()``: a random point.
         at : callable
-            ``at(expression, point)``: the value there, None where it is not finite and real.
+            ``at(expression, point)``: the value at the point, None if it is not finite and real.
 
         Raises
         ------
         ValueError
-            Naming a function, a branch of which is not found.
+            If there are too many branches, or one of them is not found; the message names the function.
         """
         if len(self._differences) > MOST:
             raise ValueError(f"it has {len(self._differences)} changes of a branch, more than {MOST}")
@@ -62,7 +62,7 @@ class Switches:
         return found
 
     def _sides(self, difference: Any, point: dict[Any, Any], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
-        """Two points on a line along a variable, at which the difference has opposite signs; [] if there are none."""
+        """Return two points on a line along a variable where the difference has opposite signs; [] if none is found."""
         for variable in sorted(difference.free_symbols & set(self._variables), key=str):
             places = [sign * sympy.Integer(2) ** power for sign in (-1, 1) for power in POWERS]
             places = [sympy.Integer(0), point[variable], *places]

@@ -26,7 +26,7 @@ BRANCHES = (sympy.Piecewise, sympy.Abs, sympy.sign, sympy.Heaviside, sympy.Max, 
 class Constrained(NamedTuple):
     """A system with the state (q, u): q' = `rates`, M u' + G^T lambda = F, and its constraints, all in real symbols.
 
-    Equal systems share their functions.
+    Equal systems share their compiled functions.
 
     Attributes
     ----------
@@ -37,10 +37,10 @@ class Constrained(NamedTuple):
         M by rows.
     forces : tuple of expressions
     positions, velocities : tuple of expressions
-        The constraints, which are 0: those on positions, and all of those on velocities, linear in the speeds, the
-        derivatives of the former included.
+        Expressions that the constraints set to 0: constraints on positions, and all constraints on velocities, which
+        are linear in the speeds and include the derivatives of `positions`.
     inputs : tuple of (str, callable)
-        Names of quantities in the forces that functions ``f(t, y)`` give, and these.
+        Names of quantities in the forces that are computed by functions ``f(t, y)``, with these functions.
     """
 
     coordinates: tuple[str, ...]
@@ -55,17 +55,17 @@ class Constrained(NamedTuple):
 
     @property
     def sizes(self) -> Sizes:
-        """Numbers of coordinates, speeds, and constraints on velocities."""
+        """Return the numbers of coordinates, speeds, and constraints."""
         return Sizes(len(self.coordinates), len(self.speeds), len(self.velocities))
 
     @property
     def arguments(self) -> Arguments:
-        """Arguments of the functions."""
+        """Return the arguments of the compiled functions."""
         return Arguments((*self.coordinates, *self.speeds), self.parameters)
 
     @property
     def variables(self) -> list[Any]:
-        """The symbols of the state."""
+        """Return the symbols of the state."""
         return [symbol(name) for name in (*self.coordinates, *self.speeds)]
 
     def rate(self, expression: Any, accelerations: Sequence[Any] = ()) -> Any:
@@ -80,7 +80,7 @@ class Constrained(NamedTuple):
 
 
 def own_speed(system: Constrained, k: int) -> list[Any]:
-    """Return the derivatives of the speeds by that of a coordinate with a speed of its own, [] for any other."""
+    """Return the derivatives of all speeds by q_k'; [] unless one speed belongs to this coordinate alone."""
     speeds = [symbol(name) for name in system.speeds]
     own = [u for u in speeds if u in system.rates[k].free_symbols]
     if len(own) != 1 or sum(own[0] in rate.free_symbols for rate in system.rates) != 1:
@@ -90,17 +90,16 @@ def own_speed(system: Constrained, k: int) -> list[Any]:
 
 
 def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) -> list[int]:
-    """Return the places of coordinates whose momenta may be constant: neither masses nor forces depend on them.
+    """Return the indices of coordinates whose momenta may be constant, because masses and forces do not depend on them.
 
-    A constraint on a speed that belongs to one of them alone has a force along it, too.
-
-    Forces that may be 0 only near the start, for they have branches or come from a function, belong to none of these.
+    A coordinate is left out if a constraint acts on its speed alone, or if the force along it has branches or comes
+    from a function, because such a force may be 0 only near the start.
 
     Parameters
     ----------
     system : Constrained
     speeds_by_rate : callable
-        ``speeds_by_rate(k)``, the derivatives (n,) of the speeds by that of coordinate k, or [].
+        ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds by the rate of coordinate k, or [].
     """
     known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
     inputs = {symbol(name) for name, _ in system.inputs}
@@ -121,9 +120,9 @@ def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) 
 
 
 def conservative(system: Constrained, active: Sequence[Any], speeds_by_rate: Callable[[int], Sequence[Any]]) -> Any:
-    """Return the potential of those of the `active` forces (n,) on the speeds that are conservative, None without any.
+    """Return the potential of the conservative part of the `active` forces (n,) on the speeds; None if there is none.
 
-    Forces that depend on the time, on inputs, or on speeds have none.
+    Terms that depend on the time, on inputs, or on speeds are not conservative.
     """
     speeds = [symbol(name) for name in system.speeds]
     still = at_rest(active, speeds, {symbol("t"), *(symbol(name) for name, _ in system.inputs)})
@@ -146,13 +145,13 @@ def parts_of(
     momenta: Sequence[tuple[str, Any]] = (),
     outputs: Sequence[tuple[str, Any]] = (),
 ) -> Parts:
-    """Return the functions of a system.
+    """Return the compiled functions of a system.
 
     Parameters
     ----------
     system : Constrained
     energies : sequence of (str, expression, expression or None)
-        Descriptions of quantities that may be constant, their expressions, and their rates where these are given.
+        Descriptions of quantities that may be constant, their expressions, and their rates if these are given.
     momenta : sequence of (str, expression)
         Names of further quantities that may be constant, and their expressions.
     outputs : sequence of (str, expression)
@@ -174,7 +173,7 @@ def parts_of(
 
 @lru_cache(maxsize=64)
 def matrices(system: Constrained) -> Callable[..., None]:
-    """Return ``fill(t, y, out, *params)`` of M, F, G, gamma and q', as `motion` takes it."""
+    """Return ``fill(t, y, out, *params)``, which fills `out` with M, F, G, gamma and q' in the order of `motion`."""
     speeds = system.variables[len(system.coordinates) :]
     gradients = [sympy.diff(item, u) if item.has(u) else sympy.Integer(0) for item in system.velocities for u in speeds]
     gammas = map(system.rate, system.velocities)
@@ -184,7 +183,7 @@ def matrices(system: Constrained) -> Callable[..., None]:
 
 @lru_cache(maxsize=64)
 def output_functions(outputs: tuple[tuple[str, Any], ...], system: Constrained) -> Outputs:
-    """Return the outputs."""
+    """Return the functions of the outputs."""
     accelerations = [acceleration(name).name for name in system.speeds]
     names, items = zip(*outputs, strict=True)
     return Outputs(names, _with_inputs(system, lambda given: filling("outputs", items, given), accelerations))
@@ -193,9 +192,9 @@ def output_functions(outputs: tuple[tuple[str, Any], ...], system: Constrained) 
 def _with_inputs(
     system: Constrained, made: Callable[[Arguments], Callable[..., None]], behind: Sequence[str] = ()
 ) -> Callable[..., None]:
-    """Return ``fill(t, y, out, *params)``, where y is the state and what is named `behind` it.
+    """Return ``fill(t, y, out, *params)``, where y holds the state and further values that are named in `behind`.
 
-    It calls the functions of the inputs, whose values the function that is `made` finds behind all of that.
+    `fill` calls the functions of the inputs and appends their values to y for the function that `made` returns.
     """
     names = (*system.coordinates, *system.speeds, *behind, *(name for name, _ in system.inputs))
     fill = made(Arguments(names, system.parameters))
@@ -217,7 +216,7 @@ def _with_input(fill: Callable[..., None], function: Callable[..., float], n: in
 
 @lru_cache(maxsize=64)
 def values_and_gradient(system: Constrained) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Return the constraints on positions and velocities and their gradient, both in place."""
+    """Return two functions that fill an array: with all constraints, and with the gradients of the constraints."""
     items = (*system.positions, *system.velocities)
     found = {(i, k): slope for i, item in enumerate(items) for k, slope in _gradient(item, system).items()}
     rows = function("gradients", list(found.values()), system.arguments, in_place=True, places=list(found))
@@ -226,7 +225,7 @@ def values_and_gradient(system: Constrained) -> tuple[Callable[..., None], Calla
 
 @lru_cache(maxsize=64)
 def energy_functions(energy: Any, system: Constrained) -> tuple[Callable[..., float], Callable[..., None]]:
-    """Return an energy ``value(t, y, *params)`` and its gradient in place."""
+    """Return an energy ``value(t, y, *params)``, and ``gradient(t, y, out, *params)``, which fills `out`."""
     value = function("energy", [energy], system.arguments, in_place=False)
     slopes = _gradient(energy, system)
     places = list(slopes)
@@ -237,17 +236,17 @@ def energy_functions(energy: Any, system: Constrained) -> tuple[Callable[..., fl
 
 @lru_cache(maxsize=64)
 def rate_function(rate: Any, system: Constrained) -> Callable[..., float]:
-    """Return the rate of an energy, ``rate(t, y, *params)``."""
+    """Return the rate of change of an energy as a function ``rate(t, y, *params)``."""
     return function("power", [rate], system.arguments, in_place=False)
 
 
 def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Callable[..., None]:
-    """Return a function that fills an array with expressions, most of which may be 0."""
+    """Return a function that fills an array with the values of expressions, most of which may be 0."""
     found = {k: item for k, item in enumerate(expressions) if item != 0}
     return function(what, list(found.values()), arguments, in_place=True, places=list(found))
 
 
 def _gradient(item: Any, system: Constrained) -> dict[int, Any]:
-    """Return the derivatives by the components of the state that are not 0, by their places."""
+    """Return the nonzero derivatives of an expression by components of the state, keyed by the components' indices."""
     slopes = ((k, sympy.diff(item, x)) for k, x in enumerate(system.variables) if item.has(x))
     return {k: slope for k, slope in slopes if slope != 0}

@@ -24,7 +24,7 @@ AGREES = 1e-9
 
 
 class Inputs(NamedTuple):
-    """Expressions by functions of time, and functions ``f(t, y)`` by name, which are called as they are."""
+    """Inputs that are expressions, by their functions of time, and inputs that are called, ``f(t, y)``, by name."""
 
     expressions: dict[Any, Any]
     called: tuple[tuple[str, Callable[..., float]], ...]
@@ -34,13 +34,13 @@ class Inputs(NamedTuple):
 def read_inputs(
     given: Any, known: Mapping[str, Any], state: Mapping[Any, str], start: tuple[float, np.ndarray]
 ) -> Inputs:
-    """Return the inputs as expressions where they have any.
+    """Return the inputs, converted into expressions where that is possible.
 
     Parameters
     ----------
     given : mapping
-        Of functions of time, their names, or tuples of them, to numbers, expressions, or functions ``f(t, y)``, which
-        return as many numbers.
+        The keys are functions of time, their names, or tuples of these. The values are numbers, expressions, or
+        functions ``f(t, y)`` that return one number for each function in the key.
     known : mapping
         The functions of time in the model by name.
     state : mapping
@@ -51,7 +51,7 @@ def read_inputs(
     Raises
     ------
     ValueError, TypeError
-        If it is not an input.
+        If a key is not an input, or a value has the wrong type or size.
     """
     if not isinstance(given, Mapping):
         raise TypeError(
@@ -84,7 +84,7 @@ def _function_of_time(key: Any, known: Mapping[str, Any], state: Mapping[Any, st
 
 
 def _as_expressions(keys: Sequence[Any], value: Any) -> dict[Any, Any]:
-    """Return numbers or expressions by function of time."""
+    """Return the numbers or expressions in `value`, by their functions of time."""
     values = [value] if len(keys) == 1 and not isinstance(value, (tuple, list, np.ndarray)) else list(value)
     if len(values) != len(keys):
         raise ValueError(f"inputs: got {len(values)} values for {', '.join(map(str, keys))}; expected {len(keys)}.")
@@ -100,7 +100,7 @@ def _as_expressions(keys: Sequence[Any], value: Any) -> dict[Any, Any]:
 def _traced(
     keys: Sequence[Any], fun: Any, state: Mapping[Any, str], start: tuple[float, np.ndarray]
 ) -> dict[Any, Any] | None:
-    """Return a function's values as expressions of the model's functions; None if it has none."""
+    """Return the values of `fun` as expressions, by the functions of time in `keys`; None if that is impossible."""
     names = tuple(state.values())
     try:
         found = traced(keys[0].func.__name__, fun, "t", names).ravel()
@@ -110,14 +110,14 @@ def _traced(
     t, y = start
     values = {symbol("t"): t, **{symbol(name): x for name, x in zip(names, y, strict=True)}}
     own = [float(sympy.sympify(item).xreplace(values)) for item in found]
-    if not np.allclose(own, np.ravel(fun(t, y)), rtol=AGREES, atol=AGREES):  # it reads more than its arguments
+    if not np.allclose(own, np.ravel(fun(t, y)), rtol=AGREES, atol=AGREES):  # `fun` depends on more than its arguments
         return None
     back = {symbol(name): item for item, name in state.items()} | {symbol("t"): TIME}
     return {key: sympy.sympify(item).xreplace(back) for key, item in zip(keys, found, strict=True)}
 
 
 def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
-    """Return the parts of a function that is called as it is."""
+    """Return a name and a function of one number for each key of an input that is called."""
     from .models import name_of
 
     if len(keys) == 1:

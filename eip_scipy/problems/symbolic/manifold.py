@@ -17,9 +17,9 @@ __all__ = ["Manifold"]
 POINTS, TRIES, NEWTON_STEPS = 8, 100, 30
 # A constraint is met, and a rate is 0, within this share of its terms.
 MET, CONSTANT = 1e-12, 1e-9
-# Gradients that are nearer than this share to dependent ones lower the rank.
+# Singular values of the gradients below this share of the largest one do not count for the rank.
 DEPENDENT = 1e-9
-BEYOND = (ValueError, ZeroDivisionError, OverflowError)  # by functions outside their domain
+BEYOND = (ValueError, ZeroDivisionError, OverflowError)  # errors of functions outside their domain
 
 
 class Manifold:
@@ -64,12 +64,12 @@ class Manifold:
             )
 
     def how_kept(self, name: str, quantity: Any) -> str:
-        """Say how it is known that a quantity is kept where the constraints hold.
+        """Return how it was shown that the quantity is conserved if the constraints hold.
 
         Raises
         ------
         ValueError
-            If it is not.
+            If the quantity is not conserved.
         """
         terms = [sympy.diff(quantity, y) * f for y, f in zip(self._variables, self._rates, strict=True)]
         terms = [item for item in [*terms, sympy.diff(quantity, sympy.Symbol("t", real=True))] if item != 0]
@@ -83,7 +83,7 @@ class Manifold:
             if abs(values.sum()) > CONSTANT * np.abs(values).sum():
                 raise self._not_kept(name, Rate(terms).total, t, y, values)
         if count == 0:
-            raise ValueError(f"{name!r}: its rate is finite at no point tried that meets the constraints.")
+            raise ValueError(f"{name!r}: its rate is not finite at any point that was tried and meets the constraints.")
         return f"numerically, at {count} points that meet the constraints"
 
     def _not_kept(self, name: str, rate: Any, t: float, y: np.ndarray, values: np.ndarray) -> ValueError:
@@ -96,7 +96,7 @@ class Manifold:
         )
 
     def _function(self, what: str, items: Sequence[Any]) -> Callable[[float, np.ndarray], np.ndarray | None]:
-        """Return a function of time and state, whose value is None where it is not finite."""
+        """Return a function of time and state, which returns None if its values are not finite."""
         places = {k: item for k, item in enumerate(items) if item != 0}
         fill = plain(function(what, list(places.values()), self._arguments, in_place=True, places=list(places)))
 
@@ -126,7 +126,7 @@ class Manifold:
                 return
 
     def _projected(self, t: float, y: np.ndarray) -> np.ndarray | None:
-        """Return the state that Newton's method finds, None if there is none."""
+        """Return the state on the constraints that Newton's method finds from y, or None if it does not converge."""
         for _ in range(NEWTON_STEPS):
             values, slopes = self._values(t, y), self._slopes(t, y)
             if values is None or slopes is None:

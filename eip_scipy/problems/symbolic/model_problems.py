@@ -75,25 +75,25 @@ def mechanics_of_model(
 
 
 def _require_rotations(problem: MechanicsProblem) -> None:
-    """Raise ValueError if a quaternion, from which SymPy makes a rotation, has another norm than 1."""
+    """Raise ValueError if a quaternion that SymPy uses for a rotation does not have the norm 1."""
     args = () if problem.params is None else (problem.params,)
     for item in problem.norms:
         slopes, value = np.empty(problem.y0.size), plain(item.function)(0.0, problem.y0, *args)
         plain(item.gradient)(0.0, np.ones(problem.y0.size), slopes, *args)
         if np.count_nonzero(slopes) == QUATERNION and not abs(value - 1) <= MET:
             raise ValueError(
-                f"mechanics: the start has {item.name} = {value:.6g}; expected 1, which the components of a quaternion "
-                "that is a rotation have. Divide them by their norm."
+                f"mechanics: the start has {item.name} = {value:.6g}; expected 1, because the quaternion of a rotation "
+                "has norm 1. Divide its components by their norm."
             )
 
 
 def _swapped(function: Any) -> Any:
-    """Return ``f(t, y)`` from a function ``f(x, t)``, as PyDy has them, or an expression as it is."""
+    """Convert a function ``f(y, t)`` of PyDy into ``f(t, y)``; return an expression unchanged."""
     return function if isinstance(function, sympy.Basic) else lambda t, y: function(y, t)
 
 
 def _by_name(given: Any, names: tuple[str, ...]) -> Any:
-    """Return a mapping by names in place of one by symbols; initial conditions of both kinds may be in one."""
+    """Return a mapping with names in place of symbols, and only with the entries of `names` if there are any."""
     if not isinstance(given, Mapping):
         return given
     found = {name_of(key): value for key, value in given.items()}

@@ -20,7 +20,7 @@ from .parser import as_expression, symbol
 
 __all__ = ["Model", "Start", "name_of", "read"]
 
-# A row of constraints depends on the others if its remainder is below this share at each of this number of points.
+# A row of constraints depends on the others if its remainder is below DEPENDENT, relative to the row, at POINTS points.
 DEPENDENT, POINTS = 1e-9, 3
 
 
@@ -35,7 +35,7 @@ class Model(NamedTuple):
     momenta, outputs : tuple of (str, expression)
         Names and expressions of momenta that may be constant, and of the quantities that are computed at saved states.
     independent : tuple of str or None
-        The components of the state that the model calls independent; None if it calls none dependent.
+        The components of the state that the model calls independent; None if it has no dependent ones.
     position_names, velocity_names : tuple of str
     notes : tuple of str
     """
@@ -61,15 +61,15 @@ class _Equations(NamedTuple):
     positions: list[Any]
     velocities: list[Any]
     energies: list[tuple[str, Any]]
-    kinetic: Any  # or the Lagrangian
-    active: list[Any]  # generalised forces of loads, unless their potential is among the energies or there are none
-    method: Any  # a KanesMethod, whose speeds may be any linear functions of the derivatives of coordinates
+    kinetic: Any  # the kinetic energy, or the Lagrangian
+    active: list[Any]  # generalised forces of loads; [] if there are none or their potential is among the energies
+    method: Any  # the KanesMethod, whose speeds may be any linear functions of the derivatives of coordinates
     independent: list[Any] | None
-    by_speeds: dict[Any, Any]  # derivatives of coordinates
+    by_speeds: dict[Any, Any]  # derivatives of coordinates as functions of speeds
 
 
 def name_of(item: Any) -> str:
-    """Return the name of a dynamicsymbol, its derivative (that of a speed), a symbol, or a string."""
+    """Return the name of a dynamicsymbol, a symbol or a string; the derivative of x is the speed ``v_x``."""
     if isinstance(item, sympy.Derivative):
         return f"v_{name_of(item.expr)}"
     text = item if isinstance(item, str) else item.func.__name__ if isinstance(item, AppliedUndef) else str(item)
@@ -91,7 +91,7 @@ def read(
     model
         A KanesMethod, LagrangesMethod, or an object with the attribute ``eom_method``, which is one of these.
     inputs : mapping
-        Expressions or functions of functions of time that are neither coordinates nor speeds, see `read_inputs`.
+        Values of the functions of time that are neither coordinates nor speeds, see `read_inputs`.
     parameters : mapping
         Values of the parameters by their names.
     energy : expression or None
@@ -133,7 +133,7 @@ class Start(NamedTuple):
     u0: Any
 
     def numbers(self, coordinates: Sequence[str], speeds: Sequence[str]) -> np.ndarray:
-        """Return a state from which functions can be called; what is not given is 0."""
+        """Return a state with which functions can be called; components that were not given are 0."""
 
         def listed(given: Any, names: Sequence[str]) -> list[float]:
             if isinstance(given, Mapping):
@@ -145,7 +145,7 @@ class Start(NamedTuple):
 
 
 class _Conversion:
-    """From expressions in a model's symbols to those in the package's symbols."""
+    """Converter of expressions from a model's symbols to the package's symbols."""
 
     def __init__(self, found: _Equations, inputs: Any, start: Start) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
@@ -161,7 +161,7 @@ class _Conversion:
             raise ValueError(f"inputs: {taken.pop()!r} is also the name of a component of the state; rename one.")
 
     def __call__(self, expression: Any) -> Any:
-        """Return the expression."""
+        """Return the converted expression."""
         found, given = self._found, self.inputs.expressions
         expression = msubs(sympy.sympify(expression), found.by_speeds)
         if given and expression.has(*given):
@@ -192,11 +192,11 @@ class _Conversion:
         )
 
     def depends_on_call(self, expression: Any) -> bool:
-        """Return whether an expression contains an input that is called."""
+        """Return True if an expression contains an input that is called as a function."""
         return bool({item.name for item in expression.free_symbols} & self._called)
 
     def output(self, name: str, given: Any, parameters: Mapping[str, float]) -> Any:
-        """Return an output, which may be text, and contain accelerations."""
+        """Return the converted expression of an output, which may be text and may contain accelerations."""
         if isinstance(given, str):
             return as_expression(f"the output {name!r}", given, {*self.names.values(), *parameters})
         found = self._found
@@ -239,13 +239,13 @@ def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, 
 def _energies(found: _Equations, energy: Any, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
     """Yield the quantities that may be the energy.
 
-    There are none where inputs are called: their work may begin at a time that is not looked at.
+    There are none if inputs are called, because such a force may begin to do work after the times that are examined.
     """
     if energy is not None:
         if converted.depends_on_call(given := converted(energy)):
             raise ValueError(
                 "mechanics: energy depends on an input that is a function without an expression, and its derivatives "
-                "are needed; give the input as an expression of t and the state."
+                "are needed. Give the input as an expression of t and the state."
             )
         yield "energy=", given
         return
@@ -261,7 +261,7 @@ def _energies(found: _Equations, energy: Any, system: Constrained, converted: _C
 
 
 def _by_rate(found: _Equations, system: Constrained, converted: _Conversion, k: int) -> list[Any]:
-    """Return the derivatives of the speeds by that of a coordinate, [] where they are not known."""
+    """Return the derivatives of the speeds by the rate of the k-th coordinate; [] if they are unknown."""
     return own_speed(system, k) or (_speeds_by_rate(found.method, k, converted) if found.method else [])
 
 
@@ -276,7 +276,7 @@ def _momenta(found: _Equations, system: Constrained, converted: _Conversion) -> 
 
 
 def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
-    """Return the derivatives of the speeds of a KanesMethod by that of a coordinate, [] where there are none."""
+    """Return the derivatives of the speeds of a KanesMethod by the rate of the k-th coordinate; [] without any."""
     by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
     if by_speeds.rows != by_speeds.cols:
         return []
@@ -294,20 +294,20 @@ def _method(model: Any) -> Any:
     if not (hasattr(method, "_L") or hasattr(method, "kindiffdict")):
         raise TypeError(
             f"mechanics: got {type(model).__name__}; expected a KanesMethod, a LagrangesMethod, or an object with "
-            "eom_method, as a System of sympy.physics.mechanics."
+            "eom_method, such as a System of sympy.physics.mechanics."
         )
     return method
 
 
 def _of_kane(method: Any) -> _Equations:
-    """Return the equations with all speeds independent, in which the constraints keep their multipliers.
+    """Return the equations of a KanesMethod with all speeds independent and multipliers for the constraints.
 
-    The model's own equations, with dependent speeds, have poles where its choice of them is singular.
+    The model's own equations, with dependent speeds, have poles at states where the choice of these is singular.
     """
     if method._uaux:
         raise ValueError(
-            f"mechanics: the model has auxiliary speeds ({', '.join(map(name_of, method._uaux))}); leave them out, and "
-            "take forces of constraints from problem.multipliers."
+            f"mechanics: the model has auxiliary speeds ({', '.join(map(name_of, method._uaux))}), which are not "
+            "supported. Remove them, and take the forces of constraints from problem.multipliers."
         )
     bodies, loads = method.bodylist, method.forcelist
     if not bodies:
@@ -371,7 +371,7 @@ def _of_lagrange(method: Any) -> _Equations:
 
 
 def _active_of_lagrange(method: Any, speeds: Sequence[Any]) -> list[Any]:
-    """Return the generalised forces of a LagrangesMethod's loads, [] without any."""
+    """Return the generalised forces of the loads of a LagrangesMethod; [] if it has no loads."""
     frame, found = method.inertial, [sympy.Integer(0)] * len(speeds)
     for place, vector in method.forcelist or ():
         motion = place.vel(frame) if isinstance(place, Point) else place.ang_vel_in(frame)
@@ -380,7 +380,7 @@ def _active_of_lagrange(method: Any, speeds: Sequence[Any]) -> list[Any]:
 
 
 def _is_constant(load: Any, frame: Any) -> bool:
-    """Return whether a load is a force that is constant in the inertial frame."""
+    """Return True if a load is a force that is constant in the inertial frame."""
     place, vector = load
     components = [vector.dot(axis) for axis in frame]
     return isinstance(place, Point) and not any(
@@ -389,7 +389,7 @@ def _is_constant(load: Any, frame: Any) -> bool:
 
 
 def _potential_of_loads(loads: Iterable[Any], frame: Any, state: set[Any]) -> Any:
-    """Return the potential of forces that are constant in the inertial frame; None where a position is not known."""
+    """Return the potential of forces that are constant in the inertial frame; None if a position is unknown."""
     total = sympy.Integer(0)
     for place, vector in loads:
         if not _is_constant((place, vector), frame):
@@ -404,7 +404,7 @@ def _potential_of_loads(loads: Iterable[Any], frame: Any, state: set[Any]) -> An
 
 
 def _fixed_point(place: Any, frame: Any) -> Any:
-    """Return a point that is at rest in the frame, connected with a point by known positions."""
+    """Return a point at rest in `frame` whose position relative to `place` is known; None if there is none."""
     seen, left = {place}, [place]
     while left:
         point = left.pop()
@@ -420,11 +420,13 @@ def _require_distinct(names: Mapping[Any, str]) -> None:
     found = list(names.values())
     twice = next((name for k, name in enumerate(found) if name in found[:k] or name == "t"), None)
     if twice is not None:
-        raise ValueError(f"mechanics: {twice!r} names two components of the state, or the time; rename one.")
+        raise ValueError(
+            f"mechanics: {twice!r} is the name of two components of the state, or of one and the time; rename one."
+        )
 
 
 def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the names of the parameters that occur, in the order in which their values are given."""
+    """Return the names of the parameters that occur in the equations, in the order of `values`."""
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
     known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
     known |= {symbol(name) for name, _ in system.inputs}
@@ -440,7 +442,7 @@ def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str,
 
 
 def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -> tuple[Constrained, list[str]]:
-    """Add the derivatives of constraints on positions that those on velocities do not contain.
+    """Add the derivatives of constraints on positions that are missing from the constraints on velocities.
 
     KanesMethod ignores a configuration constraint without its velocity constraint.
     """

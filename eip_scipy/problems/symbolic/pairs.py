@@ -1,4 +1,4 @@
-"""Which names in a Hamiltonian are coordinates, and which are their momenta."""
+"""Division of the names in a Hamiltonian into coordinates and their momenta."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
 
 
 def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Coordinates and momenta among names: x and px, q1 and p1, theta and p_theta or ptheta, the last one left and p.
+    """Return the coordinates and their momenta among names.
+
+    Pairs are x and px, q1 and p1, theta and p_theta or ptheta; p belongs to the one remaining coordinate.
 
     Raises
     ------
     ValueError
-        For a name without a partner.
+        If a name has no partner.
     """
     free = set(names)
     pairs = []
@@ -36,7 +38,7 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
-    """Return what is wrong with names without a partner, or if there are no names."""
+    """Return the message for names without a partner, or for an H without names."""
     rule = "Names are paired as x with px, q1 with p1, theta with p_theta; others by hamiltonian(H, 'a b', 'pa pb')."
     if not left:
         return f"hamiltonian: H contains neither coordinates nor momenta. {rule}"
@@ -51,7 +53,7 @@ def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
 
 
 def _coordinate(momentum: str, free: set[str]) -> str | None:
-    """Return the coordinate of which a name is the momentum, or None."""
+    """Return the name in `free` of the coordinate to which `momentum` belongs, or None."""
     if not momentum.startswith("p") or momentum == "p":
         return None
     rest = momentum[1:].removeprefix("_")
@@ -62,7 +64,7 @@ def _coordinate(momentum: str, free: set[str]) -> str | None:
 
 
 def _partner_of_p(others: list[str]) -> str | None:
-    """The coordinate that p goes with, of the names left: q, the only name of a coordinate, or the only name."""
+    """Return the partner of p among the remaining names: q, the only name of a coordinate, or the only name."""
     if "q" in others or not others:
         return "q"
     likely = [name for name in others if name in KNOWN] or others
@@ -70,5 +72,5 @@ def _partner_of_p(others: list[str]) -> str | None:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """q2 before q10."""
+    """Return a key that sorts q2 before q10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -1,7 +1,7 @@
-"""Expressions from text: Python's grammar, of which a short list of nodes, operators and functions is let through.
+"""Expressions from text in Python's grammar, of which a short list of nodes, operators and functions is allowed.
 
-Nothing of the text is ever run. SymPy's own reader (`sympify`, `parse_expr`) calls `eval` and takes E, I, S, N, Q, beta
-and gamma for objects of its own; here every name that is not called is the user's, and pi too if the user declares it.
+The text is never executed. SymPy's own parser (`sympify`, `parse_expr`) calls `eval` and reads E, I, S, N, Q, beta and
+gamma as its own objects. Here every name that is not called is a symbol of the user, even pi if the user declares it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .sizes import TooLargeError, require_constant, require_function, require_po
 
 __all__ = ["as_expression", "as_names", "symbol"]
 
-TIME = sympy.Symbol("t")  # of dynamicsymbols
+TIME = sympy.Symbol("t")  # the time in dynamicsymbols
 ONE_ARGUMENT = (
     "sqrt", "cbrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh",
     "atanh", "erf", "sign",
@@ -46,42 +46,42 @@ LARGEST = sympy.Integer(10) ** 300
 
 
 def symbol(name: str) -> sympy.Symbol:
-    """The symbol of a name; real, so that sqrt(x**2) is abs(x)."""
+    """Return the symbol of a name. It is real, so that sqrt(x**2) is abs(x)."""
     return sympy.Symbol(name, real=True)
 
 
 def as_names(what: str, names: Any) -> tuple[str, ...]:
-    """Names from "x y", "x, y", or a sequence of strings, SymPy symbols and dynamicsymbols.
+    """Return the names in "x y", "x, y", or a sequence of strings, SymPy symbols and dynamicsymbols.
 
     Raises
     ------
-    ValueError
-        If it is not a name, or occurs twice.
+    TypeError, ValueError
+        If an item is not a name, is t, or occurs twice.
     """
     items = names.replace(",", " ").split() if isinstance(names, str) else _items(what, names)
     found = tuple(_name(what, item) for item in items)
     twice = next((name for k, name in enumerate(found) if name in found[:k]), None)
     if twice is not None:
-        raise ValueError(f"{what}: {twice!r} stands twice in {', '.join(found)}.")
+        raise ValueError(f"{what}: {twice!r} occurs twice in {', '.join(found)}; expected different names.")
     if "t" in found:
         raise ValueError(f"{what}: t is the time; give the variable another name.")
     return found
 
 
 def as_expression(what: str, given: Any, declared: Iterable[str] = ()) -> sympy.Expr:
-    """A SymPy expression in real symbols from text, a number or an expression of SymPy's.
+    """Return a SymPy expression in real symbols from text, a number or a SymPy expression.
 
-    A name that is `declared`, as a component of the state or a parameter, is neither a constant nor a function.
+    A name in `declared`, such as a component of the state or a parameter, is neither a constant nor a function.
 
     Raises
     ------
     TypeError, ValueError
-        Naming what came, `what` it is, and what is allowed.
+        If `given` is not such an expression. The message begins with `what`.
     """
     if isinstance(given, str):
         found = Reader(what, given, declared).read()
     elif isinstance(given, (bool, complex)) or not isinstance(given, (int, float, sympy.Expr)):
-        raise TypeError(f"{what}: expected an expression, as text or of SymPy's, got {_cut(given)}.")
+        raise TypeError(f"{what}: expected an expression, as text or from SymPy, got {_cut(given)}.")
     else:
         found = _with_real_symbols(what, sympy.sympify(given))  # a number or an expression: no text reaches sympify
     if found.has(sympy.I, sympy.nan, sympy.zoo, sympy.oo, -sympy.oo):
@@ -103,14 +103,14 @@ def _name(what: str, item: Any) -> str:
     elif isinstance(item, AppliedUndef) and item.args == (TIME,):
         item = item.func.__name__
     if not isinstance(item, str):
-        raise TypeError(f"{what}: expected names, as 'x y' or ['x', 'y'], got {_cut(item)} among them.")
+        raise TypeError(f"{what}: expected names, as 'x y' or ['x', 'y'], but one item is {_cut(item)}.")
     if not item.isidentifier() or keyword.iskeyword(item):
         raise ValueError(f"{what}: {_cut(item)} is not a name; use letters, digits and _, and no keyword of Python.")
-    return str(ast.parse(item, mode="eval").body.id)  # type: ignore[attr-defined]  # as Python spells it in expressions
+    return str(ast.parse(item, mode="eval").body.id)  # type: ignore[attr-defined]  # Python normalises names
 
 
 def _is_float(number: sympy.Expr) -> bool:
-    """Return True if it is real and a float can represent it."""
+    """Return True if a number is real and a float can represent it."""
     value = number if isinstance(number, sympy.Rational) else sympy.N(number)
     return bool(value == 0 or ((value.is_Float or value.is_Rational) and 1 / LARGEST < abs(value) < LARGEST))
 
@@ -123,8 +123,8 @@ def _cut(value: Any) -> str:
 def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
     if derivatives := given.atoms(sympy.Derivative):
         raise ValueError(
-            f"{what}: it contains {_cut(min(derivatives, key=str))}; expected an expression of the state without "
-            "derivatives. equations takes those of components of the state."
+            f"{what}: the expression contains {_cut(min(derivatives, key=str))}; expected an expression of the state "
+            "without derivatives. Only `equations` accepts derivatives of components of the state."
         )
     functions = {item for item in given.atoms(AppliedUndef) if item.args == (TIME,)}
     if functions:
@@ -135,27 +135,27 @@ def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
     names = [_name(what, item) for item in symbols]
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:
-        raise ValueError(f"{what}: it has two different symbols called {twice}.")
+        raise ValueError(f"{what}: the expression has two different symbols called {twice}; rename one.")
     return given.xreplace({item: symbol(name) for item, name in zip(symbols, names, strict=True)})
 
 
 class Reader:
-    """One text, read once."""
+    """Reader of one text."""
 
     def __init__(self, what: str, text: str, declared: Iterable[str] = ()) -> None:
-        self.what, self.text = what, " ".join(text.split())  # it may go over several lines
+        self.what, self.text = what, " ".join(text.split())  # the text may have several lines
         self.declared = frozenset(declared)
-        self.compared = 0  # values in max and min
+        self.compared = 0  # number of values in max and min so far
 
     def read(self) -> sympy.Expr:
-        """The expression."""
+        """Return the expression."""
         if not self.text or len(self.text) > LONGEST:
             raise ValueError(f"{self.what}: expected an expression of 1 to {LONGEST} characters, got {len(self.text)}.")
-        if "#" in self.text:  # Python would leave out what follows, which once was on other lines
+        if "#" in self.text:  # Python would ignore all of the text that follows
             raise ValueError(f"{self.what}: {_cut(self.text)} has a comment. Allowed are {ALLOWED}.")
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", (SyntaxWarning, DeprecationWarning))  # of odd numbers: "1or 2"
+                warnings.simplefilter("ignore", (SyntaxWarning, DeprecationWarning))  # for text such as "1or 2"
                 tree = ast.parse(self.text, mode="eval")
         except SyntaxError as error:
             raise ValueError(f"{self.what}: {_cut(self.text)} is not an expression: {self._mistake(error)}") from None
@@ -175,7 +175,7 @@ class Reader:
     def _mistake(self, error: SyntaxError) -> str:
         words = [word for word in re.findall(r"[^\W\d]\w*", self.text) if keyword.iskeyword(word)]
         if words:
-            return f"{words[0]} is a word of Python's; call it otherwise ({words[0][:3]}, {words[0]}_)."
+            return f"{words[0]} is a keyword of Python; use another name, such as {words[0][:3]} or {words[0]}_."
         return f"{error.msg}. Allowed are {ALLOWED}."
 
     def _refuse(self, node: ast.AST, why: str) -> ValueError:
@@ -191,7 +191,7 @@ class Reader:
                 require_constant(found)
         except TooLargeError as error:
             raise self._refuse(node, str(error)) from None
-        # At every level: what is built from numbers that floats hold stays small enough to be computed at once.
+        # Checked at every level: an operation on numbers that floats can represent takes no time.
         if found.is_number and not _is_float(found):
             raise self._refuse(node, "is not a number that a float can represent")
         return found
@@ -223,7 +223,7 @@ class Reader:
         raise self._refuse(node, "is not allowed")
 
     def _chain(self, node: ast.expr, pair: tuple[type, type], inverse: Any, depth: int) -> list[sympy.Expr]:
-        """The operands of a + b - c, or of a * b / c, which nest to the left as deep as the chain is long."""
+        """Return the operands of a chain such as a + b - c or a * b / c, whose nodes are nested to the left."""
         found = []
         while isinstance(node, ast.BinOp) and isinstance(node.op, pair):
             item = self._expression(node.right, depth + 1)
@@ -238,7 +238,7 @@ class Reader:
             raise self._refuse(node, "is not a real number")
         if abs(value) > LARGEST:
             raise self._refuse(node, "is too large")
-        # Decimals as the user wrote them, 0.1 as 1/10: sums of constants and cancellations are exact.
+        # Decimals are read exactly, 0.1 as 1/10, so that sums and cancellations of constants are exact.
         return sympy.Rational(repr(value)) if isinstance(value, float) else sympy.Integer(value)
 
     def _power(self, node: ast.BinOp, depth: int) -> sympy.Expr:
@@ -255,12 +255,12 @@ class Reader:
     def _call(self, node: ast.Call, depth: int) -> sympy.Expr:
         name = node.func.id if isinstance(node.func, ast.Name) else None
         if name in self.declared:
-            raise self._refuse(node, f"calls {name}, a component or parameter here; rename that to call {name}")
+            raise self._refuse(node, f"calls {name}, which is a component or parameter; rename that to call {name}")
         if name not in FUNCTIONS:
             raise self._refuse(node.func, "is not a known function")
         function, count = FUNCTIONS[name]
         if node.keywords or len(node.args) != count:
-            raise self._refuse(node, f"is not as {name} is called, with {count} argument{'s' * (count > 1)}")
+            raise self._refuse(node, f"is wrong, because {name} takes {count} argument{'s' * (count > 1)}")
         arguments = [self._expression(item, depth + 1) for item in node.args]
         self.compared = require_function(function.__name__.lower(), arguments, self.compared)
         return function(*arguments)

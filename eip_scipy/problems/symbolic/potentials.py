@@ -10,9 +10,9 @@ from sympy.integrals.manualintegrate import manualintegrate
 
 __all__ = ["at_rest", "potential_of"]
 
-# Operations of all forces together beyond which integration may take long.
+# Forces with more operations in all are not integrated, because that may take long.
 MOST_OPERATIONS = 1000
-# Factors of an integrand, and powers of its sines and cosines.
+# Largest number of factors of an integrand, and largest power of its sines and cosines.
 MOST_FACTORS = 4
 KNOWN = (sympy.sin, sympy.cos, sympy.exp)
 # Points from which integrals are taken: the second one if forces are infinite at the first.
@@ -20,7 +20,7 @@ BASES = (0, 1)
 
 
 def at_rest(forces: Sequence[Any], speeds: Sequence[Any], others: set[Any]) -> list[Any]:
-    """Return the terms of forces that are there at rest, without those that contain `others`, such as the time."""
+    """Return the terms of the forces at zero speed, without terms that contain `others`, such as the time."""
     still = [sympy.expand_mul(sympy.sympify(item).subs(dict.fromkeys(speeds, 0))) for item in forces]
     return [sympy.Add(*(term for term in sympy.Add.make_args(F) if not term.free_symbols & others)) for F in still]
 
@@ -28,7 +28,7 @@ def at_rest(forces: Sequence[Any], speeds: Sequence[Any], others: set[Any]) -> l
 def potential_of(forces: Sequence[Any], coordinates: Sequence[Any]) -> Any:
     """Return V with forces = -dV/dq if the forces are conservative, None if no such expression is found.
 
-    V need not be right if they are not: whether it is shows in the energy that it is a part of.
+    V may be wrong if the forces are not conservative. The check of the energy that contains V detects that.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ def potential_of(forces: Sequence[Any], coordinates: Sequence[Any]) -> Any:
 
 
 def _of_lengths(forces: Sequence[Any], coordinates: Sequence[Any]) -> tuple[Any, list[Any]]:
-    """Return the potential of terms along the gradient of a length, as springs and gravity have, and the other terms.
+    """Return the potential of terms along the gradient of a length, and the other terms of the forces.
 
-    With S, the square of the length, the force is c S^p with c = a dS/dq / 2, where a is constant, and its potential
-    -a S^(p + 1) / (2 p + 2).
+    Springs and gravitation have such terms. With S, the square of the length, a term is c S^p with c = a dS/dq / 2 and
+    a constant, and its potential is -a S^(p + 1) / (2 p + 2).
     """
     potential, forces = sympy.Integer(0), list(forces)
     powers = set().union(*(item.atoms(sympy.Pow) for item in forces))
@@ -70,7 +70,10 @@ def _of_lengths(forces: Sequence[Any], coordinates: Sequence[Any]) -> tuple[Any,
 
 
 def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) -> Any:
-    """Return the integral from the base along the last coordinate, then along the one before it, and so on."""
+    """Return the integral of the forces along a path that starts at `base` and moves along one coordinate at a time.
+
+    The path moves along the last coordinate first.
+    """
     potential = sympy.Integer(0)
     for k, (force, q) in enumerate(zip(forces, coordinates, strict=True)):
         integrand = force.subs(dict.fromkeys(coordinates[:k], base))
@@ -86,10 +89,10 @@ def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) ->
 
 
 def _is_simple(term: Any, q: Any) -> bool:
-    """Return whether a term is of a kind that is integrated quickly: others may take for ever.
+    """Return True if SymPy integrates a term quickly; the integration of other terms may not end.
 
-    It is a product of powers of q or of one polynomial of degree 2, or of sines, cosines and exponentials of linear
-    functions.
+    Such a term is a product of powers of q or of one polynomial of degree 2, or of sines, cosines and exponentials of
+    linear functions.
     """
     powers = [item.as_base_exp() for item in sympy.Mul.make_args(term) if item.has(q)]
     if len(powers) > MOST_FACTORS:
@@ -99,7 +102,7 @@ def _is_simple(term: Any, q: Any) -> bool:
     others = [base for base, exponent in powers if base.has(q) and base != q and base not in roots]
     if any(exponent.has(q) or not exponent.is_Rational for base, exponent in powers if base is not sympy.E):
         return False
-    own = [exponent for base, exponent in powers if base == q] if others else []  # integrated by parts
+    own = [exponent for base, exponent in powers if base == q] if others else []  # such a term is integrated by parts
     if any(not (exponent.is_Integer and 0 < exponent <= MOST_FACTORS) for exponent in (*own, *(n for _, n in waves))):
         return False
     if any(not _degree(base.args[0], q) <= 1 or not isinstance(base, KNOWN) for base in others):

@@ -1,9 +1,8 @@
-"""SymPy expressions as functions: one operation a statement, what is common to several computed once.
+"""Functions from SymPy expressions: each statement has one operation, and common subexpressions are computed once.
 
-The code is a tree of `ast` nodes made here, compiled, and its code object made a function. No text is run, as SymPy's
-`lambdify` would: it writes source with the user's names in it and calls `exec`. The nodes are assignments of sums,
-products, powers and calls from the list below; the names are those of the arguments and `v` with a number; all else is
-numbers.
+A function is compiled from a tree of `ast` nodes. No text is executed, unlike in SymPy's `lambdify`, which writes
+source that contains the user's names and calls `exec`. The nodes are assignments of sums, products, powers and calls
+from the list below; the names are those of the arguments and `v` with a number; everything else is a number.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from ...core.jitted import compilable, is_jitted, jitted
 
 __all__ = ["Arguments", "function", "variational"]
 
-# SymPy's functions, and the names that math and NumPy have for them.
+# SymPy's functions and their names in math and NumPy.
 CALLS: dict[Any, tuple[str, str]] = {
     sympy.exp: ("exp", "exp"),
     sympy.log: ("log", "log"),
@@ -41,7 +40,7 @@ CALLS: dict[Any, tuple[str, str]] = {
     sympy.acosh: ("acosh", "arccosh"),
     sympy.atanh: ("atanh", "arctanh"),
 }
-# Functions that are 1 over another.
+# Functions that are reciprocals of others.
 RECIPROCALS: dict[Any, str] = {sympy.sec: "cos", sympy.csc: "sin", sympy.cot: "tan"}
 COMPARISONS: dict[Any, type[ast.cmpop]] = {
     sympy.Lt: ast.Lt, sympy.Le: ast.LtE, sympy.Gt: ast.Gt, sympy.Ge: ast.GtE, sympy.Eq: ast.Eq, sympy.Ne: ast.NotEq,
@@ -49,20 +48,21 @@ COMPARISONS: dict[Any, type[ast.cmpop]] = {
 OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf, sympy.Piecewise, *RECIPROCALS)
 COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "range", "ValueError")} | {"erf": math.erf}
 COMPILED = {name: getattr(math, name) for name in ("sqrt", *(name for name, _ in CALLS.values()))} | COMMON
-# Without Numba NumPy's: math's would raise where a step reaches too far, instead of giving the NaN that shortens it.
+# Functions for runs without Numba. They are NumPy's because those of math raise an error outside their domain, while
+# the NaN of NumPy's functions shortens the step.
 INTERPRETED = {name: getattr(np, of_numpy) for name, of_numpy in CALLS.values()} | {"sqrt": np.sqrt} | COMMON
-LARGEST_PRODUCT = 64  # of a power by multiplications
+LARGEST_PRODUCT = 64  # largest exponent of a power that is computed by multiplications
 
 
 class Arguments:
-    """The names in the arrays that a function reads: y, params, and dy, along which a Jacobian is taken."""
+    """Names of the entries of the arrays that a function reads: y, params, and dy, the direction of a derivative."""
 
     def __init__(self, components: Sequence[str], parameters: Sequence[str], directions: Sequence[str] = ()) -> None:
         self.arrays = {"y": tuple(components), "dy": tuple(directions), "params": tuple(parameters)}
 
     @property
     def places(self) -> dict[str, tuple[str, int | None]]:
-        """Array and index of each name; the time is a number."""
+        """Return the array and the index of each name; the index of the time is None."""
         places = {name: (array, k) for array, names in self.arrays.items() for k, name in enumerate(names)}
         return {**places, "t": ("t", None)}
 
@@ -75,23 +75,24 @@ def function(
     in_place: bool,
     places: Sequence[Any] | None = None,
 ) -> Callable[..., Any]:
-    """A function of ``(t, y[, dy][, out][, params])``, Numba's where Numba is installed.
+    """Return a function of ``(t, y[, dy][, out][, params])``, jitted if Numba is installed.
 
     Parameters
     ----------
     what : str
-        What it computes, for tracebacks and errors.
+        Description of the values, for tracebacks and errors.
     expressions : sequence of sympy.Expr
-        What it fills `out` with, or the one number that it returns.
+        The values that the function writes to `out`, or the one number that it returns.
     arguments : Arguments
     in_place : bool
+        Whether the function fills `out`.
     places : sequence of int or of tuples of int, optional
-        The places of the expressions in `out`, whose other numbers become 0. Default: all of them, in this order.
+        The places of the expressions in `out`; the other entries become 0. Default: 0, 1, ...
 
     Raises
     ------
     ValueError
-        For what has no function here.
+        If an expression contains a function that is not supported.
     """
     return _fastest(_compiled(what, _statements(what, expressions, arguments, in_place, places), arguments, in_place))
 
@@ -103,26 +104,26 @@ def variational(
     by_parameters: Sequence[Mapping[int, Any]],
     arguments: Arguments,
 ) -> Callable[..., None]:
-    """Return a function of ``(t, Y, out[, params])`` for the state with columns of derivatives behind it.
+    """Return a function of ``(t, Y, out[, params])``, where Y is the state followed by columns of derivatives.
 
-    Its values for the state have the bits of ``function(what, rates, ...)``: the statements of the rates come first, as
-    they are there, and those of their derivatives use what the former computed.
+    Its values for the state have the bits of ``function(what, rates, ...)``, because the statements of the rates come
+    first. The statements of the derivatives use their intermediate results.
 
     Parameters
     ----------
     what : str
-        What it computes, for tracebacks and errors.
+        Description of the values, for tracebacks and errors.
     rates : sequence of sympy.Expr, of length n
     jacobian : mapping of (int, int) to sympy.Expr
-        The derivatives of the rates by the components that are not 0, by row and column.
+        The nonzero derivatives of the rates by the components, by row and column.
     by_parameters : sequence of mappings of int to sympy.Expr
-        For each of the last columns the derivatives of the rates by its parameter that are not 0, by row.
+        For each of the last columns the nonzero derivatives of the rates by the parameter of that column, by row.
     arguments : Arguments
 
     Raises
     ------
     ValueError
-        For what has no function here.
+        If an expression contains a function that is not supported.
     """
     n = len(rates)
     writer = Writer(what, arguments)
@@ -188,9 +189,9 @@ def _statements(
 
 
 def _products(n: int, entries: Mapping[tuple[int, int], ast.expr]) -> list[ast.stmt]:
-    """Return the statements that fill the column of `out` at k with the Jacobian times the column of `y` there."""
+    """Return the statements that fill the column of `out` that starts at k with the Jacobian times that of `y`."""
     read = sorted({j for _, j in entries})
-    # All of them first: compiled code must not read them anew after each number that it writes.
+    # The column of y is read first, because compiled code would read it again after each number that it writes.
     body = [
         _set(
             ast.Name(id=f"d{j}", ctx=ast.Store()),
@@ -231,7 +232,7 @@ def _refused(wrong: ast.expr, text: str) -> ast.stmt:
 
 
 def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
-    """Compiled code does not look whether an index is one of the array's. Sizes cost nothing: they are known to it."""
+    """Yield statements that check the sizes of arrays, because compiled code does not check indices."""
     for array, names in arguments.arrays.items():
         if names:
             text = f"{array} must hold as many numbers as there are in ({', '.join(names)}): {len(names)}"
@@ -239,7 +240,7 @@ def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
 
 
 def _checks_of_columns(n: int, columns: int) -> Iterable[ast.stmt]:
-    """Check that `y` is the state and whole columns, of which there are at least as many, and that `out` is as long."""
+    """Yield statements that check that `y` holds the state and enough whole columns, and that `out` is as long."""
     rest = ast.BinOp(left=_size("y"), op=ast.Mod(), right=ast.Constant(value=n))
     few = ast.Compare(left=_size("y"), ops=[ast.Lt()], comparators=[ast.Constant(value=n * (columns + 1))])
     text = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {columns} columns"
@@ -260,7 +261,7 @@ def _set(target: ast.expr, value: ast.expr) -> ast.stmt:
 
 
 class Writer:
-    """Statements that compute expressions; the same operation on the same values is written once."""
+    """Writer of statements that compute expressions; the same operation on the same values is written once."""
 
     def __init__(self, what: str, arguments: Arguments) -> None:
         self.what = what
@@ -270,14 +271,14 @@ class Writer:
         self._places = arguments.places
 
     def values(self, expressions: Sequence[Any]) -> list[ast.expr]:
-        """Return the names, or the constants, of several expressions, of which what is common is computed once."""
+        """Return a name or a constant for each expression; common subexpressions are computed once."""
         common, reduced = sympy.cse(expressions, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
         for name, expression in common:
             self.known[name] = self.value(expression)
         return [self.value(expression) for expression in reduced]
 
     def value(self, expression: Any) -> ast.expr:
-        """The name, or the constant, that stands for an expression."""
+        """Return the name of the variable that holds an expression, or the constant that it is equal to."""
         if expression not in self.known:
             self.known[expression] = self._write(expression)
         return self.known[expression]
@@ -305,10 +306,10 @@ class Writer:
     def _unknown(self, expression: Any) -> ValueError:
         allowed = ", ".join(sorted(item.__name__ for item in (*CALLS, *OTHERS)))
         kind = type(expression).__name__
-        return ValueError(f"{self.what}: {kind} in {expression} is not known here. Known are {allowed}.")
+        return ValueError(f"{self.what}: {kind} in {expression} is not supported. Supported are {allowed}.")
 
     def _name(self, operation: ast.expr) -> ast.expr:
-        """A new name for an operation on names and constants, or the one that it has."""
+        """Return the variable for an operation on names and constants; write the operation if it is new."""
         text = ast.dump(operation)
         if text not in self._written:
             name = f"v{len(self._written)}"
@@ -324,7 +325,7 @@ class Writer:
         return self._name(ast.BinOp(left=left, op=operator, right=right))
 
     def _sum(self, terms: Sequence[Any]) -> ast.expr:
-        # Differences last: a sum that begins with one would first be negated.
+        # Negative terms come last, because a sum that starts with one would need a negation.
         signed = sorted(((term.could_extract_minus_sign(), term) for term in terms), key=lambda item: item[0])
         (negative, first), *others = signed
         total = self.value(first)
@@ -394,7 +395,7 @@ class Writer:
         raise self._unknown(expression)
 
     def _cases(self, expression: Any) -> ast.expr:
-        """The first value whose condition holds, NaN where none does. All values are computed."""
+        """Return the first value whose condition holds, NaN if none holds. All values are computed."""
         chosen: ast.expr = ast.Constant(value=math.nan)
         for value, condition in reversed(expression.args):
             found = self.value(value)
@@ -418,7 +419,7 @@ class Writer:
         raise self._unknown(condition)
 
     def _by_sign(self, value: ast.expr, below: float, at_zero: float) -> ast.expr:
-        """1 for positive values, `below` for negative ones."""
+        """Return 1 for positive values, `below` for negative ones, and `at_zero` for 0."""
 
         def choice(test: ast.cmpop, yes: float, no: ast.expr) -> ast.expr:
             compared = ast.Compare(left=value, ops=[test], comparators=[ast.Constant(value=0.0)])

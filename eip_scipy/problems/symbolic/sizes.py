@@ -1,4 +1,4 @@
-"""Bounds of what SymPy computes by itself when an expression is built, looked at before it does.
+"""Bounds for the work that SymPy does by itself when an expression is built; they are checked before.
 
 SymPy adds, multiplies and raises rational numbers exactly, collects equal terms and factors, and expands some arguments
 of functions. Each of these can take hours, within one operation that no signal interrupts.
@@ -24,21 +24,21 @@ __all__ = [
     "require_sum",
 ]
 
-# Bits of a numerator and its denominator: 1.0001**365 has 10 000 of them, a float 2100 at most.
+# Largest number of bits of a numerator and its denominator. 1.0001**365 has 10 000 bits, a float at most 2100.
 MOST_BITS = 2**14
-# Terms of an expanded polynomial, beyond which the algebra may take minutes where numbers take milliseconds.
+# Largest number of terms of an expanded polynomial. With more terms algebra may take minutes.
 EXPANDED_TERMS = 2000
-# Arguments of one max or min, each of which SymPy compares with each, and of all of them.
+# Largest number of arguments of one max or min, and of all of them. SymPy compares all pairs of them.
 MOST_COMPARED, MOST_COMPARED_IN_ALL = 12, 400
-# Factors of one product: its derivatives have as many terms of as many factors.
+# Largest number of factors of a product. The derivatives of n factors have n terms with n factors each.
 MOST_FACTORS = 200
-# Operations of a constant that is not rational, whose sign SymPy finds by evaluating it.
+# Largest number of operations of a constant that is not rational. SymPy evaluates such a constant to find its sign.
 LARGEST_CONSTANT = 64
 ZERO, ONE = sympy.Integer(0), sympy.Integer(1)
 
 
 class TooLargeError(ValueError):
-    """The work that an expression would be for SymPy."""
+    """SymPy would need too much work to build an expression."""
 
 
 def require_sum(items: Iterable[Any]) -> None:
@@ -64,7 +64,7 @@ def require_product(items: Iterable[Any]) -> None:
             elif exponent.is_Rational:
                 exponents[base] += exponent
                 _require(_bits(exponents[base]))
-                if base.is_Rational:  # of equal exponents SymPy multiplies the bases
+                if base.is_Rational:  # SymPy multiplies bases that have equal exponents
                     roots += _bits(base) * math.ceil(abs(exponent))
                     _require(roots)
     if len(exponents) > MOST_FACTORS:
@@ -83,7 +83,7 @@ def require_power(base: Any, exponent: Any) -> None:
 def require_function(name: str, arguments: Iterable[Any], compared: int) -> int:
     """Raise TooLargeError if SymPy would compare or expand too much to build the function.
 
-    `compared` counts the values that max and min have compared before; returns the new count.
+    `compared` is the number of values that max and min have compared so far; the function returns the new number.
     """
     if name in ("max", "min"):
         kind = sympy.Max if name == "max" else sympy.Min
@@ -91,8 +91,8 @@ def require_function(name: str, arguments: Iterable[Any], compared: int) -> int:
         compared += count
         if count > MOST_COMPARED or compared > MOST_COMPARED_IN_ALL:
             raise TooLargeError(
-                f"compares {count} values, of {compared} in all; at most {MOST_COMPARED} and {MOST_COMPARED_IN_ALL} "
-                "are possible"
+                f"compares {count} values, and the text compares {compared} in all; the limits are {MOST_COMPARED} and "
+                f"{MOST_COMPARED_IN_ALL}"
             )
     if name == "abs":
         for item in arguments:
@@ -110,7 +110,7 @@ def require_constant(number: Any) -> None:
 
 
 def expanded_terms(expression: Any) -> int:
-    """Return how many terms the expanded expression has at most, or a number above EXPANDED_TERMS."""
+    """Return an upper bound for the number of terms of the expanded expression, or a number above EXPANDED_TERMS."""
     most = EXPANDED_TERMS + 1
     match expression:
         case sympy.Add():

@@ -1,4 +1,4 @@
-"""From expressions to a `Problem`."""
+"""Construction of a `Problem` from expressions."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from .timed import Timed
 __all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem", "parameter_values"]
 
 
-HINT = "If it is kept only where constraints hold, give them as constraints=."
-LARGEST_JACOBIAN = 16  # coordinates; there are as many second derivatives as their square
+HINT = "If it is conserved only if constraints hold, pass them as constraints=."
+LARGEST_JACOBIAN = 16  # number of coordinates; the Jacobian has its square of entries
 
 
 class System(NamedTuple):
-    """Names, derivatives, invariants, balances and their rates, as written. Equal systems share their functions."""
+    """Names, derivatives, invariants, balances and their rates as expressions. Equal systems share their functions."""
 
     components: tuple[str, ...]
     parameters: tuple[str, ...]
@@ -45,12 +45,12 @@ class System(NamedTuple):
 
     @property
     def variables(self) -> list[Any]:
-        """The symbols of the state."""
+        """Return the symbols of the state."""
         return [symbol(name) for name in self.components]
 
     @property
     def accelerations(self) -> tuple[Any, ...] | None:
-        """Accelerations of q'' = a(t, q) if the equations have that form for the state (q, q')."""
+        """Return a of q'' = a(t, q) if the equations have this form for a state (q, q'); otherwise None."""
         variables, half = self.variables, len(self.components) // 2
         velocities = variables[half:]
         found = self.rates[half:]
@@ -60,7 +60,7 @@ class System(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """A system's functions; of each invariant the value and the gradient in place, of each balance the rate too."""
+    """Functions of a system: for each invariant the value and the gradient in place, for each balance also the rate."""
 
     rhs: Callable[..., None]
     acc: Callable[..., np.ndarray] | None
@@ -73,18 +73,18 @@ class Functions(NamedTuple):
 class SymbolicProblem(Problem):
     """A `Problem` written as expressions.
 
-    It has neither start nor interval until it is given them:
-    ``dataclasses.replace(problem, y0=np.array([...]), t_span=(0.0, 100.0))``, or as arguments of a run.
+    It has no start and no interval. Pass these to the run, or make a problem that has them:
+    ``dataclasses.replace(problem, y0=np.array([...]), t_span=(0.0, 100.0))``.
 
     Attributes
     ----------
     system : System
-        ``components`` and ``parameters``, their names; ``rates``, the derivatives in time, and ``invariants``, pairs of
-        name and expression, of SymPy's, in real symbols; ``balances``, triples of name, expression and rate.
+        The names ``components`` and ``parameters``; ``rates``, the time derivatives; ``invariants``, pairs of name and
+        expression; ``balances``, triples of name, expression and rate. All are SymPy expressions in real symbols.
     checks : mapping
-        How it is known that each invariant is one: "by construction", "symbolically" or "numerically, at 8 points".
+        How each invariant was shown to be conserved: "by construction", "symbolically" or "numerically, at 8 points".
     pairs : tuple of (str, str)
-        Coordinates and their momenta, of a canonical system.
+        Coordinates and their momenta, if the system is canonical.
     """
 
     system: System
@@ -93,7 +93,7 @@ class SymbolicProblem(Problem):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name."""
+        """Return the values of the parameters by name."""
         values = [] if self.params is None else self.params.tolist()
         return dict(zip(self.system.parameters, values, strict=True))
 
@@ -103,7 +103,7 @@ class SymbolicProblem(Problem):
         Returns
         -------
         SymbolicProblem
-            With velocities named ``v_x`` for a coordinate ``x``, without start and interval.
+            A problem without start and interval. The velocity of a coordinate ``x`` is called ``v_x``.
 
         Raises
         ------
@@ -114,8 +114,8 @@ class SymbolicProblem(Problem):
         half, W = len(self.pairs), self._kinetic()
         if W is None:
             raise ValueError(
-                f"{self.name}: {_cut(rates)} is not q' = W p, p' = a(t, q) with a constant matrix W, as second order "
-                "needs."
+                f"{self.name}: second_order needs q' = W p, p' = a(t, q) with a constant matrix W, but the equations "
+                f"are {_cut(rates)}."
             )
         q, p = names[:half], [symbol(item) for item in names[half:]]
         new = as_names("the state", (*q, *(f"v_{item}" for item in q)))
@@ -135,11 +135,11 @@ class SymbolicProblem(Problem):
 
     @property
     def has_second_order(self) -> bool:
-        """True if `second_order` returns a problem."""
+        """Return True if `second_order` returns a problem."""
         return self._kinetic() is not None
 
     def _kinetic(self) -> Any:
-        """The matrix W of q' = W p, where it is constant and regular and p' does not depend on p; else None."""
+        """Return the matrix W of q' = W p if it is constant and regular and p' does not depend on p; else None."""
         names, rates, half = self.system.components, self.system.rates, len(self.pairs)
         p = [symbol(item) for item in names[half:]]
         if half == 0 or len(names) != 2 * half or any(rate.has(*p) for rate in rates[half:]):
@@ -169,7 +169,7 @@ class SymbolicProblem(Problem):
         return "\n".join(lines)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Functions are made again from the expressions where it is read."""
+        """Pickle the expressions only; the functions are made from them again."""
         functions = _functions(self.system)
         own = [fun for fun, *_ in (*functions.invariants, *functions.balances)]
         kept = [own.index(item.function) if item.function in own else item for item in self.invariants]
@@ -203,7 +203,10 @@ def hamiltonian_problem(
         raise ValueError(f"hamiltonian: H = {_cut(energy)} does not depend on {', '.join(names)}.")
     if perturbed.given:
         if extended:
-            raise ValueError("hamiltonian: extended=True keeps H + p_t, and a perturbation or dissipation changes it.")
+            raise ValueError(
+                "hamiltonian: extended=True keeps H + p_t, which a perturbation or dissipation changes; omit one of "
+                "the two."
+            )
         rates, slow = _with_perturbation(energy, names, rates, values, declared, perturbed, flow)
         return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, Further(invariants), pairs, slow)
     checks = {"H": "by construction"}
@@ -215,8 +218,8 @@ def hamiltonian_problem(
         checks = {"H + p_t": "by construction"}
     elif energy.has(time):
         warnings.warn(
-            "H depends on t: it is not an invariant, and is not kept. hamiltonian(..., extended=True) adds "
-            "p_t' = -dH/dt to the state and keeps H + p_t.",
+            "H depends on t, so that it is not an invariant, and the problem does not keep it. "
+            "hamiltonian(..., extended=True) adds p_t with p_t' = -dH/dt to the state and keeps H + p_t.",
             UserWarning,
             stacklevel=3,
         )
@@ -225,7 +228,7 @@ def hamiltonian_problem(
 
 
 class Further(NamedTuple):
-    """Expressions by name of invariants, and of constraints, which are 0."""
+    """Expressions, by name, of further invariants and of constraints, which are 0."""
 
     invariants: Any
     constraints: Any = None
@@ -240,11 +243,12 @@ class Perturbed(NamedTuple):
 
     @property
     def given(self) -> bool:
-        """Return whether there is any of it."""
+        """Return True if any of the arguments is given."""
         if self.perturbation is None and self.dissipation is None:
             if self.balances is not None:
                 raise TypeError(
-                    "hamiltonian: balances belong to a perturbation or dissipation; H alone is kept exactly."
+                    "hamiltonian: balances are given without a perturbation or dissipation. Integrals of H alone are "
+                    "invariants; give them as invariants=."
                 )
             return False
         return True
@@ -259,9 +263,11 @@ def _with_perturbation(
     perturbed: Perturbed,
     flow: Callable[[Any], tuple[Any, ...]],
 ) -> tuple[tuple[Any, ...], tuple[tuple[str, Any, Any], ...]]:
-    """Return all derivatives, and the balances: integrals of H, whose rates come from what is added to it."""
+    """Return the derivatives of the perturbed system, and its balances: integrals of H, with their rates."""
     if energy.has(symbol("t")):
-        raise ValueError("hamiltonian: H depends on t and is not an integral; move what depends on t to perturbation=.")
+        raise ValueError(
+            "hamiltonian: H depends on t, so that it is not an integral; move such terms to perturbation=."
+        )
     known = {*names, *values, "t"}
     added = [sympy.Integer(0)] * len(names)
     if perturbed.perturbation is not None:
@@ -282,7 +288,7 @@ def _with_perturbation(
     for label, item in ({"H": energy} if perturbed.balances is None else dict(perturbed.balances)).items():
         quantity = as_expression(f"balance {label!r}", item, declared | set(names))
         _require_known(f"balance {label!r}", quantity, known)
-        how_kept(label, quantity, variables, rates, parameters)  # by H alone
+        how_kept(label, quantity, variables, rates, parameters)  # checked without the perturbation
         rate = sympy.Add(*(sympy.diff(quantity, y) * f for y, f in zip(variables, added, strict=True)))
         slow.append((label, quantity, rate))
     return tuple(a + b for a, b in zip(rates, added, strict=True)), tuple(slow)
@@ -308,14 +314,14 @@ def _timed(given: Any, timed: Timed) -> Any:
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
-    """Return names, the derivatives q' = dH/dp, p' = -dH/dq as a function of H, and pairs."""
+    """Return the names, a function of H that returns q' = dH/dp and p' = -dH/dq, and the pairs of names."""
     if q is None and p is None:
         q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
     elif q is None or p is None:
-        raise TypeError("hamiltonian: give q and p, or neither; with poisson=, the state as q.")
+        raise TypeError("hamiltonian: expected both q and p, or neither; with poisson= give the whole state as q.")
     q, p = as_names("q", q), as_names("p", p)
     if len(q) != len(p) or not q:
-        raise ValueError(f"hamiltonian: {len(q)} coordinates ({', '.join(q)}) and {len(p)} momenta ({', '.join(p)}).")
+        raise ValueError(f"hamiltonian: {len(q)} coordinates ({', '.join(q)}) but {len(p)} momenta ({', '.join(p)}).")
     names = as_names("q and p", (*q, *p))
 
     def flow(H: Any) -> tuple[Any, ...]:
@@ -326,9 +332,9 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
 
 
 def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
-    """Return the same for y' = B(y) grad H; there are no pairs."""
+    """Return the output of `_canonical` for y' = B(y) grad H, without pairs."""
     if y is None or p is not None:
-        raise TypeError("hamiltonian: with poisson= the names of the state are given as q, and p is left out.")
+        raise TypeError("hamiltonian: with poisson= give the names of the whole state as q, and omit p.")
     names = as_names("q", y)
     rows = poisson.tolist() if hasattr(poisson, "tolist") else [list(row) for row in poisson]
     n = len(names)
@@ -358,7 +364,7 @@ def _checked(
     pairs: Any,
     slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
-    """The problem, once all names are known and further invariants are seen to be some."""
+    """Return the problem after a check of the names and of the further invariants."""
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
     for kind, items in given._asdict().items():
@@ -367,20 +373,20 @@ def _checked(
     further, constraints = given.invariants or {}, given.constraints or {}
     both = [item for item in names if item in values]
     if both:
-        raise ValueError(f"{both[0]} is a component of the state and a parameter.")
+        raise ValueError(f"{both[0]} is the name of a component of the state and of a parameter; rename one.")
     parameters = {symbol(item): value for item, value in values.items()}
     known = {*names, *values, "t"}
     for rate in rates:
         _require_known(what, rate, known)
     for label in constraints:
         if label in further:
-            raise ValueError(f"{label!r} is a constraint and an invariant; give it once.")
+            raise ValueError(f"{label!r} is a constraint and an invariant; give it as one of them.")
     quantities = {}
     for label, item in (*constraints.items(), *further.items()):
         if not isinstance(label, str):
             raise TypeError(f"invariants: names must be strings, got {shown(label)}.")
         if label in kept:
-            raise ValueError(f"invariants: {label} is there already.")
+            raise ValueError(f"invariants: {label} is an invariant already; choose another name or omit it.")
         kind = "constraint" if label in constraints else "invariant"
         quantities[label] = _quantity(f"{kind} {label!r}", item, names, known)
     zero = {label: quantities[label] for label in constraints}
@@ -407,7 +413,7 @@ def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> A
 def _how_kept(
     label: str, quantity: Any, names: Sequence[str], rates: Any, parameters: Any, manifold: Manifold | None, hint: str
 ) -> str:
-    """Say how it is known that a quantity is kept, where the constraints hold if there are any."""
+    """Return how it was shown that a quantity is conserved, if the constraints hold."""
     try:
         return how_kept(label, quantity, [symbol(item) for item in names], rates, parameters)
     except NotKeptError as error:
@@ -419,9 +425,9 @@ def _how_kept(
 def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> SymbolicProblem:
     functions = _functions(system)
     rhs = functions.rhs
-    unset: dict[str, Any] = {"y0": None, "t_span": None}  # a run is given them
+    unset: dict[str, Any] = {"y0": None, "t_span": None}  # these are arguments of a run
     unset["component_names"] = system.components
-    # A perturbation may be friction, with which a system is not canonical.
+    # A perturbed system may have friction, so that it does not count as canonical.
     unset["canonical"] = 2 * len(others.get("pairs", ())) == len(system.components) and not system.balances
     return SymbolicProblem(
         **(unset | others),
@@ -451,7 +457,7 @@ def _invariants(system: System, params: np.ndarray | None) -> tuple[Invariant, .
 
 @lru_cache(maxsize=64)
 def _functions(system: System) -> Functions:
-    """A system's functions: made, and compiled, once."""
+    """Return the compiled functions of a system."""
     arguments = Arguments(system.components, system.parameters)
     rhs = function("derivative", system.rates, arguments, in_place=True)
 
@@ -489,11 +495,11 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
 
 
 def _deferred_jacobian(system: System) -> Deferred | None:
-    """The Jacobian of the accelerations times a vector, which is written when it is asked for; None without one."""
+    """Return the product of the accelerations' Jacobian and a vector, made on demand; None if there is none."""
     found = system.accelerations
     if found is None or len(found) > LARGEST_JACOBIAN:
         return None
-    if any(a.has(sympy.sign, sympy.Heaviside) for a in found):  # of absolute values, and the larger of two
+    if any(a.has(sympy.sign, sympy.Heaviside) for a in found):  # derivatives of abs, max and min
         return None
     return Deferred(partial(_jacobian, system))
 
@@ -503,14 +509,14 @@ def _jacobian(system: System) -> Callable[..., None]:
     found = system.accelerations
     assert found is not None
     names = system.components[: len(found)]
-    along = [f"d {name}" for name in names]  # which is nobody's name
+    along = [f"d {name}" for name in names]  # no component can have such a name
     pairs = [(symbol(q), symbol(d)) for q, d in zip(names, along, strict=True)]
     rows = [sympy.Add(*(sympy.diff(a, q) * d for q, d in pairs)) for a in found]
     return function("Jacobian", rows, Arguments(names, system.parameters, along), in_place=True)
 
 
 def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
-    """Return the right-hand side with columns of derivatives, see `Problem`, which is written when it is asked for."""
+    """Return the right-hand side with columns of derivatives, see `Problem`; it is made on demand."""
     for k in parameters:
         if not 0 <= k < len(system.parameters):
             raise ValueError(
@@ -522,7 +528,7 @@ def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., N
 @lru_cache(maxsize=64)
 def _with_columns(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
     for name, rate in zip(system.components, system.rates, strict=True):
-        if jumps := rate.atoms(sympy.sign, sympy.Heaviside):  # of these alone: those of abs, max and min are continuous
+        if jumps := rate.atoms(sympy.sign, sympy.Heaviside):  # abs, max and min are continuous
             raise ValueError(
                 f"variational: the derivative of {name} contains {_cut(min(jumps, key=str))}, which jumps; at a jump "
                 "derivatives of the state do not follow from derivatives of the equations."
@@ -540,7 +546,7 @@ def _with_columns(system: System, parameters: tuple[int, ...]) -> Callable[..., 
 
 
 def parameter_values(params: Any) -> dict[str, float]:
-    """Finite values by name."""
+    """Return the values of parameters by name after checks: they must be finite numbers."""
     if params is None:
         return {}
     if not isinstance(params, Mapping):
@@ -557,8 +563,8 @@ def _require_known(what: str, expression: Any, known: set[str]) -> None:
     unknown = sorted({item.name for item in expression.free_symbols} - known)
     if unknown:
         raise ValueError(
-            f"{what} contains {unknown[0]}, which is neither a component of the state nor a parameter; give its value: "
-            f"params={{{unknown[0]!r}: ...}}. Known are {', '.join(sorted(known))}."
+            f"{what} contains {unknown[0]}, which is neither a component of the state nor a parameter. Give its value, "
+            f"params={{{unknown[0]!r}: ...}}. Known names are {', '.join(sorted(known))}."
         )
 
 

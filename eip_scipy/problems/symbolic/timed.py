@@ -14,10 +14,10 @@ __all__ = ["Timed"]
 
 
 class Timed:
-    """The components of a state and their derivatives, of which some may be functions of time.
+    """The components of a state and their derivatives; components may be functions of time.
 
     A derivative that is a component itself, such as x' in the state (x, x'), is called ``v_x``. Any other derivative of
-    a component stands for what it is equal to.
+    a component is replaced by its right-hand side.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Timed:
         elif keys is not None:
             given = [key.expr if _is_rate(key) and key.expr not in keys else key for key in keys]
         else:
-            raise TypeError("equations: y is missing; give the components' names, or f as a mapping of them.")
+            raise TypeError("equations: y is missing; give the names of the components, or f as a mapping by names.")
         self._speeds = {item: _speed(item) for item in given if isinstance(item, sympy.Derivative)}
         self.names = as_names("the keys of f" if y is None else "y", [self._speeds.get(item, item) for item in given])
         values = list(f.values()) if isinstance(f, Mapping) else _listed(f)
@@ -62,7 +62,7 @@ class Timed:
         self.values = [self(value) for value in values]
 
     def __call__(self, expression: Any) -> Any:
-        """Return an expression without derivatives of components; text and numbers as they are."""
+        """Replace derivatives of components in an expression; return text and numbers unchanged."""
         if not isinstance(expression, sympy.Expr):
             return expression
         expression = self._with_speeds(expression)
@@ -84,7 +84,7 @@ def _listed(given: Any) -> list[Any]:
 
 
 def _is_rate(key: Any) -> bool:
-    """Return whether a key is the derivative of a function of time."""
+    """Return True if a key is the derivative of a function of time."""
     return isinstance(key, sympy.Derivative) and key.variables == (TIME,)
 
 

@@ -1,4 +1,4 @@
-"""Functions of NumPy arrays as expressions: they are called once, with symbols in place of numbers."""
+"""Conversion of functions of NumPy arrays to expressions: they are called once with symbols in place of numbers."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .parser import symbol
 
 __all__ = ["NotTraceableError", "traced"]
 
-LIBRARIES = ("numpy", "scipy", "numba", "builtins")  # whose functions are called as they are
-MOST_OPERATIONS = 20_000  # of one expression, written out
+LIBRARIES = ("numpy", "scipy", "numba", "builtins")  # functions of these packages are not copied
+MOST_OPERATIONS = 20_000  # largest number of operations of one expression
 FUNCTIONS: dict[str, Any] = {
     **{name: getattr(sympy, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh")},
     **{f"arc{name}": getattr(sympy, f"a{name}") for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
@@ -27,11 +27,11 @@ FUNCTIONS: dict[str, Any] = {
 
 
 class NotTraceableError(TypeError):
-    """A function does something that has no expression, such as a branch by a value."""
+    """A function cannot be converted to an expression, because of a branch on a value for example."""
 
 
 class Number:
-    """An expression that computes as a number does, for functions of NumPy and of math."""
+    """Expression that can take the place of a number in functions of NumPy and of math."""
 
     __slots__ = ("expression", "size")
 
@@ -86,7 +86,7 @@ class Number:
         return self
 
     def arctan2(self, other: Any) -> Number:
-        """The angle of the point (other, self)."""
+        """Return the polar angle of the point (other, self)."""
         return self._with(other, sympy.atan2)
 
     def hypot(self, other: Any) -> Number:
@@ -127,7 +127,7 @@ def traced(what: str, fun: Any, *groups: Any) -> np.ndarray:
     Raises
     ------
     NotTraceableError
-        For a function whose value cannot be written as an expression of its arguments.
+        If the value of the function cannot be written as an expression of its arguments.
     """
     arguments = [
         Number(symbol(names)) if isinstance(names, str) else _array([Number(symbol(name)) for name in names])
@@ -139,7 +139,7 @@ def traced(what: str, fun: Any, *groups: Any) -> np.ndarray:
         flat = [_number(item).expression for item in found.ravel()]
     except MemoryError:
         raise
-    except Exception as error:  # whatever NumPy or a user's function raises for what is not a number
+    except Exception as error:  # NumPy and the user's function may raise any error
         raise NotTraceableError(f"{what}: {error}") from error
     return np.array([*flat, None], dtype=object)[:-1].reshape(found.shape)
 
@@ -151,7 +151,7 @@ def _array(items: Sequence[Any]) -> np.ndarray:
 
 
 class _NumPy(types.ModuleType):
-    """NumPy, whose new arrays hold any numbers."""
+    """NumPy with functions whose new arrays hold objects, such as `Number`."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(np, name)
@@ -183,7 +183,7 @@ for _name in dir(math):
 
 
 def _replaced(item: Any, known: dict[int, Any]) -> Any:
-    """Return what stands for a variable from outside a function: NumPy, math, and functions that use them."""
+    """Return the replacement of a global or closure variable: NumPy, math, and functions that use them."""
     if item is np:
         return NUMPY
     if item is math:

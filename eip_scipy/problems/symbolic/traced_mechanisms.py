@@ -1,4 +1,4 @@
-"""The parts of a mechanism from expressions of its functions."""
+"""Construction of the parts of a mechanism from functions that are converted to expressions."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from .traced import NotTraceableError, traced
 
 __all__ = ["traced_parts"]
 
-# At the start a traced function agrees with the function itself up to rounding errors; this bound is relative.
+# Relative bound for the difference between a traced function and the function itself at the start.
 AGREES = 1e-9
 
 
 def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
-    """Return the parts, see `mechanism`.
+    """Return the parts of a mechanism, see `mechanism`.
 
     Raises
     ------
     NotTraceableError
-        For a function that has no expression.
+        If a function cannot be converted to an expression.
     """
     by_name = {"t": ("t", t), "q": (names.coordinates, q), "u": (names.speeds, u)}
 
@@ -76,7 +76,7 @@ def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
 
 
 def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
-    """Return the outputs as expressions, none if one of them has no expression."""
+    """Return the outputs as expressions; an empty list if one of them cannot be converted."""
     symbols, numbers = zip(*(by_name[letter] for letter in "tqu"), strict=True)
     names = Names(by_name["q"][0], by_name["u"][0], (), ())
     found = []
@@ -91,7 +91,7 @@ def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
 
 
 def _require_agreement(what: str, found: Any, value: Any, names: Names, numbers: Any) -> None:
-    """Raise NotTraceableError if the expressions have other values at the start than the function."""
+    """Raise NotTraceableError if the expressions and the function have different values at the start."""
     t, q, u = numbers
     values = {symbol("t"): t, **{symbol(k): x for k, x in zip(names.state, (*q, *u), strict=True)}}
     wanted = np.asarray(value, float).ravel()
