@@ -209,7 +209,7 @@ def test_what_is_wrong_is_said():
     refused("mass matrix is singular", [1, 0], [0, -G], lambda t, q: [q[0] - 1])
     refused("mass has the shape", np.eye(3), [0, -G], length)
     refused("forces has the shape", [1, 1], [0, -G, 0], length)
-    refused("expected as many, or kinematics", [1], [0], None, u0=[0])
+    refused("Give as many speeds as coordinates, or kinematics", [1], [0], None, u0=[0])
     refused("jacobian differs from the derivatives", jacobian=lambda t, q: [[q[1], q[0]]])
     refused("gamma differs", gamma=lambda t, q, u: [-1.0])
     refused("constraints must be a function", [1, 1], [0, -G], [1.0], error=TypeError)
@@ -218,7 +218,7 @@ def test_what_is_wrong_is_said():
         return [q[0] - 1, q[0] - 1.5]
 
     refused("'g1': it is 0.25, expected 0. It contradicts 'g2'", [1, 1], [0, -G], contradicting, independent=[])
-    refused("depends on none of the components that are solved for", q0=[0.6, 0.7], independent=["q1", "q2"])
+    refused("does not depend on any component that is computed", q0=[0.6, 0.7], independent=["q1", "q2"])
     parallel = lambda t, q: [q[0] - 1, q[0] - 1 - t**2]  # noqa: E731
     refused('no accelerations meet the constraints "g1\'" and "g2\'"', [1, 1], [0, -G], parallel)
     skate = {"velocity_constraints": lambda t, q, u: [u[0] ** 2 - u[1]]}

@@ -1,4 +1,4 @@
-"""Mechanical systems from functions of arrays."""
+"""Problems of mechanical systems from functions of arrays."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from .start import Names
 
 __all__ = ["RANK_TOLERANCE", "mechanism"]
 
-# Gradients of constraints, each scaled to length 1, that are nearer than this to dependent ones lower the rank.
+# Distance within which gradients of constraints, each scaled to length 1, count as dependent.
 RANK_TOLERANCE = 1e-5
-# Rounding of functions that are linear in the speeds, as a share of their values.
+# Bound for the rounding of functions that are linear in the speeds, relative to their values.
 LINEAR = 1e-9
 
 
@@ -54,46 +54,47 @@ def mechanism(
     The state is (q, u), and the equations are ``q' = u``, ``M u' + G^T lambda = F``, ``G u' = -gamma``, where
     G u + ... = 0 are the constraints on velocities: the derivatives of those on positions, and those given by
     `velocity_constraints`. A run keeps all constraints, the norms of quaternions, the momenta of cyclic coordinates,
-    and the energy where it is constant or changes slowly.
+    and the energy if it is constant or changes slowly.
 
     Parameters
     ----------
     mass : array_like or callable
         The mass matrix M, (n, n) or its diagonal (n,), or ``mass(q)``.
     forces : array_like or callable
-        The generalised forces F, (n,), or ``forces(t, q, u)``, with all terms of the equations that are not M u'.
+        The generalised forces F, (n,), or ``forces(t, q, u)``: all terms of the equations except M u' and the forces
+        of the constraints.
     constraints : callable, optional
-        ``constraints(t, q)``, (m,), which is 0.
+        ``constraints(t, q)``, (m,), the expressions that the constraints on positions set to 0.
     q0, u0 : array_like or mapping
         Coordinates and speeds at the start, in order or by name. They must meet the constraints, see `independent`.
     t_span : tuple of float, optional
-        Start and end of the interval. Without one the start is at 0.
+        Start and end of the interval. If it is omitted, the start is at t = 0.
     velocity_constraints : callable, optional
-        ``velocity_constraints(t, q, u)``, (k,), which is 0 and linear in u: constraints that are not derivatives of
-        `constraints`, such as those of wheels that roll.
+        ``velocity_constraints(t, q, u)``, (k,), linear in u, the expressions that further constraints set to 0. These
+        are constraints that are not derivatives of `constraints`, such as those of rolling wheels.
     kinematics : callable, optional
-        ``kinematics(t, q, u)``, the derivatives q', linear in u, for speeds that are not q'.
+        ``kinematics(t, q, u)``, the derivatives q', linear in u. Default: q' = u.
     jacobian, gamma : callable, optional
         ``jacobian(t, q)``, the derivatives (m, n) of `constraints` by q, and ``gamma(t, q, u)``, (m + k,), the second
-        derivatives in time of `constraints` and the first of `velocity_constraints` for u' = 0. By default both are
-        computed; those that are given are compared with that at the start.
+        time derivatives of `constraints` and the first ones of `velocity_constraints` for u' = 0. By default both are
+        computed. Given ones are compared with computed ones at the start.
     energy : callable, optional
         ``energy(t, q, u)``, the total energy.
     potential : callable, optional
-        ``potential(t, q)``, for the energy u M u / 2 + potential. Without it and `energy`, the potential of
-        conservative forces is found by integration, where the functions can be written as expressions that allow it.
+        ``potential(t, q)``, for the energy u M u / 2 + potential. If neither `potential` nor `energy` is given, the
+        potential of conservative forces is found by integration, if the functions can be converted to expressions.
     power : callable, optional
-        ``power(t, q, u)``, the rate of the energy, which is then kept as a `Balance`. By default it is computed.
+        ``power(t, q, u)``, the rate of change of the energy, which then becomes a `Balance`. Default: it is computed.
     outputs : mapping, optional
-        Functions ``f(t, q, u)`` of quantities that are computed at saved states, by name; see ``run.outputs``.
+        Functions ``f(t, q, u)``, by name, of quantities that are computed at saved states; see ``run.outputs``.
     independent : iterable of str, optional
-        Names of the coordinates and speeds that stay as they are in `q0` and `u0`. All others are guesses, from which
-        the start is found. Default: all stay.
+        Names of the coordinates and speeds whose values in `q0` and `u0` are kept. All others are guesses, from which
+        the start is computed. Default: all values are kept.
     coordinates, speeds, constraint_names : optional
-        Names, ``"q1 q2"`` or a sequence of strings, those of `velocity_constraints` after those of `constraints`.
-        Default: q1, q2, ..., u1, u2, ..., g1, g2, ...
+        Names, as text such as ``"q1 q2"`` or a sequence of strings. The names of `velocity_constraints` follow those of
+        `constraints`. Default: q1, q2, ..., u1, u2, ..., g1, g2, ...
     rank_tolerance : float, optional
-        Gradients of constraints, each scaled to length 1, count as dependent within this distance.
+        Distance within which gradients of constraints, each scaled to length 1, count as dependent.
     name : str, optional
     **others
         Further attributes of the `Problem`, such as ``units``, ``h``, ``source`` and ``reference``.
@@ -110,10 +111,10 @@ def mechanism(
 
     Notes
     -----
-    With SymPy installed the functions are called once with symbols in place of numbers. Derivatives are then exact, and
-    all functions are compiled where Numba is installed. A function that cannot be called in this way, because it
-    branches by a value, for example, is called as it is, and derivatives are computed by complex steps or differences;
-    `repr` of the problem says so.
+    If SymPy is installed, the functions are called once with symbols in place of numbers. Derivatives are then exact,
+    and all functions are compiled if Numba is installed. If a function cannot be called in this way, for example
+    because it branches on a value, the functions are not converted, and derivatives are computed by complex steps or
+    differences; the repr of the problem has a note about it.
 
     Examples
     --------
@@ -149,7 +150,7 @@ def mechanism(
 
 
 def _as_functions(given: Given) -> Given:
-    """Return functions where arrays or lists were given, and functions that return arrays."""
+    """Replace arrays and lists by functions, and functions that return lists by functions that return arrays."""
     mass, forces = given.mass, given.forces
     if not callable(mass):
         M = real_array("mass", mass)
@@ -184,7 +185,7 @@ def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
 
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
-    """Return numbers for the first calls of functions."""
+    """Return the given numbers as an array, for the first calls of the functions; numbers that are missing are 0."""
     if isinstance(given, dict):
         if names is None:
             raise TypeError(f"{what}: a mapping needs names; give coordinates= and speeds=.")
@@ -208,7 +209,7 @@ def _names(coordinates: Any, speeds: Any, constraint_names: Any, sizes: Sequence
 
 
 def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> None:
-    """Raise ValueError if a function returns an array of another shape than is expected."""
+    """Raise ValueError if a function returns an array of the wrong shape."""
     n = u.size
 
     def require(what: str, found: Any, shape: tuple[int | str, ...]) -> None:
@@ -222,8 +223,8 @@ def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
 
     if given.kinematics is None and q.size != n:
         raise ValueError(
-            f"mechanism: q0 has {q.size} coordinates and u0 {n} speeds; expected as many, or kinematics=, which "
-            "gives q' from the speeds."
+            f"mechanism: q0 has {q.size} coordinates, but u0 has {n} speeds. Give as many speeds as coordinates, or "
+            "kinematics=, which computes q' from the speeds."
         )
     require("mass", given.mass(q), (n, n))
     require("forces", given.forces(t, q, u), (n,))
@@ -240,7 +241,7 @@ def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
         require("potential", given.potential(t, q), ())
     if given.jacobian is not None:
         if given.constraints is None:
-            raise TypeError("mechanism: jacobian belongs to constraints; give both.")
+            raise TypeError("mechanism: jacobian is given without constraints; give both, or omit jacobian.")
         require("jacobian", given.jacobian(t, q), (len(given.constraints(t, q)), q.size))
 
 
@@ -258,13 +259,13 @@ def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
         if not (wrong <= LINEAR * size.max(initial=0.0)).all():
             k = int(np.argmax(wrong))
             raise ValueError(
-                f"mechanism: {what} must be linear in the speeds, and component {k} of its value is not. Write it such "
-                "that the speeds have factors of t and q alone."
+                f"mechanism: {what} must be linear in the speeds, but component {k} of its value is not. Write it so "
+                "that the factors of the speeds depend on t and q only."
             )
 
 
 def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
-    """Return the functions from expressions if the given ones can be traced, else from the given ones."""
+    """Return the parts made from expressions if the given functions can be traced, otherwise from the functions."""
     if find_spec("sympy") is None:
         return numerical_parts(given, names, t, q, u, "SymPy is not installed")
     from ..symbolic.traced import NotTraceableError

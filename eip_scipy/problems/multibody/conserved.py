@@ -1,4 +1,4 @@
-"""Momenta of cyclic coordinates and norms of quaternions, which a mechanical system keeps."""
+"""Momenta of cyclic coordinates and norms of quaternions, which a mechanical system conserves."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from .start import Names
 
 __all__ = ["momenta_of", "norms_of"]
 
-# Rounding of a rate, as a share of the gradient times the largest derivative.
+# Bound for the rounding of a rate, relative to the gradient times the largest derivative.
 ROUNDING = 1e-12
-# A gradient that is less than this share away from those of other invariants depends on them.
+# A gradient depends on those of other invariants if its distance from their span is below this share of its length.
 DEPENDENT = 1e-6
 
 
@@ -29,13 +29,13 @@ def momenta_of(
     states: Sequence[tuple],
     params: np.ndarray | None,
 ) -> tuple[Invariant, ...]:
-    """Return the candidates that are constant, and that do not follow from the invariants that are `kept` anyway.
+    """Return the candidates that are constant and independent of the invariants in `kept`.
 
     Parameters
     ----------
     candidates : sequence of Energy
     kept : sequence of Invariant
-        With functions that are not compiled.
+        Invariants whose functions are not compiled.
     derivative : callable
         ``derivative(t, y)``.
     states : sequence of (float, ndarray)
@@ -63,10 +63,10 @@ def momenta_of(
 def norms_of(
     parts: Parts, names: Names, kept: Sequence[Invariant], states: Sequence[tuple], params: np.ndarray | None
 ) -> tuple[Invariant, ...]:
-    """Return the sums of squares of coordinates that the kinematics keep.
+    """Return the sums of squares of coordinates that are constant because of the kinematics.
 
-    These are sets with sum of q q' = 0 for all speeds, such as the components of a quaternion, whose norm does not
-    follow from the invariants that are `kept` anyway.
+    These are sets of coordinates whose sum of q q' is 0 for all speeds, such as the components of a quaternion. Sums
+    that depend on the invariants in `kept` are left out.
     """
     t, y = states[-1]
     if _speeds_are_rates(parts, names, t, y, params):
@@ -81,7 +81,7 @@ def norms_of(
 
 
 def _rows(items: Sequence[Invariant], t: float, y: np.ndarray) -> np.ndarray:
-    """Return the gradients of invariants, one below the other."""
+    """Return the gradients of invariants as rows."""
     found = [np.zeros((0, y.size))]
     for item in items:
         out = np.empty((item.size, y.size) if item.size else y.size)
@@ -97,7 +97,7 @@ def _slope(gradient: Callable[..., None], t: float, y: np.ndarray, args: tuple[A
 
 
 def _is_independent(gradient: np.ndarray, rows: np.ndarray) -> bool:
-    """Return whether a gradient is not a combination of others."""
+    """Return True if a gradient is not a linear combination of `rows`."""
     sizes = np.linalg.norm(rows, axis=1)
     rows = rows[sizes > 0] / sizes[sizes > 0, None]
     _, values, directions = np.linalg.svd(rows, full_matrices=False)
@@ -121,14 +121,14 @@ def _speeds_are_rates(parts: Parts, names: Names, t: float, y: np.ndarray, param
 
 
 def _products(parts: Parts, names: Names, t: float, y: np.ndarray, params: np.ndarray | None) -> list[np.ndarray]:
-    """Return q q' of each coordinate, for speeds of 0 and for each speed alone."""
+    """Return q q' of each coordinate, at zero speed and with each speed alone."""
     nq, n = len(names.coordinates), len(names.speeds)
     speeds = np.vstack([np.zeros(n), np.eye(n)])
     return [y[:nq] * _rates(parts, names, t, np.append(y[:nq], u), params) for u in speeds]
 
 
 def _sets(products: np.ndarray) -> list[tuple[int, ...]]:
-    """Return the sets of columns, two at least, whose sum is 0 in each row."""
+    """Return the sets of at least two columns whose sum is 0 in each row."""
     if not np.isfinite(products).all():
         return []
     size = np.abs(products).max(initial=0.0)

@@ -1,4 +1,4 @@
-"""The search for an energy that a mechanical system keeps, at states that meet its constraints."""
+"""Search for an energy that a mechanical system conserves, at states that meet its constraints."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .start import nearest_start
 
 __all__ = ["CONSTANT", "FEWEST", "Energy", "energy_of", "rates_of", "states_near", "typical_speed"]
 
-# States next to the start at which rates are examined, and how far they are away, in units of the components' sizes.
+# Number of states near the start at which rates are examined, and their distance in units of the components' sizes.
 STATES, AWAY = 6, 0.2
-NEARER = (1.0, 0.3, 0.1)  # shares of that distance, of which the first is taken that gives a state
-# A quantity is examined at this number of states at least.
+NEARER = (1.0, 0.3, 0.1)  # factors of the distance; the first one that leads to a state is used
+# Smallest number of states at which a quantity is examined.
 FEWEST = 3
 # An energy is constant if its rate is below this share of the rate's terms.
 CONSTANT = 1e-9
-# A power that is given differs from the rate of its energy by at most this share of the rate's terms.
+# Largest difference between a given power and the rate of its energy, relative to the terms of the rate.
 RIGHT = 1e-6
 
 
@@ -44,12 +44,13 @@ def energy_of(
 ) -> tuple[Invariant | None, str]:
     """Return the energy as an invariant, as a balance, or None, and a description.
 
-    It is the first of the candidates that is constant, else the one of the lowest rate, if that is slow.
+    The energy is the first candidate that is constant, otherwise the candidate that changes most slowly, if its rate is
+    small enough for a balance.
 
     Raises
     ------
     ValueError
-        If a power that is given is not the rate of its energy.
+        If a given power is not the rate of its energy.
 
     Parameters
     ----------
@@ -62,13 +63,13 @@ def energy_of(
     """
     args = () if params is None else (params,)
     if candidates and len(states) < FEWEST:
-        return None, "not kept: too few states were found next to the start that meet the constraints, to examine it"
+        return None, "not kept: it was not examined, because too few states near the start meet the constraints"
     slowest, least = None, np.inf
     for item in candidates:
         rates, terms = rates_of(item, derivative, states, args)
         _require_power(item, rates, terms, states, args)
         rates = np.abs(rates)
-        # Terms may vanish at one state, as in a steady motion, where rates are rounding.
+        # All states are used together, because at one state the terms may vanish, as in a steady motion.
         if rates.max() <= CONSTANT * terms.max() and terms.max() > 0 and item.power is None:
             kept = Invariant(item.value, item.gradient, args=args, in_place=True, name="energy")
             return kept, f"invariant, {item.description}"
@@ -88,7 +89,7 @@ def energy_of(
 def _require_power(
     item: Energy, rates: np.ndarray, terms: np.ndarray, states: Sequence[tuple], args: tuple[Any, ...]
 ) -> None:
-    """Raise ValueError if the power that is given for an energy is not its rate."""
+    """Raise ValueError if the power given for an energy is not its rate of change."""
     if item.power is None:
         return
     given = np.array([float(plain(item.power)(t, y, *args)) for t, y in states])
@@ -96,9 +97,9 @@ def _require_power(
     k = int(np.argmax(wrong / np.maximum(terms, np.finfo(float).tiny)))
     if not wrong[k] <= RIGHT * max(terms[k], np.abs(given[k])):
         raise ValueError(
-            f"power is {given[k]:.6g} at a state next to the start that meets the constraints, where the energy "
-            f"({item.description}) changes at the rate {rates[k]:.6g}. Correct power or the energy, or omit power to "
-            "have it computed."
+            f"power is {given[k]:.6g} at a state near the start that meets the constraints, but the energy "
+            f"({item.description}) changes at the rate {rates[k]:.6g} there. Correct power or the energy, or omit "
+            "power to have it computed."
         )
 
 
@@ -110,9 +111,9 @@ def states_near(
     coordinates: int,
     t_end: float | None = None,
 ) -> list[tuple[float, np.ndarray]]:
-    """Return the start and states next to it, at typical speeds and other times, that meet the constraints.
+    """Return the start and states near it that meet the constraints, at typical speeds and at other times.
 
-    The times are between t and `t_end`, and not beyond the time in which the coordinates change by their size.
+    The times lie between t and `t_end`, and within the time in which the coordinates change by half their size.
     """
     rng = np.random.default_rng(20391)
     half = np.abs(y[:coordinates]).max(initial=0.0) or 1.0
@@ -130,7 +131,7 @@ def states_near(
         origin = _nearest(y, constraints, time, sizes)
         for share in NEARER:
             moved = _nearest(origin + share * sizes * direction, constraints, time, sizes)
-            # The nearest state is not farther away than the start; Newton's method may end beyond a singular position.
+            # Newton's method may end beyond a singular position. Such a state is farther away and is not used.
             near = np.linalg.norm((moved - origin) / sizes) <= 2 * share * np.linalg.norm(direction) * (1 + CONSTANT)
             meets = all(_meets(item, time, moved) for item in constraints)
             if near and meets and np.isfinite(derivative(time, moved)).all():
@@ -146,7 +147,7 @@ def _nearest(y: np.ndarray, constraints: Sequence[Invariant], t: float, sizes: n
 
 
 def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> float:
-    """Return the largest speed, or the one that is reached from rest over the size of the coordinates."""
+    """Return the largest speed, or the speed reached from rest over a distance of the coordinates' size if larger."""
     size = np.abs(q).max(initial=0.0) or 1.0
     return float(max(np.abs(u).max(initial=0.0), np.sqrt(size * np.abs(accelerations).max(initial=0.0))))
 
@@ -158,7 +159,7 @@ def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
 def rates_of(
     item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates of an energy and the sums of the sizes of their terms, at all states."""
+    """Return the rates of an energy at all states, and the sums of the absolute values of their terms."""
     rates, terms = np.zeros(len(states)), np.zeros(len(states))
     for k, (t, y) in enumerate(states):
         gradient = np.empty(y.size)

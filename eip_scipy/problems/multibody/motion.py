@@ -1,4 +1,4 @@
-"""The right-hand side of a constrained system, from a function that evaluates its matrices."""
+"""Right-hand side of a constrained system, from a function that evaluates its matrices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Sizes(NamedTuple):
 
     @property
     def matrices(self) -> int:
-        """Number of values that the matrices M, F, G and gamma have together."""
+        """Return the total number of entries of M, F, G and gamma."""
         n, m = self.speeds, self.constraints
         return n * n + n + m * n + m
 
@@ -46,8 +46,8 @@ class Motion(NamedTuple):
     rhs : callable
         ``rhs(t, y, out, *params)`` fills `out` with (q', u').
     solved : callable
-        ``solved(t, y, rates, accelerations, multipliers, *params)`` fills the arrays, the first coordinates of `rates`
-        with q', and returns the rank of the constraints, NOT_FINITE where a matrix is not finite.
+        ``solved(t, y, rates, accelerations, multipliers, *params)`` fills the arrays; the first entries of `rates` are
+        q'. It returns the rank of the constraints, or NOT_FINITE if a matrix is not finite.
     """
 
     rhs: Callable[..., None]
@@ -55,7 +55,7 @@ class Motion(NamedTuple):
 
 
 def plain(function: Any) -> Callable[..., Any]:
-    """Return a function as Python calls it: for a few calls, before a run, Numba need not compile it."""
+    """Return the Python function of a jitted one, because compilation does not pay for a few calls before a run."""
     return function.py_func if is_jitted(function) else function
 
 
@@ -69,7 +69,7 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
         ``fill(t, y, out, *params)`` fills `out` with M (by rows), F, G (by rows), gamma and q', one after the other.
     sizes : Sizes
     tolerance : float
-        Gradients of constraints that are dependent within this distance, each scaled to length 1, lower the rank.
+        Distance within which gradients of constraints, each scaled to length 1, count as dependent.
     """
     nq, n, m = sizes
     matrices = sizes.matrices
@@ -99,7 +99,7 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
 
 @lru_cache(maxsize=64)
 def vector(fill: Callable[..., None], size: int) -> Callable[..., np.ndarray]:
-    """Return a function of ``(t, y, *params)`` that returns the array of this size that `fill` fills."""
+    """Return a function of ``(t, y, *params)`` that returns a new array of length `size`, filled by `fill`."""
 
     def value(t, y, *params):
         out = np.empty(size)

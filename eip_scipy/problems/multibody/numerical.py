@@ -1,4 +1,4 @@
-"""The parts of a mechanism from functions that are called as they are, with numerical derivatives."""
+"""Construction of the parts of a mechanism from functions of numbers, with numerical derivatives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = np.ndarray
 
 
 def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
-    """Return the parts, see `mechanism`; `why` the functions are not written as expressions."""
+    """Return the parts of a mechanism, see `mechanism`; `why` is the reason why there are no expressions."""
     found = _Constraints(given, names, t, q)
     nq = q.size
 
@@ -59,7 +59,7 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
 
 
 def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
-    """Return outputs whose functions are called as they are."""
+    """Return outputs that call the functions of the user."""
     functions = tuple(given.outputs.values())
 
     def fill(t: float, x: Array, out: Array) -> None:
@@ -76,7 +76,7 @@ def _energy(given: Given) -> Callable[..., Any] | None:
 
 
 def _sizes(y: Array) -> Array:
-    """Return sizes of components, in units of which differences are taken."""
+    """Return the sizes of components, which are the units for steps of differences."""
     return np.where(y != 0, np.abs(y), np.abs(y).max(initial=0.0) or 1.0)
 
 
@@ -86,7 +86,7 @@ class _Constraints:
     def __init__(self, given: Given, names: Names, t: float, q: Array) -> None:
         self.given = given
         self._positions, self._rows, self._speeds = len(names.positions), len(names.velocities), len(names.speeds)
-        # Derivatives by q and t at once.
+        # The function of (q, t) gives the derivatives by q and by t together.
         constraints = given.constraints
         joint = np.append(q, t)
         self._slopes = None
@@ -100,7 +100,7 @@ class _Constraints:
         return u if self.given.kinematics is None else np.asarray(self.given.kinematics(t, q, u))
 
     def positions(self, t: float, q: Array) -> Array:
-        """Return the constraints on positions."""
+        """Return the values of the constraints on positions."""
         return np.zeros(0) if self.given.constraints is None else np.asarray(self.given.constraints(t, q), float)
 
     def jacobian(self, t: float, q: Array) -> tuple[Array, Array]:
@@ -112,18 +112,18 @@ class _Constraints:
         return own, slopes[:, -1]
 
     def velocities(self, t: float, q: Array, u: Array) -> Array:
-        """Return the constraints on velocities."""
+        """Return the values of the constraints on velocities."""
         J, explicit = self.jacobian(t, q)
         others = self.given.velocity_constraints
         own = [] if others is None else [np.asarray(others(t, q, u), float)]
         return np.concatenate([J @ self.rates(t, q, u) + explicit, *own])
 
     def values(self, t: float, q: Array, u: Array) -> Array:
-        """Return all constraints."""
+        """Return the values of all constraints."""
         return np.concatenate([self.positions(t, q), self.velocities(t, q, u)])
 
     def speed_gradient(self, t: float, q: Array, u: Array) -> Array:
-        """Return G: the constraints on velocities are linear in the speeds."""
+        """Return G, the derivatives of the constraints on velocities by the speeds."""
         n, others = u.size, self.given.velocity_constraints
         J, _ = self.jacobian(t, q)
         speeds = np.eye(n)
@@ -136,7 +136,7 @@ class _Constraints:
         return G if others is None else np.concatenate([G, linear(others)])
 
     def gamma(self, t: float, q: Array, u: Array) -> Array:
-        """Return the derivatives of the constraints on velocities in time for u' = 0."""
+        """Return the time derivatives of the constraints on velocities for u' = 0."""
         if self.given.gamma is not None:
             return np.asarray(self.given.gamma(t, q, u), float)
         if self._rows == 0:

@@ -1,4 +1,4 @@
-"""Quantities of a mechanical system that a user names, computed from its states."""
+"""Outputs: quantities of a mechanical system that the user defines, computed from its states."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ __all__ = ["Outputs", "columns_of", "required_outputs"]
 
 
 class Outputs(NamedTuple):
-    """Quantities that a user names, and ``fill(t, x, out, *params)``, which computes them from x = (q, u, u')."""
+    """Names of outputs, and ``fill(t, x, out, *params)``, which computes them from x = (q, u, u')."""
 
     names: tuple[str, ...]
     fill: Callable[..., None]
 
 
 def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and states as columns.
+    """Return the times as an array and the states as columns.
 
     Raises
     ------
     ValueError
-        If they do not belong together.
+        If the numbers of times and states differ, or the states do not have n components.
     """
     times, states = np.atleast_1d(np.asarray(t, float)), np.asarray(y, float)
     columns = states.reshape(len(states), -1)
@@ -43,7 +43,7 @@ def required_outputs(what: str, outputs: Any, taken: Any) -> dict[str, Any]:
     Raises
     ------
     TypeError, ValueError
-        If they are not a mapping of strings, or a name is that of a component of the state.
+        If `outputs` is not a mapping with strings as keys, or a key is the name of a component of the state.
     """
     if outputs is None:
         return {}

@@ -1,4 +1,4 @@
-"""The functions of a mechanism: those that are given, and those that a problem is made of."""
+"""Records of the functions of a mechanism: those of the user, and those that a problem is made of."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Given", "Parts"]
 
 
 class Given(NamedTuple):
-    """The functions of a mechanism as they were given, None where they were not."""
+    """The functions of a mechanism as the user gave them, or None."""
 
     mass: Any
     forces: Any
@@ -28,10 +28,10 @@ class Given(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Functions made of those that were given: see `motion` and `Energy`.
+    """The functions of which a problem is made, see `motion` and `Energy`.
 
-    ``values(t, y, out, *params)`` fills in the constraints on positions and velocities, and ``gradient`` their
-    derivatives (m, n) by the state.
+    ``values(t, y, out, *params)`` fills `out` with the constraints on positions and velocities, and ``gradient`` fills
+    it with their derivatives (m, n) by the state.
     """
 
     fill: Callable[..., None]
@@ -41,4 +41,4 @@ class Parts(NamedTuple):
     note: str = ""
     momenta: tuple[Energy, ...] = ()
     outputs: Outputs | None = None
-    origin: Any = None  # arguments of `parts_of` in symbolic/constrained.py, where the functions were made there
+    origin: Any = None  # arguments of `parts_of` in symbolic/constrained.py, if that made the functions

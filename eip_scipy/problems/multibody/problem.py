@@ -22,10 +22,10 @@ from .start import Names, name_of, started
 
 __all__ = ["MechanicsProblem", "mechanics_problem"]
 
-# Accelerations that leave more than this share of the terms of dependent constraints meet none of them.
+# Dependent constraints contradict each other if accelerations leave residuals above this share of their terms.
 CONTRADICTING = 1e-3
-# Speeds count as at least this share of a typical one where errors of constraints on velocities are compared with their
-# terms, which vanish at rest.
+# For the scale of constraints on velocities, speeds count as at least this share of a typical speed, because the terms
+# of these constraints vanish at rest.
 SLOW = 0.1
 
 
@@ -34,7 +34,7 @@ class MechanicsProblem(Problem):
     """A `Problem` of a mechanical system with constraints, whose state is (q, u).
 
     Its invariants are the constraints on positions and velocities, the norms of quaternions, the momenta of cyclic
-    coordinates, and the energy where it is known. They may be chosen apart:
+    coordinates, and the energy if it is known. To keep only some of them, pass these:
     ``integrate(problem, invariants=problem.constraints, ...)``.
 
     Attributes
@@ -42,24 +42,24 @@ class MechanicsProblem(Problem):
     names : Names
         Names of coordinates, speeds and constraints.
     constraints : tuple of Invariant
-        The constraints, with the target 0; empty for a system without any.
+        The constraints, with the target 0; empty for a system without constraints.
     norms : tuple of Invariant
-        Sums of squares of coordinates, such as the components of a quaternion, that the kinematics keep.
+        Sums of squares of coordinates that are constant because of the kinematics, such as the norm of a quaternion.
     momenta : tuple of Invariant
         Momenta of coordinates that neither the energy nor forces depend on.
     energy : Invariant, Balance or None
     energy_kept : str
-        How the energy is kept, or why it is not.
+        How a run keeps the energy, or why it does not.
     motion : Motion
         Functions of the motion.
     notes : tuple of str
-        What was done to the equations and to the start.
+        Descriptions of changes to the equations and to the start.
     parameter_names : tuple of str
     observer : Outputs, optional
         The functions of `outputs`.
     rank_tolerance : float
     origin : optional
-        What the functions were made of, if they can be made again.
+        The expressions from which the functions were made; None if they cannot be made again.
     """
 
     names: Names
@@ -77,26 +77,26 @@ class MechanicsProblem(Problem):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name."""
+        """Return the values of the parameters by name."""
         values = [] if self.params is None else self.params.tolist()
         return dict(zip(self.parameter_names, values, strict=True))
 
     @property
     def stiff_invariants(self) -> tuple[Any, ...]:
-        """The invariants that implicit methods keep by default: all but the energy."""
+        """Return the invariants that implicit methods keep by default: all except the energy."""
         return tuple(item for item in super().stiff_invariants if item is not self.energy)
 
     def multipliers(self, t: Any, y: Any, params: Any = None) -> Multipliers:
-        """Return Lagrange's multipliers at states of a run.
+        """Return the Lagrange multipliers at states of a run.
 
-        A result of `integrate` has those of its saved states, ``run.multipliers``.
+        For the saved states of a result of `integrate`, ``run.multipliers`` has them.
 
         Parameters
         ----------
         t : float or array_like, shape (k,)
-            Times, as a run's ``t``.
+            Times, such as ``run.t``.
         y : array_like, shape (n,) or (n, k)
-            States, as a run's ``y``.
+            States, such as ``run.y``.
         params : mapping or array_like, optional
             Parameters of the run. Default: those of the problem.
 
@@ -114,9 +114,9 @@ class MechanicsProblem(Problem):
         return Multipliers(self.names.velocities, found, ranks)
 
     def outputs(self, t: Any, y: Any, params: Any = None) -> dict[str, Any]:
-        """Return the outputs that the problem was given, at states of a run.
+        """Return the outputs of the problem at states of a run.
 
-        A result of `integrate` has those of its saved states, ``run.outputs``.
+        For the saved states of a result of `integrate`, ``run.outputs`` has them.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class MechanicsProblem(Problem):
         return found
 
     def _extra(self, params: Any) -> tuple[np.ndarray, ...]:
-        """Return the parameters as the last argument of functions, if there are any."""
+        """Return a tuple of the parameters, the last argument of functions; empty if there are none."""
         if params is None:
             params = self.params
         elif isinstance(params, Mapping):
@@ -160,7 +160,7 @@ class MechanicsProblem(Problem):
         return super()._named_parameters({name_of(name): value for name, value in given.items()})
 
     def motion_at(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the derivative (q', u') of one state, by functions that are not compiled."""
+        """Return the derivative (q', u') of one state, computed by functions that are not compiled."""
         out = np.empty(len(self.names.state))
         self.motion.rhs(t, np.ascontiguousarray(y, float), out, *self._extra(None))
         return out
@@ -180,16 +180,16 @@ class MechanicsProblem(Problem):
         Parameters
         ----------
         q0, u0 : array_like or mapping
-            Coordinates and speeds, in the order of ``names.coordinates`` and ``names.speeds`` or by name. Those that
-            are neither given nor independent begin at 0.
+            Coordinates and speeds, in the order of ``names.coordinates`` and ``names.speeds`` or by name. The guess for
+            those that are neither given nor independent is 0.
         params : mapping or array_like, optional
-            Parameters, by default those of the problem. Several values of a parameter, or rows of an array, are those
-            of the members of an ensemble.
+            Parameters, by default those of the problem. Several values of a parameter, or rows of an array, stand for
+            the members of an ensemble.
         t : float, optional
             The time. Default: the start of the problem's interval, or 0.
         independent : iterable of str, optional
-            Names of the coordinates and speeds that stay as they are given; all others are guesses, from which Newton's
-            method finds the nearest solution. Default: all stay.
+            Names of the coordinates and speeds whose given values are kept; all others are guesses, from which Newton's
+            method finds the nearest solution. Default: all values are kept.
 
         Returns
         -------
@@ -231,7 +231,7 @@ class MechanicsProblem(Problem):
         return f"{m} on velocities{rest}, {len(self.names.positions)} of them on positions too"
 
     def __reduce__(self) -> Any:
-        """Functions are made again from the expressions where it is read."""
+        """Pickle the expressions only, if there are any; the functions are made from them again."""
         if self.origin is None:
             return super().__reduce__()
         own = self._own_invariants
@@ -246,7 +246,7 @@ class MechanicsProblem(Problem):
         return (*self.constraints, *self.norms, *self.momenta, *([] if self.energy is None else [self.energy]))
 
 
-# Attributes that come from others.
+# Attributes that are computed from other attributes.
 REMADE = {
     "fun", "rhs", "y0", "t_span", "params", "invariants", "constraints", "norms", "momenta", "energy", "energy_kept",
     "motion", "names", "observer", "rank_tolerance", "origin",
@@ -281,7 +281,7 @@ def mechanics_problem(
     notes: tuple[str, ...] = (),
     **others: Any,
 ) -> MechanicsProblem:
-    """Return the problem of the functions `parts`, from the coordinates and speeds of `start`."""
+    """Return the problem with the functions `parts` and the coordinates and speeds `start`."""
     sizes = Sizes(len(names.coordinates), len(names.speeds), len(names.velocities))
     functions = motion(parts.fill, sizes, tolerance)
     once = motion(plain(parts.fill), sizes, tolerance)
@@ -327,7 +327,7 @@ def mechanics_problem(
 def _require_accelerations(
     what: str, parts: Parts, functions: Motion, names: Names, t: float, y: np.ndarray, params: np.ndarray | None
 ) -> None:
-    """Raise ValueError if no acceleration meets all constraints at the start, some of which depend on each other."""
+    """Raise ValueError if constraints depend on each other at the start and no acceleration meets all of them."""
     nq, n, m = len(names.coordinates), len(names.speeds), len(names.velocities)
     sizes, extra = Sizes(nq, n, m), () if params is None else (params,)
     rates, accelerations, matrices = np.empty(nq), np.empty(n), np.empty(sizes.matrices + nq)
@@ -341,7 +341,7 @@ def _require_accelerations(
         one, two = sorted(names.velocities[k] for k in np.argsort(-np.abs(left))[:2])
         raise ValueError(
             f"{what}: no accelerations meet the constraints {one!r} and {two!r} at the start, where their gradients "
-            f"depend on each other: {np.abs(left).max():.3g} remains, expected 0. Leave out a constraint that "
+            f"depend on each other: {np.abs(left).max():.3g} remains, expected 0. Remove a constraint that "
             "contradicts others, or start with speeds that the mechanism can have at this singular position."
         )
 
@@ -349,7 +349,7 @@ def _require_accelerations(
 def _constraints_invariant(
     fill: Callable[..., None], gradient: Callable[..., None], names: Names, params: np.ndarray | None
 ) -> tuple[Invariant, ...]:
-    """Return the constraints as one invariant of several values, in a tuple that is empty without any."""
+    """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints."""
     size = len(names.positions) + len(names.velocities)
     if size == 0:
         return ()
@@ -370,7 +370,7 @@ def _at_speed(
     sizes: Sizes,
     args: tuple[Any, ...],
 ) -> Any:
-    """Return the sizes of the terms of constraints or of a momentum at a typical speed: at rest they have none."""
+    """Return the sizes of the terms of constraints or of a momentum at a typical speed, because they vanish at rest."""
     nq = sizes.coordinates
     speed = typical_speed(y[:nq], y[nq:], derivative(t, y)[nq:])
     slopes = np.empty((size or 1, y.size))

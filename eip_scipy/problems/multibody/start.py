@@ -1,4 +1,4 @@
-"""States that meet the constraints of a mechanical system."""
+"""Computation of start states that meet the constraints of a mechanical system."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ...engine.trust import ProjectionWarning
 
 __all__ = ["MET", "Names", "name_of", "nearest_start", "started"]
 
-# A constraint is met if it is violated by at most this share of its terms, as given targets are.
+# A constraint is met if its residual is at most this share of its terms; the same bound holds for given targets.
 MET = 1e-8
 NEWTON_STEPS = 40
-# Gradients of which a combination is below this share of them depend on each other.
+# Gradients depend on each other if a combination of them is below this share of the gradients.
 DEPENDENT = 1e-6
-# A component that is solved for is reported if it differs from its guess by this share of its size.
+# A computed component is reported if it differs from its guess by this share of its size.
 SEEN = 1e-8
 
 
@@ -36,12 +36,12 @@ class Names(NamedTuple):
 
     @property
     def state(self) -> tuple[str, ...]:
-        """Names of all components."""
+        """Return the names of all components."""
         return (*self.coordinates, *self.speeds)
 
 
 def name_of(key: Any) -> str:
-    """Return the name that a string, or a symbol or function of SymPy, stands for."""
+    """Return the name of a component from a string, or from a symbol or function of SymPy."""
     if isinstance(key, str):
         return key
     from ..symbolic.models import name_of as of_symbol
@@ -59,7 +59,7 @@ def started(
     t: float,
     independent: Iterable[str] | None,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return a state that meets the constraints, and notes of what was solved for; see `MechanicsProblem.start`."""
+    """Return a state that meets the constraints, and notes on computed components; see `MechanicsProblem.start`."""
     held = _independent(names, independent)
     y = np.concatenate(
         [
@@ -87,14 +87,14 @@ def started(
 
 
 def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
-    """Return the names of components that stay as they are."""
+    """Return the names of the components whose given values are kept."""
     if independent is None:
         return set(names.state)
     found = {name_of(name) for name in ([independent] if isinstance(independent, str) else independent)}
     for name in sorted(found - set(names.state)):
         hint = nearest(name, names.state)
         raise ValueError(
-            f"independent: {name!r} is not a component of the state{hint}; it is {', '.join(names.state)}."
+            f"independent: {name!r} is not a component of the state{hint}; expected names of {', '.join(names.state)}."
         )
     return found
 
@@ -108,7 +108,7 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
                 raise ValueError(f"{what}: there is no {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
         missing = [name for name in names if name in held and name not in by_name]
         if missing:
-            raise ValueError(f"{what}: {missing[0]} is missing; give its value, or leave it out of independent=.")
+            raise ValueError(f"{what}: {missing[0]} is missing; give its value, or omit it from independent=.")
         given = [by_name.get(name, 0.0) for name in names]
     values = np.atleast_1d(real_array(what, given)).astype(float)
     if values.shape != (len(names),):
@@ -117,17 +117,17 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
 
 
 def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return the state that Newton's method finds from y, which moves in units of `sigma`; y where it fails."""
+    """Return the state that Newton's method finds from y, with components in units of `sigma`; y if it fails."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ProjectionWarning)  # what is left is looked at by `_violation`
+            warnings.simplefilter("ignore", ProjectionWarning)  # the remaining residuals are examined by `_violation`
             return project(y, item, t=t, sigma=sigma, iterations=NEWTON_STEPS).y
     except ValueError:
         return y
 
 
 def _downhill(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return a state with least residuals, for guesses from which Newton's method fails."""
+    """Return the state with the smallest residuals, for guesses from which Newton's method fails."""
     free = sigma > 0
 
     def whole(x: np.ndarray) -> np.ndarray:
@@ -149,10 +149,10 @@ def _gradient(item: Invariant, t: float, y: np.ndarray) -> np.ndarray:
 
 
 def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, float]:
-    """Return the constraint that is violated most, its value, and its share of the constraint's terms."""
+    """Return the index of the constraint that is violated most, its value, and its value relative to its terms."""
     values = np.asarray(item.fun(t, y), float)
     gradient = np.abs(_gradient(item, t, y))
-    # The terms of a constraint, or what it changes by while a component changes by 1.
+    # The size of a constraint is that of its terms, or its change while a component changes by 1.
     size = np.maximum(gradient @ np.abs(y), gradient.max(axis=1))
     share = np.abs(values) / np.where(size > 0, size, 1.0)
     worst = int(np.argmax(share))
@@ -167,8 +167,8 @@ def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.
     name = item.value_names[worst]
     if not sigma.any():
         raise ValueError(
-            f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. Name the "
-            "components that are to stay by independent=, and the others are solved for."
+            f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. List the "
+            "components whose values are to be kept in independent=; the others are then computed."
         )
     raise ValueError(
         f"{what}: no start was found that meets the constraint {name!r}: it is {residual:.3g}, expected 0. "
@@ -177,17 +177,17 @@ def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.
 
 
 def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
-    """Return why a constraint is not met, from the derivatives of all by the components that are solved for."""
+    """Return why a constraint is not met; `gradient` has the derivatives by the components that are computed."""
     sizes = np.linalg.norm(gradient, axis=1)
     if sizes[worst] <= DEPENDENT * sizes.max():
-        return "It depends on none of the components that are solved for; name fewer as independent=."
+        return "It does not depend on any component that is computed; list fewer components in independent=."
     unit = gradient[sizes > 0] / sizes[sizes > 0, None]
     found = np.linalg.svd(unit, compute_uv=False)
     left = np.abs(values) / np.where(sizes > 0, sizes, np.inf)
     others = [repr(item.value_names[k]) for k in np.flatnonzero(left > SEEN * left[worst]) if k != worst]
     if others and (found > DEPENDENT * found.max()).sum() < len(unit):
         return (
-            f"It contradicts {', '.join(others)}, on whose gradients its own depends there. Leave one out, name fewer "
-            "components as independent=, or give a guess that is nearer to a solution."
+            f"It contradicts {', '.join(others)}, because their gradients depend on each other there. Remove one of "
+            "them, list fewer components in independent=, or give a guess that is nearer to a solution."
         )
-    return "Name fewer components as independent=, or give a guess that is nearer to a solution."
+    return "List fewer components in independent=, or give a guess that is nearer to a solution."
