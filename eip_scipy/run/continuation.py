@@ -24,7 +24,7 @@ FIXED = ("fun", "acceleration", "t_span", "y0", "invariants")
 
 
 def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> IntegrationResult:
-    """See `IntegrationResult.continue_to`."""
+    """Continue a run to the time t, see `IntegrationResult.continue_to`."""
     origin: Origin | None = vars(result).get("_origin")
     if origin is None:
         raise ValueError(
@@ -46,7 +46,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     if options.get("t_eval") is not None:
         asked["save_every"] = None
     if "params" in options:
-        result._observe()  # with those of the first run
+        result._observe()  # outputs and multipliers are computed with the parameters of the first run
     try:
         more = integrate(**(asked | {"t_span": (origin.t, t), "y0": origin.y} | options))
     except BaseException as error:
@@ -86,7 +86,7 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
 
 
 def _observed(one: IntegrationResult, two: IntegrationResult, new: slice) -> dict[str, Any]:
-    """Return the fields of both runs that are computed when they are asked for."""
+    """Return the combined outputs and multipliers, which are computed on demand."""
     two._observe()
     found: dict[str, Any] = {}
     if "outputs" in one:

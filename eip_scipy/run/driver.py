@@ -22,7 +22,7 @@ from .memory import most_bytes
 
 __all__ = ["Driver", "check_memory", "saved_rows"]
 
-# Rows and bytes allocated at the start of a run whose number of steps is unknown; the buffers grow.
+# Rows and bytes allocated at the start of a run whose number of steps is unknown; the buffers grow later.
 FIRST_ROWS, FIRST_BYTES = 1024, 2**24
 
 
@@ -155,7 +155,7 @@ class Driver:
         }
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Return copies of these buffers after the last accepted step, updated as the loop does it."""
+        """Return copies of the buffers of `parts` after the last accepted step, updated in the way of the loop."""
         copies = {name: part.copy() for name, part in self.parts().items()}
         if self.schedule.place[PENDING] == 1:
             copies["place"][PENDING] = 0

@@ -18,7 +18,7 @@ __all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
 
 
 def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[..., Any]]) -> tuple[Any, ...]:
-    """Return other functions for the same events, with the counts of these."""
+    """Return the functions `others` for the same events, with the counts of the events so far."""
     return ContinuedEvents(others, events.happened) if isinstance(events, ContinuedEvents) else tuple(others)
 
 
@@ -88,7 +88,7 @@ class Events:
         return list(zip(self.directions.tolist(), self._allowed, strict=True))
 
     def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
-        """Let event `k` have happened in this run at the times `t` (m,) in the states `y` (m, n)."""
+        """Record that event `k` has happened in this run at the times `t` (m,) in the states `y` (m, n)."""
         self.t[k], self.y[k], self._counts[k] = t.tolist(), list(y), self._before[k] + t.size
 
     @property

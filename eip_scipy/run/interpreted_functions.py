@@ -1,4 +1,4 @@
-"""A user's functions as the loop calls them: in place, their values looked at, or compiled."""
+"""Right-hand sides in the form that the interpreted loop calls: in place, with checks of their values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..engine.native import LibraryFunction
 
 __all__ = ["FORMS", "INTERPRETED"]
 
-FORMS = {  # (given as an acceleration, in place) -> what a user's function is
+FORMS = {  # (given as an acceleration, in place) -> name of the form of the user's function
     (False, False): "value",
     (False, True): "in place",
     (True, False): "acceleration",
@@ -25,7 +25,7 @@ FORMS = {  # (given as an acceleration, in place) -> what a user's function is
 
 
 def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun") -> Callable[..., None]:
-    """The user's right-hand side as Python calls it, its values checked."""
+    """Return an in-place right-hand side that calls a function of the user and checks its value."""
     n, dtype, shape = y0.size, y0.dtype, y0.shape
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
@@ -39,7 +39,10 @@ def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, na
 def _interpreted_in_place(
     fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun"
 ) -> Callable[..., None]:
-    """The user's right-hand side in place, looked at in its first call; NaN in `out` then shows what it leaves out."""
+    """Return an in-place right-hand side that checks the user's in-place function in its first call.
+
+    `out` is filled with NaN before that call, so that components that the function does not fill are detected.
+    """
     first = not isinstance(fun, LibraryFunction)
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
@@ -57,7 +60,7 @@ def _interpreted_in_place(
 def _second_order(
     interpreted: Callable[..., Callable[..., None]], fun: Callable[..., Any], extra: tuple, y0: np.ndarray
 ) -> Callable[..., None]:
-    """Return the right-hand side of (q, v) from its acceleration."""
+    """Return the in-place right-hand side of (q, v) from the acceleration `fun`."""
     check_halves(y0.size)
     half = y0.size // 2
     acc = interpreted(fun, extra, y0[:half], "acceleration")

@@ -18,7 +18,7 @@ class TerminatedError(KeyboardInterrupt):
     """Exception raised by SIGTERM while a checkpoint must be written; it is handled as Ctrl-C is."""
 
 
-# Seconds after which a Ctrl-C is repeated that came where Python would drop it.
+# A Ctrl-C that Python would drop is repeated after this number of seconds.
 AGAIN = 0.02
 
 

@@ -9,7 +9,7 @@ from ..core.inputs import is_number, refuse_units, shown
 
 __all__ = ["check_bytes", "most_bytes"]
 
-SMALL = 2**22  # bytes; for fewer bytes the free memory is not determined, because that takes longer than filling them
+SMALL = 2**22  # number of bytes up to which the free memory is not determined, because that takes longer than a fill
 
 
 def check_bytes(max_bytes: Any) -> None:

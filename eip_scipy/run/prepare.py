@@ -39,11 +39,11 @@ from .resume import plain, settings
 
 __all__ = ["DEFAULT", "Prepared", "Request", "default_method", "prepared", "started_at"]
 
-CALLED = "fun", "It takes (t, y), out with in_place=True, and what the run has of params=... or args=(...)."
+CALLED = "fun", "It takes (t, y), then out if in_place=True, then the params or args of the run if there are any."
 CALLED_ACCELERATION = (
     "acceleration",
-    "It takes (t, q), out with in_place=True, and what the run has of params=... or args=(...). If accelerations "
-    "change with the velocity, pass the right-hand side fun(t, y) of y = (q, v) instead.",
+    "It takes (t, q), then out if in_place=True, then the params or args of the run if there are any. If accelerations "
+    "depend on the velocity, pass the right-hand side fun(t, y) of y = (q, v) instead.",
 )
 
 
@@ -341,7 +341,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     _check_choices(request)
     if request.jac is not None and not method.drives:
         raise TypeError(
-            f"jac is the Jacobian for EIPRadau and EIPBDF; {request.method.__name__} does not use one. Omit it."
+            f"jac is the Jacobian for EIPRadau and EIPBDF, but {request.method.__name__} does not use one. Omit jac."
         )
     asked, request = request, request.with_pointers()
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
@@ -394,7 +394,7 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     """Return the derivatives that a request asks for, or None."""
     if request.variations is None:
         if request.jvp is not None or request.symplectic is not None:
-            raise TypeError("jvp and symplectic need variations=...; pass variations, or omit them.")
+            raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
         return None
     require_tableau(request.method)
     y0 = _state(request.y0)
@@ -493,7 +493,7 @@ def _check_choices(request: Request) -> None:
 
 
 def _given_or_brought(request: Request) -> tuple[Any, Any]:
-    """Return t_span and y0 as given, or those of the problem."""
+    """Return t_span and y0 of the request; those of the problem if they are not given."""
     problem, t_span, y0 = request.fun, request.t_span, request.y0
     if isinstance(problem, Problem):
         return problem.t_span if t_span is None else t_span, problem.y0 if y0 is None else y0
@@ -512,7 +512,7 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
 
 
 def _with_problem(request: Request) -> tuple[Request, str]:
-    """Complete the request with what a `Problem` provides; return it and the form of its function."""
+    """Return the request, completed by the attributes of a `Problem` if it has one, and the form of its function."""
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
     problem, in_place = request.fun, flag("in_place", request.in_place)

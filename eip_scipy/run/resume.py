@@ -26,9 +26,9 @@ from .events import Events
 __all__ = ["Keeper", "keeping", "plain", "settings"]
 
 KIND = "integrate"
-# A run resumes from its last snapshot; later steps are repeated.
+# Seconds from one snapshot to the next. A run resumes from its last snapshot; later steps are repeated.
 SNAPSHOT_SECONDS = 0.2
-# Copying and writing take at most 5 % of the run time each, for any size of the state and of the saved rows.
+# Smallest ratio of run time to the time for copying or writing, so that each takes at most 5 % for any size of state.
 LEAST_RATIO = 19.0
 # Relative difference allowed between values of the same function at the same point, also on another machine.
 SAME = 1e-9
@@ -39,7 +39,7 @@ STEP = 0
 
 
 class Keeper:
-    """The events of a run that a checkpoint needs to know; this class stores nothing."""
+    """Interface between a run and its checkpoint. This class stores nothing; it serves runs without a checkpoint."""
 
     keeps = False
     seconds = 0.0
@@ -327,7 +327,7 @@ class _FileKeeper(Keeper):
         arrays = self._snapshot.arrays
         try:
             return self._known_by(self._driver.run, float(arrays["clock"][TIME]), arrays["y"])
-        except Exception:  # a function may have just ended the run with it: the checkpoint matters more
+        except Exception:  # a function may raise again what has ended the run; the checkpoint is written all the same
             return {}
 
     def _take_snapshot(self) -> None:

@@ -21,7 +21,7 @@ __all__ = ["load", "save"]
 KIND = "result"
 ENSEMBLE = "EnsembleResult"
 RESULTS: dict[str, Any] = {IntegrationResult.__name__: IntegrationResult}
-RESUMED = ("integrate", "ensemble")  # with the same arguments
+RESUMED = ("integrate", "ensemble")  # functions that continue from a checkpoint if called with the same arguments
 # Buffers of Diagnostics, in the order of its arguments.
 BUFFERS = ("_max_defect", "_last_defect", "_max_correction", "_counters", "_figures")
 OF_BALANCES = ("_balance_places", "_balance_sums")

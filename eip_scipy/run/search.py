@@ -1,4 +1,4 @@
-"""The search of `recommend`: methods that suit a problem, what each costs at the wanted error, and the reason."""
+"""The search of `recommend`: methods that suit a problem, the cost of each at the wanted error, and the reason."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class Search:
         if found[0][0] > enough and self.keeps:
             kept = self._reference(Kind(method, size=size, options=options), FINE_START)
             apart = difference(kept[1].y, found[0][1].y).max()
-            if apart <= SAME * self.bench.share * found[0][0]:  # the latter was extrapolated to the interval's end
+            if apart <= SAME * self.bench.share * found[0][0]:  # found[0][0] is for the end of the whole interval
                 found.append(kept)
         if min(item[0] for item in found) > enough and method is EIPRKN12:
             found.append(self._reference(Kind(method, size=size, options=options | PLAIN), FINE_START))
@@ -207,7 +207,7 @@ class Search:
         first = self._kind(EIPDOP853)
         chosen = self._tuned(first, self.wanted)
         if self.keeps and not any(trial.good for trial in self.trials):
-            return None  # what is wrong with the invariants is wrong for all methods
+            return None  # invariants that fail with one method fail with all methods
         rtol = self.wanted if chosen is None else chosen.options["rtol"]
         for kind, value in self._others(rtol):
             other = self._tuned(kind, value, math.inf if chosen is None else chosen.nfev)
@@ -284,7 +284,7 @@ class Search:
     # --- remarks ---
 
     def _leave_out_invariants(self) -> None:
-        """Continue without projection, and record the reason."""
+        """Continue the search without projection, and record the reason."""
         self.keeps = False
         good = [trial.error for trial in self.trials if trial.good]
         why = f"with the projection the error stays at {min(good):.1e}" if good else self.trials[-1].trouble

@@ -1,4 +1,4 @@
-"""`solve_ivp` with types: SciPy's function, whose result also says whether the run is reliable."""
+"""`solve_ivp` with typed options: SciPy's function, whose result also shows whether the run is reliable."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ __all__ = ["OdeResult", "solve_ivp"]
 
 BY_NAME = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853, "Radau": EIPRadau, "BDF": EIPBDF}
 NOTHING = np.zeros(0)
-WITHOUT = "LSODA"  # has no EIP method
-# Options of the EIP methods alone.
+WITHOUT = "LSODA"  # the method of SciPy without an EIP method
+# Options that only EIP methods have.
 OWN = {"h", "jacobian", "diagnostics", "variations", "jvp", *ProjectionOptions.names()}
 
 
 class OdeResult(Result):
-    """Result of `solve_ivp`: SciPy's OdeResult, with what says whether the run is reliable.
+    """Result of `solve_ivp`: SciPy's OdeResult with fields that show whether the run is reliable.
 
     Attributes
     ----------
@@ -63,15 +63,15 @@ class OdeResult(Result):
     status : int
         0: the end was reached; 1: an event ended the run; -1: a step failed.
     message : str
-        Why the run ended, how far `project_initial` moved the start, and why the run is not reliable if it is not.
+        The reason why the run ended, how far `project_initial` moved the start, and, for an unreliable run, the reason.
     success : bool
         ``status >= 0``.
     trusted : bool
-        Whether no step failed and nothing contradicts the run, see `Diagnostics`.
+        True if no step failed and the run is reliable, see `Diagnostics`.
     diagnostics : Diagnostics
         The record of the projections.
     variations : ndarray, shape (m, n, k)
-        The columns of derivatives, of a run that was asked for them.
+        The columns of derivatives, if they were requested.
     """
 
     t: np.ndarray
@@ -119,11 +119,10 @@ def solve_ivp(
     min_step: float | None = None,
     **projection: Unpack[ProjectionKeywords],
 ) -> OdeResult:
-    """Solve an initial value problem by `scipy.integrate.solve_ivp`, with typed options and a result that is judged.
+    """Solve an initial value problem with `scipy.integrate.solve_ivp`, and report whether the run is reliable.
 
     The states are those of `scipy.integrate.solve_ivp` with the same method. In addition this function passes `args` to
-    the invariants, takes accelerations, and returns whether the run is reliable. Editors and type checkers know its
-    options.
+    the invariants, accepts accelerations, and has options that editors and type checkers know.
 
     Parameters
     ----------
@@ -134,31 +133,32 @@ def solve_ivp(
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     method : type or str, optional
-        An EIP method (default: `EIPRK45`), or a method of SciPy by its name or class. With invariants or any other
-        option of the EIP methods, "RK23", "RK45", "DOP853", "Radau", "BDF" and other explicit Runge-Kutta classes stand
-        for the EIP methods on them; without, SciPy's own take the steps.
+        An EIP method (default: `EIPRK45`), or a method of SciPy by its name or class. If invariants or other options of
+        the EIP methods are given, "RK23", "RK45", "DOP853", "Radau", "BDF" and other explicit Runge-Kutta classes are
+        replaced by the EIP methods for them; otherwise the run uses SciPy's method.
     t_eval, dense_output, events, vectorized
         As for `scipy.integrate.solve_ivp`.
     args : tuple, optional
-        Further arguments of `fun`, of the events, of `jacobian` and `jac`, and of the invariants, where they follow
-        the invariant's own ``args`` unless both are the same.
+        Further arguments of `fun`, of the events, of `jacobian` and `jac`, and of the invariants. An invariant receives
+        them after its own ``args``, unless both are the same.
     acceleration : callable, optional
-        In place of `fun`, ``acceleration(t, q, *args) -> (n/2,)`` for q'' = a(t, q) with the state (q, v).
+        Instead of `fun`: ``acceleration(t, q, *args) -> (n/2,)`` for q'' = a(t, q) with the state (q, v).
     h : float, optional
-        Length of fixed steps.
+        Length of fixed steps. Default: adaptive steps.
     first_step, max_step, rtol, atol : optional
-        As for the methods; by default their own.
+        As for the methods, with the defaults of the methods.
     jacobian : callable, optional
         For `EIPGJ14`: ``jacobian(t, q, dq, out, *args)``.
     variations : "state" or array_like, shape (n, k), optional
-        Derivatives of the state to carry along: all n columns of the state-transition matrix, or initial columns; see
-        `integrate`, which also gives those by parameters. The result has them as ``variations``.
+        Derivatives of the state that are integrated with it: all n columns of the state-transition matrix, or columns
+        with these initial values. The result has them as ``variations``. `integrate` also gives derivatives with
+        respect to parameters.
     jvp : callable, optional
         ``jvp(t, y, dy, *args) -> (n,)``, the Jacobian times dy.
     {names of ProjectionOptions}
         As for the methods, see `EIPSolver`.
     diagnostics : Diagnostics, optional
-        An empty record to be filled; without it, the result has a new one.
+        An empty record, which the run fills. Default: a new one.
     jac, jac_sparsity : optional
         The Jacobian, for `EIPRadau`, `EIPBDF` and SciPy's implicit methods, see `scipy.integrate.Radau`.
     lband, uband, min_step : optional
@@ -167,18 +167,18 @@ def solve_ivp(
     Returns
     -------
     OdeResult
-        SciPy's result, with ``trusted`` and ``diagnostics``; ``message`` includes why a run is not reliable.
+        SciPy's result, with ``trusted`` and ``diagnostics``; for an unreliable run ``message`` includes the reason.
 
     Raises
     ------
     TypeError
-        If options of the EIP methods are given to LSODA or a class without an EIP method; and as raised by SciPy and
-        the methods.
+        If options of the EIP methods are given with LSODA or a class without an EIP method, or if SciPy or the method
+        rejects an argument.
 
     Warns
     -----
     ProjectionWarning
-        If the projection hides a failure.
+        If the run is not reliable.
     UserWarning
         If an option has no effect for the method.
 
@@ -215,7 +215,7 @@ def solve_ivp(
 def _solve(
     method: type[EIPSolver], function: Any, t_span: Any, y0: Any, common: dict[str, Any], options: dict[str, Any]
 ) -> OdeResult:
-    """Return the run by an EIP method; `common`: the options that SciPy's function takes itself."""
+    """Return the result of a run with an EIP method; `common` has the options of SciPy's solve_ivp itself."""
     common["args"], extra = _unpacked(common["args"])
     variations, jvp = options.pop("variations", None), options.pop("jvp", None)
     if "invariants" in options and extra:
@@ -235,7 +235,7 @@ def _solve(
         if (events := common["events"]) is not None:
             common["events"] = wide.events((events,) if callable(events) else events)
     elif jvp is not None:
-        raise TypeError("solve_ivp: jvp belongs to variations=...; ask for derivatives, or omit it.")
+        raise TypeError("solve_ivp: jvp needs variations=...; pass variations, or omit jvp.")
     start = initial_state(y0) if options.get("project_initial") else None
     noting, solvers = _noting(method, start)
     sol = scipy.integrate.solve_ivp(
@@ -243,7 +243,7 @@ def _solve(
     )
     if wide is not None:
         _split(sol, wide)
-    if sol.status == 1:  # SciPy does not tell the solver that its run has ended
+    if sol.status == 1:  # SciPy does not inform the solver that its run has ended
         solvers[0]._watch(ended=True)
     message = "; ".join(filter(None, (sol.message, record.moved, record.message)))
     return OdeResult(sol, message=message, trusted=bool(sol.success) and record.trusted, diagnostics=record)
@@ -252,7 +252,7 @@ def _solve(
 def _variations(
     method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, asked: Any, extra: tuple, items: Any, jvp: Any
 ) -> Variations:
-    """Return the functions of the state with its columns; `items`: invariants that have their arguments."""
+    """Return the functions of the state with its columns; the invariants `items` have their arguments bound."""
     require_tableau(method)
     start, t0 = initial_state(y0), interval(t_span)[0]
     columns = asked_columns(asked, start, NOTHING, (), method.TABLEAU.of_second_order)
@@ -261,12 +261,12 @@ def _variations(
 
 
 def _carrying(method: type[EIPSolver], wide: Variations) -> Any:
-    """Return the class for states with these columns behind them."""
+    """Return the solver class for states that are followed by these columns."""
     return SolverClass(method.__name__, (method,), {"_COLUMNS": wide.columns, "__doc__": method.__doc__})
 
 
 def _split(sol: Any, wide: Variations) -> None:
-    """Give a result the state and the columns apart."""
+    """Split the wide states of a result into states and columns."""
     columns = wide.columns
     sol.y, sol.variations = columns.apart(sol.y.T)
     sol.y = sol.y.T
@@ -277,14 +277,14 @@ def _split(sol: Any, wide: Variations) -> None:
 
 
 def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
-    """Return the function that is given, or the right-hand side of an acceleration."""
+    """Return `fun`, or the right-hand side that belongs to `acceleration`."""
     name, given = ("fun", fun) if acceleration is None else ("acceleration", acceleration)
     if acceleration is not None and fun is not None:
         raise TypeError("solve_ivp: give fun or acceleration, not both.")
     if given is None:
         raise TypeError("solve_ivp: fun is missing; give a function fun(t, y), or acceleration=a(t, q).")
     if not callable(given):
-        hint = "; a Problem is solved by problem.solve_ivp(method=...)" if hasattr(given, "solve_ivp") else ""
+        hint = "; for a Problem call problem.solve_ivp(method=...)" if hasattr(given, "solve_ivp") else ""
         raise TypeError(f"solve_ivp: {name} must be callable, got {shown(given)}{hint}.")
     if t_span is None or y0 is None:
         raise TypeError(f"solve_ivp: {'t_span' if t_span is None else 'y0'} is missing.")

@@ -1,4 +1,4 @@
-"""The comparison with an implicit method that shows whether equations are stiff."""
+"""Comparison with an implicit method, which shows whether equations are stiff."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .trials import Bench, difference
 
 __all__ = ["ImplicitRun", "implicit_run"]
 
-# Tolerances to be tried, in units of the wanted error, and what atol is of rtol times the size of the start.
+# Values of rtol to try, in units of the wanted error, and the ratio of atol to rtol times the size of the start.
 TOLERANCES, ATOL_PER_RTOL = (0.1, 1e-2, 1e-3, 1e-4), 1e-3
-# An implicit step solves a system of as many equations: beyond, that costs more than the evaluations that it saves.
+# Largest number of components. Beyond it the linear algebra of an implicit step costs more than the evaluations saved.
 LARGEST = 500
 
 
@@ -31,7 +31,7 @@ class ImplicitRun(NamedTuple):
 
 
 class _TooManyError(Exception):
-    """The evaluations are used up."""
+    """A run has used all evaluations that it may take."""
 
 
 def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> ImplicitRun | None:
@@ -40,18 +40,18 @@ def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> Implici
     Parameters
     ----------
     bench : Bench
-        With the truth to compare with.
+        The problem with the reference states.
     wanted : float
-        Error at the last time of the bench.
+        Wanted error at the last time of the bench.
     most : int
-        Evaluations that a run may take.
+        Largest number of evaluations of a run.
     keeps : bool
-        Whether the invariants are kept.
+        Whether to keep the invariants.
 
     Returns
     -------
     ImplicitRun or None
-        None if it does not get there.
+        None if no run reaches the end with the wanted error.
     """
     y0, times = bench.problem.y0, bench.times
     if y0.size > LARGEST:
@@ -78,7 +78,7 @@ def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> Implici
                 warnings.simplefilter("ignore")
                 run = solve_ivp(fun, (bench.t0, times[-1]), y0, method=EIPRadau, rtol=rtol, atol=atol, invariants=kept)
         except (_TooManyError, ValueError, ArithmeticError, np.linalg.LinAlgError):
-            return None  # what explicit methods do is recommended all the same
+            return None  # an explicit method is recommended even if the implicit run fails
         if not run.success:
             return None
         error = float(difference(run.y[:, -1:], bench.truth[:, -1:])[0])

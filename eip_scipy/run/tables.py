@@ -1,4 +1,4 @@
-"""Runs as labelled tables: xarray's Dataset and pandas' DataFrame, of results of `integrate` and of `solve_ivp`."""
+"""Conversion of results of `integrate` and `solve_ivp` to labelled tables: xarray's Dataset and pandas' DataFrame."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from .trials import Trial
 
 __all__ = ["AIM", "COARSEST_RTOL", "FINEST_RTOL", "WINDOW", "Kind", "best", "tune"]
 
-# Fractions of the wanted error: the target of the search, and the smallest error that is not needlessly accurate.
+# Fractions of the wanted error: the target of the search, and the error below which a trial is needlessly accurate.
 AIM, WINDOW = 0.4, 0.15
 MOST_TRIALS, MOST_FAILURES = 8, 4
 ATOL_PER_RTOL = 1e-3
@@ -88,8 +88,8 @@ def tune(
     The search ends early if nothing helps, or if the kind would cost much more than `bound` evaluations.
     """
     tried: dict[float, Trial] = {}
-    fine: tuple[float, float] | None = None  # logarithms of number and error: accurate enough
-    coarse: tuple[float, float] | None = None  # not accurate enough; the error is nan if the run failed
+    fine: tuple[float, float] | None = None  # logarithms of number and error of an accurate enough trial
+    coarse: tuple[float, float] | None = None  # the same of a trial that is not; its error is nan if the run failed
     x = math.log10(value)
     while len(tried) < MOST_TRIALS:
         value = kind.near(10**x)

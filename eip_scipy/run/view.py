@@ -19,10 +19,10 @@ from .tables import component_names, invariant_rows
 
 __all__ = ["page", "view"]
 
-MOST = 9  # components, or bodies, that can be distinguished
+MOST = 9  # largest number of components, or bodies, that can be distinguished
 FRAMES = 4000
-NUMBERS = 400_000  # in all frames of the state
-POINTS = 1000  # of a profile
+NUMBERS = 400_000  # largest number of values in all frames of the state
+POINTS = 1000  # largest number of points of a profile
 PLACE = "__RUN__"
 
 
@@ -109,7 +109,7 @@ def _numbers(values: Any, digits: int = 5) -> list[float | None]:
 
 
 def _state(y: np.ndarray, labels: tuple[str, ...], bodies: dict[str, tuple[int, int]], frames: np.ndarray) -> Any:
-    """Return the animated part: bodies in the plane, two components, a few curves in time, or a profile of many."""
+    """Return the animated part: bodies in the plane, two components, a few curves in time, or a profile."""
     real = np.abs(y) if np.iscomplexobj(y) else y
     if not bodies and len(y) == 2 and not np.iscomplexobj(y):
         bodies = {f"{labels[1]} over {labels[0]}": (0, 1)}
@@ -171,11 +171,13 @@ def _reference(result: Any, given: Any) -> np.ndarray | None:
         return np.array([np.full(shape[0], np.nan) if state is None else state for state in states]).T
     if hasattr(given, "y") and hasattr(given, "t"):
         if not np.array_equal(given.t, t):
-            raise ValueError("view: the reference has other times than the run; give both the same t_eval.")
+            raise ValueError("view: the times of the reference and of the run differ; give both the same t_eval.")
         given = given.y
     found = np.asarray(given)
     if found.shape != shape:
-        raise ValueError(f"view: reference has shape {found.shape}, expected {shape} as the run: {shown(given)}.")
+        raise ValueError(
+            f"view: reference {shown(given)} has the shape {found.shape}; expected {shape}, the shape of run.y."
+        )
     return found
 
 
