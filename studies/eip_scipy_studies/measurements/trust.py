@@ -104,7 +104,7 @@ def sick_table(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 def healthy_table(rows: list[dict[str, Any]]) -> list[list[str]]:
     """Count the false alarms, group by group."""
-    table = [["healthy runs", "runs", "false alarms"]]
+    table = [["correct runs", "runs", "false alarms"]]
     for group, own in {**groups(rows), "all": rows}.items():
         table.append([group, str(len(own)), str(sum(bool(row["told"]) for row in own))])
     return table

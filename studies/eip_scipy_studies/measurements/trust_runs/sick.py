@@ -47,7 +47,7 @@ REST, MOVING, LEAK, GRADIENT, LONG, BLOWN, MEMBER = (
     "wrong gradient",
     "step too long",
     "blown-up passage",
-    "sick members among healthy ones",
+    "faulty members among correct ones",
 )
 
 
