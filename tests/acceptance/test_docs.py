@@ -31,6 +31,8 @@ PAGES = (
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
     "how-to/pydy",
+    "how-to/constraints",
+    "how-to/fitting",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
