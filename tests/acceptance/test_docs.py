@@ -34,6 +34,7 @@ PAGES = (
     "how-to/constraints",
     "how-to/fitting",
     "how-to/positivity",
+    "tutorials/satellites",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
