@@ -35,6 +35,7 @@ PAGES = (
     "how-to/fitting",
     "how-to/positivity",
     "tutorials/satellites",
+    "tutorials/galactic-orbits",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
