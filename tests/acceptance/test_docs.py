@@ -36,6 +36,7 @@ PAGES = (
     "how-to/positivity",
     "tutorials/satellites",
     "tutorials/galactic-orbits",
+    "tutorials/quantum-states",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
