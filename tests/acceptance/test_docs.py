@@ -37,6 +37,7 @@ PAGES = (
     "tutorials/satellites",
     "tutorials/galactic-orbits",
     "tutorials/quantum-states",
+    "how-to/diagnostics",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
