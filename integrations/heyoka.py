@@ -1,4 +1,4 @@
-"""heyoka as a reference: its Taylor integrator, in double precision, on our states.
+"""heyoka: its Taylor integrator with projections, and as a reference, in double precision, on our states.
 
 heyoka (F. Biscani, D. Izzo, MNRAS 504 (2021) 2614-2628) is free software under the MPL and not distributed with this
 package.
@@ -22,7 +22,9 @@ except ModuleNotFoundError as error:
         'eip_scipy.integrations.heyoka needs heyoka: pip install "eip_scipy[heyoka]"', name="heyoka"
     ) from error
 
-__all__ = ["HeyokaRun", "largest_exponent", "run"]
+from ._heyoka_projection import ProjectedTaylor, TaylorOutput
+
+__all__ = ["HeyokaRun", "ProjectedTaylor", "TaylorOutput", "largest_exponent", "run"]
 
 
 @dataclass(frozen=True)

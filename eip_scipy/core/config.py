@@ -19,7 +19,7 @@ EXTRAS = {
     "matplotlib": ("plot", "figures"),
     "sympy": ("sympy", "hamiltonian, equations"),
     "rebound": ("rebound", "simulations of REBOUND; WHFast and IAS15 to compare with"),
-    "heyoka": ("heyoka", "Taylor series to compare with"),
+    "heyoka": ("heyoka", "Taylor series, projected or to compare with"),
     "astropy": ("astro", "quantities and times"),
     "jplephem": ("jpl", "JPL's ephemerides"),
     "xarray": ("xarray", "results as datasets"),
