@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,7 +69,8 @@ def problem_from_simulation(
     -------
     Problem
         In the simulation's units of length and time, with params = sim.G times the masses, and `G`. Test particles have
-        mass 0. If ``sim.units`` are set, quantities of astropy are converted to them.
+        mass 0. The distances exit_max_distance and exit_min_distance are terminal `events` of the problem. If
+        ``sim.units`` are set, quantities of astropy are converted to them.
 
     Raises
     ------
@@ -82,8 +84,7 @@ def problem_from_simulation(
     Warns
     -----
     UserWarning
-        If the simulation has features that end or observe it and that a problem cannot hold: exit_max_distance,
-        exit_min_distance (`exit_events` has events for them) and a heartbeat.
+        If the simulation has a heartbeat, which a problem cannot hold.
 
     Notes
     -----
@@ -100,7 +101,13 @@ def problem_from_simulation(
             "one in an archive is rebound.Simulation(path)"
         )
     _refuse_unsupported(sim)
-    _warn_of_what_is_left_out(sim)
+    if sim._heartbeat:
+        warnings.warn(
+            "problem_from_simulation: the simulation's heartbeat is not called by runs of the problem. If it ends the "
+            "simulation or changes particles, give integrate events=... or callback=... in its place.",
+            UserWarning,
+            stacklevel=2,
+        )
     chosen, known = (check_forces(forces), constants) if forces is not None else _attached(sim)
     if forces is None and constants is not None:
         raise ValueError("problem_from_simulation: constants belong to forces=...; REBOUNDx's forces bring their own.")
@@ -111,7 +118,7 @@ def problem_from_simulation(
         )
     sim.synchronize()
     q, v = state(sim).reshape(2, -1, 3)
-    return nbody(
+    problem = nbody(
         _attracting_masses(sim),
         q,
         v,
@@ -126,6 +133,7 @@ def problem_from_simulation(
         G=sim.G,
         balances=balances,
     )
+    return replace(problem, events=exit_events(sim) or None)
 
 
 class _Exit:
@@ -154,31 +162,13 @@ def exit_events(sim: rebound.Simulation) -> list[_Exit]:
     Returns
     -------
     list of callable
-        For ``integrate(problem, ..., events=exit_events(sim))``: one event if the largest distance of a particle from
-        the origin reaches ``sim.exit_max_distance``, and one if two particles come as near as
+        The events of `problem_from_simulation`, for runs that have further ones: one event if the largest distance of a
+        particle from the origin reaches ``sim.exit_max_distance``, and one if two particles come as near as
         ``sim.exit_min_distance``. Only the distances that are set have an event. REBOUND checks them after each step;
         an event is located within it.
     """
     given = {name: float(getattr(sim, name)) for name in ("exit_max_distance", "exit_min_distance")}
     return [_Exit(name, limit) for name, limit in given.items() if limit > 0]
-
-
-def _warn_of_what_is_left_out(sim: rebound.Simulation) -> None:
-    exits = [event.__name__ for event in exit_events(sim)]
-    if exits:
-        warnings.warn(
-            f"problem_from_simulation: the simulation ends by {' and '.join(exits)}, and a problem has no such end. "
-            "Give integrate(..., events=exit_events(sim)), from eip_scipy.integrations.rebound.",
-            UserWarning,
-            stacklevel=3,
-        )
-    if sim._heartbeat:
-        warnings.warn(
-            "problem_from_simulation: the simulation's heartbeat is not called by runs of the problem. If it ends the "
-            "simulation or changes particles, give integrate events=... or callback=... in its place.",
-            UserWarning,
-            stacklevel=3,
-        )
 
 
 def to_simulation(

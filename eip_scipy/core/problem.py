@@ -117,6 +117,9 @@ class Problem:
         to such a pair.
     G : float, optional
         Gravitational constant by which the masses of bodies are multiplied in `params`, if it is known.
+    events : callable or sequence of callable, optional
+        Events of runs by `integrate`, `ensemble` and `solve_ivp` to which no others are given; ``events=()`` there
+        leaves them out.
     """
 
     name: str
@@ -142,6 +145,7 @@ class Problem:
     method: Any = None
     variational: Callable[[tuple[int, ...]], Callable[..., None]] | None = None
     canonical: bool = False
+    events: Any = None
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
@@ -198,6 +202,8 @@ class Problem:
             fixed = self.h is not None and not method.TABLEAU.drives
             if fixed and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
                 brought["h"] = self.h
+        if self.events is not None:
+            brought["events"] = self.events
         sol = solve_ivp(self.fun, t_span, y0, method=method, **brought | options)
         if self.component_names is not None and len(self.component_names) == len(sol.y):
             sol.component_names = self.component_names
@@ -336,7 +342,7 @@ class Problem:
         interval += [] if self.h is None else [f"h = {self.h:g}"]
         zero = "" if self.epoch is None else f"t = 0 at {shown_epoch(self.epoch)}"
         kept = ", ".join(item.name or "one without a name" for item in self.invariants)
-        functions = ", ".join(["fun", *having(("rhs", "acc", "jacobian", "reference"))])
+        functions = ", ".join(["fun", *having(("rhs", "acc", "jacobian", "reference", "events"))])
         lines = [
             f"{self.name}: y = ({state}), {start}",
             f"  interval    {'; '.join(filter(None, (', '.join(interval) or 'none', self.units, zero)))}",

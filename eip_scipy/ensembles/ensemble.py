@@ -448,7 +448,7 @@ def ensemble(
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
     common["acceleration"] = acceleration
     request = Request.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
-    request = request.with_pointers()._replace(**own.of(0))
+    request = request.with_own_events().with_pointers()._replace(**own.of(0))
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
     task = Task(request, reduce, keep, total, own.padded.shape[1] if own else None)

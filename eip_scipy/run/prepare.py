@@ -96,6 +96,11 @@ class Request(NamedTuple):
         projection, others = ProjectionOptions.split(keywords)
         return cls(projection=projection, **others)
 
+    def with_own_events(self) -> Request:
+        """Return the request with the events of its problem if no others are given."""
+        has_own = self.events is None and isinstance(self.fun, Problem)
+        return self._replace(events=self.fun.events) if has_own else self
+
     def with_pointers(self) -> Request:
         """Return the request with C function pointers wrapped so that Python can call them."""
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
@@ -333,7 +338,7 @@ class Prepared:
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     """Check a request and prepare its run; for `check_start` see `RunSpec.build`."""
-    request = _plain(request)
+    request = _plain(request).with_own_events()
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
     if request.method is None:
         request = request._replace(method=default_method(request.fun))

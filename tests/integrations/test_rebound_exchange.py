@@ -7,7 +7,7 @@ import pytest
 
 rebound = pytest.importorskip("rebound")
 
-from eip_scipy import EIPDOP853, EIPRKN12, integrate, load  # noqa: E402
+from eip_scipy import EIPDOP853, EIPRKN12, ensemble, integrate, load  # noqa: E402
 from eip_scipy.integrations import rebound as exchange  # noqa: E402
 from eip_scipy.problems import ForceConstants, kepler, nbody, orbital_elements, solar_system  # noqa: E402
 from eip_scipy.results import plot, to_xarray  # noqa: E402
@@ -57,18 +57,20 @@ def test_distances_that_end_a_simulation_are_events():
     sim.add(m=1.0)
     sim.add(m=0.0, x=1.0, vx=2.0)
     sim.N_active, sim.exit_max_distance, sim.dt = 1, 3.0, 0.01
-    with pytest.warns(UserWarning, match=r"ends by exit_max_distance, .* events=exit_events\(sim\)"):
-        problem = exchange.problem_from_simulation(sim, t_span=(0, 10))
-    run = integrate(problem, method=EIPDOP853, rtol=1e-10, events=exchange.exit_events(sim))
+    problem = exchange.problem_from_simulation(sim, t_span=(0, 10))
+    run = integrate(problem, method=EIPDOP853, rtol=1e-10)
     assert run.status == 1
     assert run.y[3, -1] == pytest.approx(3.0, rel=1e-12)
+    members = ensemble(problem, problem.t_span, problem.y0[None], method=EIPDOP853, rtol=1e-10)
+    assert np.array_equal(members.y[0], run.y[:, -1])
+    assert np.array_equal(problem.solve_ivp(method=EIPDOP853, rtol=1e-10).t_events, run.t_events)
+    assert integrate(problem, method=EIPDOP853, rtol=1e-10, events=()).status == 0
     sim = rebound.Simulation()
     for side in (-1, 1):
         sim.add(m=0.5, x=side, vy=0.1 * side)
     sim.exit_min_distance, sim.dt = 0.5, 0.01
-    with pytest.warns(UserWarning, match="ends by exit_min_distance,"):
-        problem = exchange.problem_from_simulation(sim, t_span=(0, 10))
-    run = integrate(problem, method=EIPDOP853, rtol=1e-10, events=exchange.exit_events(sim))
+    problem = exchange.problem_from_simulation(sim, t_span=(0, 10))
+    run = integrate(problem, method=EIPDOP853, rtol=1e-10)
     assert np.linalg.norm(run.y[3:6, -1] - run.y[:3, -1]) == pytest.approx(0.5, rel=1e-12)
 
 
