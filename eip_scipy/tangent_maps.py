@@ -198,7 +198,7 @@ class _Piece(NamedTuple):
 def _refuse(function: str, options: dict[str, Any], also: Sequence[str] = ()) -> None:
     for name in (*OWN, *also):
         if name in options:
-            raise TypeError(f"{function}() has no option {name!r}: it sets this option of integrate itself.")
+            raise TypeError(f"{function}() does not take {name!r}: the option is set or not supported there.")
     known = {*Request._fields, *ProjectionOptions.names()} - {*OWN, *also, "projection"}
     for name in options:
         if name not in known:

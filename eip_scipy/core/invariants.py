@@ -80,7 +80,7 @@ class Invariant:
     size : int, optional
         Number l_i of the values of `fun`. It is needed for a C function that returns more than one value.
     name : str, optional
-        Name in messages and diagnostics.
+        Name in messages and diagnostics. Default: the name of the function.
     scale : float or array_like, shape (l_i,), optional
         Size of the terms that cancel in `fun`, in the unit of `fun`: residuals below four rounding errors of it are not
         corrected. Needed only if neither the value nor ``sum_k |G_k y_k|`` has that size.
@@ -294,6 +294,15 @@ def _scale(scale: Any) -> Any:
     return float(found) if found.ndim == 0 else found
 
 
+def _labels(items: Sequence[Invariant]) -> list[str]:
+    """Return the names in messages: the given ones, else those of the functions if they are distinct."""
+    found = [item.name or getattr(item.function, "__name__", "<lambda>") for item in items]
+    return [
+        name if item.name or (name.isidentifier() and found.count(name) == 1) else f"invariant {k}"
+        for k, (item, name) in enumerate(zip(items, found, strict=True))
+    ]
+
+
 def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array, extra: tuple) -> Array:
     """Return the value at the start, a number or (l_i,); `fun` is the invariant's function with its arguments bound."""
     try:
@@ -413,7 +422,7 @@ class InvariantSet:
         # The reasons why jitted invariants have no compiled gradient, by their labels.
         self.why_not: dict[str, str] = {}
         self._start = y0, f0, tau
-        self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
+        self.labels = _labels(self.items)
         functions = [bound(item.function, item.args + extra) for item in self.items]
         values = [
             _first_value(item, fun, label, t0, y0, extra)

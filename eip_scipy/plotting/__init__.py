@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..core.moved import moved_names
 
@@ -65,15 +65,16 @@ def typeset(text: str) -> str:
     return re.sub(r"\^(\d)", lambda power: POWERS[int(power[1])], greek)
 
 
-def log_errors(axis: Axes, x: str, y: str) -> None:
-    """Make y a log axis of errors, with labels, few ticks and a range of at least two powers of ten."""
-    axis.set_yscale("log")
-    low, high = axis.get_ylim()
+def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") -> None:
+    """Make y, or x, a log axis of errors, with labels, few ticks and a range of at least two powers of ten."""
+    axis.set(**{f"{along}scale": "log"})
+    low, high = axis.get_ylim() if along == "y" else axis.get_xlim()
     # A range below two powers of ten would have too few labelled ticks.
     if high / low < 100:
-        axis.set_ylim(low / 3, high * 3)
-    axis.yaxis.set_major_locator(LogLocator(numticks=9))
-    axis.yaxis.set_minor_formatter(NullFormatter())
+        axis.set(**{f"{along}lim": (low / 3, high * 3)})
+    shown = axis.yaxis if along == "y" else axis.xaxis
+    shown.set_major_locator(LogLocator(numticks=9 if along == "y" else 5))
+    shown.set_minor_formatter(NullFormatter())
     axis.set_xlabel(x)
     axis.set_ylabel(y)
     axis.grid(which="major", alpha=0.3)

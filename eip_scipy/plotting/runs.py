@@ -167,10 +167,11 @@ def _above_zero(magnitudes: np.ndarray) -> np.ndarray:
 def _draw_corrections(axis: Axes, corrections: Mapping[str, float], styles: Mapping[str, Mapping[str, Any]]) -> None:
     for k, (name, size) in enumerate(corrections.items()):
         axis.barh(k, max(size, FLOOR), height=0.6, color=styles[name]["color"])
-    axis.set(yticks=range(len(corrections)), yticklabels=list(corrections), xscale="log")
-    axis.invert_yaxis()
+    axis.set(yticks=range(len(corrections)), yticklabels=list(corrections), ylim=(len(corrections) + 0.1, -0.6))
     axis.axvline(USUAL, color="0.4", lw=1.0, ls=":")
-    text = axis.annotate("most correct runs stay below", (USUAL, 0.01), xycoords=("data", "axes fraction"), rotation=90)
-    text.set(ha="right", va="bottom", fontsize="x-small")
-    axis.set_xlabel("largest correction [local errors]")
-    axis.grid(alpha=0.3)
+    log_errors(axis, "largest correction\n[local errors]", "", along="x")
+    text = axis.annotate(
+        "most correct runs stay below", (USUAL, len(corrections) - 0.1), va="center", fontsize="x-small"
+    )
+    low, high = np.log(axis.get_xlim())
+    text.set_ha("right" if np.log(USUAL) > 0.5 * (low + high) else "left")

@@ -362,7 +362,12 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     system.bind(y0)
     calls = Counted(system.derivative)
     spec = _spec(asked.fun, request, system, calls, stepping)
-    spec = spec if variations is None else replace(spec, columns=variations.columns, fun=None)
+    if variations is not None:
+        hint = (
+            f"components from {variations.columns.n} on are derivatives, which overflow in long chaotic runs: shorten "
+            "the interval, or use megno or lyapunov_spectrum, which rescale them"
+        )
+        spec = replace(spec, columns=variations.columns, fun=None, left_out=hint)
     run = spec.build(y0, check_start=check_start)
     schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)

@@ -75,7 +75,7 @@ class Recommendation:
     @property
     def nfev(self) -> int:
         """Expected evaluations of the right-hand side."""
-        return self.trial.nfev
+        return self.trial.cost
 
     @property
     def trusted(self) -> bool:
@@ -129,13 +129,15 @@ def _empty(value: Any) -> bool:
 
 def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
     """Yield the lines of the table of trials; "->" marks the recommended one."""
-    rows = []
+    rows, output = [], any(trial.output for trial in trials)
     for trial in _one_each(trials, chosen):
         cost = f"{trial.error:9.1e} {trial.nfev:11d}" if math.isfinite(trial.error) else f"{'-':>9} {'-':>11}"
+        if output:
+            cost += f" {trial.cost if trial.output else '-':>11}"
         trouble = textwrap.shorten(trial.trouble, WIDTH, placeholder=" ...")
         rows.append(("->" if trial is chosen else "", _telling(trial.options), cost, f"  {trouble}".rstrip()))
     width = max(len(row[1]) for row in rows)
-    yield f"     {'trials':<{width}}     error evaluations"
+    yield f"     {'trials':<{width}}     error evaluations{' with output' if output else ''}"
     for mark, name, cost, trouble in rows:
         yield f"  {mark:>2} {name:<{width}} {cost}{trouble}"
 

@@ -210,8 +210,8 @@ class Search:
             return None  # invariants that fail with one method fail with all methods
         rtol = self.wanted if chosen is None else chosen.options["rtol"]
         for kind, value in self._others(rtol):
-            other = self._tuned(kind, value, math.inf if chosen is None else chosen.nfev)
-            if other is not None and (chosen is None or other.nfev < CHEAPER * chosen.nfev):
+            other = self._tuned(kind, value, math.inf if chosen is None else chosen.cost)
+            if other is not None and (chosen is None or other.cost < CHEAPER * chosen.cost):
                 chosen = other
         return chosen
 
@@ -264,7 +264,7 @@ class Search:
                 continue
             value = chosen.options[kind.knob] * (AIM * self.wanted / max(trial.error, 1e-17)) ** (1 / kind.slope)
             better = self._tuned(replace(kind, options={**kind.options, **options}), value)
-            if better is not None and better.nfev < CHEAPER * chosen.nfev:
+            if better is not None and better.cost < CHEAPER * chosen.cost:
                 self.notes.append(f"{called(options)} divides the error by {chosen.error / trial.error:.2g}.")
                 chosen = better
         return chosen
@@ -332,7 +332,7 @@ class Search:
         kind = self.kinds[id(chosen)]
         rivals = [trial for trial in self.trials if self._name(trial) not in ("", kind.name)]
         rival = best(rivals, self.wanted)
-        ratio = math.inf if rival is None else rival.nfev / chosen.nfev
+        ratio = math.inf if rival is None else rival.cost / chosen.cost
         nearly = "nearly " if ratio < 1 else ""  # the more usual method was preferred
         words = f"{form}, and the steps vary by a factor of {look.variation:.2g}: {kind.name} needs {nearly}the fewest "
         words += "evaluations" if rival is None else f"evaluations, {self._name(rival)} {ratio:.3g} times as many"

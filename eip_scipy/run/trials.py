@@ -43,6 +43,8 @@ class Trial:
         Reason why the run failed or is not reliable; empty for a good run.
     power : float
         Power of time with which the error is extrapolated; nan if the trial covers the whole interval.
+    output : int
+        Further evaluations, for states between the steps.
     """
 
     options: Mapping[str, Any]
@@ -51,6 +53,12 @@ class Trial:
     seconds: float
     trouble: str = ""
     power: float = math.nan
+    output: int = 0
+
+    @property
+    def cost(self) -> int:
+        """All evaluations."""
+        return self.nfev + self.output
 
     @property
     def good(self) -> bool:
@@ -156,7 +164,7 @@ class Bench:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             run = integrate(self.problem, (self.t0, end), **asked)
-        return replace(trial, nfev=round(run.nfev / self.share))
+        return replace(trial, output=round(run.nfev / self.share) - trial.nfev)
 
     def judged(self, options: Mapping[str, Any], done: Outcome, truth: np.ndarray) -> Trial:
         """Return the trial of a run whose states are compared with `truth`."""

@@ -133,7 +133,7 @@ def _next(kind: Kind, fine: tuple[float, float] | None, coarse: tuple[float, flo
 def best(trials: list[Trial], wanted: float) -> Trial | None:
     """Return the cheapest good trial that is accurate enough, or None."""
     enough = [trial for trial in trials if trial.good and trial.error <= wanted]
-    return min(enough, key=lambda trial: trial.nfev, default=None)
+    return min(enough, key=lambda trial: trial.cost, default=None)
 
 
 def _short(value: float, digits: int) -> float:

@@ -108,7 +108,10 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
                 raise ValueError(f"{what}: there is no {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
         missing = [name for name in names if name in held and name not in by_name]
         if missing:
-            raise ValueError(f"{what}: {missing[0]} is missing; give its value, or omit it from independent=.")
+            raise ValueError(
+                f"{what}: {missing[0]} is missing; give its value, or name in independent= "
+                "the components that are set, so that the others are computed."
+            )
         given = [by_name.get(name, 0.0) for name in names]
     values = np.atleast_1d(real_array(what, given)).astype(float)
     if values.shape != (len(names),):
