@@ -19,10 +19,10 @@ BY_NAME = "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...)
 
 
 class AccelerationField:
-    """First-order right-hand side ``f(t, y[, *args]) = (v, a)`` of y = (q, v), made of an acceleration.
+    """First-order right-hand side ``f(t, y[, *args]) = (v, a)`` of y = (q, v), made from an acceleration.
 
-    `integrate` and the functions built on it call the acceleration itself. The object pickles where the acceleration
-    does.
+    `integrate` and the functions built on it call the acceleration itself. The object can be pickled if the
+    acceleration can.
 
     Parameters
     ----------
@@ -49,12 +49,12 @@ class AccelerationField:
 def named_accelerations(
     method: str, fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray
 ) -> Iterator[None]:
-    """Refuse an acceleration in the place of `fun`, whatever its first call as a right-hand side of (q, v) raised.
+    """Explain an error in the first call of `fun` if it is an acceleration that was given as a right-hand side.
 
     Raises
     ------
     ValueError
-        Naming the argument that takes accelerations.
+        If `fun` is an acceleration. The message names the argument for accelerations.
     """
     try:
         yield
@@ -69,11 +69,11 @@ def named_accelerations(
 
 
 def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray) -> bool:
-    """Return whether a function that is not a right-hand side of y = (q, v) gives n/2 accelerations instead.
+    """Return True if `fun` is not a right-hand side of y = (q, v) but returns n/2 accelerations.
 
-    It is called with y and with q. Numba functions are called as Python code and C functions with y alone, because
-    compiled code could read or write beyond the end of a shorter array; for those behind a Python function, q is the
-    first half of an array like y.
+    The function is called with y and with q. Numba functions are called as Python code, and C functions with y only,
+    because compiled code could read or write beyond the end of a shorter array. For the same reason q is passed as the
+    first half of an array as long as y.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, .
 
 
 def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
-    """Return whether the value of `fun` at a state has `count` components."""
+    """Return True if the value of `fun` at a state has `count` components."""
     try:
         with np.errstate(all="ignore"):
             return np.shape(fun(t, state, *extra)) == (count,)
@@ -102,7 +102,7 @@ def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: n
 
 
 def _fills(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
-    """Return whether `fun` fills the first `count` components of its argument out, and no others."""
+    """Return True if `fun` fills the first `count` components of its argument out, and no others."""
     out = np.full_like(state, np.nan)
     try:
         with np.errstate(all="ignore"):

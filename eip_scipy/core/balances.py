@@ -1,4 +1,4 @@
-"""Balances: quantities that change slowly and at a known rate, and are kept as invariants are."""
+"""Balances: quantities that change slowly and at a known rate, and onto whose values a run projects."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .pointers import GRADIENT, address_hint, by_pointer
 
 __all__ = ["Balance"]
 
-LARGEST_INDEX = 2**53  # up to which floats hold all integers
+LARGEST_INDEX = 2**53  # floats represent all integers up to this one
 
 
 class Balance(Invariant):
-    """A quantity that changes slowly and at a known rate, as an energy does under friction; or several at once.
+    """A quantity F that changes slowly and at a known rate, such as an energy with friction; or several at once.
 
-    It stands among the invariants of a run. The run integrates its rate with the stages of each step and projects the
-    state onto the value that results. Where F has a small rate, its numerical error is that much smaller than the
-    error of the state, and the projected state inherits it.
+    Add it to the list of invariants of a run. The run integrates the rate with the stages of each step and projects the
+    state onto the resulting value. If the rate is small, the error of this value is smaller than that of F of a state
+    without projection by about the same factor.
 
     Parameters
     ----------
@@ -29,10 +29,10 @@ class Balance(Invariant):
         ``fun(t, y, *args) -> float or (l_i,)``, as for `Invariant`.
     rate : callable, optional
         ``rate(t, y, *args) -> float or (l_i,)``, the total derivative of `fun` in time along the solutions; a Python or
-        Numba function, or a C function by pointer (see Notes). Without it, the rate is ``grad @ f + dF/dt`` with
-        f = fun(t, y) of the system: exact to rounding for a jitted function of a real state, else by the gradient and
-        by differences in time. Its rounding is that of the terms of ``grad @ f``. Write the rate without the terms that
-        cancel where relative errors below 1e-10 matter.
+        Numba function, or a C function by pointer (see Notes). Default: the rate is computed as ``grad @ f + dF/dt``
+        with f = fun(t, y) of the system, exactly to rounding for a jitted function of a real state, otherwise with the
+        gradient and differences in time. The rounding error is then that of the terms of ``grad @ f``. If relative
+        errors below 1e-10 matter, give a rate that is written without the terms that cancel.
     grad : callable, optional
         As for `Invariant`.
     args : tuple, optional
@@ -42,39 +42,39 @@ class Balance(Invariant):
     components : array_like of int, shape (s,) or (s, k), optional
         The components of the state that the projection onto this balance may move. The k components of a row move by
         the same amount. Balances with the same components and weights are projected together, as a group. Each group is
-        projected by itself, from the same state: it does not see the corrections of other groups. Afterwards all
-        components together restore the linear invariants of `frame`. Either all invariants of a run have components, or
-        none has. `metric`, `direction` and `iterations` must then be left out.
+        projected separately, from the same state, without the corrections of other groups. Afterwards all components
+        together restore the linear invariants of `frame`. Either all invariants of a run have components, or none has.
+        `metric`, `direction` and `iterations` must be omitted if there are components.
     weights : array_like of float, shape (s,), optional
         The correction is the shortest in units of these weights, such as the sizes of the components. Default: 1.
     uses_f : bool, optional
-        ``rate(t, y, f, *args)`` and ``grad(t, y, f, *args)``, as far as they are given, also receive f, the derivative
-        of the state.
+        ``rate(t, y, f, *args)`` and ``grad(t, y, f, *args)``, if they are given, also receive f, the derivative of the
+        state.
 
     Notes
     -----
-    Balances need a Runge-Kutta method (`EIPRK1` to `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, or one made by
-    `eip_method` of a tableau), which takes the rates at its stages, or a multistep method (`EIPGJ12`, `EIPGJ14`), which
-    sums them as it sums accelerations. The stages of Nystrom methods have no velocities. The value that a run carries
-    begins as F at the start, and again where the state is set between two steps of a solver. It is summed with
-    compensation, takes no part in the error control, and is not changed by the projection. Between the steps it is
-    interpolated as the state is, and states that are handed out there lie on it.
+    Balances need a Runge-Kutta method (`EIPRK1` to `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, or one that
+    `eip_method` makes from a tableau), which evaluates the rates at its stages, or a multistep method (`EIPGJ12`,
+    `EIPGJ14`), which sums them as it sums accelerations. Nystrom methods cannot be used because their stages have no
+    velocities. The integrated value starts as F at the start, and again if the state is set between two steps of a
+    solver. It is a compensated sum, is not part of the error control, and is not changed by the projection. Between
+    the steps it is interpolated as the state is, and states between the steps are projected onto it.
 
-    A given rate is compared with ``grad @ f + dF/dt`` at the start and during the run. A wrong one is reported by a
-    `ProjectionWarning`. `Diagnostics.slowness` says how large the rate is, compared with the terms of ``grad @ f``. If
-    it is above 0.05, a balance hardly helps, and a warning says so. Balances do not help in chaotic motion and under
+    A given rate is compared with ``grad @ f + dF/dt`` at the start and during the run. A wrong rate is reported by a
+    `ProjectionWarning`. `Diagnostics.slowness` is the size of the rate, compared with the terms of ``grad @ f``. If
+    it is above 0.05, a balance hardly helps, and there is a warning. Balances do not help in chaotic motion and with
     strong driving.
 
-    The derivative in time is a difference of order 6, within the interval of the run, over three 32nds of a fixed step
-    or three eighths of the first adaptive step to both sides (to one side next to the ends of the interval). It is
-    exactly zero where `fun` does not depend on t. Jitted functions take dual numbers instead, which are exact.
+    The derivative in time is a difference of order 6, within the interval of the run, over 3/32 of a fixed step or 3/8
+    of the first adaptive step to both sides (to one side next to the ends of the interval). It is exactly zero if `fun`
+    does not depend on t. For jitted functions dual numbers are used instead, which are exact.
 
     A C function for the rate has the signature of a gradient,
     ``int r(double t, const double *y, const double *f, double *values, const double *params)``.
 
     Examples
     --------
-    A planet with a little drag, whose energy falls at the rate -c v²:
+    A planet with a little drag, whose energy decreases at the rate -c v²:
 
     >>> import numpy as np
     >>> from scipy.integrate import solve_ivp
@@ -109,7 +109,9 @@ class Balance(Invariant):
     ) -> None:
         uses_f = flag("Balance: uses_f", uses_f)
         if uses_f and rate is None and grad is None:
-            raise ValueError("Balance: uses_f describes rate and grad; give one of them or leave it out.")
+            raise ValueError(
+                "Balance: uses_f describes rate and grad, but both are missing. Give one of them, or omit uses_f."
+            )
         own: Any = rate
         if isinstance(own, OwnArguments):
             rate, args = own.function, args or own.args
@@ -135,7 +137,7 @@ class Balance(Invariant):
 
     @property
     def rate(self) -> Callable[..., Any] | None:
-        """Return the rate, which takes `args` where they are left out; None if it is computed."""
+        """Return the rate, to which `args` are passed if a call omits them; None if the rate is computed."""
         if self.rate_function is None or not self.args:
             return self.rate_function
         return OwnArguments(self.rate_function, self.args, 2 + self.rate_uses_f)
@@ -145,7 +147,7 @@ def _directions(components: Any, weights: Any) -> tuple[np.ndarray, np.ndarray] 
     """Return components as integers (s, k) and their weights (s, k), or None."""
     if components is None:
         if weights is not None:
-            raise ValueError("Balance: weights without components; weights are those of the components, give both.")
+            raise ValueError("Balance: weights are given without components; give both, or omit weights.")
         return None
     refuse_units(components=components, weights=weights)
     found = reals(components)

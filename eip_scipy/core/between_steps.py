@@ -1,4 +1,4 @@
-"""Attributes of a solver that may be set between its steps, as on SciPy's: checks of what was set."""
+"""Checks of the attributes that a user may set between two steps of a solver, as on SciPy's solvers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ N_LEFT = 7
 
 
 class Settings(NamedTuple):
-    """The attributes of a solver that may be set between its steps, by the objects that the last step left there."""
+    """The attributes of a solver that may be set between its steps, with their objects after the last step."""
 
     t: float
     y: np.ndarray
@@ -42,12 +42,12 @@ def kept_state(y: np.ndarray) -> bytes | np.ndarray:
 
 
 def is_state(y: np.ndarray, kept: bytes | np.ndarray) -> bool:
-    """Return whether `y` is still the state of which `kept` is a copy."""
+    """Return True if `y` is equal to the state of which `kept` is a copy."""
     return y.tobytes() == kept if type(kept) is bytes else np.array_equal(y, kept)
 
 
 def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
-    """Return a state or a derivative that was set as a new array of the size and type of `like`.
+    """Return a state or a derivative that the user has set, as a new array of the size and type of `like`.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
 
 
 def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: int) -> Stepping:
-    """Return how a solver goes on from its present time with the attributes that it has now.
+    """Return the step control with which a solver continues from its present time, from its present attributes.
 
     Raises
     ------

@@ -24,7 +24,7 @@ PARTS, ROUNDINGS = 8.0, 16.0
 
 
 def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
-    """``fun`` with its last arguments given; itself where there are none."""
+    """Return ``fun`` with its last arguments bound; ``fun`` itself if there are none."""
     return (lambda *first: fun(*first, *arguments)) if arguments else fun
 
 
@@ -140,7 +140,7 @@ class Carried:
         return self.known(t, y, f)[self.given_places]
 
     def rates(self, low: float, high: float, shift: float, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the rates as the engine calls them, by `functions` or in Python."""
+        """Return the rates in the form that the engine calls: `functions`, or functions of Python."""
         items = tuple((k, self._starts[k + 1] - self._starts[k]) for k in self.items)
         return Rates(items, tuple(map(self._call, self.items) if functions is None else functions), low, high, shift)
 

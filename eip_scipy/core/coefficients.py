@@ -1,4 +1,4 @@
-"""Coefficients as attributes of solver classes, as SciPy's RungeKutta classes have them: shown, and read."""
+"""Coefficients as attributes of solver classes, as in SciPy's RungeKutta classes: set on ours, read from others."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str,
 
 
 def tableau_of(solver: type[OdeSolver]) -> Tableau:
-    """Return the tableau of a class of another package, by its coefficients; the step control of the class is left.
+    """Return the tableau of a class of another package from its coefficients; its step control is not used.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def tableau_of(solver: type[OdeSolver]) -> Tableau:
 
 
 def is_same(solver: type[OdeSolver], own: type[OdeSolver]) -> bool:
-    """Return whether a subclass of `own` makes the same steps."""
+    """Return True if a subclass of `own` makes the same steps."""
     if not issubclass(solver, own) or _own_functions(solver, own):
         return False
     pairs: Any = ((getattr(solver, name, None), getattr(own, name, None)) for name in NAMES)
@@ -111,7 +111,7 @@ def _floats(values: np.ndarray) -> Any:
 
 
 def _require_plain_steps(solver: type[OdeSolver]) -> None:
-    """Refuse a subclass of SciPy's RungeKutta whose steps are made by functions of its own."""
+    """Raise an error for a subclass of SciPy's RungeKutta that overrides the functions that make its steps."""
     base: Any = RK45.__bases__[0]
     own = _own_functions(solver, base) if issubclass(solver, base) and _array(solver, "E5") is None else []
     if own:

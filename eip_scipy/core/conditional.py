@@ -1,4 +1,4 @@
-"""Quantities that a system keeps only where others hold, as constraints and energies of constrained systems are."""
+"""Quantities that a system conserves only if others hold, such as constraints and energies of constrained systems."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ VANISHES, UNSEEN = 0.05, 1e-8
 def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Derivative) -> Array | None:
     """Return the state nearest to y, in units of `span`, on which all invariants have their targets.
 
-    None where y is there already, or where no such state is found.
+    None if y itself is such a state, or if none is found.
     """
     state, best, nearest = y, np.inf, None
     weights = np.repeat(span, state.view(float).size // span.size)
@@ -58,7 +58,7 @@ def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Deriva
 def is_kept_on_a_surface(
     known: InvariantSet, k: int, held: Array, t: float, y: Array, f: Array, rhs: Derivative
 ) -> bool:
-    """Return whether the rate of invariant k vanishes on a surface near y that the flow does not leave.
+    """Return True if the rate of invariant k vanishes on a surface near y that the flow does not leave.
 
     The rate of a length is the velocity along it, and a system with that constraint keeps both together: the rate is 0
     near y, and there its own rate is 0. Friction, a driving force or a wrong term do neither.
@@ -122,7 +122,7 @@ class _Rate:
     def root(self, G: Array) -> Array | None:
         """Return the nearest state at which the rate vanishes and the invariants of gradients G do not change, or None.
 
-        None also if Newton's method does not find one, or finds it far away.
+        The function also returns None if Newton's method finds no such state, or finds it far away.
         """
         floats, first = self.floats, self(self.floats)
         value = first
@@ -139,7 +139,7 @@ class _Rate:
         return floats if abs(value) <= CONVERGED * abs(first) else None
 
     def is_kept_at(self, floats: Array | None) -> bool:
-        """Return whether the flow leaves the rate as it is at a state."""
+        """Return True if the flow does not change the rate at a state."""
         if floats is None:
             return False
         moving = self.weights > 0
@@ -149,7 +149,7 @@ class _Rate:
         return bool(abs(changes.sum()) <= share * np.abs(changes).sum())
 
     def _newton_step(self, slope: Array, value: float, G: Array) -> Array | None:
-        """Return the least move, in units of the weights, that makes the linear rate 0; None if there is none."""
+        """Return the shortest move, in units of the weights, that makes the linear rate 0; None if there is none."""
         rows = np.vstack([slope, G.view(float) * self.weights])
         lengths = np.linalg.norm(rows, axis=1)
         if not (0 < lengths[0] < np.inf and np.isfinite(lengths).all()):

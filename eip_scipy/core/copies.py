@@ -1,4 +1,4 @@
-"""Copies of solvers in the middle of a run, in memory or by pickle: they go on to the same bits.
+"""Copies of solvers in the middle of a run, in memory or by pickle, which continue to the same bits.
 
 The engine and what is bound to the user's functions are made again; everything that a step left is copied.
 """
@@ -32,7 +32,10 @@ class RunParts(NamedTuple):
 
 
 def parts_of(run: Run) -> RunParts:
-    """Return what makes a run again; the user's one-step method stays out; of a solver of SciPy its values."""
+    """Return the parts from which `run_of` makes a run again.
+
+    They contain the values of a solver of SciPy, but not a one-step method of the user.
+    """
     values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
     values["options"] = run.options._replace(joint=None)
     if run.tableau.in_python:
@@ -41,7 +44,7 @@ def parts_of(run: Run) -> RunParts:
 
 
 def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
-    """Return the run of these parts, on copies of their buffers.
+    """Return a run made from its parts, with copies of their buffers.
 
     Parameters
     ----------
@@ -69,7 +72,7 @@ def scipy_values(solver: OdeSolver) -> dict[str, Any]:
 
 
 def set_scipy_values(solver: OdeSolver, values: dict[str, Any]) -> None:
-    """Give a solver of SciPy these attributes; its stages, K, may be a part of an array, and are filled in place."""
+    """Set attributes of a solver of SciPy; the stages K are filled in place, because K may be a view of an array."""
     for name, value in values.items():
         if name.startswith("K"):
             getattr(solver, name)[...] = value

@@ -1,4 +1,4 @@
-"""Examinations of a run on its way: whether its quantities are invariants there, and their gradients correct.
+"""Examinations during a run: whether its quantities are invariants, and whether their gradients are correct.
 
 At the start a rate or a gradient may vanish, or a function may take another branch than later. So the invariants are
 checked again after 10, 100, 1000, ... steps and at the end. Steps that the engine suspects are examined, too (`suspect`
@@ -37,9 +37,9 @@ __all__ = ["Examiner", "is_check_due", "steps_to_check"]
 
 # Number of steps before the first check of the invariants, and the factor from one check to the next.
 FIRST_CHECK = SPACING = 10
-# Number of points of a step at which rates are examined, because a push may be shorter than the step.
+# Number of points of a step at which rates are examined, because a force may act for less than a step.
 POINTS = 8
-# Points of each step on the way back over steps that were not projected.
+# Number of points in each earlier step that was not projected.
 BACK = 4
 # Factor by which the largest correction has to grow before a large correction is examined again.
 GROWTH = 2.0
@@ -57,7 +57,7 @@ def steps_to_check(steps: int) -> int:
 
 
 def is_check_due(steps: int) -> bool:
-    """Return whether a check of the invariants is due after `steps` steps."""
+    """Return True if a check of the invariants is due after `steps` steps."""
     return steps > 0 and steps_to_check(steps - 1) == 1
 
 
@@ -71,11 +71,11 @@ class Examiner:
     tau : float
         The length of a step.
     figures : ndarray, shape (l, N_FIGURES)
-        The figures of the run's corrections. The rates of change that are found here are added to them.
+        The figures of the run's corrections, in which the examiner also stores rates of change.
     resolution : callable
         ``resolution(rhs, t, h, y, end_of_run)``: see `unresolved`.
     largest : float
-        The largest correction when a large correction was examined last.
+        The largest correction at the time of the last examination of a large correction.
     """
 
     invariants: InvariantSet
@@ -85,11 +85,11 @@ class Examiner:
     largest: float = 0.0
 
     def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
-        """Return what is wrong with an invariant or a gradient at a state of the run, or None."""
+        """Return a finding about an invariant or a gradient at a state of the run, or None."""
         return self._unless_refused(_complaint, rhs, t, y, True)
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
-        """Return what is wrong in the step that the engine suspects, or None. The engine may then suspect another."""
+        """Return a finding about the step that the engine suspects, or None. The engine may then suspect another."""
         reason, t_old, t_new = suspect[REASON], float(suspect[SUSPECT_FROM]), float(suspect[SUSPECT_TO])
         suspect[REASON] = NOTHING
         old, new = np.split(suspect[N_SUSPECT:].copy().view(self.invariants.dtype), 2)
@@ -102,10 +102,10 @@ class Examiner:
         return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new), int(suspect[SUSPECT_WAITED]))
 
     def _unless_refused(self, look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
-        """Return what an examination finds, which calls the user's functions through guards.
+        """Return the result of the examination `look`; None if a function of the user raises an exception in it.
 
-        The states that it looks at are near those of the run, but the run does not visit them. A function that refuses
-        one of them by an exception says nothing about the run.
+        The examined states are near those of the run, but the run does not visit them. Therefore an exception at such a
+        state says nothing about the run.
         """
         known = copy.copy(self.invariants)
         known.functions = _Guarded(known.functions)
@@ -117,11 +117,11 @@ class Examiner:
 
 
 class _RefusedError(Exception):
-    """A user's function has refused a state that the run does not visit."""
+    """A function of the user raised an exception at a state that the run does not visit."""
 
 
 class _Guarded:
-    """Functions of invariants whose exceptions are those of a refused state."""
+    """Functions of invariants whose exceptions become `_RefusedError`."""
 
     def __init__(self, functions: Any) -> None:
         self._functions = functions
@@ -131,7 +131,7 @@ class _Guarded:
 
 
 def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function whose exceptions are those of a refused state; a lack of memory remains one."""
+    """Return a function whose exceptions become `_RefusedError`, except MemoryError."""
 
     def call(*args: Any) -> Any:
         try:
@@ -147,7 +147,10 @@ def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
 def _complaint(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, y: Array, on_manifold: bool
 ) -> str | None:
-    """Return what is wrong at a state. Off the manifold, invariants that are kept where others hold may change."""
+    """Return a finding at a state, or None.
+
+    If the state is not on the manifold, findings about invariants that depend on others are ignored.
+    """
     f = rhs(t, y)
     if not np.isfinite(f).all():
         return None
@@ -159,7 +162,7 @@ def _complaint(
 
 
 def _unresolved(examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, h: float, y: Array) -> str | None:
-    """Return which part of the state the steps from here do not resolve, or None."""
+    """Return a sentence on the part of the state that steps from (t, y) do not resolve, or None."""
     return examiner.resolution(rhs, t, h, y, known.t_span[1])
 
 
@@ -171,9 +174,9 @@ def _along_chord(
     ends: tuple[Array, Array],
     waited: int,
 ) -> str | None:
-    """Return what is wrong between the two ends of a step with a large correction, or in the steps before it, or None.
+    """Return a finding between the two ends of a step with a large correction, or in the steps before it, or None.
 
-    `waited` steps before it were not projected, and any of them may be what the correction comes from.
+    The `waited` steps before it were not projected, and each of them may be the cause of the correction.
     """
     largest = float(examiner.figures[:, NU].max(initial=0.0))
     if largest < GROWTH * examiner.largest:
@@ -191,10 +194,10 @@ def _along_chord(
 def _on_the_way(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, start: tuple[float, Array], h: float, steps: int
 ) -> str | None:
-    """Return what is wrong on the way that led to a state, or None; it is followed back for about `steps` steps."""
+    """Return a finding on the trajectory that led to a state, or None; it is followed back for about `steps` steps."""
     (t, y), part = start, h / BACK
     begin = known.t_span[0]
-    # Steps that vary may have been longer before.
+    # More than `steps` steps of length h are followed, because earlier steps may have been longer.
     for _ in range(BACK * (steps + (steps + 1) // 2)):
         if (t - part - begin) * part < 0:
             return None

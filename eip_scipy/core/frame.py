@@ -1,4 +1,4 @@
-"""The frame (C, S): linear invariants that corrections must not touch."""
+"""The frame (C, S): linear invariants that corrections must not change."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NO_FRAME = FrameRows(np.zeros((2, 1), INDEX), np.zeros(0, INDEX), np.zeros(0), n
 
 
 def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
-    """The frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1, over float views.
+    """Return the frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1, over float views.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
 
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
-    """Which gradients, rows of G, are sums of rows of C, so that nothing but rounding is left of them."""
+    """Return a mask of the gradients (rows of G) that are combinations of rows of C, which the frame removes."""
     C, M = (_dense_rows(start, frame, G.shape[1]) for start in frame.start)
     size = np.abs(G).max(axis=1)
     return (size > 0) & (np.abs(G - (G @ M.T) @ C).max(axis=1) <= SPANNED * size)
@@ -73,7 +73,7 @@ def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndar
 
 
 def _real_form(a: np.ndarray) -> np.ndarray:
-    """The matrix that acts on (Re, Im) pairs as `a` does on complex components."""
+    """Return the real matrix that acts on (Re, Im) pairs as `a` does on complex components."""
     out = np.empty((a.shape[0], 2, a.shape[1], 2))
     out[:, 0, :, 0] = out[:, 1, :, 1] = a.real
     out[:, 1, :, 0], out[:, 0, :, 1] = a.imag, -a.imag
@@ -81,7 +81,7 @@ def _real_form(a: np.ndarray) -> np.ndarray:
 
 
 def _by_bodies(a: np.ndarray) -> np.ndarray:
-    """Weights (k, b) of b bodies, where `a` (3 k, 3 k b) sums the x, y and z of k groups of them; else none."""
+    """Return weights (k, b) of b bodies if `a` (3 k, 3 k b) sums x, y and z of k groups of them; otherwise none."""
     groups = a.shape[0] // 3
     if groups == 0 or a.shape[1] % (3 * groups):
         return np.zeros((0, 0))

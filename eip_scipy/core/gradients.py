@@ -1,4 +1,4 @@
-"""Gradients of invariants that come without one: complex steps where they are right, differences elsewhere."""
+"""Numerical gradients of invariants: complex steps if they are correct, otherwise differences."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ __all__ = ["NumericalGradient", "difference_gradient", "random_directions", "typ
 Array = np.ndarray
 
 COMPLEX_STEP = 1e-100
-# How far from the start, in units of its components' sizes, a complex step is tried, and how far it may then be from
-# differences, in units of the largest component. The shorter distances stay clear of a singularity close to the start.
+# Distances from the start, in units of its components' sizes, at which a complex step is tried, and the largest allowed
+# difference from central differences, in units of the largest component. The shorter distances avoid a singularity
+# close to the start.
 TRIALS = ((1e-2, 1e-7), (1e-4, 1e-9), (1e-6, 1e-10))
 # Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1); those of order 4, to compare.
 DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
@@ -29,11 +30,11 @@ DIFFER, ROUNDINGS, LEAST = 1e-8, 1e3, np.finfo(float).tiny
 
 
 class NumericalGradient:
-    """Gradient of a function without one: by complex steps where they are right, else by differences of order 6.
+    """Numerical gradient: by complex steps if they are correct, otherwise by differences of order 6.
 
-    A complex step is wrong where the function takes an absolute value, a norm or a real part, which may be in a part of
-    its domain only. Each gradient by complex steps is therefore compared with a difference along one direction. The
-    choice depends on the state alone, so that a run that is resumed takes the same steps.
+    A complex step is wrong if the function uses an absolute value, a norm or a real part, perhaps only in a part of its
+    domain. Therefore each gradient by complex steps is compared with a difference along one direction. The choice
+    depends on the state only, so that a resumed run makes the same steps.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ class NumericalGradient:
     args : tuple
         The invariant's own arguments. Those of the run follow them in each call.
     takes_complex : bool
-        False for functions that complex steps must not be tried with.
+        False for functions that cannot be called with complex states.
     t, y
         The start.
     floors : ndarray, shape (n,)
@@ -76,15 +77,15 @@ class NumericalGradient:
         return np.asarray(self._function(t, y.copy(), *self._args, *extra))
 
     def _by_complex_step(self, t: float, y: Array, extra: tuple) -> Array | None:
-        """The gradient by complex steps; None where it disagrees with a difference."""
+        """Return the gradient by complex steps; None if it disagrees with a difference."""
         return BUILD.gradients.checked_complex_step(
             self._function, t, y, self._args + extra, COMPLEX_STEP, self._direction, self.floors
         )
 
     def _takes_complex_steps(self, t: float, y: Array, extra: tuple) -> bool:
-        """Return whether the function takes complex states and is analytic near the start.
+        """Return True if the function accepts complex states and is analytic near the start.
 
-        It is evaluated next to y, because derivatives of abs(y_k) and the like may happen to vanish at y itself.
+        It is evaluated near y, because derivatives of abs(y_k) and similar terms may happen to vanish at y itself.
         """
         real = self._fun(t, y, extra)
         try:
@@ -96,7 +97,7 @@ class NumericalGradient:
                 return any(self._agrees_beside(t, y, extra, *trial) for trial in TRIALS)
         except MemoryError:
             raise
-        except Exception:  # whatever a library raises for numbers that it does not know
+        except Exception:  # libraries may raise any error for complex numbers
             return False
 
     def _agrees_beside(self, t: float, y: Array, extra: tuple, length: float, tolerance: float) -> bool:
@@ -108,15 +109,15 @@ class NumericalGradient:
 
 
 def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
-    """Gradient of value(y) by central differences of order 6, shifts in units of |y_k| + floor_k.
+    """Return the gradient of value(y) by central differences of order 6, with shifts in units of |y_k| + floor_k.
 
-    Where those of order 4 do not agree, as next to a singularity that is nearer than the state's size, the shifts are
-    shortened until they do; if they never do, the shift at which the orders agree best is taken. The engine computes
+    If differences of order 4 disagree, as near a singularity that is closer than the state's size, the shifts are
+    shortened until both agree. If they never agree, the shift with the best agreement is used. The engine computes
     the same bits (engine/cpp/differences.hpp).
     """
 
     def along(k: int, unit: complex) -> Any:
-        # A power of two: y + shift and y - shift then differ by the shift exactly, except for their own rounding.
+        # The shift is a power of two, so that adding it to y has no other error than the rounding of the sum.
         shift = 2.0 ** np.round(np.log2(FIRST_SHIFT * (abs(y[k]) + floor[k])))
         found, least = None, np.inf
         for _ in range(MOST_SHIFTS):
@@ -136,7 +137,7 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
 
 
 def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: complex) -> tuple[Array, float]:
-    """The sums of order 6 over shifts of y_k, and by how much more than they may those of order 4 differ."""
+    """Return the differences of order 6 for y_k, and the excess of their disagreement with those of order 4."""
     sums, lower, largest = np.zeros(()), np.zeros(()), np.zeros(())
     for (multiple, weight), lower_weight in zip(DIFFERENCE_WEIGHTS, LOWER_WEIGHTS, strict=True):
         ends = [y.copy(), y.copy()]
@@ -152,9 +153,9 @@ def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: comple
 
 
 def typical_sizes(y: Array, f: Array, tau: float) -> Array:
-    """Return for each component how far it moves in a step, which stands for its size where it is smaller than that.
+    """Return for each component its motion in a step, which is used as its size if the component is smaller.
 
-    Components about which nothing is known take the largest size of the others, or 1.
+    Components without any motion get the largest size of the others, or 1.
     """
     floors = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
     floors = np.maximum(floors, 1e-3 * np.abs(y))
@@ -164,7 +165,7 @@ def typical_sizes(y: Array, f: Array, tau: float) -> Array:
 
 @lru_cache
 def random_directions(n: int, is_complex: bool) -> Array:
-    """Return two directions, the same in each run: a generator takes as long to make as all else in a check."""
+    """Return two directions, the same in each run. They are cached, because making a generator takes long."""
     rng = np.random.default_rng(20220)
     parts = rng.standard_normal((2, 2 if is_complex else 1, n))
     return parts[:, 0] + 1j * parts[:, 1] if is_complex else parts[:, 0]

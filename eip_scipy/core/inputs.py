@@ -60,7 +60,7 @@ def refuse_units(**arguments: Any) -> None:
 
 
 def is_plain(value: Any) -> bool:
-    """Return whether a value is a plain number, an array of numbers, or a list or tuple of plain numbers, for sure."""
+    """Return True if a value is certainly a plain number, an array of numbers, or a list or tuple of plain numbers."""
     kind = type(value)
     if kind is np.ndarray:
         return value.dtype.kind in "fiubc"

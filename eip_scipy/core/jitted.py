@@ -1,4 +1,4 @@
-"""Numba functions, recognised without loading Numba: where it is not loaded, there are none."""
+"""Recognition of Numba functions without an import of Numba: if it is not imported, there are none."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def jit_is_off() -> bool:
 
 
 def compilable(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Mark a function of ours as one that `jitted` may compile."""
+    """Mark a function of this package as one that `jitted` may compile."""
     fun.compilable = True  # type: ignore[attr-defined]
     return fun
 
 
 @cache
 def jitted(fun: Any) -> Any:
-    """A `compilable` function as Numba's, where Numba is installed; all else, and without Numba, as it is."""
+    """Jit a `compilable` function if Numba is installed; return any other function unchanged."""
     if not getattr(fun, "compilable", False) or find_spec("numba") is None:
         return fun
     from numba import njit
@@ -65,12 +65,12 @@ def jitted(fun: Any) -> Any:
 
 
 def is_compiled(fun: Any) -> bool:
-    """Return True if Numba functions can call it: a Numba function, or one of the library."""
+    """Return True if Numba functions can call `fun`, which is a Numba function or one of the library."""
     return is_jitted(fun) or isinstance(fun, LibraryFunction)
 
 
 def compiled_like(fun: Callable[..., Any], *others: Callable[..., Any]) -> Callable[..., Any]:
-    """`fun` as Numba's if all of the others, which it calls, are compiled, and Numba is installed; else as it is."""
+    """Jit `fun` if Numba is installed and all of the `others`, which it calls, are compiled; otherwise return `fun`."""
     if not all(is_compiled(other) for other in others):
         return fun
     return cast(Callable[..., Any], jitted(compilable(fun)))

@@ -1,4 +1,4 @@
-"""Compiled functions of a state with columns of derivatives behind it; loaded only where all of a run is compiled."""
+"""Compiled functions of a state with columns of derivatives; imported only if the whole run is compiled."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def rhs_by_duals(
 
 
 def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) -> Any:
-    """Return a function that copies the parameters as duals, where derivatives are taken by some."""
+    """Return a function that copies the parameters as duals, for derivatives with respect to some of them."""
     if not parameters:
         return inside(lambda params, Y, first: params)
     places, lanes = np.array(parameters, np.int64), dual.lanes
@@ -89,7 +89,7 @@ def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) 
 
 
 def _with_out(fun: Any, form: str, has_params: bool, one_by_one: bool) -> Any:
-    """Return a function of (t, x, out, params) that returns the derivative, which it may have filled into out."""
+    """Return a function of (t, x, out, params) that returns the derivative; it may use `out` for it."""
     if form.endswith("place"):
         if one_by_one:
             return inside(lambda t, x, out, numbers: _second(fun(t, x, out, *numbers), out))
@@ -110,7 +110,7 @@ def _second(first, second):
 
 @lru_cache(maxsize=256)
 def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
-    """The right-hand side in place of a state with columns, by a jitted ``jvp(t, y, dy, ...) -> (n,)``."""
+    """Return the in-place right-hand side of a state with columns, from a jitted ``jvp(t, y, dy, ...) -> (n,)``."""
     taken = n // 2 if form.startswith("acceleration") else n
     offset, in_place = n - taken, form.endswith("place")
 
@@ -131,7 +131,7 @@ def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
 
 @lru_cache(maxsize=256)
 def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
-    """The right-hand side in place of a state that has the numbers that `rhs` takes at these places; others stay."""
+    """Return `rhs` as an in-place function of a state whose entries at `places` are the state of `rhs`."""
     order = np.array(places, np.int64)
 
     def in_place(t, Y, out, *extra):
@@ -148,7 +148,7 @@ def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
 
 @lru_cache(maxsize=256)
 def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...], parameters: tuple[int, ...]) -> Any:
-    """The derivatives ``slopes(t, y, params) -> (..., k)`` of a jitted invariant by k of its p parameters.
+    """Return the derivatives ``slopes(t, y, params) -> (..., k)`` of a jitted invariant by k of its p parameters.
 
     Raises
     ------

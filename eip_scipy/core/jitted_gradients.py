@@ -1,4 +1,4 @@
-"""Compiled gradients of jitted invariants that come without one; loaded only where there is such an invariant."""
+"""Compiled gradients of jitted invariants without a gradient; imported only if there is such an invariant."""
 
 from __future__ import annotations
 
@@ -76,13 +76,13 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
 
 
 def dual_along(directions: int) -> Dual:
-    """Return the duals that carry derivatives along a number of directions in the fewest passes, all alike."""
+    """Return the dual type that gives derivatives along `directions` directions in the fewest equal passes."""
     passes = -(-directions // LANES)
     return Dual(-(-directions // passes))
 
 
 def new_state(dual: Any, n: int) -> Any:
-    """Return a function that makes room for a state of duals."""
+    """Return a function that allocates a state of duals."""
     return inside((lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n)), forceinline=True)
 
 
@@ -133,7 +133,7 @@ def _by_signature(function: Callable[..., Any], arguments: list[Any]) -> Any:
 
 
 def put_slopes(value, out, first, count):
-    """The derivatives of an invariant into columns of its gradient; for compiled code alone."""
+    """Write derivatives of an invariant to columns of its gradient; only compiled code can call this."""
 
 
 @overload(put_slopes)

@@ -20,7 +20,7 @@ TOLERANCE = 1e-14
 
 
 class AtRealTimes(DenseOutput):
-    """Dense output that says what is wrong with times that are not real numbers."""
+    """Dense output that raises a clear error for times that are not real numbers."""
 
     def __call__(self, t: Any) -> Array:
         """Return the states at a time or at times (m,), as (n,) or (n, m).
@@ -65,7 +65,7 @@ class KeptDenseOutput(AtRealTimes):
 
 
 def kept(t_old: float, t: float, states: Callable[[Array], Array]) -> KeptDenseOutput:
-    """Return the polynomial that stands for the states (n, m) at times (m,) over a step."""
+    """Return the polynomial that approximates the states (n, m) at times (m,) over a step."""
 
     def polynomial() -> KeptDenseOutput:
         return KeptDenseOutput(t_old, t, (times - t_old) / (t - t_old), found)

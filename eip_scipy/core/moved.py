@@ -1,4 +1,4 @@
-"""Names that have moved: for this version they are found in their old places, with a warning that says the new one."""
+"""Names that have moved: in this version their old places still work, with a warning that names the new place."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MOVED = {  # a module: its old names, or "*" for all of them, and the modules th
 
 
 def moved_names(module: str, stacklevel: int = 2) -> Callable[[str], Any]:
-    """Make the ``__getattr__`` of a module some of whose names have moved.
+    """Return the ``__getattr__`` of a module from which names have moved.
 
     Nothing is imported before an old name is used.
 

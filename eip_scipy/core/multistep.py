@@ -1,4 +1,4 @@
-"""Multistep methods in a run: what they hold of it, whether its step is stable, and what the Jacobian is to correct."""
+"""Multistep methods in a run: their history, the check that the step is stable, and the use of the Jacobian."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DIFFERENCE = 1e-6
 
 
 class SecondOrder(NamedTuple):
-    """A system q'' = a(t, q[, v]) as a multistep method sees it.
+    """A system q'' = a(t, q[, v]) in the form that a multistep method needs.
 
     `jacobian`: ``jacobian(t, q, dq) -> (n/2,)``, the derivative of the accelerations along dq, or None. `frequencies`:
     see `Problem`, or None where only the accelerations are known.
@@ -44,7 +44,7 @@ class SecondOrder(NamedTuple):
 
 
 def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Array, Array], Array]:
-    """A user's ``jacobian(t, q, dq, out, *extra)`` as a function that returns its product with dq."""
+    """Return a function of the product with dq, made from a user's in-place ``jacobian(t, q, dq, out, *extra)``."""
 
     def product(t: float, q: Array, dq: Array) -> Array:
         out = np.empty_like(q)
@@ -56,7 +56,7 @@ def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Arra
 
 
 def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping, *, level: bool) -> None:
-    """Give a run of a multistep method its history, after a look at its step.
+    """Give a run of a multistep method its history, after a check of its step.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping,
 
 
 def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, check: bool) -> slice:
-    """Return which floats of the accelerations the Jacobian corrects; with `check` refuse a step that is not stable."""
+    """Return a mask of the floats of the accelerations that the Jacobian corrects; `check`: reject an unstable step."""
     y0 = system.start.y
     half = y0.size // 2
     plain = stability_limit(method.order, False)
@@ -114,7 +114,7 @@ def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, chec
 
 
 def _largest_frequency(system: SecondOrder) -> float:
-    """The largest frequency of small changes of the state at the start: of the Jacobian's most negative eigenvalue."""
+    """Return the largest frequency of small motions at the start, from the Jacobian's most negative eigenvalue."""
     t, y, _, _ = system.start
     half = y.size // 2
 
@@ -131,7 +131,7 @@ def _largest_frequency(system: SecondOrder) -> float:
 
 
 def _largest_damping(system: SecondOrder) -> float:
-    """The largest eigenvalue, by its size, of the accelerations' derivative by the velocities at the start."""
+    """Return the eigenvalue of largest modulus of the accelerations' derivative by the velocities at the start."""
     y = system.start.y
     return _largest(lambda d: _difference(system, d, slice(y.size // 2, None)), y)
 
@@ -146,7 +146,7 @@ def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
 
 
 def _largest(product: Callable[[Array], Array], y: Array) -> float:
-    """The largest eigenvalue of a matrix, by its size, to some per cent: from its products with vectors."""
+    """Return the eigenvalue of largest modulus of a matrix, to a few per cent, from its products with vectors."""
     d, found = np.random.default_rng(0).standard_normal(y.size // 2).astype(y.dtype), 0.0
     for _ in range(ROUNDS):
         d = product(d / np.sqrt(np.vdot(d, d).real))
@@ -191,7 +191,7 @@ def _record(
 
 
 def _aligned(shape: tuple[int, ...]) -> Array:
-    """Zeros from the beginning of a cache line on: else each load of a vector may take two."""
+    """Return zeros aligned to a cache line, because unaligned loads of vectors may take twice as long."""
     size = math.prod(shape)
     memory = np.zeros(size * 8 + ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % ALIGNMENT

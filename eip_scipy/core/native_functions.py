@@ -1,4 +1,4 @@
-"""A user's functions as the native engine takes them, by their addresses: C functions by pointer, and Numba's."""
+"""The user's functions by address, in the form that the native engine needs: C functions and Numba functions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Kind(NamedTuple):
 
 
 class Native(NamedTuple):
-    """A function that has an address, and how many floats it fills; None for a gradient by differences."""
+    """A function that has an address, and the number of floats that it fills; None for a gradient by differences."""
 
     function: PointerFunction | Compiled | LibraryFunction | None
     floats: int
@@ -115,7 +115,7 @@ def native_functions(
 
 
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
-    """Return what a function of a state with columns of derivatives is of the state alone; others are what they are."""
+    """Return the `OfState` of a function of a state with columns of derivatives; return other functions unchanged."""
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
 
@@ -166,7 +166,7 @@ def with_events(
 def with_jacobian(
     functions: NativeFunctions, jacobian: Callable[..., Any], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
-    """Return the functions with the address of the Jacobian times a vector, ``jacobian(t, q, dq, out[, params])``.
+    """Return the functions with the address of ``jacobian(t, q, dq, out[, params])``, the Jacobian times a vector.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def with_rates(
 
 
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:
-    """Raise what a failed call in the engine is to a run, from the arguments of its `FailedCallError`.
+    """Raise the exception of a failed call in the engine, from the arguments of its `FailedCallError`.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""The library's own functions inside Numba functions: `problem.rhs` may be called from a user's compiled code.
+"""Use of the library's functions inside Numba functions: a user's compiled code may call `problem.rhs`.
 
-Numba finds `register` by the package's entry point ``numba_extensions``.
+Numba finds `register` through the package's entry point ``numba_extensions``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Numba functions as the native engine takes them: by C pointers, compiled when a run begins."""
+"""Numba functions as C function pointers for the native engine, compiled when a run begins."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ __all__ = ["Compiled", "compiled"]
 
 # Counter for the names of C functions.
 _serial = count()
-# Called from compiled code alone. Inlined, for that an array is nobody's and needs no counting of references shows only
-# there.
+# Compiles functions that only compiled code calls. They are inlined, because only then the compiler sees that their
+# arrays need no counting of references.
 _called = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 _inlined = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class Pointer(NamedTuple):
-    """The address of a function, what keeps its code, and whether the function returns None in some places."""
+    """The address of a function, the owner of its code, and whether the function returns None in some branches."""
 
     address: int
     library: Any
@@ -36,7 +36,7 @@ class Pointer(NamedTuple):
 
 
 class Compiled(NamedTuple):
-    """A function as C calls it, with all arguments."""
+    """A function that C can call, with all arguments."""
 
     pointer: Pointer
     fun: Any
@@ -63,12 +63,12 @@ class Compiled(NamedTuple):
 
 
 def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
-    """A Numba function compiled for states of one kind, of numbers of the type that `kind` names, or of `number`.
+    """Compile a Numba function for states of one kind, with the type of numbers in `kind`, or `number`.
 
     Raises
     ------
     NotCompilableError
-        When it does not compile for the arguments that `integrate` documents.
+        If the function does not compile for the arguments that `integrate` documents.
     """
     try:
         pointer = _compile(fun, kind, number)
@@ -84,7 +84,7 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
 
 @lru_cache(maxsize=256)
 def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
-    """For the same function and kind of state once in a process."""
+    """Compile a function once in a process for the same kind of state."""
     call = _with_all_arguments(fun, kind, _inlined)
 
     def array(scalar: Any, ndim: int) -> Any:
@@ -104,7 +104,8 @@ def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
 def _c_function(compiled: Any, kind: Kind) -> Pointer:
     """Wrap a function compiled for (t, y, f, out, params) as a C function that returns 0, or -1 after an exception.
 
-    Written in LLVM's own language: Numba's `cfunc` would take twice as long to compile, and each call of it be two.
+    The wrapper is written in LLVM's language, because Numba's `cfunc` would take twice as long to compile, and each
+    call would consist of two.
     """
     name = f"eip_scipy.{next(_serial)}"
     context = compiled.target_context
@@ -127,7 +128,7 @@ def _c_function(compiled: Any, kind: Kind) -> Pointer:
 
 
 def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tuple[int, ...]) -> Any:
-    """A C array at `data` as a value of Numba's array type, which nobody owns."""
+    """Return a C array at `data` as a value of Numba's array type without an owner."""
     array = context.make_array(kind)(context, builder)
     item = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     strides = np.cumprod((item, *shape[:0:-1]))[::-1].tolist()
@@ -139,7 +140,7 @@ def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tupl
 
 
 def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
-    """``call(t, y, f, out, params)``, which puts the function's value into out."""
+    """Return ``call(t, y, f, out, params)``, which writes the value of `fun` to out."""
     has_params = kind.p >= 0
     numbers = _numbers(kind.scalars, jit)
     bare = jit(
@@ -168,7 +169,7 @@ def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
 
 
 def _numbers(types: str, jit: Any, k: int = 0) -> Any:
-    """``numbers(params)``: those from the kth on as a tuple, of these types."""
+    """Return ``numbers(params)``, a function that returns params[k:] as a tuple of numbers of these types."""
     if k == len(types):
         return jit(lambda params: ())
     rest = _numbers(types, jit, k + 1)

@@ -1,4 +1,4 @@
-"""One-step methods of a user's own in place of the Runge-Kutta step: their protocol, and the raw step by them."""
+"""User-defined one-step methods in place of the Runge-Kutta step: their protocol, and their unprojected step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NUMBERS = (float, np.float64, int, complex, np.complex128)
 class OneStepMethod(Protocol):
     """A one-step method, which `eip_method` accepts instead of a tableau.
 
-    Any object with these members will do; nothing is inherited.
+    Any object with these members is accepted; it need not be a subclass.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class OneStepMethod(Protocol):
     order: int
 
     def one_step(self, t: float, y: np.ndarray, h: float) -> Any:
-        """One step from (t, y) to t + h.
+        """Make one step from (t, y) to t + h.
 
         Parameters
         ----------
@@ -59,7 +59,7 @@ class OneStepMethod(Protocol):
 
 
 class OneStep(Ordered):
-    """A user's one-step method, checked, in the roles of a tableau and of its arrays.
+    """A user's one-step method after checks; it takes the place of a tableau and of its arrays.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class OneStep(Ordered):
         return f"<OneStep {self.name}: order {self.order}>"
 
     def fill(self, w: Work, t: float, y: np.ndarray, h: float) -> None:
-        """One step into the buffers `w`: the state, and the estimate where there is one."""
+        """Make one step and write the state, and the error estimate if there is one, to the buffers `w`."""
         result = self._one_step(float(t), y.copy(), float(h))
         w.counters[NFEV] += self.evaluations
         if self.has_estimate:

@@ -1,6 +1,6 @@
-"""Solvers of a state whose parts lie on several processes: the step on each part, the projection on all together.
+"""Solvers of a state that is distributed over several processes: each makes the step of its part, all project together.
 
-The seam for libraries that carry messages: a subclass says where it stands and gathers numbers.
+A subclass connects this module to a library for messages: it defines the number of the process and gathers numbers.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from .solvers import EIPSolver
 
 __all__ = ["SolverOfParts"]
 
-DEPENDENT = 2.0**-26  # what is left of a normalised gradient that is a combination of others, to round-off
+DEPENDENT = 2.0**-26  # bound for the remainder of a normalised gradient that is a combination of others
 SCALARS = {"values", "g", "band", "before", "defect", "max_defect", "max_correction", "norm", "counters"}
 
 
 class SolverOfParts(EIPSolver):
     """Wrapper of a method that every process calls with its part of the state.
 
-    The right-hand side fills a part of the derivative; an invariant returns the same number everywhere and the
-    gradient's part. For fixed steps in the Euclidean metric.
+    The right-hand side fills a part of the derivative. An invariant returns the same number on every process, and its
+    gradient the part of the process. Only fixed steps and the Euclidean metric are supported.
 
     Attributes
     ----------
     place : (int, int)
-        Which process this is, and of how many.
+        Number of this process, and number of processes.
     known : InvariantSet
         The run's invariants.
     """
@@ -40,25 +40,25 @@ class SolverOfParts(EIPSolver):
 
     @property
     def place(self) -> tuple[int, int]:
-        """Which process this is, and of how many."""
+        """Return the number of this process and the number of processes."""
         raise NotImplementedError
 
     def gathered(self, a: Any) -> np.ndarray:
-        """An array of floats of every process, in their order."""
+        """Return the arrays `a` of all processes, stacked in the order of the processes."""
         raise NotImplementedError
 
     @property
     def known(self) -> InvariantSet:
-        """The run's invariants."""
+        """Return the invariants of the run."""
         return self._run.invariants
 
     def _hooks(self) -> dict[str, Any]:
         if self.known.balances.items:
-            raise ValueError("invariants: a state in parts on several processes does not carry a Balance.")
+            raise ValueError("invariants: a Balance is not supported for a state on several processes; omit it.")
         return {"agree": self._all_agree, "project": _Coordinates(self).project}
 
     def _all_agree(self, here: bool) -> bool:
-        """A step fails everywhere if it fails in one place: the others would wait for it in a sum."""
+        """Return True if the step succeeded on all processes; otherwise it must fail on all, because all must agree."""
         agreed = bool(self.gathered(here).all())
         self._fails_elsewhere = here and not agreed
         return agreed
@@ -71,10 +71,10 @@ class SolverOfParts(EIPSolver):
 
 
 class _Coordinates:
-    """The projection in coordinates of the space that the gradients span, the raw result being its origin.
+    """The projection in coordinates of the space that the gradients span; the origin is the unprojected state.
 
-    The engine calls `rhs`, `inv` and `grad` with coordinates of all processes, ``c[rank * l + i]`` along the basis'
-    row i of that one.
+    The engine calls `rhs`, `inv` and `grad` with coordinates of all processes: ``c[rank * l + i]`` belongs to row i of
+    the basis on process `rank`.
     """
 
     def __init__(self, solver: SolverOfParts) -> None:
@@ -83,7 +83,7 @@ class _Coordinates:
         self._gathered, self._derivative, self._run = solver.gathered, solver._derivative, run
         self._own, n = slice(rank * size, (rank + 1) * size), ranks * size
         each = blocks_of(None, n, 1)
-        # Sizes of the invariants' terms stand in for those that the step would find at the state itself.
+        # `scales` will hold the sizes of the invariants' terms, which do not follow from the coordinates.
         self._options = run.options._replace(
             rtol=np.zeros(n), atol=np.zeros(n), block_atol=np.zeros(n), groups=each, kinds=each, joint=None,
             scales=np.empty(size), computed=np.zeros(size),
@@ -103,23 +103,23 @@ class _Coordinates:
         self._begins = False
 
     def project(self, t_old: float, t: float, last: bool, y_new: np.ndarray) -> int:
-        """Project the run's raw result into `y_new`; returns the engine's code."""
+        """Project the unprojected state of the run, write the result to `y_new`, and return the engine's code."""
         self._begins = True
         status: int = self._engine.project(t_old, self._origin, t, last, self._moved)
         y_new[:] = self._at(self._moved)
         return status
 
     def rhs(self, t: float, c: np.ndarray) -> np.ndarray:
-        """The derivative at c, kept for `grad`; its coordinates are of no use."""
+        """Compute the derivative at c and store it for `grad`; the returned coordinates are not used."""
         self._run.work.f_point[:] = self._derivative(t, self._at(c))
         return self._origin
 
     def inv(self, t: float, c: np.ndarray) -> np.ndarray:
-        """The invariants (l,)."""
+        """Return the invariants (l,) at c."""
         return self._run.invariants.values(t, self._at(c))
 
     def grad(self, t: float, c: np.ndarray) -> np.ndarray:
-        """The gradients' coordinates (l, ranks * l); a basis is chosen at the raw result, where a projection begins."""
+        """Return the coordinates (l, ranks * l) of the gradients; the basis is chosen at the start of a projection."""
         w, size = self._run.work, self._options.scales.size
         begins, self._begins = self._begins, False
         w.G[:] = self._run.invariants.gradients(t, self._at(c), w.K[-1] if begins else w.f_point)
@@ -135,7 +135,7 @@ class _Coordinates:
         return parts[:, :, :-1].swapaxes(0, 1).reshape(size, -1)
 
     def _at(self, c: np.ndarray) -> np.ndarray:
-        """The part of the state that is here, at c; a buffer."""
+        """Return this process's part of the state at c, in a buffer."""
         w = self._run.work
         if not c.any():
             return w.y_hat
@@ -151,7 +151,7 @@ def _given(value: Any, t: float) -> np.ndarray:
 def _orthonormal_rows(rows: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` with an orthonormal basis of the rows' space, zeros for rows that depend on those before them.
 
-    Where they are not finite, NaN. Two passes of Gram-Schmidt leave them orthogonal to round-off.
+    If the rows are not finite, `out` is filled with NaN. Two passes of Gram-Schmidt give orthogonality to round-off.
     """
     for k, row in enumerate(rows):
         unit, before = out[k], out[:k]

@@ -36,14 +36,14 @@ _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c
 
 @dataclass(frozen=True)
 class CFunctions:
-    """A C function by pointer, and the same for eight members of an ensemble; it stands wherever a C function does.
+    """A C function by pointer, and its version for eight members of an ensemble; it can be used like a C function.
 
     Parameters
     ----------
     one, eight : LowLevelCallable, ctypes or cffi function pointer
-        Both of the same signature, that of :doc:`/tutorials/c-functions`. For `eight`, each number of the arrays
-        is eight, one of each member: component i of member k is ``y[8 * i + k]``, and alike in `f`, `out` and
-        `params`; t is that of all. Each member has to get the bits that `one` gives it.
+        Both have the same signature, see :doc:`/tutorials/c-functions`. The arrays of `eight` have eight numbers, one
+        for each member, in place of each number: component i of member k is ``y[8 * i + k]``, and the same applies to
+        `f`, `out` and `params`; t is common to all members. The results must have the bits of those of `one`.
 
     Examples
     --------
@@ -57,25 +57,25 @@ class CFunctions:
 
 
 class PointerFunction:
-    """A C function as Python calls it: ``(t, y[, f], out[, params])``, f for gradients that take it.
+    """A C function in a form that Python can call: ``(t, y[, f], out[, params])``, with f for gradients that use it.
 
     Parameters
     ----------
     pointer : LowLevelCallable, ctypes or cffi function pointer, or CFunctions
-        Kept, so that what it points to lives as long as this does.
+        The pointer. It is stored, so that its function lives as long as this object.
     name : str
-        Of the function in messages.
+        Name of the function in messages.
     kind : str
-        VALUE or GRADIENT, what the C function is to be.
+        VALUE or GRADIENT, the required signature.
     takes_f : bool, optional
-        Whether f is given from Python. From the engine a gradient gets it always; here it gets NaN in its place.
+        Whether Python passes f. The engine always passes f to a gradient; without `takes_f` Python passes NaN.
     shape : tuple of int, optional
-        With it, there is no argument `out`: a new array of that shape is returned, a float for ``()``.
+        If it is given, there is no argument `out`: a new array of this shape is returned, or a float for ``()``.
 
     Raises
     ------
     TypeError
-        When the pointer is of another signature, or comes with user_data.
+        If the pointer has another signature, or user_data.
     """
 
     def __init__(
@@ -96,12 +96,12 @@ class PointerFunction:
         self._function = PROTOTYPES[kind](self.address)
 
     def __call__(self, t: float, y: np.ndarray, *others: Any) -> Any:
-        """Call it: what is in `out`, or returned, is NaN where it has no value.
+        """Call the function. Entries of the value that it does not fill are NaN; all are NaN if the status is above 0.
 
         Raises
         ------
         RuntimeError
-            When it returns a status below 0.
+            If the function returns a status below 0.
         """
         rest = list(others)
         state = np.ascontiguousarray(y, complex if np.iscomplexobj(y) else float)
@@ -132,8 +132,8 @@ class PointerFunction:
     def unpicklable(self) -> TypeError:
         """Return the error for an attempt to pickle it."""
         return TypeError(
-            f"{self.name} is a C function by pointer, which cannot be pickled: its address means nothing in another "
-            "process. Ensembles on Dask and on processes, and all else that pickles, need functions in Python or Numba."
+            f"{self.name} is a C function by pointer, which cannot be pickled, because its address is not valid in "
+            "another process. Use Python or Numba functions for ensembles on Dask or on processes."
         )
 
     def failure(self, t: float, status: int) -> RuntimeError:
@@ -148,18 +148,18 @@ def _as_params(rest: tuple[Any, ...]) -> np.ndarray | None:
 def is_pointer(fun: Any) -> bool:
     """Return True if a function is a C function pointer.
 
-    SciPy and cffi are not loaded to find out: where they are not loaded, none is theirs.
+    SciPy and cffi are not imported for the test: a pointer cannot be theirs if they are not imported.
     """
     return isinstance(fun, (CFunctions, FROM_CTYPES)) or _is_low_level(fun) or _is_of_cffi(fun)
 
 
 def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
-    """A C function by pointer as a `PointerFunction`, with its keywords; all else as it is.
+    """Return a C function pointer as a `PointerFunction` with these keywords; return anything else unchanged.
 
     Raises
     ------
     TypeError
-        As by `PointerFunction`.
+        As for `PointerFunction`.
     """
     return PointerFunction(fun, name, kind, **form) if is_pointer(fun) else fun
 
@@ -194,7 +194,7 @@ def _require_signature(pointer: Any, name: str, kind: str) -> None:
     if _normalised(found) != TYPES[kind]:
         raise TypeError(f"{name} is a C function of the signature {found!r}, expected {kind}.")
     if _is_low_level(pointer) and pointer.user_data is not None:
-        raise TypeError(f"{name} is a LowLevelCallable with user_data, which no argument takes; pass it by params.")
+        raise TypeError(f"{name} is a LowLevelCallable with user_data, which is not supported; pass it as params.")
 
 
 def _signature(pointer: Any) -> str:

@@ -36,7 +36,7 @@ def unresolved(
     y: Array,
     end_of_run: float,
 ) -> str | None:
-    """Return which part of the state steps of length h from (t, y) do not resolve, in a sentence; None for no part.
+    """Return a sentence on the part of the state that steps of length h from (t, y) do not resolve, or None.
 
     `method` is that of a run. Methods of one stage are not judged, because all that a first step of order 1 from rest
     changes is an error of it; a user-defined method counts as one of them. Functions are not called at times behind the

@@ -1,4 +1,4 @@
-"""From what is asked for to a run that is ready to step: the one way of solve_ivp, integrate, ensemble and project."""
+"""Construction of a run that is ready to step, from a specification: for solve_ivp, integrate, ensemble and project."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ Array = np.ndarray
 
 @dataclass(frozen=True, kw_only=True)
 class RunSpec:
-    """A run as it is asked for, in numbers and functions of (t, y), whichever interface it came by.
+    """Specification of a run in numbers and functions of (t, y), which is common to all interfaces.
 
     Attributes
     ----------
     name : str
         Name of the solver class, for messages.
     method : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
-        With `is_known` it is the `tableau` of another run of these equations, and they are not examined again.
+        If `is_known`, it is the `tableau` of another run of these equations, which are not examined again.
     rhs : callable
         ``rhs(t, y) -> (n,)``, checked; it returns new arrays.
     stepping : Stepping
@@ -49,20 +49,20 @@ class RunSpec:
     extra : tuple
         Further arguments of the invariants' functions, ``(params,)`` or those of ``args``.
     fun, in_place : callable, bool
-        The user's function, which may be an acceleration by mistake, or None, and how it is called.
+        The user's function or None, and whether it fills its argument. The function may be an acceleration by mistake.
     jacobian : callable
-        Returns the Jacobian of a multistep method, see `SecondOrder`, that of an implicit method, see `Jacobian`, or
-        None.
+        ``jacobian()`` returns the Jacobian for a multistep method, see `SecondOrder`, or for an implicit method, see
+        `Jacobian`, or None.
     frequencies : callable, optional
         ``frequencies(y0, length)`` for an interval of that length, see `Problem`.
     level : bool
-        Whether states of multistep methods are shown at the newest end of the history.
+        Whether the states of multistep methods are those at the newest end of the history.
     hint : callable
-        Returns the end of a message: what the caller can do if the equations are not of second order.
+        ``hint()`` returns the end of a message: advice for equations that are not of second order.
     called, left_out : str
         See `Run`.
     columns : Columns, optional
-        Columns of derivatives behind the state, which `stepping` and `projection` do not know of.
+        Columns of derivatives that follow the state; `stepping` and `projection` are for the state without them.
     """
 
     name: str
@@ -83,13 +83,13 @@ class RunSpec:
     columns: Columns | None = None
 
     def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
-        """Return the run from a state on, after a check of the options, the functions and the invariants.
+        """Return the run that starts at the state y0, after a check of the options, the functions and the invariants.
 
         Parameters
         ----------
         y0 : ndarray, shape (n,)
         f0 : ndarray, shape (n,), optional
-            The derivative there, evaluated if it is not given.
+            The derivative at y0. Default: it is evaluated.
         tau : float, optional
             Length of the first step, by default that of `stepping`.
         check_start : bool
@@ -100,7 +100,7 @@ class RunSpec:
         tau = self._first_step(method, y0, f0) if tau is None else tau
         run = self._with_buffers(method, Start(t0, y0, f0, tau), check_start)
         if method is AT_REST:
-            return run  # its state need not be near the targets
+            return run  # the state may be far from the targets
         self._check(run, check_start)
         if method.has_history:
             self.attach_history(run, run.start)
@@ -121,14 +121,14 @@ class RunSpec:
             return steppers.checked(self.method, self.rhs, Start(t0, y0, f0, 0.0), self.name, self.hint), f0
 
     def attach_history(self, run: Run, start: Start) -> None:
-        """Give a run of a multistep method the history that it makes from a start on."""
+        """Make the history of a run with a multistep method, from a start."""
         span = self.stepping.span
         frequencies = None if self.frequencies is None else self.frequencies(start.y, span.t_bound - span.t0)
         seen = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
         attach_history(run, self.name, seen, self.stepping, level=self.level)
 
     def attach_solver(self, run: Run, start: Start) -> None:
-        """Give a run of an implicit method the solver of SciPy that begins at a start."""
+        """Make the solver of SciPy of a run with an implicit method, from a start."""
         run.method.begin(self.rhs, start, self.stepping, self.jacobian())
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
@@ -172,7 +172,7 @@ class RunSpec:
         )  # fmt: skip
 
     def _check(self, run: Run, invariants_too: bool) -> None:
-        """Bring a run to its targets where that is asked for, and refuse a start that misses them."""
+        """Project the start if that is requested, and raise an error if the start misses the targets."""
         if run.options.frame.products.size:
             run.options = run.options._replace(scales=_scales(run))
         if self.projection.project_initial:
@@ -191,10 +191,10 @@ class RunSpec:
 
 
 def _scales(run: Run) -> Array:
-    """Scales of the invariants' dead bands: endless ones for what is a function of the frame's C y.
+    """Return the scales of the invariants' dead bands, which are infinite for invariants that are functions of C y.
 
-    Corrections do not touch these, and nothing but rounding is left of their gradients once the frame is taken out.
-    At two states, for a gradient may lie in the frame by chance.
+    Corrections do not change these, because the frame removes their gradients up to rounding. The gradients are
+    examined at two states, because a gradient may be a combination of rows of C by chance.
     """
     (t0, y0, f0, tau), frame, invariants, G = run.begin, run.options.frame, run.invariants, run.work.G
     held = spanned(frame, G.view(float))

@@ -1,4 +1,4 @@
-"""A run that is ready to step: its buffers and options, and how it is watched."""
+"""A run that is ready to step: its buffers and options, and the checks during the run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Start(NamedTuple):
 
 @dataclass
 class Run:
-    """A run as `RunSpec.build` makes it: all that a driver needs, apart from the user's functions.
+    """A run that `RunSpec.build` has made: everything that a driver needs, except the user's functions.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Run:
     tableau : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
         The method as it was given.
     method : Method, OneStep or Stepper
-        What the engine takes the steps by.
+        The form of the method that the engine uses for the steps.
     options : Options
     work : Work
     invariants : InvariantSet
@@ -57,13 +57,13 @@ class Run:
     called : str
         Name of the argument that gave the right-hand side.
     left_out : str
-        What NaN in its value may come from.
+        A possible cause of NaN in the value of the right-hand side.
     looked : int
         The step at which the invariants were checked last.
     warned_of_balances : bool
         Whether there was a warning of balances that change too fast.
     moved : str
-        How far `project_initial` has moved the start, or nothing.
+        A sentence on how far `project_initial` has moved the start, or "".
     """
 
     begin: Start
@@ -84,15 +84,15 @@ class Run:
 
     @property
     def y0(self) -> np.ndarray:
-        """Return the state from which the first step goes."""
+        """Return the state at which the first step starts."""
         return self.start.y
 
     def engine(
         self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
     ) -> Engine:
-        """Return the engine of the run, which `begins` where work.K[0] is the derivative, or is to go on.
+        """Return the engine of the run; work.K[0] must hold the derivative.
 
-        `others` are further `Hooks`.
+        `begins` is False if the engine continues a run. `others` are further `Hooks`.
         """
         in_python = self.tableau.in_python
         hooks = Hooks(
@@ -105,13 +105,13 @@ class Run:
         engine, w = Engine(self.method, self.options, self.work, functions, schedule, _if_any(hooks)), self.work
         if self.options.watched and begins:
             t, f = schedule.span.t0, w.K[0]
-            if self.start is not self.begin:  # whose values and gradients there are already
+            if self.start is not self.begin:  # the buffers have the values and gradients at `begin`
                 w.values[:], w.G[:] = self.invariants.values(t, self.y0), self.invariants.gradients(t, self.y0, f)
             engine.start(self.y0, f, self.start.tau)
         return engine
 
     def projected(self, rhs: Derivative, t: float, y: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return a state projected, and the engine's code; work.K[-1] is to hold the derivative there.
+        """Return the projection of a state, and the engine's code; work.K[-1] must hold the derivative at the state.
 
         `rhs` returns the derivative at the states of further Newton steps.
         """
@@ -139,14 +139,14 @@ class Run:
 
     @property
     def shows(self) -> bool:
-        """Return whether states that are not projected are handed out as projected copies."""
+        """Return True if the run returns projected copies of states that are not projected."""
         return self.invariants.size > 0 and (self.options.every != 1 or self.tableau.has_history)
 
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
-        """Examine a run after `steps` steps, or where it has `ended`. Return whether it is to be reported now.
+        """Examine a run after `steps` steps, or at its end (`ended`). Return True if it must be reported now.
 
-        Steps that the engine suspects are examined. The invariants are checked after some numbers of steps and at the
-        end, and where the corrections are too large, to find the reason. `rhs` returns a new array.
+        Steps that the engine suspects are examined. The invariants are checked after 10, 100, 1000, ... steps, at the
+        end, and if the corrections are too large, to find the reason. `rhs` returns a new array.
         """
         if not self.options.watched or self.trust.failed:
             return False  # a failure has its own message
@@ -154,7 +154,7 @@ class Run:
             self._warn_of_fast_balances()
         suspect = self.work.suspect
         if self.trust.doubts:
-            # One examination still has to tell how fast the invariants change, by which corrections are judged.
+            # One examination is still needed for the rates of the invariants, which are used to judge corrections.
             if suspect[REASON] != NOTHING and not self.work.trust[:, EXAMINED].any():
                 self.examiner.examine(suspect, rhs)
             return self._is_doubtful(ended)
@@ -167,7 +167,7 @@ class Run:
         return found is not None or self._is_doubtful(ended)
 
     def _warn_of_fast_balances(self) -> None:
-        """Warn once of balances that change too fast to be of help."""
+        """Warn once about balances that change too fast to be useful."""
         carried = self.invariants.balances
         if not carried.items or self.warned_of_balances:
             return
@@ -185,7 +185,7 @@ class Run:
         )
 
     def _is_doubtful(self, ended: bool) -> bool:
-        """Return whether the corrections contradict the run, or will do so at its end."""
+        """Return True if the run is unreliable because of its corrections, or certainly will be at its end."""
         return bool(self.trust.sick.any()) if ended else self.trust.beyond_doubt
 
     @cached_property

@@ -1,4 +1,4 @@
-"""States and derivatives as a user gives them, taken as arrays."""
+"""Conversion of states and derivatives from the user to arrays."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
 
 
 def states(name: str, value: Any) -> np.ndarray:
-    """A state, or several, as a new float64 or complex128 array of any shape.
+    """Return a state, or several states, as a new float64 or complex128 array of any shape.
 
     Raises
     ------

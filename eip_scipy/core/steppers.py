@@ -36,7 +36,7 @@ Derivative = Callable[[float, Array], Array]
 
 @singledispatch
 def arrays(method: Any) -> Method | OneStep | Stepper:
-    """Return a method as the engine takes its steps."""
+    """Return a method in the form that the engine uses for its steps."""
     raise TypeError(f"{type(method).__name__} is not a family of methods.")
 
 
@@ -57,7 +57,7 @@ def _(method: AtRest) -> Method:
 
 @arrays.register
 def _(method: GaussJackson) -> Any:
-    # The method that makes the first states.
+    # The engine needs the coefficients of the method that makes the first states.
     return arrays(DOP853 if method.velocities else RKN1210)
 
 
@@ -83,7 +83,7 @@ def _(method: Tableau) -> Method:
 
 @arrays.register
 def _(method: NystromTableau) -> Method:
-    # A last stage that is the next step's first one is f at the new point, after the step.
+    # If the last stage is the first stage of the next step, it is f at the new point and is evaluated after the step.
     s = method.n_stages - method.fsal
 
     def weights(e: Array) -> Array:
@@ -116,23 +116,23 @@ def _exponent(method: Tableau | NystromTableau) -> float:
 
 @singledispatch
 def rated(method: Any) -> Array:
-    """Return at which stages (s,) of a method the rates of balances are needed.
+    """Return a mask (s,) of the stages of a method at which the rates of balances are needed.
 
     Raises
     ------
     ValueError
-        If the method does not carry balances.
+        If the method does not support balances.
     """
     raise ValueError(
-        f"invariants: {method.name} does not carry a Balance, because it has no stages with velocities, where rates "
-        "are taken. Use EIPRK4, EIPDOP853, eip_method of a tableau, or EIPGJ12, or list invariants only."
+        f"invariants: {method.name} does not carry a Balance, because it has no stages with velocities, at which rates "
+        "could be evaluated. Use EIPRK4, EIPDOP853, eip_method(tableau) or EIPGJ12, or omit the balances."
     )
 
 
 @rated.register
 def _(method: GaussJackson) -> Array:
     coefficients: Any = arrays(method)
-    return np.zeros(coefficients.b.size, np.int64)  # rates are taken at the nodes
+    return np.zeros(coefficients.b.size, np.int64)  # rates are evaluated at the nodes of the history
 
 
 @rated.register
@@ -140,7 +140,7 @@ def _(method: Tableau) -> Array:
     stages = (method.b != 0) | (method.b_low != 0)
     if method.P is not None:
         stages |= np.any(method.P[: stages.size] != 0, axis=1)
-    stages[0] = True  # for interpolants
+    stages[0] = True  # interpolants need the rate at the start of a step
     return stages.astype(np.int64)
 
 
@@ -148,7 +148,7 @@ def _(method: Tableau) -> Array:
 
 
 class Form(NamedTuple):
-    """Kind of a run's interpolants, how many states one consists of without its ends, and what they are made with."""
+    """Form of a run's interpolants: kind, number of states without the two ends, and how the states are computed."""
 
     kind: int
     rows: int
@@ -160,7 +160,7 @@ class Form(NamedTuple):
 
 @singledispatch
 def form(method: Any, brief: bool) -> Form:
-    """Return the form of the interpolants of a method. `brief`: a run with too few steps for a history."""
+    """Return the form of the interpolants of a method; `brief`: the run has too few steps for a history."""
     raise TypeError(f"{type(method).__name__} is not a family of methods.")
 
 
@@ -194,7 +194,7 @@ def _(method: GaussJackson, brief: bool) -> Form:
     if not brief:
         weights = interpolation_weights(method.order).reshape(-1, method.order)
         return Form(HISTORY, (method.order + 1) // 2 + 2, weights)
-    # The method that starts takes all steps; several in one where accelerations depend on velocities.
+    # The starting method makes all steps, and several for each step if accelerations depend on velocities.
     return Form(QUINTIC, 3, own_slopes=True) if method.velocities else form(RKN1210, brief)
 
 
@@ -203,7 +203,7 @@ def _(method: GaussJackson, brief: bool) -> Form:
 
 @singledispatch
 def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> Any:
-    """Return the method for equations, which are evaluated once more if they have to be of second order.
+    """Return the method after a check of the equations, which are evaluated again if they must be of second order.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[
     name : str
         Name of the solver class, for messages.
     hint : callable
-        Returns what else the caller can do if the equations are of another kind.
+        ``hint()`` returns further advice for the message if the equations are of another kind.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[
 def _(method: NystromTableau, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> NystromTableau:
     if depends_on_velocity(rhs, start, name, hint):
         raise ValueError(
-            f"{name} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
+            f"{name} integrates q'' = a(t, q), but the accelerations in fun depend on the velocity; use a Runge-Kutta "
             f"method such as EIPDOP853."
         )
     return method
@@ -242,11 +242,14 @@ def _(method: GaussJackson, rhs: Derivative, start: Any, name: str, hint: Callab
 def check_halves(n: int) -> None:
     """Raise a ValueError if n components cannot be (q, v)."""
     if n % 2:
-        raise ValueError(f"a Nystrom method needs the state (q, v), an even number of components; y0 has {n}.")
+        raise ValueError(
+            f"a Nystrom method needs the state (q, v) with an even number of components, but y0 has {n}. Use a "
+            "Runge-Kutta method such as EIPDOP853."
+        )
 
 
 def depends_on_velocity(rhs: Derivative, start: Any, name: str, hint: Callable[[], str] = str) -> bool:
-    """Return whether the accelerations of q'' = a(t, q, v), y = (q, v), change with v.
+    """Return True if the accelerations of q'' = a(t, q, v), y = (q, v), depend on v.
 
     Raises
     ------
@@ -262,7 +265,7 @@ def depends_on_velocity(rhs: Derivative, start: Any, name: str, hint: Callable[[
     if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
         raise ValueError(
             f"{name} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
-            f"the second half of the state, and are not. Take a Runge-Kutta method such as EIPDOP853, or where the "
-            f"system is one of second order, write it with the velocities as that half{hint()}."
+            f"the second half of the state, but are not. Use a Runge-Kutta method such as EIPDOP853, or, if the system "
+            f"is of second order, write it with the velocities as the second half of the state{hint()}."
         )
     return not np.array_equal(f[half:], f0[half:], equal_nan=True)

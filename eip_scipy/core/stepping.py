@@ -1,4 +1,4 @@
-"""How a run steps: by a fixed length, or by tolerances; the options of that, checked."""
+"""Step control of a run, by a fixed length or by tolerances, and the check of its options."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ __all__ = [
 
 AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | Driven | AtRest
 UNBOUNDED = 2**62
-LEAST_RTOL = 100 * EPS  # SciPy's
+LEAST_RTOL = 100 * EPS  # as in SciPy
 
 
 class DefaultTolerance(float):
-    """A tolerance that the user has not given."""
+    """Default value of a tolerance, to distinguish it from a value that the user gave."""
 
 
-ATOL = DefaultTolerance(1e-6)  # SciPy's
+ATOL = DefaultTolerance(1e-6)  # as in SciPy
 
 
 @dataclass(frozen=True)
 class Stepping:
-    """How a run steps: by a fixed `h`, or, where that is None, by tolerances, from `first_step` (None: estimated)."""
+    """Step control of a run: a fixed `h`, or tolerances if `h` is None; `first_step` is None if it is estimated."""
 
     span: Span
     h: float | None
@@ -55,7 +55,7 @@ class Stepping:
 
     @classmethod
     def at_rest(cls, t: float, n: int) -> Stepping:
-        """Return how a state of n components is projected where it is: without a step."""
+        """Return the step control for the projection of a state of n components without a step."""
         return cls(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
 
     def first(
@@ -65,12 +65,12 @@ class Stepping:
         f0: np.ndarray,
         tableau: AnyMethod,
     ) -> float:
-        """Length of the first step.
+        """Return the length of the first step.
 
         Raises
         ------
         ValueError
-            When it is to be estimated and the error of a component has no scale.
+            If the length must be estimated and the error of a component has no scale.
         """
         if self.h is not None:
             length = abs(self.span.t_bound - self.span.t0)
@@ -83,7 +83,10 @@ class Stepping:
     def estimated(
         self, rhs: Callable[[float, np.ndarray], np.ndarray], y0: np.ndarray, f0: np.ndarray, order: int
     ) -> float:
-        """First step of an adaptive run (Hairer, Norsett & Wanner I, II.4), one more call of `rhs`; NaN for NaN."""
+        """Estimate the first step of an adaptive run (Hairer, Norsett & Wanner I, II.4) with one call of `rhs`.
+
+        The result is NaN if the derivative is NaN.
+        """
         span = self.span
         if y0.size == 0:
             return math.inf
@@ -108,21 +111,21 @@ class Stepping:
         return min(100 * h0, h1, length, span.max_step)
 
     def require_scale(self, y0: np.ndarray) -> None:
-        """Refuse tolerances that leave the error of a component at the start without a scale."""
+        """Raise an error if the error of a component has no scale at the start."""
         none = np.flatnonzero(self.atol + self.rtol * np.abs(y0) == 0)
         if none.size:
             raise ValueError(
-                f"the tolerances of component {none[0]} are 0: y0 is 0 there, and so is `atol`. Its error has no "
-                "scale; give atol > 0, or a fixed step h."
+                f"the error of component {none[0]} has no scale, because y0 and `atol` are 0 there. Give atol > 0, or "
+                "a fixed step h."
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepOptions:
-    """The options of the step size as a user gives them.
+    """The options of the step size as the user gives them.
 
-    The default of `atol` counts for adaptive steps only. Fixed steps use it as a scale of the error metric and nothing
-    else, which a number that ignores the units of the state would spoil; unless it is given, it is 0 for them.
+    The default of `atol` applies to adaptive steps only. With fixed steps `atol` is only a scale of the error metric,
+    and its default is 0, so that the metric does not depend on the units of the state.
     """
 
     h: Any = None
@@ -132,7 +135,7 @@ class StepOptions:
     atol: Any = ATOL
 
     def checked(self, name: str, method: AnyMethod, t0: float, t_bound: float, n: int, *, stacklevel: int) -> Stepping:
-        """How a run of n components steps; `stacklevel` is that of the user, for a warning.
+        """Return the step control of a run with n components; `stacklevel` is for a warning.
 
         Raises
         ------
@@ -144,17 +147,17 @@ class StepOptions:
         if h is None and method.fixed_steps_only:
             why = "takes fixed steps" if method.has_estimate else "has no error estimate"
             raise ValueError(
-                f"{name} {why} and needs the step h=...: without it, and where rtol, atol, first_step "
-                "or max_step ask for them, steps are adaptive."
+                f"{name} {why} and needs the step h=...: without h, and also if rtol, atol, first_step or max_step are "
+                "given to a problem with a step, steps are adaptive."
             )
         if h is not None and method.drives:
             raise ValueError(
                 f"h={shown(h)}: the steps of {name} are those of SciPy's {method.name}, which controls their length. "
-                "Leave h out and give rtol and atol, and max_step to bound the steps."
+                "Omit h, and give rtol and atol, and max_step to bound the steps."
             )
         if h is not None and (self.first_step is not None or self.max_step != np.inf):
             raise ValueError(
-                "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
+                "h sets a fixed step, but first_step and max_step are for adaptive steps; omit h, or the other two."
             )
         first_step, max_step = step_bounds(self.first_step, self.max_step, t0, t_bound)
         unset = h is not None and isinstance(self.atol, DefaultTolerance)
@@ -171,14 +174,14 @@ class StepOptions:
 
 
 def interval(t_span: Any) -> tuple[float, float]:
-    """Start and end of an interval, whose end may be infinite.
+    """Return start and end of an interval, whose end may be infinite.
 
     Raises
     ------
     TypeError
-        For values with a unit, and dates.
+        If a value has a unit or is a date.
     ValueError
-        For what are not two real numbers, NaN, and an infinite start.
+        If t_span does not hold two real numbers, one of them is NaN, or the start is infinite.
     """
     refuse_units(t_span=t_span)
     ends = reals(t_span)
@@ -191,14 +194,14 @@ def interval(t_span: Any) -> tuple[float, float]:
 
 
 def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Both tolerances as arrays (n,).
+    """Return both tolerances as arrays (n,).
 
     Raises
     ------
     TypeError
-        For values with a unit.
+        If a value has a unit.
     ValueError
-        For NaN, infinite or negative values or a wrong shape.
+        If a value is NaN, infinite or negative, or a shape is wrong.
     """
     refuse_units(rtol=rtol, atol=atol)
     out = []
@@ -210,13 +213,13 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
         if a is None:
             raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {shown(value)}.")
         if a.ndim > 0 and a.shape != (n,):
-            raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, the state ({n},).")
+            raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, but the state has ({n},).")
         if not np.all(a >= 0):
             raise ValueError(f"`{name}` must be positive. Got {shown(value)}.")
         if not np.all(np.isfinite(a)):
             raise ValueError(
-                f"`{name}` must be finite. Got {shown(value)}; a large number such as 1e30 leaves a component out of "
-                "the step control."
+                f"`{name}` must be finite. Got {shown(value)}; to exclude a component from the step control, use a "
+                "large number such as 1e30."
             )
         out.append(np.array(np.broadcast_to(a, (n,)), order="C"))
     return out[0], out[1]
@@ -225,14 +228,14 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
 def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool = False) -> float:
     """Return the step h as a positive float.
 
-    A step that may be longer than the interval is shortened to it, as the last step of any run.
+    With `may_be_longer` the step may be longer than the interval; it is then shortened, as the last step of any run.
 
     Raises
     ------
     TypeError
-        When it has a unit.
+        If h has a unit.
     ValueError
-        When it is not a positive number, or longer than the interval, or below ten spacings of t.
+        If h is not a positive number, is longer than the interval, or is below ten spacings of t.
     """
     refuse_units(h=h)
     if not is_number(h) or not 0 < h < math.inf:
@@ -253,17 +256,17 @@ def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool =
 
 
 def _slack(h: float, t0: float, t_bound: float) -> float:
-    """How far T/h may be from a whole number and still count as one."""
+    """Return the largest distance of T/h from an integer that still counts as rounding."""
     if not math.isfinite(t_bound):
         return 0.0
     return max(1e-9, 8 * EPS * (abs(t_bound - t0) + abs(t0) + abs(t_bound)) / h)
 
 
 def fixed_steps(h: float, t0: float, t_bound: float) -> int:
-    """Number of steps of length h from t0 to t_bound, UNBOUNDED for an endless interval.
+    """Return the number of steps of length h from t0 to t_bound; UNBOUNDED for an infinite interval.
 
-    T/h is rounded if it is an integer up to round-off, else the next larger integer; the last step is then shorter.
-    An interval that is not empty takes one step at least, however much longer h is.
+    The number is T/h, rounded if it is an integer up to round-off, otherwise rounded up, so that the last step is
+    shorter. An interval that is not empty has at least one step, for any h.
     """
     ratio = abs(t_bound - t0) / h
     if not ratio < UNBOUNDED:
@@ -273,12 +276,12 @@ def fixed_steps(h: float, t0: float, t_bound: float) -> int:
 
 
 def saved_steps(n_steps: int, save_every: int) -> np.ndarray:
-    """Numbers of the steps after which a state is saved: 0, each `save_every`-th one (0: none), and the last."""
+    """Return the numbers of the steps after which a state is saved: 0, each `save_every`-th (0: none) and the last."""
     return np.append(np.arange(0, n_steps, save_every or max(n_steps, 1)), n_steps)
 
 
 def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tuple[float | None, float]:
-    """first_step and max_step, with SciPy's messages for what they must not be."""
+    """Return first_step and max_step after checks, with SciPy's messages."""
     refuse_units(first_step=first_step, max_step=max_step)
     if not is_number(max_step) or not max_step > 0:
         raise ValueError(f"`max_step` must be positive. Got {shown(max_step)}; give a real number > 0.")

@@ -1,4 +1,4 @@
-"""Quantities and times of astropy as plain numbers in the units of a problem; nothing is imported for it."""
+"""Conversion of astropy's quantities and times to plain numbers in the units of a problem; astropy is not imported."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Unit(NamedTuple):
     Attributes
     ----------
     name : str
-        Of a unit that astropy knows by it.
+        Name of a unit of astropy.
     scale : float
-        How many of that unit it has.
+        Size in this unit of astropy.
     si : float
-        Metres or seconds.
+        Size in metres or seconds.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Unit(NamedTuple):
 
 
 def units(text: str) -> tuple[Unit, Unit] | None:
-    """The units of length and time that a text such as "AU, yr" or "km, 5022642.9 s" names; None for others."""
+    """Return the units of length and time in a text such as "AU, yr" or "km, 5022642.9 s"; None for other texts."""
     parts = [part.strip() for part in text.split(",")]
     if len(parts) != 2:
         return None
@@ -65,24 +65,26 @@ def _unit(text: str, known: dict[str, float]) -> Unit | None:
 
 
 def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, Unit] | None) -> Any:
-    """A value with a unit, or a list of them, as plain numbers in the unit length**a time**b; plain ones as they are.
+    """Convert a value with a unit, or a list of such values, to plain numbers in the unit length**a time**b.
+
+    Plain numbers are returned unchanged.
 
     Parameters
     ----------
     name : str
-        How the user knows the value.
+        Name of the argument, for messages.
     value : object
     powers : (int, int)
         The exponents a and b.
     known : (Unit, Unit) or None
-        Units of length and time; None refuses all that has one.
+        Units of length and time; None raises an error for all values with a unit.
 
     Raises
     ------
     TypeError
-        For a value with a unit where no units are known, and for what has a unit that is not astropy's.
+        If a value has a unit but no units are known, or the unit is not one of astropy.
     TypeError and ValueError
-        astropy's UnitConversionError, when the dimensions do not fit.
+        astropy's UnitConversionError, if the dimensions do not fit.
     """
     if known is None:
         refuse_units(**{name: value})
@@ -92,19 +94,19 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
         if is_time(item):
             raise TypeError(f"{name}: {shown(item)} is a moment; expected {_expected(powers, known)}.")
         if powers != (0, 1) and not has_unit(item) and np.any(item):
-            raise TypeError(f"{name}: {shown(item)} has no unit, but others have one; give it one too.")
+            raise TypeError(f"{name}: {shown(item)} has no unit, but others have one; give it a unit too.")
         return _converted(name, item, powers, known)
 
     return _each(name, value, convert)
 
 
 def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch | None, whose: str) -> Any:
-    """Times as numbers in the unit of time, counted from the epoch; durations, and plain numbers, count from 0.
+    """Convert moments to numbers in the unit of time, counted from the epoch; durations and numbers count from 0.
 
     Raises
     ------
     TypeError, ValueError
-        As by `in_unit`; TypeError for a moment where there is no epoch to count from.
+        As for `in_unit`; TypeError for a moment if there is no epoch.
     """
     if known is None:
         refuse_units(**{name: value})
@@ -115,8 +117,8 @@ def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch 
             return _converted(name, item, (0, 1), known)
         if epoch is None:
             raise TypeError(
-                f"{name}: {shown(item)} is a date, and {whose} does not say at which one t is 0; expected plain "
-                f"numbers, durations, or a problem made with epoch=..., such as nbody(..., epoch=...)."
+                f"{name}: {shown(item)} is a date, but {whose} does not define the date of t = 0. Give plain numbers "
+                f"or durations, or make the problem with epoch=..., such as nbody(..., epoch=...)."
             )
         return days_since(name, epoch, item) * (DAY_S / known[1].si)
 
@@ -129,19 +131,19 @@ def is_time(value: Any) -> bool:
 
 
 def apart(span: Any) -> Any:
-    """The ends of a span as a pair, where they are one array of times of astropy."""
+    """Return the ends of a span as a pair if they are one array of astropy's times; otherwise the span unchanged."""
     return tuple(span) if is_time(span) and np.shape(span.jd1) else span
 
 
 def as_epoch(name: str, value: Any) -> Epoch:
-    """A moment as a Julian date in TDB, in two parts: one of astropy's in any scale, or a number, or two.
+    """Return a moment as a Julian date in TDB in two parts, from a Time of astropy in any scale, a number, or two.
 
     Raises
     ------
     TypeError
-        If it has a unit, is a date of Python, or is not a number.
+        If the value has a unit, is a date of Python, or is not a number.
     ValueError
-        For more than one moment, and for what is not finite.
+        If there is more than one moment, or the value is not finite.
     """
     if is_time(value):
         dynamic = value.tdb
@@ -155,8 +157,8 @@ def as_epoch(name: str, value: Any) -> Epoch:
         first, second = (float(part) for part in parts)
     except (TypeError, ValueError):
         raise TypeError(
-            f"{name}: expected a Julian date in TDB, as a number or as two that are added up, or a Time of astropy; "
-            f"got {shown(value)}."
+            f"{name}: expected a Julian date in TDB, as a number or as two numbers with this sum, or a Time of "
+            f"astropy; got {shown(value)}."
         ) from None
     if not (math.isfinite(first) and math.isfinite(second)):
         raise ValueError(f"{name}: expected a finite Julian date, got {shown(value)}.")
@@ -164,21 +166,21 @@ def as_epoch(name: str, value: Any) -> Epoch:
 
 
 def days_since(name: str, epoch: Epoch, time: Any) -> Any:
-    """Days of TDB from the epoch to a moment, or to each of an array of them."""
+    """Return the days of TDB from the epoch to a moment, or to each moment of an array."""
     dynamic = time.tdb
     days = (np.asarray(dynamic.jd1, dtype=float) - epoch[0]) + (np.asarray(dynamic.jd2, dtype=float) - epoch[1])
     return float(days) if days.shape == () else days
 
 
 def exact_sum(a: float, b: float) -> tuple[float, float]:
-    """The rounded sum and what the rounding lost."""
+    """Return the rounded sum and its rounding error."""
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)
 
 
 def shown_epoch(epoch: Epoch) -> str:
-    """JD and its scale."""
+    """Return the Julian date and its scale as text."""
     return f"JD {epoch[0] + epoch[1]:.13g} TDB"
 
 

@@ -1,4 +1,4 @@
-"""Columns of derivatives carried behind a state: what a user asks for, and the functions of the wider state."""
+"""Columns of derivatives that follow a state, called a wide state: the user's option, and functions of this state."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ __all__ = [
 
 Array = np.ndarray
 STATE = "state"
-# How far a complex step may be from a difference, relative to the largest component: that of differences of order 6.
+# Largest difference between a complex step and a difference of order 6, relative to the largest component.
 AGREES = 1e-6
-# The bound for a jvp of the user, whose right-hand side may be rough.
+# Bound for a jvp of the user, which is larger because the right-hand side may not be smooth.
 WRONG = 1e-3
 SHIFT = 332  # binary digits of a complex step, relative to its direction
-LEAST = 1e-3  # size of a parameter that is 0, for differences
+LEAST = 1e-3  # size for differences of a parameter that is 0
 
 
 class OfState(NamedTuple):
-    """An invariant or event of a wide state as a function of the `n` components of the state, as the engine calls it.
+    """An invariant or event of a wide state as a function of the `n` components of the state, which the engine calls.
 
-    `by_parameters`: of an invariant, its derivatives by the `parameters` that are behind the state, if there are any.
+    `by_parameters` returns the derivatives of an invariant by the `parameters` that follow the state, if there are any.
     """
 
     n: int
@@ -58,20 +58,20 @@ class OfState(NamedTuple):
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of a run, at its start or where it goes on.
+    """The columns of a run, at its start or where it is continued.
 
     Attributes
     ----------
     values : ndarray, shape (n + p, k)
-        Initial columns; the last p rows are those of the parameters, which stay.
+        Initial columns; the last p rows belong to the parameters and are constant.
     parameters : tuple of int
-        Which of the run's parameters the rows behind the state stand for.
+        Indices of the run's parameters to which the last p rows belong.
     is_transition : bool
         Whether the first n columns are those of the state-transition matrix from the start of the first run.
     symplectic : bool
-        Whether these are kept symplectic.
+        Whether the state-transition matrix is kept symplectic.
     in_halves : bool
-        Whether the wide state has all positions first and then all velocities, as Nystrom methods take it; otherwise
+        Whether the wide state has all positions first and then all velocities, as Nystrom methods need it; otherwise
         one column follows the other.
     """
 
@@ -132,7 +132,7 @@ class Columns:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Return what decides the bits of a run, as settings of its checkpoint."""
+        """Return the settings for a checkpoint: the properties of the columns that determine the bits of a run."""
         return {"variations": self.values, "derivatives by": self.parameters, "symplectic": self.symplectic}
 
     def after(self, wide: Array) -> Columns:
@@ -141,27 +141,27 @@ class Columns:
 
 
 def require_tableau(method: Any) -> None:
-    """Refuse classes of methods that carry no columns.
+    """Raise an error for methods that do not support columns of derivatives.
 
     Raises
     ------
     ValueError
-        For all but Runge-Kutta and Nystrom methods.
+        If the method is neither a Runge-Kutta nor a Nystrom method.
     """
     if method.TABLEAU.has_history or method.TABLEAU.in_python:
         raise ValueError(
-            f"variations: {method.__name__} carries no derivatives: its steps are not the stages of a tableau. Take "
+            f"variations: {method.__name__} carries no derivatives, because its steps are not stages of a tableau. Use "
             "EIPDOP853, EIPRKN12 or another Runge-Kutta or Nystrom method."
         )
 
 
 def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in_halves: bool) -> Columns:
-    """The columns that the option `variations` asks for.
+    """Return the columns for the option `variations`.
 
     Raises
     ------
     TypeError, ValueError
-        For anything else than the option's documentation says, a complex state, or parameters that a run lacks.
+        If the option has a wrong value, the state is complex, or the run does not have a parameter.
     """
     if isinstance(asked, Columns):
         return replace(asked, in_halves=in_halves)
@@ -172,7 +172,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in
     if isinstance(items, list | tuple) and items and all(map(_is_name, items)):
         own = [_parameter(item, params, names) for item in items if item != STATE]
         if own and in_halves:
-            raise ValueError("variations: Nystrom methods give no derivatives by parameters; take EIPDOP853.")
+            raise ValueError("variations: Nystrom methods give no derivatives by parameters; use EIPDOP853.")
         if len(set(own)) < len(own) or list(items).count(STATE) > 1:
             raise ValueError(f"variations: {shown(asked)} asks for the same derivatives twice.")
         has_state, p = STATE in items, len(own)
@@ -194,17 +194,17 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in
 
 
 def _is_name(item: Any) -> bool:
-    """Return whether this names the state or a parameter, or is the place of one."""
+    """Return True if an item is "state", or the name or the index of a parameter."""
     return isinstance(item, str | int | np.integer) and not isinstance(item, bool)
 
 
 def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invariants: Sequence[Invariant]) -> Columns:
-    """Return the columns with the answer to whether they are kept symplectic; `canonical`: the problem's own answer.
+    """Return the columns with `symplectic` set, to the option of the user or by default to `canonical` of the problem.
 
     Raises
     ------
     ValueError
-        When this is asked for and cannot be done.
+        If the option is True but the columns cannot be kept symplectic.
     """
     reasons = {
         'derivatives by parameters or along directions do not make a tangent map; ask for variations="state" alone':
@@ -230,7 +230,7 @@ def _parameter(item: Any, params: Array, names: Sequence[str]) -> int:
 
 
 def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tuple[Any, Array]:
-    """Return the options and weights of a state for the same with columns behind it; `G`: gradients at the start."""
+    """Return options and weights for the wide state, from those of the state; `G` has the gradients at the start."""
     n, places = columns.n, columns.order[0]
 
     def spread(values: Array | float) -> Array:
@@ -258,7 +258,7 @@ def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tu
 
 
 class StateSolution(OdeSolution):
-    """The state alone, of a solution that has columns of derivatives behind it."""
+    """Dense output of the state alone, from that of a wide state."""
 
     def __init__(self, solution: OdeSolution, columns: Columns) -> None:
         super().__init__(solution.ts, solution.interpolants)
@@ -271,7 +271,7 @@ class StateSolution(OdeSolution):
 
 @dataclass(frozen=True)
 class Variations:
-    """The functions of a state with columns behind it.
+    """The functions of a wide state.
 
     Attributes
     ----------
@@ -280,9 +280,9 @@ class Variations:
         In place: ``rhs(t, Y, out, *extra)``.
     invariants : tuple of Invariant
     given : tuple of Invariant
-        The same as functions of the state.
+        The invariants as functions of the state.
     source : str
-        Where the products of the Jacobian come from: "problem", "jvp", "dual numbers" or "complex steps".
+        Source of the products with the Jacobian: "problem", "jvp", "dual numbers" or "complex steps".
     """
 
     columns: Columns
@@ -303,14 +303,14 @@ class Variations:
         *,
         in_python: bool = False,
     ) -> Variations:
-        """Make them from what `right_hand_side` returns; `extra`: that of the invariants.
+        """Make the functions from the output of `right_hand_side`; `extra` has the further arguments of the invariants.
 
-        `in_python`: Python calls the functions, and nothing is compiled for them.
+        With `in_python` the functions are called from Python, and nothing is compiled.
 
         Raises
         ------
         ValueError
-            For balances.
+            If there are balances.
         """
         if any(item.is_balance for item in invariants):
             raise ValueError(
@@ -355,7 +355,7 @@ class Variations:
 
 
 def _has_address(fun: Any) -> bool:
-    """Return whether the engine may call a function by its address."""
+    """Return True if the engine can call a function by its address."""
     return isinstance(fun, LibraryFunction) or (is_jitted(fun) and not jit_is_off())
 
 
@@ -364,12 +364,12 @@ def right_hand_side(
 ) -> tuple[Callable[..., Any], str]:
     """Return the right-hand side of the wide state, in place, and the source of its products with the Jacobian.
 
-    `own`: the problem's ``variational``, or None.
+    `own` is the ``variational`` of the problem, or None.
 
     Raises
     ------
     TypeError, ValueError
-        For a wrong `jvp`, and where there is no way to the derivatives.
+        If `jvp` is wrong, or no source of derivatives is available.
     """
     if columns.parameters and scalars(extra) != "":
         raise ValueError("variations: derivatives by parameters need them as params=[...], one array of numbers.")
@@ -383,7 +383,7 @@ def right_hand_side(
 def _of_columns_in_order(
     columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, jvp: Any
 ) -> tuple[Callable[..., Any], str]:
-    """Return the same for a wide state in which one column follows the other."""
+    """Return the output of `right_hand_side` for a wide state in which one column follows the other."""
     n, parameters = columns.n, columns.parameters
     if jvp is not None:
         _require_products(columns, _derivative(fun, form, y0), jvp, t0, y0, extra)
@@ -398,7 +398,7 @@ def _of_columns_in_order(
         try:
             rhs = rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
             return rhs, "dual numbers"
-        except NotCompilableError:  # a complex step may do
+        except NotCompilableError:  # a complex step may work
             pass
     return _by_complex_steps(columns, fun, form, t0, y0, extra), "complex steps"
 
@@ -406,7 +406,7 @@ def _of_columns_in_order(
 def _require_products(
     columns: Columns, derivative: Callable[..., Array], jvp: Any, t0: float, y0: Array, extra: tuple
 ) -> None:
-    """Refuse a `jvp` that is none of this right-hand side.
+    """Raise an error if `jvp` is not the product of the right-hand side's Jacobian and a vector.
 
     Raises
     ------
@@ -434,7 +434,7 @@ def _require_products(
 
 
 def _direction(y0: Array, parameters: int) -> tuple[Array, Array]:
-    """A direction of a check that leaves no component out, and moves none by much more than its size."""
+    """Return a direction for a check that moves all components, and none by much more than its size."""
     rng = np.random.default_rng(0)
     dy, dp = rng.standard_normal(y0.size), rng.standard_normal(parameters)
     sizes = np.abs(y0)
@@ -446,9 +446,9 @@ def _agree(found: Array, right: Array, bound: float) -> bool:
 
 
 def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
-    """Return a right-hand side of columns, one after the other, for a state that has their numbers at these places.
+    """Return a right-hand side for a state whose entries at `places` are the state of `rhs`, in this order.
 
-    What stands at no place does not change.
+    The other entries of the state do not change.
     """
     if np.array_equal(places.ravel(), np.arange(places.size)):
         return rhs
@@ -467,7 +467,7 @@ def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
 
 
 def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
-    """The derivative as a function f(t, y, extra) of real or complex states."""
+    """Return the derivative as a function f(t, y, extra) of real or complex states."""
     n = y0.size
     half = n // 2 if form.startswith("acceleration") else 0
 
@@ -504,7 +504,7 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
         size = max(np.abs(dy).max(initial=0.0), np.abs(dp).max(initial=0.0))
         if size == 0.0:
             return np.zeros(y.size)
-        # A power of two: the product has the same bits for any other length of the direction.
+        # The step is a power of two, so that the bits of the product do not depend on the length of the direction.
         step, arguments = 2.0 ** -(SHIFT + np.frexp(size)[1]), extra
         if places:
             params = extra[0].astype(complex)
@@ -517,13 +517,13 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
         good = _agree(product(t0, y0, dy, dp), _difference(derivative, t0, y0, dy, dp, places, extra), AGREES)
     except MemoryError:
         raise
-    except Exception:  # whatever a function raises for complex numbers
+    except Exception:  # a function may raise any error for complex numbers
         good = False
     if not good:
         raise ValueError(
-            "variations: the right-hand side is neither that of a problem with derivatives, nor jitted by Numba for "
-            "dual numbers, nor right for a complex step. Give jvp=..., a function jvp(t, y, dy) that returns the "
-            "product of the Jacobian with dy."
+            "variations: the derivatives of the right-hand side cannot be computed: it does not belong to a problem "
+            "with derivatives, is not jitted by Numba, and does not support complex steps. Give jvp=..., a function "
+            "jvp(t, y, dy) that returns the product of the Jacobian with dy."
         )
     return _interpreted(columns, fun, form, y0, product)
 
@@ -531,7 +531,7 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
 def _difference(
     derivative: Callable[..., Array], t: float, y: Array, dy: Array, dp: Array, places: list[int], extra: tuple
 ) -> Array:
-    """The derivative along (dy, dp) by central differences of order 6."""
+    """Return the derivative along (dy, dp) by central differences of order 6."""
 
     def along(s: Array) -> Array:
         if not places:
@@ -544,10 +544,10 @@ def _difference(
 
 
 class _WideInvariant:
-    """An invariant as a function of the wide state, with its gradient, as Python calls them.
+    """An invariant as a function of the wide state, with its gradient, for calls from Python.
 
-    `shape`: that of its value. `parameters`: those that it depends on and derivatives are taken by; `slopes`: the
-    function of the derivatives by these, differences by default.
+    `shape` is the shape of its value, `parameters` are the parameters of the columns on which it depends, and `slopes`
+    returns the derivatives by these, by default from differences.
     """
 
     def __init__(
@@ -573,11 +573,11 @@ class _WideInvariant:
         self.own_gradient: Callable[..., Any] = gradient
 
     def value(self, t: float, Y: Array, *extra: Any) -> Any:
-        """Return the value, with parameters from behind the state."""
+        """Return the value, with the parameters that follow the state."""
         return self.item.function(t, self.columns.own(Y), *self.item.args, *self._arguments(Y, extra))
 
     def gradient(self, t: float, Y: Array, *rest: Any) -> Array:
-        """Return the gradient over the wide state; `rest` begins with f where it is used."""
+        """Return the gradient with respect to the wide state; `rest` begins with f if the gradient uses it."""
         own, places, n = self.columns.own, self.columns.places, self.columns.n
         first: tuple[Any, ...] = (t, own(Y))
         if self.uses_f:
@@ -628,7 +628,7 @@ def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple,
 def _of_state(
     item: Invariant, n: int, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
 ) -> OfState | None:
-    """Return the invariant as the engine calls it, with a gradient; None if not all of its functions have addresses."""
+    """Return the invariant with a gradient as an `OfState`; None if a function has no address."""
     own, slopes = copy(item), None
     if not _has_address(own.function) or (parameters and not is_jitted(own.function)):
         return None
@@ -642,6 +642,6 @@ def _of_state(
             from .jitted_columns import parameter_gradient
 
             slopes = parameter_gradient(own.function, extra[0].size, shape, parameters)
-    except NotCompilableError:  # Python then calls it
+    except NotCompilableError:  # the function is then called from Python
         return None
     return OfState(n, own, slopes, len(parameters)) if _has_address(own.gradient) else None

@@ -492,7 +492,7 @@ def test_tolerances_no_numbers(driver, name, value):
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 @pytest.mark.parametrize("value", [math.inf, [1e-3, math.inf]])
 def test_tolerances_finite(driver, name, value, step):
-    with pytest.raises(ValueError, match=f"`{name}` must be finite. Got .*; a large number such as 1e30"):
+    with pytest.raises(ValueError, match=f"`{name}` must be finite. Got .*; to exclude a component"):
         driver(**{name: value, **step})
     assert driver(**{name: 1e30, **step}).status == 0
 
@@ -503,7 +503,7 @@ def test_tolerances_finite(driver, name, value, step):
 def test_tolerances_without_a_scale(driver, method, invariants):
     """An error has no scale if both the start and atol are 0; the message says so and does not mention h."""
     options = {"h": None, "method": method, "atol": [1e-6, 0.0], "invariants": invariants}
-    with pytest.raises(ValueError, match="tolerances of component 1 are 0: y0 is 0 there, and so is `atol`"):
+    with pytest.raises(ValueError, match="error of component 1 has no scale, because y0 and `atol` are 0 there"):
         driver(y0=[1.0, 0.0], **options)
     assert driver(y0=[1.0, 0.0], **{**options, "first_step": 0.01}).status == 0
     assert driver(y0=[1.0, 0.0], **{**options, "h": 0.1, "metric": "error"}).status == 0

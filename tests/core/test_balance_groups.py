@@ -296,7 +296,7 @@ def test_complex_states():
 @pytest.mark.parametrize(
     ("components", "weights", "message"),
     [
-        (None, [1.0], "weights without components"),
+        (None, [1.0], "weights are given without components"),
         ([], None, "must be integers of shape"),
         (3, None, "must be integers of shape"),
         ([[[0]]], None, "must be integers of shape"),

@@ -202,13 +202,13 @@ def test_what_is_no_second_order_system(method):
     """The order of the state is wrong, an acceleration depends on the velocity, or the number of components is odd."""
     with pytest.raises(ValueError, match="the first 2 components of fun must be v"):
         solve_ivp(lambda t, y: np.concatenate([acceleration(t, y[2:]), y[:2]]), (0, 1), Y0, method=method, h=0.1)
-    with pytest.raises(ValueError, match="accelerations change with the velocity; take a Runge-Kutta"):
+    with pytest.raises(ValueError, match="accelerations in fun depend on the velocity; use a Runge-Kutta"):
         solve_ivp(lambda t, y: [y[2], y[3], -y[2], -y[3]], (0, 1), Y0, method=method, h=0.1)
     for call in (
         lambda: solve_ivp(lambda t, y: -y, (0, 1), Y0[:3], method=method, h=0.1),
         lambda: integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0[:3], method=method, h=0.1),
     ):
-        with pytest.raises(ValueError, match="even number of components; y0 has 3"):
+        with pytest.raises(ValueError, match="even number of components, but y0 has 3"):
             call()
     with pytest.raises(ValueError, match=r"acceleration returned shape \(4,\), expected \(2,\)"):
         integrate(acceleration=lambda t, q: np.zeros(4), t_span=(0, 1), y0=Y0, method=method, h=0.1)

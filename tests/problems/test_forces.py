@@ -386,7 +386,7 @@ def test_through_solve_ivp():
 def test_nystrom_methods_say_why_they_cannot(forces):
     given = mercury(forces)
     assert given.acc is None
-    with pytest.raises(ValueError, match="accelerations change with the velocity; take a Runge-Kutta method"):
+    with pytest.raises(ValueError, match="accelerations in fun depend on the velocity; use a Runge-Kutta method"):
         integrate(given, method=EIPRKN12)
 
 

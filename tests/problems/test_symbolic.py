@@ -351,11 +351,11 @@ def test_parameters_by_name_in_runs():
 def test_nystrom_methods_say_what_works():
     """The problem in (q, v) where there is one, and not where there is none."""
     options = {"method": EIPRKN12, "h": 0.1}
-    with pytest.raises(ValueError, match=r"Take a Runge-Kutta .*this problem does it: problem\.second_order\(\)"):
+    with pytest.raises(ValueError, match=r"Use a Runge-Kutta .*this problem does it: problem\.second_order\(\)"):
         integrate(hamiltonian("px**2/4 + x**2/2"), (0, 1), [1.0, 2.0], **options)
     prey = equations({"x": "x*(1 - y)", "y": "y*(x - 1)"})
     for problem in (prey, hamiltonian("px**2*x + x**2")):
-        with pytest.raises(ValueError, match=r"Take a Runge-Kutta method such as EIPDOP853, .* as that half\.$"):
+        with pytest.raises(ValueError, match=r"Use a Runge-Kutta method such as EIPDOP853, .* half of the state\.$"):
             integrate(problem, (0, 1), [1.0, 2.0], **options)
 
 

@@ -88,7 +88,7 @@ def test_methods_without_an_estimate_need_a_step(how, options):
 @both
 def test_a_step_and_bounds_of_adaptive_ones_contradict(how):
     for options in ({"first_step": 0.01}, {"max_step": 0.01}):
-        with pytest.raises(ValueError, match="h sets a fixed step; first_step and max_step belong to adaptive steps"):
+        with pytest.raises(ValueError, match="h sets a fixed step, but first_step and max_step are for adaptive steps"):
             how(PROBLEM, method=EIPRK4, h=0.02, **options)
 
 
