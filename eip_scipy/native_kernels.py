@@ -1,6 +1,6 @@
-"""Compiled loops of the engine for methods with fixed steps that the projection is compared with.
+"""Compiled loops of the engine for methods with fixed steps, with which the projection is compared.
 
-This module is the door through which other packages, `eip_scipy_studies.comparators` among them, reach these loops.
+Other packages, such as `eip_scipy_studies.comparators`, use these loops through this module.
 `run_in_place` and `run_second_order` run a scheme over a function of the user, compiled if it has an address; `fields`
 holds loops over the points of a complex field, one call for each part of a step of the Gross-Pitaevskii equation. The
 schemes follow the engine and may change with it.
@@ -45,13 +45,13 @@ class FixedStepResult:
     Attributes
     ----------
     t : ndarray, shape (m,)
-        Saved times, the first and the last of the interval among them.
+        Saved times, including start and end of the interval.
     y : ndarray, shape (n, m)
         States at `t`.
     nfev : int
         Evaluations of the function.
     wall_time : float
-        Seconds spent in the integration, compilation excluded.
+        Time of the integration in seconds, without compilation.
     message : str
         "compiled", or "interpreted" and the reason; and where the states stop being finite, if they do.
     """
@@ -64,7 +64,7 @@ class FixedStepResult:
 
 
 def _check_span(t_span: Any) -> tuple[float, float]:
-    """Return start and end as floats; ValueError for anything but two finite numbers."""
+    """Return start and end as floats; raise ValueError unless t_span holds two finite numbers."""
     refuse_units(t_span=t_span)
     span = reals(t_span)
     if span is None or span.shape != (2,) or not np.isfinite(span).all():
@@ -86,7 +86,7 @@ def _real_vector(values: Any, name: str) -> np.ndarray:
 
 
 def check_state(y0: Any) -> np.ndarray:
-    """Copy the initial state; ValueError unless all of its components are finite."""
+    """Copy the initial state; raise ValueError unless all of its components are finite."""
     y = _real_vector(y0, "y0")
     if not np.isfinite(y).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
@@ -94,10 +94,10 @@ def check_state(y0: Any) -> np.ndarray:
 
 
 class FixedSteps(NamedTuple):
-    """The steps of a run and what it saves.
+    """The steps of a run and the states that it saves.
 
-    `h` and `last` are the lengths of a step and of the last one, with their sign; `saved` holds the numbers of the
-    steps after which the state is saved, 0, the start, the first of them.
+    `h` and `last` are the lengths of a step and of the last step, with their sign; `saved` holds the numbers of the
+    steps after which the state is saved, starting with 0 for the start.
     """
 
     t0: float
@@ -108,7 +108,7 @@ class FixedSteps(NamedTuple):
 
     @classmethod
     def of(cls, t_span: Any, h: Any, save_every: Any) -> FixedSteps:
-        """Make the steps from the user's arguments, which are checked."""
+        """Make the steps from the user's arguments after checks."""
         t0, t_bound = _check_span(t_span)
         h = check_fixed_step(h, t0, t_bound)
         if save_every is None:
@@ -121,14 +121,14 @@ class FixedSteps(NamedTuple):
 
     @property
     def t(self) -> np.ndarray:
-        """The saved times."""
+        """Return the saved times."""
         t = self.t0 + self.saved * self.h
         t[-1] = self.t_bound
         return t
 
 
 def _message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
-    """Say how the run went; `reason` says why it was interpreted, and is empty if it was compiled."""
+    """Return the message of a run; `reason` is the reason why it was interpreted, "" if it was compiled."""
     text = f"interpreted: {reason}" if reason else "compiled"
     finite = np.isfinite(ys).all(axis=1)
     if finite.all():
@@ -165,7 +165,7 @@ def run_in_place(
         Name of `fun` in messages.
     takes, fills : int
     constant : float, optional
-        Number that the scheme takes, such as the charge per mass.
+        A number that the scheme uses, such as the charge per mass.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def run_second_order(
 ) -> FixedStepResult:
     """Run a scheme over an acceleration, ``acc(t, q[, params]) -> (n/2,)``; see `run_in_place`.
 
-    It is called once before the run, which checks the shape of its value.
+    The acceleration is called once before the run to check the shape of its value.
     """
     given = None if params is None else _real_vector(params, "params")
     half = y.size // 2
@@ -203,7 +203,7 @@ def run_second_order(
 
 
 def _converter(size: int) -> Callable[[Any, float], np.ndarray]:
-    """Make a function that converts values of `acc`: NumPy would silently broadcast scalars or drop imaginary parts."""
+    """Return a converter for values of `acc`: NumPy would silently broadcast scalars or drop imaginary parts."""
 
     def convert(value: Any, t: float) -> np.ndarray:
         if value is None:
@@ -230,7 +230,7 @@ def _run(
     constant: float = 0.0,
     second_order: bool = False,
 ) -> FixedStepResult:
-    """Take all steps from y, which moves, with the function's address or, if it has none, with `in_python`."""
+    """Make all steps from y, which is overwritten, with the function's address or, if it has none, with `in_python`."""
     functions: NativeFunctions | PythonFunctions
     try:
         functions, reason = function_alone(fun, kind, name, params, second_order=second_order), ""

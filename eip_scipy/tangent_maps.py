@@ -1,4 +1,4 @@
-"""Chaos indicators, periodic orbits and fits, from derivatives that runs carry along (``variations=`` of `integrate`).
+"""Chaos indicators, periodic orbits and fits, from derivatives that runs integrate (``variations=`` of `integrate`).
 
 Each function takes what `integrate` takes: a function or a `Problem`, and all of its options.
 """
@@ -54,7 +54,7 @@ OWN = ("variations", "dense_output", "t_eval", "checkpoint", "checkpoint_every",
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Followed:
-    """Fields of what is found along a whole run, which have their texts in the results."""
+    """Fields that results of whole runs have in common; the docstrings of the results describe them."""
 
     y: Array = field(repr=False)
     diagnostics: Diagnostics = field(repr=False)
@@ -64,7 +64,7 @@ class _Followed:
 
 
 def _end_of(run: IntegrationResult) -> dict[str, Any]:
-    """Return these fields at the end of a run."""
+    """Return the fields of `_Followed` at the end of a run."""
     return {"y": run.y[:, -1], **{name: run[name] for name in ("diagnostics", "success", "trusted", "message")}}
 
 
@@ -186,8 +186,8 @@ class PeriodicOrbit:
 class _Piece(NamedTuple):
     """A part of a run between two orthonormalisations.
 
-    `run` ends with the piece, and has its own rows after the first one. `growth`: R of the QR factorisation at its end;
-    `columns`: Q.
+    `run` ends with the piece; its first row is the start of the piece. `growth` and `columns` are R and Q of the QR
+    factorisation at its end.
     """
 
     run: IntegrationResult
@@ -211,7 +211,7 @@ def _start(fun: Any, t_span: Any, y0: Any, options: dict[str, Any]) -> Prepared:
 
 
 def _length(every: Any, start: Prepared, pieces: int) -> float:
-    """The time between two orthonormalisations; by default a whole number of steps, where they have one length."""
+    """Return the time between two orthonormalisations, by default a whole number of steps if these are equal."""
     h, (t0, t_bound) = abs(start.schedule.span.h), _ends(start)
     span = abs(t_bound - t0)
     if every is None:
@@ -224,7 +224,7 @@ def _length(every: Any, start: Prepared, pieces: int) -> float:
 def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: float, options: Any) -> Iterator[_Piece]:
     """Run from t[0] to t[1] with columns that are orthonormal at the start of each piece.
 
-    Lengths are halved where the columns grow apart too far. A piece that fails for another reason is the last.
+    A piece is halved if its columns grow too differently. A piece that fails for another reason is the last one.
     """
     begin, end = t
     now, sign, run = begin, np.sign(end - begin), None
@@ -425,13 +425,13 @@ def _unit(deviation: Any, n: int) -> Array:
 
 
 def _numbers(given: Any) -> Array:
-    """Return what was given as an array, an empty one if it does not hold real numbers."""
+    """Return a value as an array of floats, an empty one if it does not consist of real numbers."""
     found = reals(given)
     return np.zeros(0) if found is None else found
 
 
 def _indicators(s: Array, L: Array) -> tuple[Array, Array]:
-    """MEGNO and its mean from the logarithms at the times s, which begin at 0."""
+    """Return MEGNO and its mean from the logarithms L at the times s, which start at 0."""
     if s.size < 2:
         return np.zeros(s.size), np.zeros(s.size)
     # At the start the integrals are 0, and so are the indicators.
@@ -542,7 +542,7 @@ def periodic_orbit(
 
 
 def _component(item: Any, names: Sequence[str]) -> int | None:
-    """Return the place of a component that is given by its name or place, None for anything else."""
+    """Return the index of a component from its name or index; None for anything else."""
     if isinstance(item, str):
         return list(names).index(item) if item in names else None
     is_place = isinstance(item, int | np.integer) and not isinstance(item, bool) and 0 <= item < len(names)
@@ -557,7 +557,7 @@ def _place(item: Any, names: Sequence[str]) -> int:
 
 
 def _odd(symmetry: Any, y: Array) -> Array:
-    """Return which components change their signs; those of y become 0."""
+    """Return a mask of the components whose sign is -1, and set these components of y to 0."""
     if symmetry is None:
         return np.zeros(y.size, bool)
     signs = np.asarray(symmetry)
@@ -604,21 +604,21 @@ class _Reached:
 
     @property
     def residual(self) -> Array:
-        """Return what is to be 0."""
+        """Return the residual: the difference between end and start, or the components that must vanish by symmetry."""
         y, odd = self.run.y[:, -1], self.shooting.odd
         return y[odd] if odd.any() else y - self.y0
 
     @property
     def size(self) -> float:
-        """Return its size, relative to the start."""
+        """Return the size of the residual, relative to that of the start."""
         return float(np.abs(self.residual).max() / np.abs(self.y0).max())
 
     def begun_at(self, y: Array) -> Prepared:
-        """Return what a run from a state knows of it."""
+        """Return the prepared run that starts at a state."""
         return _start(self.shooting.fun, (0.0, self.period), y, {**self.shooting.options, "project_initial": False})
 
     def correction(self, free: Array) -> Array:
-        """Return the least-norm step of Newton in (y0, T), 0 where these are fixed."""
+        """Return the Newton step of smallest norm in (y0, T); fixed components do not change."""
         odd, M = self.shooting.odd, self.run.stm[-1]
         f = self.begun_at(self.run.y[:, -1]).run.start.f
         rows = np.column_stack([M, self.shooting.share * f])
@@ -654,7 +654,7 @@ class _Reached:
 
 
 def _in_pairs(values: Array) -> Array:
-    """Multipliers by decreasing modulus, each followed by the one nearest to 1 divided by it if all have one."""
+    """Return the multipliers by decreasing modulus, each followed by its reciprocal if all have one."""
     left = sorted(values.astype(complex), key=lambda value: (-abs(value), -value.imag))
     ordered, rest = list(left), list(left)
     pairs = []
@@ -671,7 +671,7 @@ def _in_pairs(values: Array) -> Array:
 class TrajectoryFit:
     """Residuals of a trajectory against data, and their Jacobian, for `scipy.optimize.least_squares`.
 
-    Both come from one integration for each x, whose derivatives by x the run carries along.
+    Both come from one run for each x, which also integrates the derivatives by x.
 
     Parameters
     ----------
@@ -680,16 +680,16 @@ class TrajectoryFit:
     t : array_like, shape (m,)
         Times of the data, on one side of `t0`, in order from there.
     data : array_like, shape (d, m)
-        Data at these times; nan for what was not measured.
+        Data at these times; nan if a value was not measured.
     y0 : array_like, shape (n,), optional
         First guess of the state at `t0`, or its known value. Default: that of the problem.
     free : sequence of str or int, optional
-        What is fitted: ``"state"``, the initial state, and names or places of parameters, as in ``variations=`` of
-        `integrate`.
+        The quantities to fit: ``"state"`` for the initial state, and names or indices of parameters, as in
+        ``variations=`` of `integrate`.
     t0 : float, optional
         Time of `y0`. Default: the first of `t`.
     observe : sequence of str or int, or (callable, callable), optional
-        Components that are measured, by name or place; or a function ``g(t, y) -> (d,)`` and its Jacobian
+        Components that are measured, by name or index; or a function ``g(t, y) -> (d,)`` and its Jacobian
         ``dg(t, y) -> (d, n)``. Default: all components.
     sigma : array_like, optional
         Standard deviations of the data, of a shape that NumPy broadcasts to that of `data`. Default: 1.
@@ -791,7 +791,7 @@ class TrajectoryFit:
         return run
 
     def residuals(self, x: Any) -> Array:
-        """Return (model - data) / sigma, of what was measured: by the components, and within each by time."""
+        """Return (model - data) / sigma of the measured values, ordered by component and then by time."""
         run = self.run(x)
         model = np.array([self._g(t, y) for t, y in zip(run.t, run.y.T, strict=True)]).T[:, self._from]
         found: Array = ((model - self._data) / self._sigma)[self._kept]
@@ -807,7 +807,7 @@ class TrajectoryFit:
 
 
 def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
-    """Return the interval, the distinct times in it, and for each of the data the place of its time."""
+    """Return the interval, its distinct times, and for each datum the index of its time."""
     times = _numbers(t)
     if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all():
         raise ValueError(f"t must be an array of finite times, one for each of the data, got {shown(t)}.")

@@ -123,7 +123,7 @@ def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
 def function_alone(
     fun: Callable[..., Any], kind: Kind, name: str, params: np.ndarray | None, *, second_order: bool = False
 ) -> NativeFunctions:
-    """The address of a right-hand side without invariants and events, which takes and gives what `kind` says.
+    """Return the address of a right-hand side of the signature `kind`, without invariants and events.
 
     Raises
     ------

@@ -64,7 +64,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
 
 
 def _orbit(e: float, t: float) -> np.ndarray:
-    """The unperturbed orbit, by Kepler's equation E - e sin E = t."""
+    """Return the unperturbed orbit, by Kepler's equation E - e sin E = t."""
     mean = np.remainder(t + np.pi, 2 * np.pi) - np.pi
     E = brentq(lambda x: x - e * np.sin(x) - mean, mean - 1.0, mean + 1.0, xtol=1e-15, rtol=1e-15)
     b, r = sqrt(1 - e * e), 1 - e * np.cos(E)

@@ -23,7 +23,7 @@ def named_invariant(
     uses_f: bool = False,
     where: str = "",
 ) -> Invariant:
-    """The invariant of that name, from its value ``value(y)`` and its gradient in place.
+    """Return the invariant of that name, from its value ``value(y)`` and its gradient in place.
 
     Raises
     ------
@@ -60,7 +60,7 @@ Parts = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 def damped_invariant(
     item: Invariant, rated: Invariant, parts: Parts, total: Callable[[float], float] | None = None
 ) -> Balance:
-    """An invariant of the equation without damping as a balance of that with it.
+    """Return an invariant of the undamped equation as a balance of the damped equation.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Fictitious time: the same orbit in steps that are short where the motion is fast, with a fixed step.
+"""Fictitious time: with a fixed step in it the steps in time are short during fast motion.
 
-With dt = g(y) ds the state (y, t) as a function of s obeys another autonomous system, whose invariants are those of
-the problem. So a method of fixed step, with its projection, needs nothing new for close encounters.
+With dt = g(y) ds the state (y, t) as a function of s obeys another autonomous system, which has the invariants of the
+problem. In this way a method with a fixed step and its projection can be used for close encounters.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 
 @compilable
 def centre_time(y, params):
-    """Time scale r^(3/2) of motion around one centre with G M = 1: the choice of g for `kepler`."""
+    """Return the time scale r^(3/2) of motion around one centre with G M = 1: the choice of g for `kepler`."""
     r2 = 0.0
     for k in range(y.size // 2):
         r2 += y[k] * y[k]
@@ -33,7 +33,7 @@ def centre_time(y, params):
 
 @compilable
 def pair_time(y, params):
-    """Time scale of the closest pair of N bodies, smooth in all: (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2)."""
+    """Return (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2), a smooth time scale of the closest pair of N bodies."""
     rate2 = 0.0
     for i in range(params.size):
         for j in range(i):
@@ -44,34 +44,34 @@ def pair_time(y, params):
 
 
 def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pair_time) -> Problem:
-    """Write a problem in fictitious time s, dt = g(y) ds.
+    """Return a problem in fictitious time s, dt = g(y) ds.
 
     Parameters
     ----------
     problem : Problem
-        Autonomous, with ``rhs``.
+        An autonomous problem with ``rhs``.
     s_end : float
-        End of the interval of s, which starts at 0. To stop at a time t, choose it large and give
+        End of the interval of s, which starts at 0. To stop at a time t, use a large value and pass
         ``events=reaches(t)`` to `integrate`.
     g : callable, optional
-        Compiled ``g(y, params) -> float``, positive: what one unit of s is worth at y. Default: `pair_time`, for
-        `nbody` and its like; `centre_time` is for `kepler`. With these a circular orbit takes 2 pi in s (of two bodies
-        that are alone), and so does about half of a narrow ellipse with a passage of its pericentre.
+        Compiled ``g(y, params) -> float``, positive: the time dt for a unit of s at y. Default: `pair_time`, for
+        problems such as `nbody`; `centre_time` is for `kepler`. With these functions a circular orbit of two bodies
+        takes 2 pi in s, and so does about half of a narrow ellipse with a passage of its pericentre.
 
     Returns
     -------
     Problem
-        State (y, t), with t = ``problem.t_span[0]`` at the start. The same invariants, blocks and frame; t is in none
-        of them. It has no step of its own.
+        A problem with the state (y, t), where t = ``problem.t_span[0]`` at the start. It has the same invariants,
+        blocks and frame, which do not contain t. It has no step `h`.
 
     Raises
     ------
     ValueError
-        When the problem has no compiled right-hand side, or a part of its state would have the wrong size.
+        If the problem has no compiled right-hand side, or a part of its state would have the wrong size.
 
     Notes
     -----
-    The system is of the first order: Nyström methods do not apply to it.
+    The system is of first order, so that Nyström methods cannot be used.
 
     References
     ----------
@@ -105,7 +105,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
 
 
 def reaches(t: float) -> Callable[..., float]:
-    """Make a terminal event for `integrate` on a transformed problem: the time is `t`."""
+    """Return a terminal event for a run of a transformed problem, which ends the run at the time `t`."""
     refuse_units(t=t)
     t = float(t)
 
@@ -117,7 +117,7 @@ def reaches(t: float) -> Callable[..., float]:
     return made
 
 
-# Cached, so that two problems of the same functions are one to the compiler.
+# The functions are cached, so that they are compiled once for all problems with the same functions.
 @cache
 def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callable[..., None]:
     def transformed(s, y, out, params):
@@ -134,8 +134,8 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
 def _transformed_invariant(item: Invariant) -> Invariant:
     if item.is_balance:
         raise ValueError(
-            f"time_transformed: {item!r} is a Balance, whose rate is one in time. Give the new problem a Balance "
-            "with its rate in the new time, by replace(problem, invariants=...)."
+            f"time_transformed: {item!r} is a Balance, whose rate is a derivative by time. Omit it, and give the new "
+            "problem a Balance with the rate in fictitious time: replace(problem, invariants=...)."
         )
     fun, grad = _transformed_functions(item.function, item.gradient, item.uses_f)
     return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
@@ -145,7 +145,7 @@ def _transformed_invariant(item: Invariant) -> Invariant:
 def _transformed_functions(
     fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The functions of an invariant for the state (y, t); those that want f = dy/dt get it from dy/ds and dt/ds."""
+    """Return value and gradient of an invariant for the state (y, t); f = dy/dt is computed from dy/ds and dt/ds."""
 
     def value(s, y, params):
         return fun(y[-1], y[:-1], params)

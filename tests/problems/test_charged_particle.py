@@ -418,7 +418,11 @@ def start(field=UNIFORM, position=(1.0, 0, 0), velocity=(0, 0.1, 0), **options):
         (lambda: start(position=(0.0, 0.0, 0.0)), (ValueError, ZeroDivisionError), "."),
         (lambda: start(field=ParticleField(magnetic=constant_b)), ValueError, "vector_potential"),
         (lambda: ParticleField(), ValueError, "vector_potential, or magnetic"),
-        (lambda: ParticleField(magnetic=constant_b, jacobian=mirror_jacobian), ValueError, "give vector_potential too"),
+        (
+            lambda: ParticleField(magnetic=constant_b, jacobian=mirror_jacobian),
+            ValueError,
+            "without vector_potential",
+        ),
         (lambda: ParticleField(vector_potential=3.0), TypeError, "function of"),
         (lambda: ParticleField(constant_a, length=0.0), ValueError, "length must be positive"),
         (lambda: start(field=ParticleField(constant_a, magnetic=mirror_b)), ValueError, "the curl of"),

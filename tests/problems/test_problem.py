@@ -89,5 +89,5 @@ def test_solve_ivp_by_a_method_of_scipy_gets_no_options_of_ours():
 
 def test_a_balance_is_not_written_in_another_time():
     balance = Balance(lambda t, y: y @ y, lambda t, y: 0.0, lambda t, y: 2 * y, name="B")
-    with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is one in time"):
+    with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is a derivative by time"):
         time_transformed(replace(kepler(), invariants=(balance,)), 1.0, centre_time)

@@ -1,4 +1,4 @@
-"""Bodies with units and names: what `nbody` takes, and what can be read off its problems and their runs."""
+"""Bodies with units and names: arguments of `nbody`, and the bodies of its problems and their runs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Bodies(NamedTuple):
 
 
 def bodies_of(run: Any) -> Bodies:
-    """The bodies of a problem that `nbody` made, or of a run of one.
+    """Return the bodies of a problem that `nbody` made, or of a run of one.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def bodies_of(run: Any) -> Bodies:
 
 
 def body_names(names: Sequence[str], n: int) -> tuple[str, ...]:
-    """Names of n bodies.
+    """Return the names of n bodies.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | N
 
 
 def _gravitational(gm: Any, known: tuple[Unit, Unit]) -> Any:
-    """G m of values that are G m or masses."""
+    """Return G m of values that are G m or masses."""
     if isinstance(gm, tuple | list) or type(gm) is np.ndarray:
         return np.array([_gravitational(value, known) for value in gm])
     if not _is_mass(gm):  # a plain 0 among others is a test particle
@@ -148,20 +148,20 @@ def _is_mass(value: Any) -> bool:
 
 
 def _first(value: Any) -> Any:
-    """The first item of nested lists."""
+    """Return the first item of nested lists."""
     while isinstance(value, tuple | list) and len(value):
         value = value[0]
     return value
 
 
 def _time_unit(speed: Any) -> Any:
-    """The s of km / s."""
+    """Return the unit of time in a unit of velocity, such as s in km / s."""
     found = [base for base, power in zip(speed.bases, speed.powers, strict=True) if power == -1]
     return next((base for base in found if base.physical_type == "time"), speed.si.bases[-1])
 
 
 def _named(unit: Any, base: str, place: int) -> str:
-    """A unit of astropy as `units` reads it: by its name, or as a number of metres or seconds."""
+    """Return a unit of astropy as text for `units`: its name, or a number of metres or seconds."""
     if not unit.is_equivalent(base):  # what is converted to it will say so
         return base
     pair = f"{unit}, s" if place == 0 else f"m, {unit}"

@@ -92,7 +92,7 @@ NEEDS = {
 
 
 def check_forces(forces: Any) -> tuple[str, ...]:
-    """The names of forces, one name or several, in the order of `FORCES`.
+    """Return the names of forces, one name or several, in the order of `FORCES`.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
 
 
 def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstants | None) -> np.ndarray:
-    """The vector of parameters: every G m, then the forces' own.
+    """Return the vector of parameters: G m of all bodies, then the parameters of the forces.
 
     Raises
     ------
@@ -164,19 +164,19 @@ def _check_constant(force: str, name: str, value: Any, n: int) -> None:
 
 
 def equations(forces: tuple[str, ...]) -> tuple[Any, Any]:
-    """The right-hand side, and the accelerations where they depend on positions only (else None)."""
+    """Return the right-hand side, and the accelerations if they depend on positions only (else None)."""
     return library["forces.rhs"], None if set(forces) & set(VELOCITY_DEPENDENT) else library["forces.acc"]
 
 
 def acceleration(y: np.ndarray, params: np.ndarray) -> np.ndarray:
-    """The accelerations (N, 3) of a state."""
+    """Return the accelerations (N, 3) of a state."""
     out = np.empty_like(y)
     library["forces.rhs"](0.0, y, out, params)
     return out[y.size // 2 :].reshape(-1, 3)
 
 
 def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> tuple[Invariant, ...]:
-    """The invariants that the equations have with these forces, see `nbody`."""
+    """Return the invariants of the equations with these forces, see `nbody`."""
     if "drag" in forces:
         return ()
     if "1pn" in forces:

@@ -1,4 +1,4 @@
-"""How fast bodies move: what bounds the step of a multistep method."""
+"""Frequencies of bodies, which limit the step of a multistep method."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["orbital_frequencies"]
 
 
 def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf) -> tuple[np.ndarray, float]:
-    """The largest angular frequency of each body on its orbit about the heaviest one, and that of all other pairs.
+    """Return the largest angular frequency of each orbit about the heaviest body, and that of all other pairs.
 
     Parameters
     ----------

@@ -75,7 +75,7 @@ class OrbitalElements:
     P: np.ndarray
 
     def __getitem__(self, body: str | int) -> OrbitalElements:
-        """The elements of one body, by its name or its place in `bodies`: arrays (m,), or numbers."""
+        """Return the elements of one body, by its name or its place in `bodies`: arrays (m,), or numbers."""
         if isinstance(body, str) and body not in self.bodies:
             raise KeyError(f"no orbit of {body!r}; there are those of {', '.join(self.bodies)}.")
         k = self.bodies.index(body) if isinstance(body, str) else body
@@ -84,7 +84,7 @@ class OrbitalElements:
 
 
 def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi") -> OrbitalElements:
-    """Osculating orbital elements of the bodies of a state, or of all saved states of a run at once.
+    """Return the osculating orbital elements of the bodies of a state, or of all saved states of a run.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
 
 
 def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, tuple[str, ...]]:
-    """States (2, N, 3, ...), times, G m and names."""
+    """Return the states (2, N, 3, ...), times, G m and names."""
     t, names = None, None
     if hasattr(run, "y") and hasattr(run, "t"):
         y, t, names = run.y, np.asarray(run.t, dtype=float), getattr(run, "component_names", None)
@@ -169,7 +169,7 @@ def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray,
 
 
 def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States relative to the centre of mass of all bodies before, and G times the mass up to each."""
+    """Return the states relative to the centre of mass of all bodies before, and G times the mass up to each."""
     if not gm[0] > 0:
         raise ValueError(f"orbital_elements: the first body needs a mass for Jacobi's orbits, its G m is {gm[0]!r}.")
     total = np.cumsum(gm)
@@ -181,7 +181,7 @@ def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _around(
     state: np.ndarray, gm: np.ndarray, primary: str | int, names: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """States relative to one primary, mu, and whose they are."""
+    """Return the states relative to one primary, mu, and the indices of the bodies."""
     every = list(range(gm.size))
     if primary == "barycentric":
         total = gm.sum()
@@ -204,7 +204,7 @@ def _around(
 
 
 def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
-    """The elements of relative states (2, bodies, 3, ...)."""
+    """Return the elements of relative states (2, bodies, 3, ...)."""
     (x, y, z), (vx, vy, vz) = np.moveaxis(state, 2, 1)
     mu = mu.reshape(-1, *[1] * (x.ndim - 1))
     # Adding 0 leaves no -0, whose arc tangent is pi.
@@ -249,7 +249,7 @@ def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """The angle in the plane of the orbit from the ascending node to q; 0 where there is no node or no q."""
+    """Return the angle in the plane of the orbit from the ascending node to q; 0 if the node or q is undefined."""
     hx, hy, hz = momentum
     along = hx * q[1] - hy * q[0] + 0.0
     # Product of h x node, (-hx hz, -hy hz, hx^2 + hy^2), with q, divided by h.
@@ -259,7 +259,7 @@ def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.nda
 
 
 def _mean_anomaly(e: np.ndarray, f: np.ndarray, a: np.ndarray, r: np.ndarray, rv: np.ndarray) -> np.ndarray:
-    """The mean anomaly, by Kepler's equation, from 0 to 2 pi of an ellipse; `rv`: position times velocity, mu = 1."""
+    """Return the mean anomaly from Kepler's equation, between 0 and 2 pi for an ellipse; `rv` is q . v with mu = 1."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         sine, cosine = rv / np.sqrt(np.abs(a)), 1 - r / a  # e times those of the eccentric anomaly
         nearly = 2 * np.arctan2(np.sqrt(np.abs(1 - e)) * np.sin(f / 2), np.sqrt(1 + e) * np.cos(f / 2))

@@ -173,7 +173,7 @@ def centres(gm: Array, y0: Array) -> Array:
 
 
 def _is_below(about: Array, body: int, top: int) -> bool:
-    """Return whether a body moves about another, or about one that does."""
+    """Return True if a body moves about another, directly or through a chain of centres."""
     while body >= 0:
         body = int(about[body])
         if body == top:
@@ -182,7 +182,7 @@ def _is_below(about: Array, body: int, top: int) -> bool:
 
 
 def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orbit:
-    """Return the orbit of a body, together with all that move about it, about its centre."""
+    """Return the orbit about its centre of a body together with all bodies that move about it."""
     centre = int(about[body])
     group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
     total = float(gm[group].sum())
@@ -203,7 +203,7 @@ def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orb
 def _balance(
     quantity: str, group: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str
 ) -> Balance:
-    """Return the balance of one quantity for all orbits, by the functions of a `group` of the library."""
+    """Return the balance of one quantity for all orbits, from the functions of a `group` of the library."""
     fun, grad, rate = (library[f"{group}.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
     each = 1 if quantity == "energy" else 3
     kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)

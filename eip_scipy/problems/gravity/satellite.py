@@ -37,7 +37,7 @@ def satellite(
     name: str = "satellite",
     units: str = "",
 ) -> Problem:
-    """Satellite about an oblate planet, with drag in an atmosphere whose density falls exponentially.
+    """Return the problem of a satellite about an oblate planet, with drag in an exponential atmosphere.
 
     The acceleration is the gradient of ``mu / r (1 - j2 (radius / r)^2 (3 sin(latitude)^2 - 1) / 2)``, and
     ``-drag exp((radius + height - r) / scale_height) |u| u``, u the velocity relative to the air.
@@ -132,6 +132,6 @@ def satellite(
 
 
 def _sixteenth(x: np.ndarray, v: np.ndarray, mu: float) -> float | None:
-    """Return this part of the period of Kepler's orbit, None for an unbound one."""
+    """Return 1/16 of the period of the Kepler orbit, None for an unbound orbit."""
     inverse = 2 / float(np.linalg.norm(x)) - float(v @ v) / mu  # of the semi-major axis
     return None if inverse <= 0 else 2 * np.pi / STEPS / float(np.sqrt(mu * inverse**3))

@@ -29,7 +29,7 @@ COMET_VELOCITY = np.array([-2.100710600073, -0.613156552068, 0.134394494981])
 
 
 def pythagorean() -> Problem:
-    """Burrau's three bodies: masses 3, 4 and 5 at rest in the corners of the triangle with these sides.
+    """Return Burrau's problem: masses 3, 4 and 5 at rest in the corners of the triangle with these sides.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def pythagorean() -> Problem:
 
 
 def figure_eight(periods: float = 100.0) -> Problem:
-    """Three equal masses that chase each other along an eight.
+    """Return the problem of three equal masses that follow each other along a figure of eight.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def figure_eight(periods: float = 100.0) -> Problem:
 
 
 def comet() -> Problem:
-    """A short-period comet that one passage of Jupiter throws far out; Sun, Jupiter, Saturn and the comet.
+    """Return the problem of a comet, Sun, Jupiter and Saturn, in which a passage of Jupiter ejects the comet.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def comet() -> Problem:
 
 
 def _reference(name: str, t: float) -> np.ndarray | None:
-    """The stored state, None at a time without one."""
+    """Return the stored state at a time; None if there is none."""
     for time, state in _references()[name]:
         if abs(t - time) <= 1e-14 * abs(time):
             return np.array(state)

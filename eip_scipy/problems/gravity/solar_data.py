@@ -1,4 +1,4 @@
-"""Initial data and reference states of the solar system: what the package carries, and no solver.
+"""Initial data and reference states of the solar system that are contained in the package.
 
 Four sets travel with the package: ``"de440"``, the Sun and the nine system barycentres of JPL's DE440 at
 2014-02-02 20:18:00 TDB, the epoch of Cai, Gong and Wang; ``"de440-j2000"``, the same at JD 2451545.0 TDB;
@@ -94,12 +94,12 @@ class SolarSystemData:
 
 
 def available() -> tuple[str, ...]:
-    """Names of the data sets that `load` knows."""
+    """Return the names of the data sets that `load` knows."""
     return tuple(_read(SOLAR_SYSTEM_JSON))
 
 
 def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
-    """Load initial data of the solar system that the package carries.
+    """Load initial data of the solar system from the package.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
 
 
 def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
-    """Accurate states of the Newtonian ten-body problem ``solar_system("de440")``.
+    """Return accurate states of the Newtonian ten-body problem ``solar_system("de440")``.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def gm_from_km3_s2(gm: Any) -> np.ndarray:
 
 
 def to_barycentre(gm: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities relative to the centre of mass.
+    """Return the positions and velocities relative to the centre of mass.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _centre(gm: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _state(rows: np.ndarray) -> np.ndarray:
-    """Rows (q, v) of each body as the state (q of all bodies, v of all bodies)."""
+    """Rearrange rows (q, v) of the bodies as the state (q of all bodies, v of all bodies)."""
     return rows.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
 
 

@@ -35,7 +35,7 @@ def solar_system(
     forces: str | Sequence[str] = (),
     balances: str | Sequence[str] | None = None,
 ) -> Problem:
-    """The solar system from JPL initial data; by default under Newton's gravitation (the paper's Experiment II).
+    """Return the solar system from JPL initial data; by default under Newton's gravitation (the paper's Experiment II).
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def _starts_as_references(data: SolarSystemData) -> bool:
 
 
 def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, time: float) -> ForceConstants:
-    """The constants in units of `length` to the AU and `time` to the day."""
+    """Return the constants in units of `length` to the AU and `time` to the day."""
     km = length / AU_KM
     if "moon-quadrupole" in forces and "EMB" not in data.bodies:
         raise ValueError(
@@ -126,7 +126,7 @@ def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, ti
 
 
 def _pole(axes: str) -> tuple[float, float, float]:
-    """The Sun's north pole on the axes of the data."""
+    """Return the Sun's north pole on the axes of the data."""
     ra, dec = math.radians(POLE_RA_DEG), math.radians(POLE_DEC_DEG)
     x, y, z = math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)
     if axes == "ICRF":
@@ -136,7 +136,7 @@ def _pole(axes: str) -> tuple[float, float, float]:
 
 
 def _units(units: str) -> tuple[float, float]:
-    """One AU and one day in the given units."""
+    """Return one AU and one day in the given units."""
     if units == "AU, yr":
         return 1.0, 1.0 / YEAR_D
     if units == "SI":

@@ -1,4 +1,4 @@
-"""Mass and energy of the Gross-Pitaevskii equation in a step, where f = -i H psi is known: no transforms."""
+"""Mass and energy of the Gross-Pitaevskii equation inside a step, computed from f = -i H psi without transforms."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ class _Known:
         self.energy, self._peak = 0.0, np.inf  # the latter a bound of |psi|^2
 
     def note(self, psi: np.ndarray, f: np.ndarray) -> Moments:
-        """Take the energy of a state from f there."""
+        """Store the energy of a state, computed from f at this state."""
         gpe = self._gpe
         found = gpe.moments(psi, f)
         self.energy, self._peak = gpe.grid.cell * found.energy(gpe.beta), found.quartic**0.5
         return found
 
     def beside(self, square: float, slope: float) -> float | None:
-        """The energy of a state whose difference d has those sums of ``|d|^2`` and Re(conj(H psi) d).
+        """Return the energy of a state at the difference d, from the sums of ``|d|^2`` and Re(conj(H psi) d).
 
-        None where the terms of second order and higher are not far below its rounding.
+        The result is None if the terms of second order and higher are not far below the rounding of the energy.
         """
         cell = self._gpe.grid.cell
         density = 3 * self._peak + 2 * (self._peak * square) ** 0.5 + 0.5 * square
@@ -46,7 +46,7 @@ class _Known:
 class Energy:
     """The energy as an invariant: value, and gradient 2 w i f.
 
-    A step needs the gradient at its raw result, the energy there, and that of the projected state close to it. Neither
+    A step needs the gradient and the energy at its unprojected result, and the energy of the projected state. Neither
     needs a transform.
 
     Parameters
@@ -59,7 +59,7 @@ class Energy:
         self._near: tuple[np.ndarray, np.ndarray] | None = None  # the state noted last and f there
 
     def value(self, y: np.ndarray) -> float:
-        """The energy of a state."""
+        """Return the energy of a state."""
         gpe = self._gpe
         energy = None
         if self._near is not None:
@@ -79,7 +79,7 @@ class Energy:
 
 
 class Joint:
-    """Mass and energy, or one of them, as one: all that a projection needs in two passes over the field.
+    """Mass and energy, or one of them, with the functions of `JointInvariants`: two passes over the field.
 
     The gradients 2 w psi and 2 w H psi = 2 w i f are never formed: their products are sums over psi and f, and so is
     the energy.
@@ -98,7 +98,7 @@ class Joint:
     def moments(
         self, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray, gram: np.ndarray, terms: np.ndarray
     ) -> None:
-        """Fill what a projection asks for at a state.
+        """Fill the values, products of gradients and terms at a state that a projection needs.
 
         Parameters
         ----------
@@ -124,7 +124,7 @@ class Joint:
     def shift(
         self, t: float, y: np.ndarray, f: np.ndarray, mu: np.ndarray, out: np.ndarray, values: np.ndarray
     ) -> None:
-        """Move along the gradients at the state of the last `moments`, and take the invariants there.
+        """Move along the gradients at the state of the last `moments`, and compute the invariants at the new state.
 
         Parameters
         ----------

@@ -89,19 +89,19 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         out += (self._growth + 1j * self.mu) * y
 
     def energy(self, psi: Any) -> float:
-        """Energy as of `GrossPitaevskii`."""
+        """Return the energy of `GrossPitaevskii`."""
         psi = self.as_field(psi)
         f = np.empty(psi.size, complex)
         super().rhs(0.0, psi.reshape(-1), f)
         return self.grid.cell * self.moments(psi, f).energy(self.beta)
 
     def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``-i H psi``, and what damping and losses add to it, without the rotation of the phase."""
+        """Return ``-i H psi``, and the terms of damping and losses without the rotation of the phase."""
         turning = (f - (self._growth + 1j * self.mu) * y) / (1 - 1j * self.damping)
         return turning, self._growth * y - 1j * self.damping * turning
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Balance, ...]:
-        """Make balances of what `GrossPitaevskii` keeps.
+        """Make balances of the invariants of `GrossPitaevskii`.
 
         Parameters
         ----------

@@ -131,17 +131,17 @@ class GrossPitaevskii:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
 
     def changed(self, **options: Any) -> GrossPitaevskii:
-        """Make the same equation with other values of `potential`, `Omega`, `beta` and so on: a quench."""
+        """Return the equation with other values of `potential`, `Omega`, `beta` and so on, as after a quench."""
         options = {"potential": self.V, "Omega": self.Omega, "beta": self.beta, **self._options, **options}
         return type(self)(self.grid, **options)
 
     def kinetic_factor(self, axis: int) -> np.ndarray:
-        """The factor k^2 / 2 of the modes along one axis."""
+        """Return the factor k^2 / 2 of the modes along one axis."""
         k = self.grid.wavenumbers(axis, odd=self.nyquist == "zero")
         return 0.5 * k * k
 
     def rotation_factors(self) -> list[np.ndarray]:
-        """Factors of Lz = x q - y k: of the modes along x and of those along y.
+        """Return the factors of Lz = x q - y k: of the modes along x and of those along y.
 
         Raises
         ------
@@ -163,7 +163,7 @@ class GrossPitaevskii:
 
     @cached_property
     def _moving(self) -> tuple[SpectralSum, ...]:
-        """Minus i times the first derivative along each axis."""
+        """Return -i times the first derivative along each axis."""
         factors = [self.grid.wavenumbers(axis, odd=True) for axis in range(self.grid.dim)]
         terms = [self._multiplier((axis,), factor) for axis, factor in enumerate(factors)]
         return tuple(SpectralSum(self.grid, self.transforms, [term]) for term in terms)
@@ -171,11 +171,11 @@ class GrossPitaevskii:
     # These four a field on several ranks does in another way (`eip_scipy.integrations.mpi_fields`).
 
     def _method(self) -> Splitting | None:
-        """The method that suits the equation."""
+        """Return the method that suits the equation."""
         return Splitting(self)
 
     def _total(self, sums: Any) -> Any:
-        """Sums over the whole grid from those over the part that is here."""
+        """Return the sums over the whole grid, from those over this process's part."""
         return sums
 
     def _multiplier(self, axes: Axes, factor: Any) -> Multiplier:
@@ -185,9 +185,9 @@ class GrossPitaevskii:
         return float(np.abs(a).max())
 
     def linear_terms(self) -> list[tuple[Axes, Any]]:
-        """The linear part, kinetic energy and rotation, as axes and the real factors of the modes along them.
+        """Return the linear part, kinetic energy and rotation, as axes and the real factors of the modes along them.
 
-        As few transforms as there are: all axes at once without rotation, else x, and then y and z together.
+        The number of transforms is smallest in this way: all axes together without rotation, otherwise x, then y and z.
         """
         kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
         if self.Omega == 0:
@@ -197,7 +197,7 @@ class GrossPitaevskii:
         return [((0,), kinetic[0] - self.Omega * along_x), (others, sum(kinetic[1:]) - self.Omega * along_y)]
 
     def as_field(self, psi: Any) -> np.ndarray:
-        """`psi`, a field or a flat state, as a contiguous complex field.
+        """Return `psi`, a field or a flat state, as a contiguous complex field.
 
         Raises
         ------
@@ -219,7 +219,7 @@ class GrossPitaevskii:
             derivative_at_once(psi, self.V, self.beta, image)
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
-        """-i H(psi) psi, flat: what `solve_ivp` takes."""
+        """Return -i H(psi) psi as a flat array, for `solve_ivp`."""
         y = np.ascontiguousarray(y, dtype=complex)
         out = np.empty_like(y)
         self.rhs(t, y, out)
@@ -240,7 +240,7 @@ class GrossPitaevskii:
         self._turning.apply(psi, out)
 
     def hamiltonian(self, psi: Any) -> np.ndarray:
-        """H(psi) psi, a field."""
+        """Return H(psi) psi, a field."""
         psi = self.as_field(psi)
         out = np.empty_like(psi)
         self.linear(psi, out)
@@ -248,20 +248,20 @@ class GrossPitaevskii:
         return out
 
     def mass(self, psi: Any) -> float:
-        """Sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
+        """Return the sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
         return float(self.grid.cell * self._total(total_mass(self.as_field(psi))))
 
     def energy(self, psi: Any) -> float:
-        """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of ``|psi|^4``."""
+        """Return the sum of kinetic, potential, rotational and interaction energy (beta / 2 sum of ``|psi|^4``)."""
         psi = self.as_field(psi)
         return self.grid.cell * self.moments(psi, self.fun(0.0, psi.reshape(-1))).energy(self.beta)
 
     def moments(self, psi: np.ndarray, f: np.ndarray) -> Moments:
-        """Sums over the grid that mass, energy and their gradients' products are made of; `f` as `fun` gives it."""
+        """Return the sums over the grid from which mass, energy and products of gradients follow; f = fun(t, psi)."""
         return Moments(*map(float, self._total(moments(psi, f))))
 
     def angular_momentum(self, psi: Any) -> float:
-        """Mean of Lz times the mass.
+        """Return the mean of Lz times the mass.
 
         Raises
         ------
@@ -271,12 +271,12 @@ class GrossPitaevskii:
         return float(self.grid.cell * self._total(self._turning.expectation(self.as_field(psi))))
 
     def momentum(self, psi: Any) -> np.ndarray:
-        """Means of -i d_x, -i d_y and -i d_z, of those that the grid has, times the mass."""
+        """Return the means of -i times the derivatives along the axes of the grid, times the mass."""
         psi = self.as_field(psi)
         return self.grid.cell * np.array([self._total(along.expectation(psi)) for along in self._moving])
 
     def chemical_potential(self, psi: Any) -> float:
-        """Mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
+        """Return the mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
         psi = self.as_field(psi)
         above, below = self._total((np.vdot(psi, self.hamiltonian(psi)).real, np.vdot(psi, psi).real))
         return float(above / below)
@@ -390,13 +390,13 @@ class GrossPitaevskii:
         )
 
     def largest_frequency(self) -> float:
-        """A bound of the linear part's norm: the terms' largest values one by one."""
+        """Return a bound for the norm of the linear part: the sum of the largest values of its terms."""
         kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
         turning = sum(self._largest(f) for f in self.rotation_factors()) if self.Omega else 0.0
         return kinetic + abs(self.Omega) * turning + self._largest(self.V)
 
     def largest_step(self, psi: Any, limit: float = 2 * 2**0.5) -> float:
-        """The step above which an explicit method is unstable.
+        """Return the step above which an explicit method is unstable.
 
         Parameters
         ----------
@@ -416,7 +416,7 @@ class GrossPitaevskii:
 
 
 def on_grid(potential: Any, grid: Grid, name: str = "potential") -> np.ndarray:
-    """Return the values (J[, K[, L]]) of a potential, or of what `name` says."""
+    """Return the values (J[, K[, L]]) of a potential or another quantity on the grid; `name` is for messages."""
     values = np.asarray(potential(*grid.mesh()) if callable(potential) else 0.0 if potential is None else potential)
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name} must be real, got values of type {values.dtype}.")

@@ -62,13 +62,13 @@ class LinearFlow:
 
     @staticmethod
     def _factor(gpe: GrossPitaevskii, axes: Axes, phases: list[Any]) -> tuple[Axes, list[np.ndarray]]:
-        """The factors exp(-i phase), which broadcast, the first divided by the number of points."""
+        """Return the factors exp(-i phase), which broadcast, the first divided by the number of points."""
         points = int(np.prod([gpe.grid.shape[axis] for axis in axes]))
         first, *rest = (np.exp(-1j * phase) for phase in phases)
         return axes, [first / points, *rest]
 
     def apply(self, psi: np.ndarray, work: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The field's image, in one of the two arrays, and the other one; both are overwritten."""
+        """Return the field's image, in one of the two arrays, and the other one; both are overwritten."""
         for axes, factors in self._factors:
             self._fft.forward(psi, axes, work)
             for factor in factors:

@@ -1,4 +1,4 @@
-"""The frame at rest instead of the rotating one, for potentials that are round about the z axis."""
+"""The frame at rest instead of the rotating one, for potentials that are symmetric about the z axis."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def at_rest(problem: FieldProblem) -> FieldProblem:
 
 
 def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
-    """exp(i angle Lz) psi: the field's values at points turned by `angle`, anticlockwise, about the z axis.
+    """Return exp(i angle Lz) psi, the field at points turned anticlockwise by `angle` about the z axis.
 
     A solution of the equation with Omega = 0 and a potential that is round about z becomes that of Omega when it is
     rotated by ``Omega t``: the rotating frame, from the frame at rest.

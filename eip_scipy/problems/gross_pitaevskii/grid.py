@@ -80,15 +80,15 @@ class Grid:
         return int(np.prod(self.shape))
 
     def points(self, axis: int) -> np.ndarray:
-        """Coordinates along one axis, lower + j h."""
+        """Return the coordinates along one axis, lower + j h."""
         return self.lower[axis] + self.spacing[axis] * np.arange(self.shape[axis])
 
     def mesh(self) -> tuple[np.ndarray, ...]:
-        """Coordinates that broadcast to fields: for two axes of shapes (J, 1) and (1, K)."""
+        """Return the coordinates that broadcast to fields: for two axes of shapes (J, 1) and (1, K)."""
         return tuple(self._along(axis, self.points(axis)) for axis in range(self.dim))
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """Wavenumbers along one axis, of shapes as `mesh`; with `odd` that of the Nyquist mode is 0.
+        """Return the wavenumbers along one axis, of shapes as `mesh`; with `odd` that of the Nyquist mode is 0.
 
         The mode of an even number of points has no sign: an odd derivative is 0 there, an even one is not.
         """
@@ -102,7 +102,7 @@ class Grid:
         return values.reshape([-1 if k == axis else 1 for k in range(self.dim)])
 
     def field(self, y: Any) -> np.ndarray:
-        """States as fields, a view where `y` is contiguous.
+        """Return the states as fields, a view where `y` is contiguous.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ class Multiplier:
         fft.backward(out, self.axes)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
-        """Sum over the grid of conj(psi) times the multiplied field, by Parseval's theorem one transform only."""
+        """Return the sum over the grid of conj(psi) times the multiplied field, with one transform (Parseval)."""
         fft.forward(psi, self.axes, work)
         return float(weighted_square(work, self._factor))
 
@@ -227,5 +227,5 @@ class SpectralSum:
             out[begin : begin + rest.shape[0]] += rest
 
     def expectation(self, psi: np.ndarray) -> float:
-        """Sum over the grid of conj(psi) times the image."""
+        """Return the sum over the grid of conj(psi) times the image."""
         return sum(term.expectation(self._fft, psi, self._work) for term in self._terms)

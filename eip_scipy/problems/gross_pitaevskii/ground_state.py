@@ -140,12 +140,12 @@ class _Descent:
         return GroundState(self.psi, self.gpe.energy(self.psi), mu, norm, iteration, norm <= tol, message)
 
     def energy(self, mu: float) -> float:
-        """The energy, by the last sums over the field: mu less half of the interaction."""
+        """Return the energy from the last sums over the field: mu minus half of the interaction energy."""
         density = np.abs(self.psi) ** 2
         return mu - 0.5 * self.gpe.beta * self.gpe.grid.cell * float(np.vdot(density, density))
 
     def refresh(self) -> None:
-        """Remove what rounding has gathered, and fit the preconditioner."""
+        """Remove accumulated rounding errors, and adapt the preconditioner."""
         self.psi /= sqrt(self.inner(self.psi, self.psi))
         self.apply(self.psi, self.image)
         self.preconditioner.fit(self.psi)
@@ -160,7 +160,7 @@ class _Descent:
         return mu, sqrt(self.inner(r, r))
 
     def turn(self) -> bool:
-        """The next direction: conjugate, or, where that does not descend, steepest; False where neither does."""
+        """Choose the next direction: conjugate, or steepest if that does not descend; return False if neither does."""
         r, old = self.residual, self.old_residual
         d = self.preconditioner(r, self.psi)
         slope = self.inner(r, d)
@@ -174,7 +174,7 @@ class _Descent:
         return False
 
     def advance(self) -> bool:
-        """To the least energy along the great circle through psi and p; False where that does not move psi."""
+        """Move to the smallest energy along the great circle through psi and p; return False if psi does not move."""
         r, norm = self.old_residual, sqrt(self.inner(self.p, self.p))
         self.apply(self.p, self.p_image)
         g = 0.5 * self.gpe.beta * self.gpe.grid.cell
@@ -192,7 +192,7 @@ class _Descent:
 
 
 def _least_energy(e: tuple[float, float, float, float, float]) -> float:
-    """The t = tan(a) of least sum_k e_k cos(a)^(4 - k) sin(a)^k.
+    """Return the t = tan(a) of least sum_k e_k cos(a)^(4 - k) sin(a)^k.
 
     Its derivative in a is a polynomial of degree 4 in t, over cos(a)^-4; the curve is not flat, for e_1 < 0.
     """
@@ -216,7 +216,7 @@ class _Preconditioner:
         self.zero = np.zeros(gpe.grid.size)
 
     def fit(self, psi: np.ndarray) -> None:
-        """Take the constants from a field: the kinetic, potential and interaction energy of each part of it."""
+        """Compute the constants from a field: its kinetic, potential and interaction energy."""
         gpe = self._gpe
         density = np.abs(psi) ** 2
         local = float(np.vdot(density, self._V + abs(gpe.beta) * density))
@@ -224,7 +224,7 @@ class _Preconditioner:
         self._inverse = Multiplier(gpe.grid, self._axes, 1 / (self._a + self._kinetic))
 
     def __call__(self, r: np.ndarray, psi: np.ndarray) -> np.ndarray:
-        """The preconditioned residual, in a buffer."""
+        """Return the preconditioned residual, in a buffer."""
         local = (psi, self._V, abs(self._gpe.beta), self._a)
         divide_by_root(r, *local, self._scaled)
         self._inverse.apply(self._gpe.transforms, self._scaled, self._out)

@@ -1,4 +1,4 @@
-"""Mass, energy and their gradients' products from psi and f = -i H psi alone: one pass over both, no transform."""
+"""Mass, energy and products of their gradients from psi and f = -i H psi, in one pass without a transform."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class Moments(NamedTuple):
     sizes: float
 
     def energy(self, beta: float) -> float:
-        """The sum whose multiple by the cell is the energy: beta / 2 of `quartic` are counted twice in `along`."""
+        """Return the energy divided by the size of a cell; `along` contains beta / 2 times `quartic` twice."""
         return self.along - 0.5 * beta * self.quartic
 
 
 def moments(psi: np.ndarray, f: np.ndarray) -> Moments:
-    """The moments of a field and f there."""
+    """Return the moments of a field `psi` and its derivative f."""
     return Moments(*_native.moments(psi, f))
 
 

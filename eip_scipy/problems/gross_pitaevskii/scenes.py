@@ -26,7 +26,7 @@ def soliton(
     h: float | None = None,
     **options: Any,
 ) -> FieldProblem:
-    """Bright soliton of the focusing NLS equation in 1D, with its closed form.
+    """Return the problem of a bright soliton of the focusing NLS equation in 1D, with its closed form.
 
     ``psi = a / sqrt(-beta) sech(a (x - v t)) exp(i (v x + (a^2 - v^2) t / 2))``, on a ring of the given length.
 
@@ -74,7 +74,7 @@ def breather(
     h: float | None = None,
     **options: Any,
 ) -> FieldProblem:
-    """Two solitons of the focusing NLS equation in 1D at one place, which beat, with their closed form.
+    """Return the problem of two solitons of the focusing NLS equation in 1D at one place, with the closed form.
 
     ``psi = 2 a / sqrt(-beta) sech(a x) exp(i v x)`` at t = 0, the wave of Satsuma and Yajima: its modulus comes back
     after pi / (2 a^2), on a ring of the given length.
@@ -129,7 +129,7 @@ def plane_wave(
     h: float | None = None,
     **options: Any,
 ) -> FieldProblem:
-    """Plane wave of the NLS equation, the paper's test of efficiency: a stationary state, H psi = omega psi.
+    """Return the problem of a plane wave of the NLS equation, a stationary state H psi = omega psi.
 
     ``psi = A exp(i (k . x - omega t))``, ``omega = |k|^2 / 2 + beta A^2``, on a box of sides 2 pi. The gradients of
     mass and energy are parallel: a projection onto both has rank 1.
@@ -172,7 +172,7 @@ def plane_wave(
 def rotating_packet(
     Omega: float = 0.5, points: int = 128, t_end: float = 0.5, h: float = 2e-4, **options: Any
 ) -> FieldProblem:
-    """The rotating wave packet of the paper's table 5, psi0 = 2 / sqrt(pi) (x + i y) exp(-8 (x^2 + y^2)).
+    """Return the rotating wave packet of the paper's table 5, psi0 = 2 / sqrt(pi) (x + i y) exp(-8 (x^2 + y^2)).
 
     On [-2, 2]^2 with V = (x^2 + y^2) / 2 and beta = 1.
 
@@ -199,7 +199,7 @@ def rotating_packet(
 
 
 def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> GrossPitaevskii:
-    """The paper's fast rotating ring: V = -0.1 r^2 + kappa / 4 r^4 on [-10, 10]^2, Omega = 3.5, beta = 1000.
+    """Return the paper's fast rotating ring: V = -0.1 r^2 + kappa / 4 r^4 on [-10, 10]^2, Omega = 3.5, beta = 1000.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> Gr
 
 
 def line_condensate(Omega: float = 0.7, points: int = 64, **options: Any) -> GrossPitaevskii:
-    """The paper's condensate with vortex lines: V = (x^2 + y^2 + z^2 / 4) / 2, beta = 400.
+    """Return the paper's condensate with vortex lines: V = (x^2 + y^2 + z^2 / 4) / 2, beta = 400.
 
     On [-10, 10]^2 x [-15, 15].
 
@@ -256,7 +256,7 @@ def _breather(x: np.ndarray, length: float, amplitude: float, velocity: float, b
 
 
 def _moving(x: np.ndarray, length: float, velocity: float, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """The distance from a centre that moves, the short way round, and the phase that goes with its motion."""
+    """Return the shortest periodic distance from a moving centre, and the phase that belongs to the motion."""
     # The phase follows the distance, so that nothing jumps where it turns.
     s = np.remainder(x - velocity * t + length / 2, length) - length / 2
     return s, np.exp(1j * (velocity * (s + velocity * t) - 0.5 * velocity**2 * t))

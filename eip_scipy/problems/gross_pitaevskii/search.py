@@ -1,4 +1,4 @@
-"""The lowest of many stationary states: several starts, and for a condensate with a hole a walk over windings."""
+"""Search for the lowest stationary state from several starts, and over windings for a condensate with a hole."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lowest_state(
     max_iterations: int = 10_000,
     progress: Progress | None = None,
 ) -> list[GroundState]:
-    """Search from several starts.
+    """Search for the lowest state from several starts.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def lowest_ring(
     progress: Progress | None = None,
     report: Callable[[int, int, float], Any] | None = None,
 ) -> GroundState:
-    """Search the lowest state with one row of vortices in a ring, by their number and the winding inside.
+    """Search for the lowest state with one row of vortices in a ring, over their number and the winding inside.
 
     Parameters
     ----------

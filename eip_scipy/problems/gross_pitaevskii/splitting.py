@@ -1,4 +1,4 @@
-"""Splitting methods for the Gross-Pitaevskii equation, as one-step methods: explicit, unitary, of any step."""
+"""Splitting methods for the Gross-Pitaevskii equation as one-step methods: explicit, unitary, stable for any step."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Scheme(NamedTuple):
 
 
 def _palindrome(half: tuple[float, ...], *, odd: bool, total: float = 1.0) -> tuple[float, ...]:
-    """The coefficients from their first half, without its last one, which makes the sum `total`."""
+    """Return symmetric coefficients from the first ones; the middle coefficient follows from the sum `total`."""
     rest = total - 2 * sum(half)
     return (*half, rest, *half[::-1]) if odd else (*half, rest / 2, rest / 2, *half[::-1])
 
@@ -116,7 +116,7 @@ class Splitting:
         return f"Splitting({self.gpe!r}, {self.scheme.name!r})"
 
     def one_step(self, t: float, y: np.ndarray, h: float) -> np.ndarray:
-        """One step of length h; `y` is overwritten and returned."""
+        """Make one step of length h; `y` is overwritten and returned."""
         if h != self._h:
             self._flows, self._h = self._linear_flows(h), h
         gpe, scheme = self.gpe, self.scheme

@@ -1,4 +1,4 @@
-"""Fields to start the search for a ground state from: Thomas-Fermi densities with vortices."""
+"""Start fields for the search for a ground state: Thomas-Fermi densities with vortices."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
 
 
 def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
-    """The density (mu - V + Omega^2 r^2 / 2) / beta where that is positive, of mass 1.
+    """Return the density (mu - V + Omega^2 r^2 / 2) / beta where that is positive, of mass 1.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
 
 
 def imprint(gpe: GrossPitaevskii, positions: Any) -> np.ndarray:
-    """Thomas-Fermi amplitude with singly charged vortices, in three dimensions straight lines along z.
+    """Return the Thomas-Fermi amplitude with singly charged vortices, which are lines along z in three dimensions.
 
     Parameters
     ----------
@@ -76,13 +76,13 @@ def imprint(gpe: GrossPitaevskii, positions: Any) -> np.ndarray:
 
 
 def polygon(count: int, radius: float) -> np.ndarray:
-    """Corners (count, 2) of a regular polygon about the origin, the first on the x axis."""
+    """Return the corners (count, 2) of a regular polygon about the origin, the first on the x axis."""
     angle = 2 * pi * np.arange(count) / max(count, 1)
     return radius * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
-    """A ring with `count` vortices at equal distances in its middle, and a phase that winds `winding` times inside.
+    """Return a ring with `count` vortices at equal distances in its middle, and a phase with `winding` inside.
 
     Parameters
     ----------
@@ -100,20 +100,20 @@ def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
 
 
 def mean_square_radius(gpe: GrossPitaevskii) -> float:
-    """Mean of x^2 + y^2 over the Thomas-Fermi density."""
+    """Return the mean of x^2 + y^2 over the Thomas-Fermi density."""
     density = thomas_fermi(gpe)
     x, y, *_ = gpe.grid.mesh()
     return float(((x**2 + y**2) * density).sum() / density.sum())
 
 
 def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -> np.ndarray:
-    """The field with complex noise of `size` times its modulus at each point: no symmetry is left."""
+    """Add complex noise of `size` times the modulus at each point, so that the field has no symmetry."""
     noise = rng.standard_normal((2, *psi.shape))
     return psi + size * np.abs(psi) * (noise[0] + 1j * noise[1])
 
 
 def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[np.ndarray]:
-    """Fields with triangular lattices of vortices, each turned, shifted and stretched at random, and a little noise.
+    """Yield fields with triangular lattices of vortices, turned, shifted and stretched at random, with some noise.
 
     A condensate that turns as a rigid body has Omega / pi vortices per unit area; the lattices have 0.6 to 1.2 times
     as many, over the whole condensate and any hole in it. Without rotation there are none.
@@ -138,7 +138,7 @@ def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[n
 
 
 def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Points (k, 2) of a triangular lattice within the condensate's outer radius, of the sense of the rotation."""
+    """Return points (k, 2) of a triangular lattice within the outer radius of the condensate."""
     x, y, *_ = gpe.grid.mesh()
     radius = sqrt(float(np.max((x**2 + y**2) * (amplitude > 0))))
     area = pi / abs(gpe.Omega) / rng.uniform(0.6, 1.2)

@@ -1,4 +1,4 @@
-"""Fourier transforms of complex fields: which library and how many threads, decided here and nowhere else."""
+"""Fourier transforms of complex fields; only this module chooses the library and the number of threads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vortices of a field: where its phase winds, in the condensate, by plaquettes of the grid."""
+"""Vortices of a field: plaquettes of the grid inside the condensate around which the phase winds."""
 
 from __future__ import annotations
 
@@ -90,13 +90,13 @@ def vortices(
 
 
 def core_size(gpe: GrossPitaevskii, top: float, core: float | None = None) -> list[int]:
-    """Points (odd, three at least) along x and y of the core of a vortex, whose width follows from the top density."""
+    """Return the odd numbers of points (at least 3) of a vortex core along x and y, from the largest density."""
     width = core if core is not None else CORE / sqrt(2 * gpe.beta * top) if gpe.beta > 0 else 0.0
     return [max(3, ceil(width / d) | 1) for d in gpe.grid.spacing[:2]]
 
 
 def _charges(psi: np.ndarray, Omega: float, x: np.ndarray, y: np.ndarray, dx: float, dy: float) -> np.ndarray:
-    """Winding number of each plaquette, (J - 1, K - 1); none across the ends of the box."""
+    """Return the winding numbers (J - 1, K - 1) of the plaquettes, except those across the ends of the box."""
     psi = np.where(psi == 0, 1.0, psi)  # a vortex on a point of the grid: any phase will do, as long as it has one
     along_x = np.angle(psi[1:] * np.conj(psi[:-1]) * np.exp(1j * Omega * dx * y))
     along_y = np.angle(psi[:, 1:] * np.conj(psi[:, :-1]) * np.exp(-1j * Omega * dy * x[:, None]))

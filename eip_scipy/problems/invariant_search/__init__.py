@@ -1,4 +1,4 @@
-"""Invariants from the vector field alone: combinations of monomials, and of functions given, whose rate is zero."""
+"""Search for invariants in a vector field: combinations of monomials and given functions whose rate is zero."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def find_invariants(
     rtol: float = 1e-9,
     seed: int = 0,
 ) -> list[Invariant]:
-    """Find what y' = f(t, y) keeps among polynomials of the state and functions given.
+    """Find invariants of y' = f(t, y) among combinations of polynomials of the state and given functions.
 
     The rate of a sum of monomials is linear in its coefficients: those of an invariant are a null vector of the rates
     at random points. What is found is tried at fresh points and times, and along a trajectory.
@@ -124,7 +124,7 @@ def _term(item: Any, k: int, name: str | None) -> Term:
 
 
 def _of_state(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of y from one of (t, y), or of y."""
+    """Return a function of y from a function of (t, y) or of y."""
     if isinstance(fun, np.ufunc) or len(inspect.signature(fun).parameters) != 2:
         return fun
     return compiled_like(lambda y: fun(0.0, y), fun)

@@ -1,4 +1,4 @@
-"""A vector field at random points around a state: the rates there of monomials and further functions."""
+"""A vector field at random points around a state, and the rates of monomials and further functions at these."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Surroundings:
         self.trajectory = self._follow()
 
     def _slope(self, t: float, y: Array) -> Array:
-        """f, NaN where it cannot be computed."""
+        """Return f, or NaN if it cannot be computed."""
         try:
             found = np.asarray(self.fun(t, y.copy()), dtype=float)
         except (ArithmeticError, ValueError) as error:
@@ -56,7 +56,7 @@ class Surroundings:
         return found
 
     def term_gradients(self, y: Array) -> Array:
-        """Values with a row for each term; NaN if it cannot be computed."""
+        """Return the gradients with a row for each term; NaN if one cannot be computed."""
         try:
             return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
         except (ArithmeticError, ValueError) as error:
@@ -64,14 +64,14 @@ class Surroundings:
             return np.full((len(self.terms), y.size), np.nan)
 
     def term_values(self, y: Array) -> Array:
-        """Return the value of each term, NaN where it cannot be computed."""
+        """Return the value of each term; NaN if it cannot be computed."""
         try:
             return np.array([item.fun(y.copy()) for item in self.terms], dtype=float)
         except (ArithmeticError, ValueError):
             return np.full(len(self.terms), np.nan)
 
     def _look_around(self) -> None:
-        """Sizes of the components, and a time in which the state moves by its own size."""
+        """Return the sizes of the components, and a time in which the state moves by its own size."""
         here, self.scale, self.tau = self.y0, np.abs(self.y0), 0.0
         for _ in range(3):  # a component may start to move only where others have moved
             f = np.abs(self._slope(self.t, here))
@@ -84,7 +84,7 @@ class Surroundings:
         self.scale[self.scale == 0.0] = np.max(self.scale) or 1.0
 
     def sample(self, wanted: int, basis: Sequence[Monomial]) -> Sample:
-        """Rates at random points of the monomials of a basis, and of the terms.
+        """Return the rates of the monomials of a basis and of the terms at random points.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class Surroundings:
         ) from self.failure
 
     def _follow(self) -> Array:
-        """States along a trajectory from y0."""
+        """Return the states along a trajectory from y0."""
         solver = DOP853(self._slope, self.t, self.y0, self.t + 3 * self.tau, rtol=1e-12, atol=1e-16 * self.scale)
         states = [self.y0]
         while solver.status == "running" and len(states) <= STEPS:

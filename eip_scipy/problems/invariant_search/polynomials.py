@@ -35,7 +35,7 @@ class Functions(NamedTuple):
 
 
 def product_of(a: Polynomial, b: Polynomial) -> Polynomial:
-    """The product of two polynomials."""
+    """Return the product of two polynomials."""
     out: Polynomial = {}
     for x, u in a.items():
         for y, v in b.items():
@@ -47,7 +47,7 @@ def product_of(a: Polynomial, b: Polynomial) -> Polynomial:
 def functions(
     polynomial: Polynomial, terms: Sequence[tuple[Term, float]], n: int, like: Callable[..., object]
 ) -> Functions:
-    """A polynomial of n variables plus multiples of terms; jitted where `like` and the terms are."""
+    """Return a polynomial of n variables plus multiples of terms; it is jitted if `like` and the terms are."""
     found = _of_polynomial(polynomial, n)
     compiled = [like]
     for term, coefficient in terms:
@@ -98,7 +98,7 @@ def _with_term(others: Functions, term: Term, coefficient: float) -> Functions:
 
 
 def written(polynomial: Polynomial, terms: Sequence[tuple[Term, float]], names: Sequence[str]) -> str:
-    """As one would write it, "y0*y3 - y1*y2"."""
+    """Return a polynomial as text such as "y0*y3 - y1*y2"."""
     factors = [(_product(item, names), c) for item, c in polynomial.items()] + [(term.name, c) for term, c in terms]
     text = ""
     for name, coefficient in factors:

@@ -1,4 +1,4 @@
-"""The null space of the rates, and in it invariants that are simple and independent."""
+"""Search for simple and independent invariants in the null space of the rates."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Search:
 
     @property
     def found(self) -> list[tuple[Polynomial, list[tuple[Term, float]]]]:
-        """Invariants as polynomials of y, and multiples of terms."""
+        """Return the invariants as polynomials of y and multiples of terms."""
         rows = [row * self.units for row in self.accepted]
         of_terms = [zip(self.terms, row[len(self.basis) :].tolist(), strict=True) for row in rows]
         return [
@@ -61,7 +61,7 @@ class Search:
         ]
 
     def _search(self, columns: list[int]) -> None:
-        """Take in what is kept among some columns, and does not depend on what is there already."""
+        """Accept conserved combinations of some columns that are independent of those accepted before."""
         null, numerical = self._null_space(columns), self._numerical_null_space(columns)
         # The larger space first: a row alone of a smaller one is any combination of what spans the larger.
         if len(numerical) > len(null):
@@ -69,7 +69,7 @@ class Search:
         self._take(null, columns)
 
     def _take(self, null: Array, columns: list[int]) -> None:
-        """Take in of the rows of a null space those that are kept."""
+        """Accept the rows of a null space that are conserved."""
         known = np.array([self._row(item) for item in self._products(columns)]).reshape(-1, self._width)
         rows = self._reduced(known, null)
         for row in sorted(rows, key=self._simplicity):
@@ -82,7 +82,7 @@ class Search:
         return len(self.basis) + len(self.terms)
 
     def _null_space(self, columns: Any) -> Array:
-        """Rows that span it: singular vectors from the smallest on, as long as they are kept at the fresh points."""
+        """Return rows that span the null space: singular vectors, smallest values first, until one is not conserved."""
         # A component that does not move is conserved; relative to such columns no rounding error is small.
         still, _, rows = self._singular(columns)
         found = [self._spread(np.ones(1), [k]) for k in still]
@@ -93,7 +93,7 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _numerical_null_space(self, columns: Any) -> Array:
-        """Return the rows whose singular values are 0 except for rounding, if these stand apart; none is tried yet.
+        """Return the rows whose singular values are 0 up to rounding, if there is a gap to the others, without a test.
 
         Rounding leaves such a row with a little of all columns. Near the points at which all terms of the invariant
         vanish, of y1**2 + y0**4/2 where y0 does, that little is more than the terms, and the row is not kept there.
@@ -218,7 +218,7 @@ class Search:
         return row
 
     def _rational(self, row: Array) -> Array:
-        """With small fractions for the coefficients of y where all are near to some, in units of one of them."""
+        """Replace the coefficients of y, in units of one of them, by small fractions if all are close to such."""
         raw = row * self.units
         raw = raw / raw[np.argmax(np.abs(row))]
         for unit in (1.0, np.min(np.abs(raw[raw != 0]))):
@@ -248,7 +248,7 @@ class Search:
         return False
 
     def _stays(self, row: Array) -> bool:
-        """Return whether it is constant along the trajectory, as far as the errors of the states allow to tell."""
+        """Return True if a candidate is constant along the trajectory, up to the errors of the states."""
         states, coefficients = self.around.trajectory, row[len(self.basis) :]
         points = states / self.around.scale
         parts = [row[k] * points[:, item].prod(axis=1) for k, item in enumerate(self.basis) if row[k]]

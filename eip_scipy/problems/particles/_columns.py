@@ -66,7 +66,7 @@ def variational(
 
 @jitable
 def combined(scale, u, v, w, first, second, third, fourth):
-    """Return scale (u first + v second + w third + fourth), of three numbers each."""
+    """Return scale (u first + v second + w third + fourth), for vectors of three numbers."""
     return (
         scale * (u * first[0] + v * second[0] + w * third[0] + fourth[0]),
         scale * (u * first[1] + v * second[1] + w * third[1] + fourth[1]),
@@ -157,7 +157,7 @@ def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[floa
 
 
 def _by_duals(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
-    """Return the same, compiled.
+    """Return the output of `_slopes`, compiled with dual numbers.
 
     Raises
     ------

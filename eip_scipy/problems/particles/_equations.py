@@ -44,7 +44,7 @@ class ParticleEquations(NamedTuple):
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
-    """`fun`, compiled if all of the others are, with what it calls here."""
+    """Return `fun`, compiled together with functions of this module that it calls if all of the others are compiled."""
     if all(is_compiled(other) for other in others if other is not None):
         _register()
     return compiled_like(fun, *(other for other in others if other is not None))
@@ -61,7 +61,7 @@ def jitable(fun: Callable[..., Any]) -> Callable[..., Any]:
 
 @cache
 def _register() -> None:
-    """Let Numba compile these into their callers."""
+    """Make Numba compile these functions into their callers."""
     from numba.extending import register_jitable
 
     for fun in _inlined:
@@ -69,12 +69,12 @@ def _register() -> None:
 
 
 def no_potential(t, x, y, z):
-    """A potential that is 0 everywhere."""
+    """Return a potential that is 0 everywhere."""
     return 0.0
 
 
 def no_force(t, x, y, z):
-    """An electric field that is 0 everywhere."""
+    """Return an electric field that is 0 everywhere."""
     return 0.0, 0.0, 0.0
 
 
@@ -228,7 +228,7 @@ def velocity_energy(phi, t, y, m, q):
 
 
 def kinetic_energy(t, y, params):
-    """Kinetic energy m |v|^2 / 2."""
+    """Return the kinetic energy m |v|^2 / 2."""
     return 0.5 * params[MASS] * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
 
 
@@ -300,7 +300,7 @@ def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def difference_jacobian(A: Callable[..., Any], step: float) -> Callable[..., Any]:
-    """Rows of dA_i/dx_j by central differences of order 6."""
+    """Return the rows of dA_i/dx_j by central differences of order 6."""
 
     def along(t, x, y, z, dx, dy, dz):
         d0 = d1 = d2 = 0.0

@@ -64,7 +64,7 @@ class ParticleProblem(Problem):
         return float(self.params[CHARGE])
 
     def velocity(self, y: Any) -> np.ndarray:
-        """Velocities of states: (p - q A(x)) / m in the canonical form.
+        """Return the velocities of states: (p - q A(x)) / m in the canonical form.
 
         Parameters
         ----------
@@ -96,7 +96,7 @@ def charged_particle(
     reference: Callable[[float], np.ndarray | None] | None = None,
     balances: str | None = None,
 ) -> ParticleProblem:
-    """One charged particle in a field, m x'' = q (E(t, x) + x' x B(t, x)).
+    """Return the problem of one charged particle in a field, m x'' = q (E(t, x) + x' x B(t, x)).
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def _vector(name: str, value: Any) -> np.ndarray:
 
 
 def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STEP, h: float = STEP) -> ParticleProblem:
-    """Charged particle in B = e_z and the potential 1e-2 / R: a gyrating particle that drifts around the origin.
+    """Return a charged particle in B = e_z and the potential 1e-2 / R, which gyrates and drifts around the origin.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STE
 def tokamak(
     orbit: str = "banana", *, form: str = "canonical", t_end: float = TOKAMAK_STEPS * STEP, h: float = STEP
 ) -> ParticleProblem:
-    """Charged particle in the field of an axisymmetric tokamak, on a trapped (banana) or a passing (transit) orbit.
+    """Return a charged particle in an axisymmetric tokamak, on a trapped (banana) or a passing (transit) orbit.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def _paper(
 
 
 def _reference(name: str, form: str, t: float) -> np.ndarray | None:
-    """The stored state, None at a time without one."""
+    """Return the stored state at a time; None if there is none."""
     for row in _references()[name]:
         if abs(t - row["t"]) <= 1e-14 * row["t"]:
             return np.array(row["position"] + row["momentum" if form == "canonical" else "velocity"])

@@ -25,29 +25,30 @@ from ._equations import (
 
 __all__ = ["TOKAMAK", "UNIFORM", "ParticleField"]
 
-DIFFERENCE_STEP = 2.0**-7  # of the field's length
-AGREEMENT = 1e-6  # of functions of the field that must go together
-ROUND_OFF = 1e-10  # of a difference, where the true one is 0
+DIFFERENCE_STEP = 2.0**-7  # step of differences, in units of `length`
+AGREEMENT = 1e-6  # largest relative difference of functions that must agree
+ROUND_OFF = 1e-10  # bound for the rounding of a difference whose true value is 0
 TINY = 1e-300
-# Divergence of B in its largest derivative: beyond this a field is none, from AGREEMENT on it may be one from a table.
+# Largest divergence of B relative to its largest derivative. Above AGREEMENT there is only a warning, because B may be
+# interpolated in a table.
 NO_FIELD = 0.1
-FINER = (1.0, 0.25, 0.0625)  # steps of the differences, in the usual one
+FINER = (1.0, 0.25, 0.0625)  # steps of the differences, in units of the usual step
 # Further points, in steps from the start: a field may be correct at one point by symmetry.
 NEAR = ((0.0, 0.0, 0.0), (2.9, -1.7, 1.3), (-2.3, 2.1, 2.7), (1.1, 3.1, -2.2))
 
 
 @dataclass(frozen=True, eq=False)
 class ParticleField:
-    """An electromagnetic field, by functions of the position ``(x, y, z)``, or of ``(t, x, y, z)`` if it varies.
+    """An electromagnetic field, defined by functions of ``(x, y, z)``, or of ``(t, x, y, z)`` if it varies in time.
 
-    Give A, with its derivatives where they are known, or B; and phi and E where there is an electric field. With
-    Numba's functions (lazily jitted, three floats in, a float or a tuple of floats out) a particle's equations are
-    compiled; with any other callables everything works, interpreted.
+    Give A, with its derivatives if they are known, or B; and phi and E if there is an electric field. With Numba
+    functions (lazily jitted, with three floats as arguments and a float or a tuple of floats as value) the equations
+    of a particle are compiled; with other callables they are interpreted.
 
     Attributes
     ----------
     vector_potential : callable, optional
-        ``A(x, y, z) -> (A_x, A_y, A_z)``. Needed for the canonical form, and for L in the other.
+        ``A(x, y, z) -> (A_x, A_y, A_z)``. Needed for the canonical form, and for L in the form (x, v).
     jacobian : callable, optional
         ``(x, y, z) -> 3 rows``, row i holding dA_i/dx, dA_i/dy, dA_i/dz. Default: differences of A.
     potential : callable, optional
@@ -59,24 +60,24 @@ class ParticleField:
     axisymmetric : bool
         Whether A and phi do not change under rotations about the z axis; then L = x p_y - y p_x is an invariant.
     varies : bool
-        Whether all functions take the time first, ``A(t, x, y, z)`` and so on. `electric` is then needed. It is the
-        whole field, ``-grad phi - dA/dt``, with the part that the varying magnetic field induces.
+        Whether the first argument of all functions is the time, ``A(t, x, y, z)`` and so on. `electric` is then needed.
+        It is the whole field, ``-grad phi - dA/dt``, including the part that the varying magnetic field induces.
     length : float
-        A length over which the field changes little (by some tens of per cent), in the unit of the positions: it sets
-        the step of the differences.
+        A length over which the field changes by some tens of per cent, in the unit of the positions. It determines the
+        step of the differences.
     name : str
 
     Raises
     ------
     TypeError
-        When something given is not callable.
+        If a function is not callable.
     ValueError
-        With neither A nor B, derivatives without their function, or a wrong length.
+        If neither A nor B is given, derivatives are given without their function, or the length is wrong.
 
     Notes
     -----
     Differences are central and of order 6, with step length / 128: relative errors of about 1e-12, and 18 evaluations
-    of A in each evaluation of the equations. With a jacobian and E of your own neither is needed.
+    of A in each evaluation of the equations. If you give `jacobian` and `electric`, they are not needed.
     """
 
     vector_potential: Callable[..., Any] | None = None
@@ -97,7 +98,7 @@ class ParticleField:
         if self.vector_potential is None and self.magnetic is None:
             raise ValueError("ParticleField: give vector_potential, or magnetic, or both; got neither.")
         if self.vector_potential is None and self.jacobian is not None:
-            raise ValueError("ParticleField: jacobian is that of vector_potential; give vector_potential too.")
+            raise ValueError("ParticleField: jacobian is given without vector_potential; give both, or omit jacobian.")
         if self.varies and self.electric is None:
             raise ValueError("ParticleField: a field that varies needs electric, -grad phi - dA/dt; give it.")
         if not (self.length > 0 and isfinite(self.length)):
@@ -105,12 +106,12 @@ class ParticleField:
 
     @property
     def _step(self) -> float:
-        """Shift of the differences: a power of two, so that adding and subtracting it causes almost no rounding."""
+        """Return the shift of the differences, a power of two, so that adding it causes almost no rounding."""
         return float(2.0 ** round(log2(DIFFERENCE_STEP * self.length)))
 
     @cached_property
     def functions(self) -> FieldFunctions:
-        """All functions of the field, those not given made from the others."""
+        """Return all functions of the field; functions that were not given are computed from the others."""
         step = self._step
         given = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
         A, jacobian, phi, E, B = (fun if fun is None or self.varies else at_any_time(fun) for fun in map(jitted, given))
@@ -128,7 +129,7 @@ class ParticleField:
 
     @cached_property
     def fill(self) -> Callable[..., None]:
-        """``fill(t, x, out)``: E in out[:3], B in out[3:]; what `eip_scipy_studies.comparators.boris` takes."""
+        """Return ``fill(t, x, out)``, which writes E to out[:3] and B to out[3:], for the Boris pusher."""
         E, B = self.functions.E, self.functions.B
 
         def fields(t: float, x: np.ndarray, out: np.ndarray) -> None:
@@ -144,12 +145,12 @@ class ParticleField:
         return jit_like(fields, E, B)
 
     def _plain(self, key: str) -> Callable[..., Any]:
-        """Return one of the given functions as one of (t, x, y, z), interpreted."""
+        """Return a given function as an interpreted function of (t, x, y, z)."""
         fun = getattr(self, key)
         return (lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where))
 
     def check(self, position: np.ndarray, t: float = 0.0) -> None:
-        """See that the functions given go together at one point and time.
+        """Check that the given functions agree with each other at one point and time.
 
         Parameters
         ----------
@@ -196,9 +197,10 @@ class ParticleField:
         warnings.warn(said, stacklevel=4)
 
     def _divergence(self, point: np.ndarray, t: float) -> tuple[float, float, float]:
-        """The divergence of B: its share in the largest derivative, itself, and that derivative.
+        """Return the divergence of B: its share in the largest derivative, itself, and that derivative.
 
-        Of several steps of the differences the one with the smallest share: their errors shrink with it.
+        Several steps of the differences are tried, and the result with the smallest share is returned, because errors
+        of differences only increase it.
         """
         B = self._plain("magnetic")
         slack = ROUND_OFF * float(np.abs(B(t, *point)).max()) / self.length
@@ -219,14 +221,14 @@ class ParticleField:
         return value
 
     def along(self, key: str, position: Any, t: Any = 0.0) -> np.ndarray:
-        """One of the field's functions at many points.
+        """Return the values of a function of the field at many points.
 
         Parameters
         ----------
         key : {"A", "phi", "E", "B"}
         position : array_like, shape (3, m)
         t : float or array_like, shape (m,), optional
-            Times, of a field that varies.
+            Times, for a field that varies.
 
         Returns
         -------

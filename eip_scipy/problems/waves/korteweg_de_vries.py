@@ -184,7 +184,7 @@ class KortewegDeVries:
         return Invariant(partial(_value, rate, item), partial(_gradient, rate, item), name=name, in_place=True)
 
     def largest_step(self, u: Any, limit: float = 2.8) -> float:
-        """The step above which `Lawson` is unstable: a bound by the nonlinear term alone, for the linear one is exact.
+        """Return the step above which `Lawson` is unstable; only the nonlinear term limits it, the linear one is exact.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Lawson's method, or that of the integrating factor: the linear part exact, the rest by a Runge-Kutta tableau."""
+"""Lawson's method (integrating factors): the linear part is exact, the rest is integrated by a Runge-Kutta tableau."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Lawson:
         return f"Lawson({self.equation!r}, {self.tableau!r})"
 
     def one_step(self, t: float, y: np.ndarray, h: float) -> Any:
-        """One step of length h; with the tableau's error estimate where it has one."""
+        """Make one step of length h; return the state, and the error estimate if the tableau has one."""
         if h != self._h:
             nodes = (*self.tableau.c, 1.0)
             phases = [1j * h * c * self.equation.frequencies for c in nodes]

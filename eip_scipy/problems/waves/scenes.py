@@ -26,7 +26,7 @@ def sine_gordon_breather(
     t_end: float = 20.0,
     h: float | None = None,
 ) -> WaveProblem:
-    """Breather of the sine-Gordon equation, at rest or moving, with its closed form.
+    """Return the problem of a breather of the sine-Gordon equation, at rest or moving, with its closed form.
 
     ``tan(q / 4) = b / w sin(w s) / cosh(b z)``, b = sqrt(1 - w^2), with s and z the time and place in the frame that
     moves with the breather, on a ring of the given length.
@@ -63,7 +63,7 @@ def sine_gordon_breather(
 def sine_gordon_kinks(
     points: int = 512, velocity: float = 0.5, length: float = 80.0, t_end: float = 20.0, h: float | None = None
 ) -> WaveProblem:
-    """Kink and antikink of the sine-Gordon equation that meet, pass through each other and part, with the closed form.
+    """Return the problem of a kink and an antikink of the sine-Gordon equation that collide, with its closed form.
 
     ``tan(q / 4) = sinh(v c s) / (v cosh(c x))``, c = 1 / sqrt(1 - v^2), s = t - t_end / 2: they meet in the middle of
     the run, at the middle of the ring.
@@ -131,7 +131,7 @@ def korteweg_de_vries_solitons(
     t_end: float = 20.0,
     h: float | None = None,
 ) -> WaveProblem:
-    """Solitons of the Korteweg-de Vries equation that overtake each other, with their closed form.
+    """Return the problem of Korteweg-de Vries solitons that overtake each other, with its closed form.
 
     One soliton is ``u = c / 2 sech^2(sqrt(c) (x - c t - x0) / 2)``; of several the closed form is Hirota's.
 
@@ -192,5 +192,5 @@ def _solitons(x: np.ndarray, length: float, k: np.ndarray, x0: np.ndarray, t: fl
 
 
 def _around(x: np.ndarray, length: float) -> np.ndarray:
-    """Distances on the ring, the short way round."""
+    """Return the shortest distances on the ring."""
     return np.remainder(x + length / 2, length) - length / 2

@@ -42,9 +42,9 @@ class SineGordon:
 
     Notes
     -----
-    The energy ``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``, w the cell, is an invariant of the equations on the grid,
-    whatever the field. The momenta ``-w sum p dq`` are so to spectral accuracy only: sin q has modes that the grid
-    does not, and what it takes them for does not vanish where the field is not resolved.
+    The energy ``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``, with w the size of a cell, is an invariant of the equations
+    on the grid for every field. The momenta ``-w sum p dq`` are conserved to spectral accuracy only, because sin q has
+    modes that the grid does not have; their aliases do not vanish if the field is not resolved.
 
     Examples
     --------
@@ -91,7 +91,7 @@ class SineGordon:
         return out
 
     def energy(self, y: np.ndarray) -> float:
-        """``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``."""
+        """Return the energy ``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``, where w is the size of a cell."""
         n = self.grid.size
         q, p = y[:n], y[n:]
         laplacian = self._modes.backward(-self._square * self._modes.forward(q))
@@ -100,7 +100,7 @@ class SineGordon:
         return float(self.grid.cell * density)
 
     def momentum(self, y: np.ndarray) -> np.ndarray:
-        """The momenta ``-w sum p dq`` along the axes that the grid has."""
+        """Return the momenta ``-w sum p dq`` along the axes that the grid has."""
         return np.array([self._momentum_along(axis, y) for axis in range(self.grid.dim)])
 
     def _momentum_along(self, axis: int, y: np.ndarray) -> float:
@@ -111,7 +111,7 @@ class SineGordon:
         return self._modes.backward(1j * self._modes.wavenumbers(axis, odd=True) * self._modes.forward(field))
 
     def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivative without damping, and what damping adds to it."""
+        """Return the derivative without damping, and the damping term."""
         lost = np.zeros_like(y)
         lost[self.grid.size :] = -self.damping * y[self.grid.size :]
         return f - lost, lost
@@ -159,7 +159,7 @@ class SineGordon:
         return damped_invariant(item, item, self._parts) if self.damping else item
 
     def largest_step(self, limit: float = 8.0) -> float:
-        """The step above which an explicit method is unstable.
+        """Return the step above which an explicit method is unstable.
 
         Parameters
         ----------
