@@ -40,6 +40,7 @@ __all__ = [
     "fields_movie",
     "gains_figure",
     "linkage_figure",
+    "linkages_figure",
     "longitude_figure",
     "orbit_in_time_figure",
     "orbits_figure",
@@ -560,6 +561,37 @@ def linkage_figure(
     """
     figure = blank_figure(4.9 * len(panels), 7.4, title)
     above, below = figure.subplots(2, len(panels), height_ratios=[1, 1.15], squeeze=False)
+    _draw_linkages(figure, above, drawings, unit, time)
+    styles = method_styles(dict.fromkeys(name for panel in panels for name in panel.curves))
+    for axis, panel in zip(below, panels, strict=True):
+        _draw_costs(axis, panel, styles, largest)
+        _log_x(axis)
+        log_errors(axis, panel.cost, error)
+    _legend_below(figure, below[0])
+    return figure
+
+
+def linkages_figure(drawings: Mapping[str, Linkage], *, unit: str, time: str) -> Figure:
+    """Draw a linkage at several times, a panel for each run, as the upper row of `linkage_figure`.
+
+    Parameters
+    ----------
+    drawings : mapping of str to Linkage
+        Linkages by the titles of the panels; all have the same times.
+    unit, time : str
+        Unit of length, label of the time.
+
+    Returns
+    -------
+    Figure
+    """
+    figure = blank_figure(4.5 * len(drawings), 2.7)
+    _draw_linkages(figure, figure.subplots(1, len(drawings)), drawings, unit, time)
+    return figure
+
+
+def _draw_linkages(figure: Figure, above: Any, drawings: Mapping[str, Linkage], unit: str, time: str) -> None:
+    """Draw linkages in a row of axes, and a colour scale of the time."""
     t = np.asarray(next(iter(drawings.values())).t, dtype=float)
     for axis, (name, linkage) in zip(above, drawings.items(), strict=True):
         links = LineCollection(
@@ -579,13 +611,6 @@ def linkage_figure(
         axis.set_title(name, fontsize="medium")
         axis.grid(alpha=0.2)
     figure.colorbar(links, ax=list(above), label=time, shrink=0.8, pad=0.01)
-    styles = method_styles(dict.fromkeys(name for panel in panels for name in panel.curves))
-    for axis, panel in zip(below, panels, strict=True):
-        _draw_costs(axis, panel, styles, largest)
-        _log_x(axis)
-        log_errors(axis, panel.cost, error)
-    _legend_below(figure, below[0])
-    return figure
 
 
 def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> None:

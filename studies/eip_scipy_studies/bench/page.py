@@ -204,7 +204,9 @@ def markdown(found: Found, names: Mapping[Where, str]) -> str:
         return value.replace("|", "\\|").replace("<", "&lt;")
 
     def lay(each: Table, level: int) -> list[str]:
-        lines = [f"{'#' * level} {each.title}", ""] if each.title else []
+        # One problem has a table for each kind of function.
+        title = each.title if each.where is None else f"{each.title}: {each.head[0]}"
+        lines = [f"{'#' * level} {title}", ""] if title else []
         if each.where is not None and each.where in names:
             lines += [f"![{each.title}: error against time]({names[each.where]})", ""]
         lines += [f"| {' | '.join(map(cell, row))} |" for row in (each.head,)]

@@ -1,7 +1,8 @@
-"""``eip-scipy study with-and-without``: the README's figure, a comet by RK45 and by EIPRK45.
+"""``eip-scipy study with-and-without``: a comet by RK45 and by EIPRK45, a satellite with drag by DOP853 and EIPDOP853.
 
-SciPy's `solve_ivp` runs both; EIPRK45 keeps the two invariants. The numbers are calls of `fun` and the largest errors
-of energy and position in the first and the last period; positions are compared with Kepler's equation.
+SciPy's `solve_ivp` runs all of them. EIPRK45 keeps the comet's two invariants. The numbers are calls of `fun` and the
+largest errors of energy and position in the first and the last period; positions are compared with Kepler's equation.
+EIPDOP853 keeps the balances of the satellite; places are compared with a run with tolerances of 1e-13.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK45, Invariant
-from eip_scipy.problems import kepler
+from eip_scipy import EIPDOP853, EIPRK45, Invariant, integrate
+from eip_scipy.problems import Problem, kepler, satellite
 
 from ..report import table
 from ..study import Figures, Session, Study
@@ -24,6 +25,11 @@ PERIOD = 2 * np.pi
 T_END = 32 * PERIOD
 TOLERANCES = {"rtol": 1e-6, "atol": 1e-9}
 START = [0.4, 0, 0, 2]
+DAY, DAYS = 86400, 10
+EARTH: dict[str, Any] = {"mu": 398600.4418, "radius": 6378.137, "j2": 1.08262668e-3}  # km and s
+AIR: dict[str, Any] = {"drag": 3.3e-11, "height": 400, "scale_height": 60}
+ALTITUDE, INCLINATION = 420, np.radians(51.6)
+FLIGHT = {"rtol": 3e-10, "atol": 1e-11}
 
 
 def fun(t, y):
@@ -57,11 +63,55 @@ class Errors(NamedTuple):
         }
 
 
+class Flight(NamedTuple):
+    """Times of a run [days], Kepler's energy of the satellite [km^2/s^2], errors of its place [m], calls of `fun`."""
+
+    t: np.ndarray
+    energy: np.ndarray
+    metres: np.ndarray
+    nfev: int
+
+
+class Found(NamedTuple):
+    """Runs of the comet and of the satellite, each by the name of its method."""
+
+    comet: dict[str, Errors]
+    satellite: dict[str, Flight]
+
+
+def low_orbit() -> Problem:
+    """Return a satellite 420 km above an oblate Earth with an atmosphere."""
+    a = EARTH["radius"] + ALTITUDE
+    velocity = np.sqrt(EARTH["mu"] / a) * np.array([0, np.cos(INCLINATION), np.sin(INCLINATION)])
+    return satellite([a, 0, 0], velocity, **EARTH, **AIR, t_span=(0, DAYS * DAY))
+
+
+def flights() -> dict[str, Flight]:
+    """Run the satellite without and with its balances."""
+    problem = low_orbit()
+    times = np.linspace(0, DAYS * DAY, 721)
+    common: dict[str, Any] = {"fun": problem.fun, "t_span": problem.t_span, "y0": problem.y0, "t_eval": times}
+    # Without invariants EIPDOP853 takes the steps of DOP853, compiled here.
+    truth = integrate(problem, method=EIPDOP853, rtol=1e-13, atol=1e-13, t_eval=times, invariants=()).y[3:6]
+    ways: dict[str, dict[str, Any]] = {
+        "DOP853": {"method": "DOP853"},
+        "EIPDOP853": {"method": EIPDOP853, "invariants": problem.invariants},
+    }
+    found = {}
+    for name, options in ways.items():
+        run = solve_ivp(**common, **options, **FLIGHT)
+        place, velocity = run.y[3:6], run.y[9:12]  # the Earth rests in the origin
+        kinetic = (velocity**2).sum(axis=0) / 2
+        kepler_energy = kinetic - EARTH["mu"] / np.linalg.norm(place, axis=0)
+        found[name] = Flight(times / DAY, kepler_energy, 1e3 * np.linalg.norm(place - truth, axis=0), run.nfev)
+    return found
+
+
 @dataclass(frozen=True, kw_only=True)
-class WithAndWithout(Study[dict[str, Errors]]):
+class WithAndWithout(Study[Found]):
     """The command."""
 
-    def measure(self, session: Session) -> dict[str, Errors]:
+    def measure(self, session: Session) -> Found:
         kept = {"invariants": [Invariant(energy), Invariant(momentum)]}
         ways: dict[str, dict[str, Any]] = {"RK45": {"method": "RK45"}, "EIPRK45": {"method": EIPRK45, **kept}}
         reference = kepler(relativistic=0.0).reference
@@ -72,32 +122,68 @@ class WithAndWithout(Study[dict[str, Errors]]):
             defect = np.abs(energy(run.t, run.y) - energy(0, np.asarray(START))) * 2  # |H| is 1/2
             exact = np.array([reference(time) for time in run.t]).T
             found[name] = Errors(run.t, defect, np.hypot(*(run.y[:2] - exact[:2])), run.nfev)
-        return found
+        return Found(found, flights())
 
-    def text(self, found: dict[str, Errors]) -> str:
-        body = [(name, [str(run.nfev), *(f"{x:.1e}" for x in run.largest().values())]) for name, run in found.items()]
+    def text(self, found: Found) -> str:
+        comet = [
+            (name, [str(run.nfev), *(f"{x:.1e}" for x in run.largest().values())]) for name, run in found.comet.items()
+        ]
         heads = [["calls"], ["|dH/H|", "first period"], ["", "last"], ["place", "first period"], ["", "last"]]
-        return table(heads, body)
+        low = [(name, [str(run.nfev), f"{run.metres[-1]:.2f}"]) for name, run in found.satellite.items()]
+        return table(heads, comet) + "\n\n" + table([["calls"], ["off after", f"{DAYS} days [m]"]], low)
 
-    def numbers(self, found: dict[str, Errors]) -> dict[str, Any]:
-        return {"errors": {name: {"nfev": run.nfev, **run.largest()} for name, run in found.items()}}
+    def numbers(self, found: Found) -> dict[str, Any]:
+        low = {name: {"nfev": run.nfev, "metres": float(run.metres[-1])} for name, run in found.satellite.items()}
+        return {
+            "errors": {name: {"nfev": run.nfev, **run.largest()} for name, run in found.comet.items()},
+            "satellite": low,
+        }
 
-    def figures(self, found: dict[str, Errors]) -> Figures:
-        from eip_scipy.plotting import PALETTE
+    def figures(self, found: Found) -> Figures:
+        yield "with-and-without.png", comet_figure(found.comet)
+        yield "low-orbit.png", satellite_figure(found.satellite)
 
-        from ..plotting import blank_figure
 
-        looks = {"RK45": (PALETTE[2], "RK45"), "EIPRK45": (PALETTE[0], "EIPRK45, energy and angular momentum kept")}
-        figure = blank_figure(9, 3.6)
-        energies, places = figure.subplots(1, 2)
-        for name, run in found.items():
-            colour, label = looks[name]
-            energies.semilogy(run.t[1:] / PERIOD, np.maximum(run.energy[1:], 1e-16), color=colour, lw=1.2, label=label)
-            places.semilogy(run.t[1:] / PERIOD, run.place[1:], color=colour, lw=1.2)
-        energies.set(xlabel="periods of the comet", ylabel="error of the energy, |ΔH/H|")
-        places.set(xlabel="periods of the comet", ylabel="error of the place [semi-major axes]", ylim=(1e-7, 1e-1))
-        for axes in (energies, places):
-            axes.grid(alpha=0.3)
-            axes.set_xlim(0, T_END / PERIOD)
-        figure.legend(loc="outside upper center", ncols=2, frameon=False)
-        yield "with-and-without.png", figure
+def comet_figure(found: dict[str, Errors]) -> Any:
+    """Draw the errors of the energy and of the place of the comet."""
+    from eip_scipy.plotting import PALETTE
+
+    from ..plotting import blank_figure
+
+    looks = {"RK45": (PALETTE[2], "RK45"), "EIPRK45": (PALETTE[0], "EIPRK45, energy and angular momentum kept")}
+    figure = blank_figure(9, 3.6)
+    energies, places = figure.subplots(1, 2)
+    for name, run in found.items():
+        colour, label = looks[name]
+        energies.semilogy(run.t[1:] / PERIOD, np.maximum(run.energy[1:], 1e-16), color=colour, lw=1.2, label=label)
+        places.semilogy(run.t[1:] / PERIOD, run.place[1:], color=colour, lw=1.2)
+    energies.set(xlabel="periods of the comet", ylabel="error of the energy, |ΔH/H|")
+    places.set(xlabel="periods of the comet", ylabel="error of the place [semi-major axes]", ylim=(1e-7, 1e-1))
+    for axes in (energies, places):
+        axes.grid(alpha=0.3)
+        axes.set_xlim(0, T_END / PERIOD)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    return figure
+
+
+def satellite_figure(found: dict[str, Flight]) -> Any:
+    """Draw the energy of the satellite, which falls, and the error of its place."""
+    from eip_scipy.plotting import PALETTE
+
+    from ..plotting import blank_figure
+
+    looks = {"DOP853": (PALETTE[2], "DOP853"), "EIPDOP853": (PALETTE[0], "EIPDOP853, balances kept")}
+    figure = blank_figure(9, 3.6)
+    energies, places = figure.subplots(1, 2)
+    for name, run in found.items():
+        colour, label = looks[name]
+        places.semilogy(run.t[1:], np.maximum(run.metres[1:], 1e-3), color=colour, lw=1.2, label=label)
+    run = found["EIPDOP853"]
+    energies.plot(run.t, run.energy - run.energy[0], color=PALETTE[0], lw=0.8)
+    energies.set(xlabel="days", ylabel="change of the energy [km²/s²]")
+    places.set(xlabel="days", ylabel="error of the place [m]")
+    for axes in (energies, places):
+        axes.grid(alpha=0.3)
+        axes.set_xlim(0, DAYS)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    return figure

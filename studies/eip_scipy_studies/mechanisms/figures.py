@@ -12,7 +12,7 @@ from eip_scipy import EIPRK45, integrate
 
 from .examples import four_bar
 
-__all__ = ["four_bar_figure", "joints"]
+__all__ = ["four_bar_figures", "joints"]
 
 TOLERANCE, LAST = 1e-4, np.array([2.0, 1.5, 1.0, 0.5, 0.0])  # of the runs that are drawn; seconds before the end
 
@@ -25,9 +25,9 @@ def joints(y: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
     return np.concatenate([np.zeros((len(ends), 1, 2)), ends], axis=1)
 
 
-def four_bar_figure(panels: Sequence[Any]) -> Any:
-    """Draw the linkage by RK45, without projection and with constraints and energy kept, and two `CostPanel`."""
-    from ..plotting import Linkage, linkage_figure
+def four_bar_figures(panels: Sequence[Any]) -> tuple[Any, Any]:
+    """Draw the linkage by RK45 without projection and with all invariants kept: above two `CostPanel`, and alone."""
+    from ..plotting import Linkage, linkage_figure, linkages_figure
 
     problem = four_bar()
     pivots, drawings = [[0, 0], [problem.parameters["ln"], 0]], {}
@@ -42,7 +42,7 @@ def four_bar_figure(panels: Sequence[Any]) -> Any:
             warnings.simplefilter("ignore")
             run = integrate(problem, invariants=invariants, **options)
         drawings[f"RK45 at {TOLERANCE:g}, {name}"] = Linkage(run.t, joints(run.y, problem.parameters), pivots)
-    return linkage_figure(
+    both = linkage_figure(
         drawings,
         panels,
         unit="m",
@@ -51,3 +51,4 @@ def four_bar_figure(panels: Sequence[Any]) -> Any:
         title="Four-bar linkage",
         largest=1.0,
     )
+    return both, linkages_figure(drawings, unit="m", time="t [s]")

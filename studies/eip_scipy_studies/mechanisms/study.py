@@ -19,7 +19,7 @@ from ..report import compact, describe_machine, table
 from ..study import Check, Figures, Rows, Session, Study, some_of
 from ..work_precision import costs_at, curves, work_precision
 from .examples import EXAMPLES, PUBLISHED
-from .figures import four_bar_figure
+from .figures import four_bar_figures
 from .speed import Speed, speed
 from .ways import BOTH, CONSTRAINTS, FACTORS, NEITHER, Outcome, Way, kept, ways
 
@@ -150,7 +150,7 @@ class Mechanisms(Study[Found]):
         if (own := found.by_mechanism.get("four-bar")) is not None:
             costs = {"calls": "calls of the right-hand side", "seconds": "processor time [s]"}
             panels = [CostPanel("", label, curves(own, cost)) for cost, label in costs.items()]
-            yield "four-bar.png", four_bar_figure(panels)
+            yield from zip(("four-bar.png", "linkage.png"), four_bar_figures(panels), strict=True)
 
 
 def _costs(lines: Sequence[Line]) -> str:
