@@ -10,6 +10,8 @@ pytestmark = pytest.mark.needs_jit
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^```(python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"^```(?:python|py|diff|console|\{code-cell\} ipython3)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+COLUMN = 88
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 ROUND_OFF = 1e-9
 
@@ -30,14 +32,8 @@ PAGES = (
     "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/find-invariants",
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
-    "how-to/pydy",
-    "how-to/constraints",
-    "how-to/fitting",
-    "how-to/positivity",
-    "tutorials/satellites",
-    "tutorials/galactic-orbits",
-    "tutorials/quantum-states",
-    "how-to/diagnostics",
+    "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity", "tutorials/satellites",
+    "tutorials/galactic-orbits", "tutorials/quantum-states", "how-to/diagnostics",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
@@ -93,6 +89,20 @@ def test_links_have_a_text():
     pages = [page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts]
     assert pages
     assert [page.name for page in pages if "[](" in page.read_text(encoding="utf-8")] == []
+
+
+def test_code_fits_the_column():
+    """Lines of more characters are cut off at the edge of a page on a screen of 1400 pixels."""
+    pages = (*(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").glob("*.md"))
+    long = [
+        f"{page.name}: {line}"
+        for page in pages
+        if not {"_build", "generated", "notebooks"} & set(page.parts)
+        for block in CODE.finditer(page.read_text(encoding="utf-8"))
+        for line in block[1].splitlines()
+        if len(line) > COLUMN
+    ]
+    assert long == []
 
 
 def test_notebooks_are_listed():
