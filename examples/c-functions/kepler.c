@@ -19,15 +19,17 @@ int kepler(double t, const double *y, double *out, const double *params)
     return 0;
 }
 
-/* The energy and the angular momentum, one after the other, and their gradients, a row for each. */
+/* The energy and the angular momentum, and their gradients, a row for each. */
 int kept(double t, const double *y, double *values, const double *params)
 {
-    values[0] = 0.5 * (y[2] * y[2] + y[3] * y[3]) - params[0] / sqrt(y[0] * y[0] + y[1] * y[1]);
+    double r = sqrt(y[0] * y[0] + y[1] * y[1]);
+    values[0] = 0.5 * (y[2] * y[2] + y[3] * y[3]) - params[0] / r;
     values[1] = y[0] * y[3] - y[1] * y[2];
     return 0;
 }
 
-int kept_gradient(double t, const double *y, const double *f, double *out, const double *params)
+int kept_gradient(double t, const double *y, const double *f, double *out,
+                  const double *params)
 {
     double r3 = cubed(y);
     out[0] = params[0] * y[0] / r3;

@@ -23,4 +23,5 @@ run = integrate(
     events=turn,
 )
 print(run.compiled, set(run.calls.values()))
-print(f"{run.t_events[0].size} pericentres, energy and angular momentum kept: {run.max_defect.max() < 1e-11}")
+kept = run.max_defect.max() < 1e-11
+print(f"{run.t_events[0].size} pericentres, energy and angular momentum kept: {kept}")

@@ -5,9 +5,9 @@ from scipy import LowLevelCallable
 
 from eip_scipy import EIPRK4, Invariant, integrate
 
-fun, energy, energy_gradient = (
-    LowLevelCallable.from_cython(oscillator, name) for name in ("oscillator", "energy", "energy_gradient")
-)
+names = ("oscillator", "energy", "energy_gradient")
+functions = [LowLevelCallable.from_cython(oscillator, name) for name in names]
+fun, energy, energy_gradient = functions
 run = integrate(
     fun,
     (0, 100),
