@@ -1,19 +1,20 @@
-"""heyoka: its Taylor integrator with projections, and as a reference, in double precision, on our states.
+"""heyoka: its Taylor integrator with the projection onto invariants.
 
 heyoka (F. Biscani, D. Izzo, MNRAS 504 (2021) 2614-2628) is free software under the MPL and not distributed with this
-package.
+package; version 7 is tested.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from time import perf_counter
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from eip_scipy.core.inputs import refuse_units
+from eip_scipy.core.inputs import count, shown
+from eip_scipy.engine.data import EPS, LARGE_SHARE
+from eip_scipy.engine.trust import ProjectionWarning
 
 try:
     import heyoka
@@ -22,114 +23,286 @@ except ModuleNotFoundError as error:
         'eip_scipy.integrations.heyoka needs heyoka: pip install "eip_scipy[heyoka]"', name="heyoka"
     ) from error
 
-from ._heyoka_projection import ProjectedTaylor, TaylorOutput
+__all__ = ["ProjectedTaylor", "TaylorOutput"]
 
-__all__ = ["HeyokaRun", "ProjectedTaylor", "TaylorOutput", "largest_exponent", "run"]
+# Gradients that are linearly dependent up to this factor reduce the rank: the square of that of the engine.
+DEPENDENT = EPS
+# Expressions with more products than this are compiled in heyoka's compact mode, which takes less time to compile.
+MOST_PRODUCTS = 200
+# Residuals of correct runs after a projection are below this number of rounding errors of their terms.
+REMAINS = 400.0
+POINTS = 1024  # of a grid that are handed to heyoka at once, because it copies them
+TIME_LIMIT, STEP_LIMIT = heyoka.taylor_outcome.time_limit, heyoka.taylor_outcome.step_limit
 
 
-@dataclass(frozen=True)
-class HeyokaRun:
-    """Result of `run`.
+class ProjectedTaylor:
+    """Taylor integrator of heyoka whose state is projected onto invariants after every few steps.
+
+    heyoka makes the steps, with its own step sizes, events and dense output. The projection is one Newton step, which
+    heyoka compiles together with the gradients of the expressions.
+
+    Parameters
+    ----------
+    integrator : heyoka.taylor_adaptive
+        In double precision, at the state at which the invariants have their targets. It is used, not copied.
+    invariants : sequence or mapping of heyoka.expression
+        Expressions of the state variables and of the integrator's parameters; a mapping gives them names.
+    every : int, optional
+        Number of steps between two projections. A projection takes about as long as 10 steps of a small system; if a
+        step takes more than a few microseconds, a smaller number gives smaller errors at the same cost. Default: 1024
+        if the tolerance of the integrator is at most 1e-12, else 256.
 
     Attributes
     ----------
-    version : str
-        heyoka's version.
-    t : float
-        The end.
-    y : ndarray, shape (6 N,)
-        The state (q, v) at the end.
-    wall_time : float
-        Seconds spent in the integration, without making and compiling the integrator.
-    steps : int
-    """
-
-    version: str
-    t: float
-    y: np.ndarray
-    wall_time: float
-    steps: int
-
-
-def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> HeyokaRun:
-    """Integrate N bodies from t = 0 to `t_end`.
-
-    Parameters
-    ----------
-    gm : array_like, shape (N,)
-        G times the masses.
-    y0 : array_like, shape (6 N,)
-        Initial state (q, v).
-    t_end : float
-    tolerance : float, optional
-        heyoka's; default: the spacing of numbers at 1.
-
-    Returns
-    -------
-    HeyokaRun
+    integrator : heyoka.taylor_adaptive
+    names : tuple of str
+        Of the invariants.
+    targets : ndarray, shape (l,)
+        Values that are kept. After you have changed the state of the integrator, assign `values` to it.
+    max_residual : ndarray, shape (l,)
+        Largest magnitude of each invariant error before a projection.
+    n_projections : int
 
     Raises
     ------
-    ValueError
-        If shapes disagree, `t_end` or the tolerance is not a positive number, or the integration does not reach the
-        end.
+    TypeError, ValueError
+        If the integrator is of another kind, or an invariant has other variables or parameters than it, depends on
+        time, or is not finite.
+
+    Warns
+    -----
+    ProjectionWarning
+        By the methods, if invariant errors are too large to be errors of the steps, or remain after the projection.
+
+    Notes
+    -----
+    Rows of `propagate_grid` and values of the dense output are projected, too. Dependent gradients reduce the rank, as
+    in `eip_scipy.project`. The page :doc:`/how-to/other-packages` has an example.
     """
-    refuse_units(gm=gm, y0=y0, t_end=t_end, tolerance=tolerance)
-    gm, y0 = np.array(gm, dtype=float), np.array(y0, dtype=float)
-    if gm.ndim != 1 or y0.shape != (6 * gm.size,):
-        raise ValueError(f"gm has shape {gm.shape} and the state {y0.shape}; expected (N,) and (6 N,)")
-    if not (t_end > 0 and (tolerance is None or tolerance > 0)):
-        raise ValueError(f"t_end and the tolerance must be positive, got {t_end!r} and {tolerance!r}")
-    equations = heyoka.model.nbody(gm.size, masses=gm.tolist(), Gconst=1.0)
-    by_body = y0.reshape(2, -1, 3).swapaxes(0, 1).ravel()
-    options = {} if tolerance is None else {"tol": float(tolerance)}
-    integrator = heyoka.taylor_adaptive(equations, by_body, **options)
-    start = perf_counter()
-    outcome, *_, steps = integrator.propagate_until(float(t_end))[:4]
-    wall_time = perf_counter() - start
-    if outcome != heyoka.taylor_outcome.time_limit:
-        raise ValueError(f"heyoka stopped at t = {integrator.time:g}: {outcome}")
-    y = integrator.state.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
-    return HeyokaRun(heyoka.__version__, float(t_end), y, wall_time, int(steps))
+
+    def __init__(self, integrator: Any, invariants: Any, *, every: int | None = None) -> None:
+        if not isinstance(integrator, heyoka.taylor_adaptive_dbl) or integrator.is_variational:
+            raise TypeError(
+                f"ProjectedTaylor: expected a heyoka.taylor_adaptive in double precision, without variational "
+                f"equations, got {shown(integrator)}."
+            )
+        every = (1024 if integrator.tol <= 1e-12 else 256) if every is None else every
+        self.integrator, self._every = integrator, count("every", every)
+        named = _named(invariants, integrator)
+        # Parameters and targets are variables of the compiled functions, because heyoka takes microseconds to look at
+        # parameters.
+        names, pars = [name for name, _ in integrator.sys], _variables("__par", len(integrator.pars))
+        replaced = {heyoka.par[k]: par for k, par in enumerate(pars)}
+        self.names, expressions = tuple(named), [heyoka.subs(item, replaced) for item in named.values()]
+        self._function = _projection(names, pars, expressions)
+        self._checked = _examination(names, pars, expressions)
+        self.n_projections, self.max_residual = 0, np.zeros(len(expressions))
+        self.targets = self.values
+        if not np.isfinite(self.targets).all():
+            raise ValueError(f"the invariants {self.names} have the values {self.targets} at the start.")
+
+    @property
+    def values(self) -> np.ndarray:
+        """Values of the invariants at the present state, shape (l,)."""
+        return np.split(self._examined(), 2)[0]
+
+    def propagate_until(self, t: float, *, c_output: bool = False, **options: Any) -> tuple[Any, ...]:
+        """Integrate to `t`, as ``heyoka.taylor_adaptive.propagate_until``.
+
+        Parameters
+        ----------
+        t : float
+            End, before or after the present time.
+        c_output : bool, optional
+            Return a dense output, too.
+        **options
+            Options ``max_delta_t`` and ``callback`` of heyoka; a callback sees states before their projection.
+
+        Returns
+        -------
+        tuple
+            heyoka's: outcome, smallest and largest step, number of steps, the dense output or None, callback. The
+            dense output, a function of times, stores one state for each projection and integrates again from there.
+        """
+        starts = [self._clock()] if c_output else None
+        found = self._run(lambda: self.integrator.propagate_until(t, max_steps=self._every, **options), starts)
+        return (*found[:4], None if starts is None else TaylorOutput(self, starts, self.integrator.dtime), found[5])
+
+    def propagate_grid(self, grid: Any, **options: Any) -> tuple[Any, ...]:
+        """Integrate over a grid of times, as ``heyoka.taylor_adaptive.propagate_grid``.
+
+        Parameters
+        ----------
+        grid : array_like, shape (m,)
+            Monotonic times; the first one is the present time.
+        **options
+            As for `propagate_until`.
+
+        Returns
+        -------
+        tuple
+            heyoka's: outcome, smallest and largest step, number of steps, callback, and the states (m, n), fewer if an
+            event or a callback ended the run.
+        """
+        grid = np.ascontiguousarray(grid, dtype=float)
+        rows = [self.integrator.state[None].copy()]
+        at, done = grid[:1], 1
+
+        def advance() -> tuple[Any, ...]:
+            nonlocal at, done
+            ahead = np.concatenate([at, grid[done : done + POINTS]])
+            found = self.integrator.propagate_grid(ahead, max_steps=self._every, **options)
+            at = [self.integrator.time]
+            rows.append(found[-1][1:])
+            done += len(rows[-1])
+            return (STEP_LIMIT if found[0] == TIME_LIMIT and done < grid.size else found[0], *found[1:])
+
+        found = self._run(advance, None) if grid.size > 1 else self.integrator.propagate_grid(grid, **options)
+        return (*found[:5], self._projected(np.concatenate(rows), self._known()))
+
+    def _projected(self, y: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Return the projections of states (m, n) with known parameters and targets."""
+        z = np.concatenate([y.T, np.repeat(known[:, None], len(y), axis=1)])
+        return self._function(np.ascontiguousarray(z))[: y.shape[1]].T.copy()
+
+    def _run(self, advance: Any, starts: list[Any] | None) -> tuple[Any, ...]:
+        """Call `advance` and project until it does not end by its number of steps; return what heyoka returns."""
+        state, function = self.integrator.state, self._function
+        z, out = np.concatenate([state, self._known()]), np.empty(state.size + len(self.names))
+        at, projected, residuals = z[: state.size], out[: state.size], out[state.size :]
+        largest, steps, least, most = self.max_residual, 0, np.inf, 0.0
+        while True:
+            found = advance()
+            steps += found[3]
+            least, most = min(least, found[1]), max(most, found[2])
+            at[:] = state
+            function(z, out)
+            state[:] = projected
+            np.maximum(largest, np.abs(residuals, out=residuals), out=largest)
+            self.n_projections += 1
+            if found[0] != STEP_LIMIT:
+                break
+            if starts is not None:
+                starts.append(self._clock())
+        self._judge(residuals)
+        return (found[0], least, most, steps, *found[4:])
+
+    def _clock(self) -> tuple[tuple[float, float], np.ndarray]:
+        return self.integrator.dtime, self.integrator.state.copy()
+
+    def _known(self) -> np.ndarray:
+        return np.concatenate([self.integrator.pars, self.targets])
+
+    def _examined(self) -> np.ndarray:
+        return self._checked(np.concatenate([self.integrator.state, self.integrator.pars]))
+
+    def _judge(self, before: np.ndarray) -> None:
+        """Warn if the errors `before` the last projection, or of the run, are not those of accurate steps."""
+        values, terms = np.split(self._examined(), 2)
+        after = np.abs(self.targets - values)
+        for k, name in enumerate(self.names):
+            remains = not after[k] <= max(before[k], REMAINS * EPS * terms[k])
+            if remains or self.max_residual[k] > LARGE_SHARE * terms[k]:
+                warnings.warn(
+                    f"invariant {name!r} had errors of up to {self.max_residual[k]:.3g} before projections, and "
+                    f"{after[k]:.3g} after the last one, with terms of size {terms[k]:.3g}. Decrease tol or every, "
+                    "and check that it is an invariant of this system.",
+                    ProjectionWarning,
+                    stacklevel=4,
+                )
 
 
-def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_end: float, every: float) -> float:
-    """Compute the largest Lyapunov exponent of a Hamiltonian system by heyoka's variational equations.
+class TaylorOutput:
+    """Dense output of a run from ``bounds[0]`` to ``bounds[1]``: times and states after the projections."""
 
-    Parameters
-    ----------
-    energy : callable
-        ``energy(heyoka, *y)``: the Hamiltonian of the components of the state (q, p), as an expression.
-    y0, deviation : array_like, shape (n,)
-        Initial state (q, p) and tangent vector.
-    t_end, every : float
-        End of the run from t = 0, and the interval after which the vector is normalised.
+    def __init__(self, flow: ProjectedTaylor, starts: Sequence[Any], end: tuple[float, float]) -> None:
+        own = flow.integrator
+        self.bounds = float(starts[0][0][0]), float(end[0])
+        self._flow, self._starts, self._known = flow, starts, flow._known()
+        self._sign = 1.0 if self.bounds[1] >= self.bounds[0] else -1.0
+        self._times = np.array([time[0] for time, _ in starts])
+        self._again = heyoka.taylor_adaptive(
+            own.sys, own.state, pars=own.pars, tol=own.tol,
+            high_accuracy=own.high_accuracy, compact_mode=own.compact_mode,
+        )  # fmt: skip
 
-    Returns
-    -------
-    float
+    def __call__(self, t: Any) -> np.ndarray:
+        """Return the state (n,) at one time, or states (m, n) at times (m,)."""
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        if not ((times - self.bounds[0]) * (times - self.bounds[1]) <= 0).all():
+            raise ValueError(f"the dense output reaches from {self.bounds[0]} to {self.bounds[1]}, got t={shown(t)}.")
+        order = np.argsort(self._sign * times, kind="stable")
+        block = np.searchsorted(self._sign * self._times, self._sign * times[order], side="right") - 1
+        rows = np.empty((times.size, self._again.dim))
+        for k in np.unique(block):
+            chosen = order[block == k]
+            self._again.dtime, self._again.state[:] = self._starts[k]
+            ahead, place = np.unique(self._sign * np.append(times[chosen], self._times[k]), return_inverse=True)
+            rows[chosen] = self._again.propagate_grid(self._sign * ahead)[-1][place[:-1]]
+        rows = self._flow._projected(rows, self._known)
+        return rows if np.ndim(t) else rows[0]
 
-    Raises
-    ------
-    ValueError
-        If shapes disagree or a time is not positive.
+
+def _named(invariants: Any, integrator: Any) -> dict[str, Any]:
+    """Return the expressions by name, checked."""
+    if not isinstance(invariants, Mapping):
+        invariants = {f"invariant {k}": item for k, item in enumerate(invariants)}
+    named = {str(name): heyoka.expression(item) for name, item in invariants.items()}
+    if not named:
+        raise ValueError("ProjectedTaylor: expected at least one invariant; without any, use heyoka's integrator.")
+    known = {str(name) for name, _ in integrator.sys}
+    own = {str(heyoka.par[k]) for k in range(len(integrator.pars))}
+    for name, item in named.items():
+        others = set(heyoka.get_variables(item)) - known | set(map(str, heyoka.get_params(item))) - own
+        if others:
+            raise ValueError(
+                f"invariant {name!r} contains {', '.join(sorted(others))}, which the integrator does not have; its "
+                f"variables are {', '.join(sorted(known))}, and it has {len(own)} parameters."
+            )
+        if heyoka.cfunc([item], [variable for variable, _ in integrator.sys]).is_time_dependent:
+            raise ValueError(f"invariant {name!r} depends on time; make time a variable of the system.")
+    return named
+
+
+def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
+    """Compile the Newton step: of a state, parameters and targets, the projected state and the residuals.
+
+    The correction x has the smallest norm with G x = residuals; the rows of G are made orthogonal one after the other.
     """
-    refuse_units(y0=y0, deviation=deviation, t_end=t_end, every=every)
-    y, d = np.array(y0, dtype=float), np.array(deviation, dtype=float)
-    if y.ndim != 1 or y.size % 2 or d.shape != y.shape or not (t_end > 0 and every > 0):
-        raise ValueError(f"the state {y.shape} and the tangent vector {d.shape} must be (q, p), and the times positive")
-    names = heyoka.make_vars(*(f"y{k}" for k in range(y.size)))
-    H, half = energy(heyoka, *names), y.size // 2
-    rates = [*(heyoka.diff(H, p) for p in names[half:]), *(-heyoka.diff(H, q) for q in names[:half])]
-    system = heyoka.var_ode_sys(list(zip(names, rates, strict=True)), heyoka.var_args.vars)
-    integrator = heyoka.taylor_adaptive(system, y, compact_mode=True)
-    matrix, total = integrator.get_vslice(order=1), 0.0
-    pieces = max(1, round(t_end / every))
-    for k in range(1, pieces + 1):
-        integrator.state[matrix] = np.eye(y.size).ravel()
-        integrator.propagate_until(t_end * k / pieces)
-        d = integrator.state[matrix].reshape(y.size, y.size) @ d
-        size = np.linalg.norm(d)
-        total += np.log(size)
-        d /= size
-    return float(total / t_end)
+    targets = _variables("__target", len(expressions))
+    basis: list[list[Any]] = []
+    moves: list[Any] = []
+    residuals = [target - item for target, item in zip(targets, expressions, strict=True)]
+    for item, residual in zip(expressions, residuals, strict=True):
+        row = [heyoka.diff(item, name) for name in names]
+        size, rest = _dot(row, row), residual
+        for direction, move in zip(basis, moves, strict=True):
+            share = _dot(row, direction)
+            row = [a - share * b for a, b in zip(row, direction, strict=True)]
+            rest = rest - share * move
+        left = _dot(row, row)
+        inverse = heyoka.select(heyoka.gt(left, DEPENDENT * size), 1.0 / heyoka.sqrt(left), heyoka.expression(0.0))
+        basis.append([a * inverse for a in row])
+        moves.append(rest * inverse)
+    projected = [
+        name + heyoka.sum([move * direction[k] for move, direction in zip(moves, basis, strict=True)])
+        for k, name in enumerate(names)
+    ]
+    compact = len(names) * len(expressions) ** 2 > MOST_PRODUCTS
+    return heyoka.cfunc([*projected, *residuals], [*names, *pars, *targets], compact_mode=compact)
+
+
+def _examination(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
+    """Compile the invariants and the sizes of their terms, which are those of their gradients times the state."""
+    terms = [_dot(row := [heyoka.diff(item, name) * name for name in names], row) for item in expressions]
+    return heyoka.cfunc(
+        [*expressions, *map(heyoka.sqrt, terms)], [*names, *pars], compact_mode=len(names) > MOST_PRODUCTS
+    )
+
+
+def _variables(name: str, n: int) -> list[Any]:
+    return [heyoka.make_vars(f"{name}_{k}") for k in range(n)]
+
+
+def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    return heyoka.sum([p * q for p, q in zip(a, b, strict=True)])

@@ -47,6 +47,9 @@ __all__ = [
     "some_of",
 ]
 
+# Packages whose comparison is not among the integrations.
+PEERS = {"heyoka": "eip_scipy_studies.comparators.heyoka"}
+
 Found = TypeVar("Found")
 Rows = Sequence[Mapping[str, Any]]
 """The lines of a CSV file, each with its columns' names."""
@@ -188,7 +191,7 @@ class Session:
         return tqdm(total=total, desc=what, unit=unit, disable=not self.shown, **{"leave": False, **settings})
 
     def peer(self, name: str, methods: str) -> Any:
-        """Find one of `eip_scipy.integrations`; return None, and add a line at the end, if its package is missing.
+        """Find an integration or one of `PEERS`; return None, and add a line at the end, if its package is missing.
 
         Parameters
         ----------
@@ -201,7 +204,7 @@ class Session:
         module or None
         """
         try:
-            return import_module(f"eip_scipy.integrations.{name}")
+            return import_module(PEERS.get(name, f"eip_scipy.integrations.{name}"))
         except ImportError as error:
             line = f"no comparison with {methods}: {error}"
             if line not in self.absent:

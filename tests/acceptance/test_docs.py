@@ -33,9 +33,13 @@ PAGES = (
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
     "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity", "tutorials/satellites",
-    "tutorials/galactic-orbits", "tutorials/quantum-states", "how-to/diagnostics",
+    "tutorials/galactic-orbits", "tutorials/quantum-states", "how-to/diagnostics", "how-to/other-packages",
 )  # fmt: skip
-NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
+NEEDED = {
+    "docs/how-to/gradients.md": ("jax", "torch"),
+    "docs/how-to/pydy.md": ("pydy",),
+    "docs/how-to/other-packages.md": ("gala", "galpy", "qutip", "heyoka"),
+}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
 NIGHTLY = (
     "results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",

@@ -1,0 +1,83 @@
+"""Runs of orbits in galaxies with their invariants kept; `integrations.gala` and `integrations.galpy` use them."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from eip_scipy import Invariant, integrate
+
+# A rate of change along the flow is zero up to this fraction of its terms; the rate at fixed state is a difference.
+RATE = 1e-6
+STATES = 6  # at which rates are looked at
+
+
+class System(Protocol):
+    """The derivative (dH/dp, -dH/dq) at a state (q, p), and the energy H."""
+
+    def __call__(self, t: float, w: np.ndarray) -> np.ndarray: ...
+    def energy(self, t: float, w: np.ndarray) -> float: ...
+
+
+def run_orbits(
+    system: System, starts: np.ndarray, times: np.ndarray, options: dict[str, Any], pattern_speed: float = 0.0
+) -> np.ndarray:
+    """Integrate each of the states `starts` (orbits, 2 n) and return the states (orbits, m, 2 n) at `times` (m,).
+
+    Without `options` for them, tolerances are 1e-10, and the invariants those of `kept_invariants`.
+
+    Raises
+    ------
+    RuntimeError
+        If a run does not reach its end.
+    """
+    options = ({} if "h" in options else {"rtol": 1e-10, "atol": 1e-10}) | options
+    if "invariants" not in options:
+        options["invariants"] = kept_invariants(system, starts[0], times, pattern_speed)
+    rows = np.empty((len(starts), times.size, starts.shape[1]))
+    for k, start in enumerate(starts):
+        run = integrate(system, (times[0], times[-1]), start, t_eval=times, **options)
+        if not run.success:
+            raise RuntimeError(f"orbit {k}: {run.message}")
+        rows[k] = run.y.T
+    return rows
+
+
+def kept_invariants(system: System, w: np.ndarray, times: np.ndarray, pattern_speed: float) -> list[Invariant]:
+    """Return the energy, or Jacobi's integral, and L_z, if they do not change at random states near w = (q, p).
+
+    Jacobi's integral is the energy minus `pattern_speed` times L_z.
+    """
+    n = w.size // 2
+
+    def momentum(t: float, y: np.ndarray) -> float:
+        return float(y[0] * y[n + 1] - y[1] * y[n])
+
+    def momentum_gradient(t: float, y: np.ndarray, f: np.ndarray) -> np.ndarray:
+        out = np.zeros(2 * n)
+        out[[0, 1, n, n + 1]] = y[n + 1], -y[n], -y[1], y[0]
+        return out
+
+    def energy(t: float, y: np.ndarray) -> float:
+        return system.energy(t, y) - (pattern_speed * momentum(t, y) if pattern_speed else 0.0)
+
+    def energy_gradient(t: float, y: np.ndarray, f: np.ndarray) -> np.ndarray:
+        out = np.concatenate([-f[n:], f[:n]])
+        return out - pattern_speed * momentum_gradient(t, y, f) if pattern_speed else out
+
+    found: list[tuple[str, Any, Any]] = [("Jacobi" if pattern_speed else "energy", energy, energy_gradient)]
+    if n > 1:
+        found.append(("L_z", momentum, momentum_gradient))
+    rng, apart = np.random.default_rng(1), 1e-4 * np.linalg.norm(w[:n]) / np.linalg.norm(w[n:])
+    for _ in range(STATES):
+        t = times[0] + rng.random() * (times[-1] - times[0])
+        turns = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
+        y = np.concatenate([turn @ part for turn, part in zip(turns, (w[:n], w[n:]), strict=True)])
+        y *= np.repeat(rng.uniform(0.5, 1.5, size=2), n)
+        f = system(t, y)
+        rates = [
+            [(fun(t + apart, y) - fun(t - apart, y)) / (2 * apart), *(grad(t, y, f) * f)] for _, fun, grad in found
+        ]
+        found = [x for x, each in zip(found, rates, strict=True) if abs(sum(each)) <= RATE * np.abs(each).sum()]
+    return [Invariant(fun, grad, uses_f=True, name=name) for name, fun, grad in found]

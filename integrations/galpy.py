@@ -1,0 +1,137 @@
+"""galpy: orbits in its potentials that keep the energy, or Jacobi's integral, and L_z.
+
+galpy (J. Bovy, Astrophysical Journal Supplement 216 (2015) 29) is free software under the BSD licence and not
+distributed with this package; version 1.12 is tested.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from typing import Any
+
+import numpy as np
+
+from eip_scipy import EIPDOP853
+
+from ._orbits import run_orbits
+
+try:
+    import galpy
+    from galpy.orbit import integrateFullOrbit
+    from galpy.potential import evaluatephitorques, evaluatePotentials, evaluateRforces, evaluatezforces
+    from galpy.util import conversion
+except ModuleNotFoundError as error:
+    raise ImportError(
+        'eip_scipy.integrations.galpy needs galpy: pip install "eip_scipy[galpy]"', name="galpy"
+    ) from error
+
+__all__ = ["integrate"]
+
+# Versions whose C functions are called; they are not documented, and others may have other arguments.
+KNOWN_IN_C = "1.12."
+ROOM = 8192  # bytes for galpy's description of one potential in C, which are more than it needs
+
+
+def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **options: Any) -> None:
+    """Integrate orbits as ``orbit.integrate(t, pot)`` does, with the invariants kept.
+
+    Parameters
+    ----------
+    orbit : galpy.orbit.Orbit
+        One orbit in three dimensions or several, each of which is integrated by itself. It holds the result as after
+        its own method, so that all its other methods work; an earlier integration is replaced.
+    t : array_like or Quantity, shape (m,)
+        Times, of which the first is that of the initial conditions.
+    pot : galpy.potential.Potential or sum of potentials
+    pattern_speed : float, optional
+        Angular velocity, in galpy's units, of a potential that rotates about the z axis: Jacobi's integral is kept.
+    **options
+        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10, and the
+        invariants below.
+
+    Raises
+    ------
+    ValueError
+        If the orbit is not one in three dimensions.
+    RuntimeError
+        If a run does not reach its end.
+
+    Notes
+    -----
+    The invariants are the energy, or Jacobi's integral, unless it depends on time, and L_z if the potential has this
+    symmetry; both is found out at random positions. Forces are galpy's C functions, called from Python, if all
+    potentials have them and the version of galpy is 1.12.
+    """
+    if orbit.dim() != 3:
+        raise ValueError(f"orbit has {orbit.dim()} dimensions; expected 3. Give an Orbit of [R, vR, vT, z, vz, phi].")
+    times = np.asarray(conversion.parse_time(t, ro=orbit._ro, vo=orbit._vo), dtype=float)
+    starts = orbit.vxvv if orbit.phasedim() == 6 else np.pad(orbit.vxvv, ((0, 0), (0, 1)))
+    options = {"method": EIPDOP853} | options
+    rows = _cylindrical(run_orbits(_System(pot), _rectangular(starts), times, options, pattern_speed))
+    vars(orbit).pop("_orbInterp", None)
+    orbit.t, orbit._integrate_t_asQuantity = times, hasattr(t, "unit")
+    orbit._pot = orbit._orig_pot = pot
+    orbit.orbit = rows[..., : orbit.phasedim()]
+
+
+class _System:
+    """Derivative and energy in potentials of galpy at one state (q, v)."""
+
+    def __init__(self, pot: Any) -> None:
+        self._pot = pot
+        parts = list(pot) if hasattr(pot, "__iter__") else [pot]
+        self._derivative: Any = None
+        if (
+            galpy.__version__.startswith(KNOWN_IN_C)
+            and integrateFullOrbit._ext_loaded
+            and all(part.hasC for part in parts)
+        ):
+            count, kinds, numbers, functions = integrateFullOrbit._parse_pot(parts)
+            if not functions:  # of time, in Python
+                self._bind(integrateFullOrbit._lib, count, kinds, numbers)
+
+    def _bind(self, library: Any, count: int, kinds: np.ndarray, numbers: np.ndarray) -> None:
+        self._room = room = ctypes.create_string_buffer(count * ROOM)
+        library.init_potentialArgs(ctypes.c_int(count), room)
+        places = [ctypes.c_void_p(kinds.ctypes.data), ctypes.c_void_p(numbers.ctypes.data), ctypes.c_void_p()]
+        library.parse_leapFuncArgs_Full(ctypes.c_int(count), room, *map(ctypes.byref, places))
+        weakref.finalize(self, library.free_potentialArgs, ctypes.c_int(count), room)
+        pointer, self._count = ctypes.c_void_p, count
+        self._derivative = ctypes.CFUNCTYPE(None, ctypes.c_double, pointer, pointer, ctypes.c_int, pointer)(
+            ("evalRectDeriv", library)
+        )
+
+    def __call__(self, t: float, w: np.ndarray) -> np.ndarray:
+        out = np.empty(6)
+        if self._derivative is not None:
+            self._derivative(t, w.ctypes.data, out.ctypes.data, self._count, self._room)
+            return out
+        R, phi, z = np.hypot(w[0], w[1]), np.arctan2(w[1], w[0]), w[2]
+        radial, vertical, torque = (
+            force(self._pot, R, z, phi=phi, t=t, use_physical=False)
+            for force in (evaluateRforces, evaluatezforces, evaluatephitorques)
+        )
+        out[:3], out[5] = w[3:], vertical
+        out[3] = (w[0] * radial - w[1] * torque / R) / R
+        out[4] = (w[1] * radial + w[0] * torque / R) / R
+        return out
+
+    def energy(self, t: float, w: np.ndarray) -> float:
+        at = np.hypot(w[0], w[1]), w[2]
+        value = evaluatePotentials(self._pot, *at, phi=np.arctan2(w[1], w[0]), t=t, use_physical=False)
+        return float(w[3:] @ w[3:] / 2 + value)
+
+
+def _rectangular(rows: np.ndarray) -> np.ndarray:
+    """Return (q, v) of (R, vR, vT, z, vz, phi)."""
+    R, vR, vT, z, vz, phi = np.moveaxis(rows, -1, 0)
+    c, s = np.cos(phi), np.sin(phi)
+    return np.stack([R * c, R * s, z, vR * c - vT * s, vR * s + vT * c, vz], axis=-1)
+
+
+def _cylindrical(rows: np.ndarray) -> np.ndarray:
+    """Return (R, vR, vT, z, vz, phi) of (q, v)."""
+    x, y, z, vx, vy, vz = np.moveaxis(rows, -1, 0)
+    R = np.hypot(x, y)
+    return np.stack([R, (x * vx + y * vy) / R, (x * vy - y * vx) / R, z, vz, np.arctan2(y, x)], axis=-1)

@@ -1,0 +1,129 @@
+"""heyoka as a reference: its Taylor integrator, in double precision, on our states.
+
+heyoka (F. Biscani, D. Izzo, MNRAS 504 (2021) 2614-2628) is free software under the MPL and not distributed with this
+package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+try:
+    import heyoka
+except ModuleNotFoundError as error:
+    raise ImportError(
+        'the comparison with heyoka needs heyoka: pip install "eip_scipy[heyoka]"', name="heyoka"
+    ) from error
+
+__all__ = ["HeyokaRun", "largest_exponent", "run"]
+
+
+@dataclass(frozen=True)
+class HeyokaRun:
+    """Result of `run`.
+
+    Attributes
+    ----------
+    version : str
+        heyoka's version.
+    t : float
+        The end.
+    y : ndarray, shape (6 N,)
+        The state (q, v) at the end.
+    wall_time : float
+        Seconds spent in the integration, without making and compiling the integrator.
+    steps : int
+    """
+
+    version: str
+    t: float
+    y: np.ndarray
+    wall_time: float
+    steps: int
+
+
+def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> HeyokaRun:
+    """Integrate N bodies from t = 0 to `t_end`.
+
+    Parameters
+    ----------
+    gm : array_like, shape (N,)
+        G times the masses.
+    y0 : array_like, shape (6 N,)
+        Initial state (q, v).
+    t_end : float
+    tolerance : float, optional
+        heyoka's; default: the spacing of numbers at 1.
+
+    Returns
+    -------
+    HeyokaRun
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, `t_end` or the tolerance is not a positive number, or the integration does not reach the
+        end.
+    """
+    gm, y0 = np.array(gm, dtype=float), np.array(y0, dtype=float)
+    if gm.ndim != 1 or y0.shape != (6 * gm.size,):
+        raise ValueError(f"gm has shape {gm.shape} and the state {y0.shape}; expected (N,) and (6 N,)")
+    if not (t_end > 0 and (tolerance is None or tolerance > 0)):
+        raise ValueError(f"t_end and the tolerance must be positive, got {t_end!r} and {tolerance!r}")
+    equations = heyoka.model.nbody(gm.size, masses=gm.tolist(), Gconst=1.0)
+    by_body = y0.reshape(2, -1, 3).swapaxes(0, 1).ravel()
+    options = {} if tolerance is None else {"tol": float(tolerance)}
+    integrator = heyoka.taylor_adaptive(equations, by_body, **options)
+    start = perf_counter()
+    outcome, *_, steps = integrator.propagate_until(float(t_end))[:4]
+    wall_time = perf_counter() - start
+    if outcome != heyoka.taylor_outcome.time_limit:
+        raise ValueError(f"heyoka stopped at t = {integrator.time:g}: {outcome}")
+    y = integrator.state.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
+    return HeyokaRun(heyoka.__version__, float(t_end), y, wall_time, int(steps))
+
+
+def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_end: float, every: float) -> float:
+    """Compute the largest Lyapunov exponent of a Hamiltonian system by heyoka's variational equations.
+
+    Parameters
+    ----------
+    energy : callable
+        ``energy(heyoka, *y)``: the Hamiltonian of the components of the state (q, p), as an expression.
+    y0, deviation : array_like, shape (n,)
+        Initial state (q, p) and tangent vector.
+    t_end, every : float
+        End of the run from t = 0, and the interval after which the vector is normalised.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree or a time is not positive.
+    """
+    y, d = np.array(y0, dtype=float), np.array(deviation, dtype=float)
+    if y.ndim != 1 or y.size % 2 or d.shape != y.shape or not (t_end > 0 and every > 0):
+        raise ValueError(f"the state {y.shape} and the tangent vector {d.shape} must be (q, p), and the times positive")
+    names = heyoka.make_vars(*(f"y{k}" for k in range(y.size)))
+    H, half = energy(heyoka, *names), y.size // 2
+    rates = [*(heyoka.diff(H, p) for p in names[half:]), *(-heyoka.diff(H, q) for q in names[:half])]
+    system = heyoka.var_ode_sys(list(zip(names, rates, strict=True)), heyoka.var_args.vars)
+    integrator = heyoka.taylor_adaptive(system, y, compact_mode=True)
+    matrix, total = integrator.get_vslice(order=1), 0.0
+    pieces = max(1, round(t_end / every))
+    for k in range(1, pieces + 1):
+        integrator.state[matrix] = np.eye(y.size).ravel()
+        integrator.propagate_until(t_end * k / pieces)
+        d = integrator.state[matrix].reshape(y.size, y.size) @ d
+        size = np.linalg.norm(d)
+        total += np.log(size)
+        d /= size
+    return float(total / t_end)

@@ -1,0 +1,96 @@
+"""Orbits in gala's potentials against gala's own integrators."""
+
+import numpy as np
+import pytest
+
+gala = pytest.importorskip("gala", reason='needs gala: pip install "eip_scipy[gala]"')
+
+from astropy import units as u  # noqa: E402
+from gala.dynamics import PhaseSpacePosition  # noqa: E402
+from gala.integrate import DOPRI853Integrator  # noqa: E402
+from gala.potential import (  # noqa: E402
+    CCompositePotential,
+    ConstantRotatingFrame,
+    Hamiltonian,
+    LongMuraliBarPotential,
+    MiyamotoNagaiPotential,
+    NFWPotential,
+    PotentialBase,
+)
+from gala.potential.common import PotentialParameter  # noqa: E402
+from gala.units import dimensionless, galactic  # noqa: E402
+
+from eip_scipy.integrations._orbits import kept_invariants  # noqa: E402
+from eip_scipy.integrations.gala import _System, integrate_orbit  # noqa: E402
+
+W = np.array([8.0, 0.0, 0.5, 0.03, 0.2, 0.05])
+HALO = CCompositePotential(
+    disk=MiyamotoNagaiPotential(m=6e10, a=3, b=0.3, units=galactic), halo=NFWPotential(m=6e11, r_s=15, units=galactic)
+)
+BAR = CCompositePotential(
+    disk=HALO["disk"],
+    bar=LongMuraliBarPotential(m=1e10, a=4, b=0.5, c=0.3, alpha=0.3, units=galactic),
+)
+SPEED = [0, 0, -40] * u.km / u.s / u.kpc
+TIMES = {"dt": 5.0, "n_steps": 400}
+
+
+class Ring(PotentialBase):
+    """A harmonic potential in Python, in two dimensions."""
+
+    k = PotentialParameter("k", physical_type=None)
+    ndim = 2
+
+    def _energy(self, q, t=0.0):
+        return 0.5 * self.parameters["k"] * (q**2).sum(axis=1)
+
+    def _gradient(self, q, t=0.0):
+        return self.parameters["k"] * q
+
+
+@pytest.mark.parametrize(
+    ("hamiltonian", "kept"),
+    [
+        (HALO, ["energy", "L_z"]),
+        (Hamiltonian(HALO, ConstantRotatingFrame([10, 0, 40] * u.km / u.s / u.kpc, units=galactic)), ["energy"]),
+        (Hamiltonian(BAR, ConstantRotatingFrame(SPEED, units=galactic)), ["energy"]),
+    ],
+)
+def test_orbits(hamiltonian, kept):
+    """In each frame: gala's derivative and energy, its orbit at tight tolerances, and what is kept."""
+    h = Hamiltonian(hamiltonian)
+    system = _System(h)
+    at = np.zeros(1)
+    assert np.allclose(system(0.0, W), h._gradient(np.ascontiguousarray(W[:, None]), at)[:, 0], rtol=1e-15, atol=1e-18)
+    assert system.energy(0.0, W) == pytest.approx(h._energy(W[None], at)[0], rel=1e-14)
+    assert [item.name for item in kept_invariants(system, W, np.array([0.0, 2000.0]), 0.0)] == kept
+    w0 = PhaseSpacePosition.from_w(np.stack([W, 1.1 * W], axis=-1), galactic)
+    orbits = integrate_orbit(h, w0, **TIMES)
+    assert orbits.shape == (401, 2)
+    truth = h.integrate_orbit(
+        w0, Integrator=DOPRI853Integrator, Integrator_kwargs={"rtol": 1e-13, "atol": 1e-13}, **TIMES
+    )
+    assert np.abs((orbits.xyz - truth.xyz).to_value(u.kpc)).max() < 1e-5
+    usual = h.integrate_orbit(w0, Integrator=DOPRI853Integrator, **TIMES)
+
+    def spread(found):
+        w = found.w(galactic)
+        energies = [h._energy(np.ascontiguousarray(w[:, :, k].T), at) for k in range(2)]
+        return np.abs(np.ptp(energies, axis=1) / np.mean(energies, axis=1)).max()
+
+    assert spread(orbits) < 1e-11
+    assert spread(usual) > 1e-9
+    if "L_z" in kept:
+        assert np.ptp(orbits.angular_momentum()[2], axis=0).value.max() < 1e-13
+
+
+def test_potentials_in_python_and_options():
+    """A harmonic potential in two dimensions: the closed form, back in time, from an array."""
+    potential = Ring(k=4.0, units=dimensionless)
+    orbit = integrate_orbit(potential, [1.0, 0.0, 0.0, 1.0], t=np.linspace(0, -3, 7), options={"h": 0.01})
+    t = orbit.t.value
+    assert np.abs(orbit.xyz.value - [np.cos(2 * t), np.sin(2 * t) / 2]).max() < 1e-12
+    with np.errstate(all="ignore"), pytest.raises(RuntimeError, match="orbit 0: "):
+        integrate_orbit(
+            potential, [1.0, 0.0, 0.0, 1.0], t=np.linspace(0, 1e5, 3), options={"h": 10.0, "invariants": ()}
+        )
