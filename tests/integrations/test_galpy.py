@@ -11,7 +11,6 @@ from galpy.potential import MWPotential2014, SoftenedNeedleBarPotential, evaluat
 
 from eip_scipy.integrations.galpy import _System, integrate
 
-pytestmark = pytest.mark.filterwarnings("ignore:Using C implementation")
 START = [1.0, 0.1, 1.1, 0.1, 0.05, 0.3]
 BAR = MWPotential2014 + SoftenedNeedleBarPotential(amp=0.3, a=0.5, b=0.1, c=0.1, omegab=1.3)
 TIMES = np.linspace(0, 40, 81)
