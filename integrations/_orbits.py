@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from eip_scipy import Invariant, integrate
 
-# A rate of change along the flow is zero up to this fraction of its terms; the rate at fixed state is a difference.
+# A rate of change along the flow, which is computed by a difference, is zero up to this fraction of its terms.
 RATE = 1e-6
 STATES = 6  # at which rates are looked at
 
 
-class System(Protocol):
-    """The derivative (dH/dp, -dH/dq) at a state (q, p), and the energy H."""
-
-    def __call__(self, t: float, w: np.ndarray) -> np.ndarray: ...
-    def energy(self, t: float, w: np.ndarray) -> float: ...
-
-
 def run_orbits(
-    system: System, starts: np.ndarray, times: np.ndarray, options: dict[str, Any], pattern_speed: float = 0.0
+    system: Any, starts: np.ndarray, times: np.ndarray, options: dict[str, Any], pattern_speed: float = 0.0
 ) -> np.ndarray:
-    """Integrate each of the states `starts` (orbits, 2 n) and return the states (orbits, m, 2 n) at `times` (m,).
+    """Integrate the states (q, p) of `starts` (orbits, 2 n); return the states (orbits, m, 2 n) at `times` (m,).
 
-    Without `options` for them, tolerances are 1e-10, and the invariants those of `kept_invariants`.
+    ``system(t, w)`` is the derivative (dH/dp, -dH/dq), and ``system.energy(t, w)`` is H. Without `options` for them,
+    tolerances are 1e-10, and the invariants those of `kept_invariants`.
 
     Raises
     ------
@@ -44,7 +38,7 @@ def run_orbits(
     return rows
 
 
-def kept_invariants(system: System, w: np.ndarray, times: np.ndarray, pattern_speed: float) -> list[Invariant]:
+def kept_invariants(system: Any, w: np.ndarray, times: np.ndarray, pattern_speed: float) -> list[Invariant]:
     """Return the energy, or Jacobi's integral, and L_z, if they do not change at random states near w = (q, p).
 
     Jacobi's integral is the energy minus `pattern_speed` times L_z.
@@ -69,15 +63,16 @@ def kept_invariants(system: System, w: np.ndarray, times: np.ndarray, pattern_sp
     found: list[tuple[str, Any, Any]] = [("Jacobi" if pattern_speed else "energy", energy, energy_gradient)]
     if n > 1:
         found.append(("L_z", momentum, momentum_gradient))
-    rng, apart = np.random.default_rng(1), 1e-4 * np.linalg.norm(w[:n]) / np.linalg.norm(w[n:])
+    rng = np.random.default_rng(1)
     for _ in range(STATES):
         t = times[0] + rng.random() * (times[-1] - times[0])
         turns = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
         y = np.concatenate([turn @ part for turn, part in zip(turns, (w[:n], w[n:]), strict=True)])
         y *= np.repeat(rng.uniform(0.5, 1.5, size=2), n)
         f = system(t, y)
-        rates = [
-            [(fun(t + apart, y) - fun(t - apart, y)) / (2 * apart), *(grad(t, y, f) * f)] for _, fun, grad in found
-        ]
-        found = [x for x, each in zip(found, rates, strict=True) if abs(sum(each)) <= RATE * np.abs(each).sum()]
+        q, p, a = np.linalg.norm(y[:n]) or 1.0, np.linalg.norm(y[n:]), np.linalg.norm(f[n:])
+        apart = 1e-4 / (p / q + (a / q) ** 0.5)
+        changes = [fun(t + apart, y + apart * f) - fun(t - apart, y - apart * f) for _, fun, _ in found]
+        sizes = [2 * apart * np.abs(grad(t, y, f) * f).sum() for _, _, grad in found]
+        found = [x for x, change, size in zip(found, changes, sizes, strict=True) if abs(change) <= RATE * size]
     return [Invariant(fun, grad, uses_f=True, name=name) for name, fun, grad in found]

@@ -164,8 +164,7 @@ def exit_events(sim: rebound.Simulation) -> list[_Exit]:
     list of callable
         The events of `problem_from_simulation`, for runs that have further ones: one event if the largest distance of a
         particle from the origin reaches ``sim.exit_max_distance``, and one if two particles come as near as
-        ``sim.exit_min_distance``. Only the distances that are set have an event. REBOUND checks them after each step;
-        an event is located within it.
+        ``sim.exit_min_distance``, if these are set. REBOUND checks them after each step; an event is located in it.
     """
     given = {name: float(getattr(sim, name)) for name in ("exit_max_distance", "exit_min_distance")}
     return [_Exit(name, limit) for name, limit in given.items() if limit > 0]

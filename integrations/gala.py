@@ -27,6 +27,10 @@ __all__ = ["integrate_orbit"]
 def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None = None, **time_spec: Any) -> Orbit:
     """Integrate orbits as ``integrate_orbit`` of gala's potentials does, with the invariants kept.
 
+    The invariants are the energy (Jacobi's integral in a rotating frame) unless the potential depends on time, and L_z
+    if the potential and the axis of the frame allow it; both is found out at random positions. Forces are gala's own C
+    functions, called from Python. gala's own ``integrate_orbit`` accepts no other integrators than gala's.
+
     Parameters
     ----------
     hamiltonian : gala.potential.PotentialBase or gala.potential.Hamiltonian
@@ -34,7 +38,7 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
         One position or several, each of which is integrated by itself. An array has the units of the potential.
     options : dict, optional
         Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10 (as gala's
-        integrator "dopri853" in C), and the invariants below.
+        integrator "dopri853" in C), and these invariants.
     **time_spec
         Times as gala takes them: ``dt, n_steps``; ``dt, t1, t2``; ``t``.
 
@@ -46,12 +50,6 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
     ------
     RuntimeError
         If a run does not reach its end.
-
-    Notes
-    -----
-    The invariants are the energy (Jacobi's integral in a rotating frame) unless the potential depends on time, and L_z
-    if the potential and the axis of the frame allow it; both is found out at random positions. Forces are gala's own C
-    functions, called from Python. gala's own ``integrate_orbit`` accepts no other integrators than gala's.
     """
     system = _System(Hamiltonian(hamiltonian))
     units = system.hamiltonian.units

@@ -36,6 +36,10 @@ ROOM = 8192  # bytes for galpy's description of one potential in C, which are mo
 def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **options: Any) -> None:
     """Integrate orbits as ``orbit.integrate(t, pot)`` does, with the invariants kept.
 
+    The invariants are the energy, or Jacobi's integral, unless it depends on time, and L_z if the potential has this
+    symmetry; both is found out at random positions. Forces are galpy's C functions, called from Python, if all
+    potentials have them and the version of galpy is 1.12.
+
     Parameters
     ----------
     orbit : galpy.orbit.Orbit
@@ -47,8 +51,7 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
     pattern_speed : float, optional
         Angular velocity, in galpy's units, of a potential that rotates about the z axis: Jacobi's integral is kept.
     **options
-        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10, and the
-        invariants below.
+        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol``, ``atol`` 1e-10 and these invariants.
 
     Raises
     ------
@@ -56,12 +59,6 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
         If the orbit is not one in three dimensions.
     RuntimeError
         If a run does not reach its end.
-
-    Notes
-    -----
-    The invariants are the energy, or Jacobi's integral, unless it depends on time, and L_z if the potential has this
-    symmetry; both is found out at random positions. Forces are galpy's C functions, called from Python, if all
-    potentials have them and the version of galpy is 1.12.
     """
     if orbit.dim() != 3:
         raise ValueError(f"orbit has {orbit.dim()} dimensions; expected 3. Give an Orbit of [R, vR, vT, z, vz, phi].")
@@ -82,45 +79,38 @@ class _System:
         self._pot = pot
         parts = list(pot) if hasattr(pot, "__iter__") else [pot]
         self._derivative: Any = None
-        if (
-            galpy.__version__.startswith(KNOWN_IN_C)
-            and integrateFullOrbit._ext_loaded
-            and all(part.hasC for part in parts)
-        ):
+        in_c = galpy.__version__.startswith(KNOWN_IN_C) and all(part.hasC for part in parts)
+        if in_c and integrateFullOrbit._ext_loaded:
             count, kinds, numbers, functions = integrateFullOrbit._parse_pot(parts)
             if not functions:  # of time, in Python
-                self._bind(integrateFullOrbit._lib, count, kinds, numbers)
+                self._bind(integrateFullOrbit._lib, ctypes.c_int(count), kinds, numbers)
 
-    def _bind(self, library: Any, count: int, kinds: np.ndarray, numbers: np.ndarray) -> None:
-        self._room = room = ctypes.create_string_buffer(count * ROOM)
-        library.init_potentialArgs(ctypes.c_int(count), room)
-        places = [ctypes.c_void_p(kinds.ctypes.data), ctypes.c_void_p(numbers.ctypes.data), ctypes.c_void_p()]
-        library.parse_leapFuncArgs_Full(ctypes.c_int(count), room, *map(ctypes.byref, places))
-        weakref.finalize(self, library.free_potentialArgs, ctypes.c_int(count), room)
-        pointer, self._count = ctypes.c_void_p, count
-        self._derivative = ctypes.CFUNCTYPE(None, ctypes.c_double, pointer, pointer, ctypes.c_int, pointer)(
-            ("evalRectDeriv", library)
-        )
+    def _bind(self, library: Any, count: Any, kinds: np.ndarray, numbers: np.ndarray) -> None:
+        pointer, self._count, self._room = ctypes.c_void_p, count, ctypes.create_string_buffer(count.value * ROOM)
+        library.init_potentialArgs(count, self._room)
+        places = pointer(kinds.ctypes.data), pointer(numbers.ctypes.data), pointer()
+        library.parse_leapFuncArgs_Full(count, self._room, *map(ctypes.byref, places))
+        weakref.finalize(self, library.free_potentialArgs, count, self._room)
+        derivative = ctypes.CFUNCTYPE(None, ctypes.c_double, pointer, pointer, ctypes.c_int, pointer)
+        self._derivative = derivative(("evalRectDeriv", library))
 
     def __call__(self, t: float, w: np.ndarray) -> np.ndarray:
         out = np.empty(6)
         if self._derivative is not None:
             self._derivative(t, w.ctypes.data, out.ctypes.data, self._count, self._room)
             return out
-        R, phi, z = np.hypot(w[0], w[1]), np.arctan2(w[1], w[0]), w[2]
-        radial, vertical, torque = (
-            force(self._pot, R, z, phi=phi, t=t, use_physical=False)
-            for force in (evaluateRforces, evaluatezforces, evaluatephitorques)
-        )
-        out[:3], out[5] = w[3:], vertical
+        R, forces = np.hypot(w[0], w[1]), (evaluateRforces, evaluatephitorques, evaluatezforces)
+        radial, torque, out[5] = (self._at(force, t, w) for force in forces)
+        out[:3] = w[3:]
         out[3] = (w[0] * radial - w[1] * torque / R) / R
         out[4] = (w[1] * radial + w[0] * torque / R) / R
         return out
 
     def energy(self, t: float, w: np.ndarray) -> float:
-        at = np.hypot(w[0], w[1]), w[2]
-        value = evaluatePotentials(self._pot, *at, phi=np.arctan2(w[1], w[0]), t=t, use_physical=False)
-        return float(w[3:] @ w[3:] / 2 + value)
+        return float(w[3:] @ w[3:] / 2 + self._at(evaluatePotentials, t, w))
+
+    def _at(self, function: Any, t: float, w: np.ndarray) -> Any:
+        return function(self._pot, np.hypot(w[0], w[1]), w[2], phi=np.arctan2(w[1], w[0]), t=t, use_physical=False)
 
 
 def _rectangular(rows: np.ndarray) -> np.ndarray:

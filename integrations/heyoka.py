@@ -38,8 +38,9 @@ TIME_LIMIT, STEP_LIMIT = heyoka.taylor_outcome.time_limit, heyoka.taylor_outcome
 class ProjectedTaylor:
     """Taylor integrator of heyoka whose state is projected onto invariants after every few steps.
 
-    heyoka makes the steps, with its own step sizes, events and dense output. The projection is one Newton step, which
-    heyoka compiles together with the gradients of the expressions.
+    heyoka makes the steps, with its own events and dense output, and compiles the projection, which is one Newton step.
+    Rows of `propagate_grid` and values of the dense output are projected, too. Dependent gradients reduce the rank. The
+    methods warn with a `ProjectionWarning` if invariant errors are too large to be errors of the steps.
 
     Parameters
     ----------
@@ -48,15 +49,11 @@ class ProjectedTaylor:
     invariants : sequence or mapping of heyoka.expression
         Expressions of the state variables and of the integrator's parameters; a mapping gives them names.
     every : int, optional
-        Number of steps between two projections. A projection takes about as long as 10 steps of a small system; if a
-        step takes more than a few microseconds, a smaller number gives smaller errors at the same cost. Default: 1024
-        if the tolerance of the integrator is at most 1e-12, else 256.
+        Number of steps between two projections, each of which takes about 10 microseconds: if a step takes longer than
+        that, small numbers are better. Default: 1024 if the integrator's tolerance is at most 1e-12, else 256.
 
     Attributes
     ----------
-    integrator : heyoka.taylor_adaptive
-    names : tuple of str
-        Of the invariants.
     targets : ndarray, shape (l,)
         Values that are kept. After you have changed the state of the integrator, assign `values` to it.
     max_residual : ndarray, shape (l,)
@@ -66,18 +63,7 @@ class ProjectedTaylor:
     Raises
     ------
     TypeError, ValueError
-        If the integrator is of another kind, or an invariant has other variables or parameters than it, depends on
-        time, or is not finite.
-
-    Warns
-    -----
-    ProjectionWarning
-        By the methods, if invariant errors are too large to be errors of the steps, or remain after the projection.
-
-    Notes
-    -----
-    Rows of `propagate_grid` and values of the dense output are projected, too. Dependent gradients reduce the rank, as
-    in `eip_scipy.project`. The page :doc:`/how-to/other-packages` has an example.
+        If the integrator is of another kind, or an invariant has other variables, depends on time, or is not finite.
     """
 
     def __init__(self, integrator: Any, invariants: Any, *, every: int | None = None) -> None:
@@ -89,8 +75,7 @@ class ProjectedTaylor:
         every = (1024 if integrator.tol <= 1e-12 else 256) if every is None else every
         self.integrator, self._every = integrator, count("every", every)
         named = _named(invariants, integrator)
-        # Parameters and targets are variables of the compiled functions, because heyoka takes microseconds to look at
-        # parameters.
+        # Parameters and targets are variables of the compiled functions: heyoka takes microseconds to read parameters.
         names, pars = [name for name, _ in integrator.sys], _variables("__par", len(integrator.pars))
         replaced = {heyoka.par[k]: par for k, par in enumerate(pars)}
         self.names, expressions = tuple(named), [heyoka.subs(item, replaced) for item in named.values()]
@@ -107,12 +92,11 @@ class ProjectedTaylor:
         return np.split(self._examined(), 2)[0]
 
     def propagate_until(self, t: float, *, c_output: bool = False, **options: Any) -> tuple[Any, ...]:
-        """Integrate to `t`, as ``heyoka.taylor_adaptive.propagate_until``.
+        """Integrate to `t`, before or after the present time, as ``heyoka.taylor_adaptive.propagate_until``.
 
         Parameters
         ----------
         t : float
-            End, before or after the present time.
         c_output : bool, optional
             Return a dense output, too.
         **options
@@ -121,28 +105,18 @@ class ProjectedTaylor:
         Returns
         -------
         tuple
-            heyoka's: outcome, smallest and largest step, number of steps, the dense output or None, callback. The
+            As by heyoka: outcome, smallest and largest step, number of steps, the dense output or None, callback. The
             dense output, a function of times, stores one state for each projection and integrates again from there.
         """
-        starts = [self._clock()] if c_output else None
+        starts: list[Any] | None = [] if c_output else None
         found = self._run(lambda: self.integrator.propagate_until(t, max_steps=self._every, **options), starts)
-        return (*found[:4], None if starts is None else TaylorOutput(self, starts, self.integrator.dtime), found[5])
+        return (*found[:4], None if starts is None else TaylorOutput(self, starts), found[5])
 
     def propagate_grid(self, grid: Any, **options: Any) -> tuple[Any, ...]:
-        """Integrate over a grid of times, as ``heyoka.taylor_adaptive.propagate_grid``.
+        """Integrate over a grid of times (m,), as ``heyoka.taylor_adaptive.propagate_grid``.
 
-        Parameters
-        ----------
-        grid : array_like, shape (m,)
-            Monotonic times; the first one is the present time.
-        **options
-            As for `propagate_until`.
-
-        Returns
-        -------
-        tuple
-            heyoka's: outcome, smallest and largest step, number of steps, callback, and the states (m, n), fewer if an
-            event or a callback ended the run.
+        Options are those of `propagate_until`. Returns, as by heyoka, outcome, smallest and largest step, number of
+        steps, callback, and the states (m, n), fewer if an event or a callback ended the run.
         """
         grid = np.ascontiguousarray(grid, dtype=float)
         rows = [self.integrator.state[None].copy()]
@@ -171,7 +145,10 @@ class ProjectedTaylor:
         z, out = np.concatenate([state, self._known()]), np.empty(state.size + len(self.names))
         at, projected, residuals = z[: state.size], out[: state.size], out[state.size :]
         largest, steps, least, most = self.max_residual, 0, np.inf, 0.0
-        while True:
+        found: tuple[Any, ...] = (STEP_LIMIT,)
+        while found[0] == STEP_LIMIT:
+            if starts is not None:
+                starts.append((self.integrator.dtime, state.copy()))
             found = advance()
             steps += found[3]
             least, most = min(least, found[1]), max(most, found[2])
@@ -180,15 +157,8 @@ class ProjectedTaylor:
             state[:] = projected
             np.maximum(largest, np.abs(residuals, out=residuals), out=largest)
             self.n_projections += 1
-            if found[0] != STEP_LIMIT:
-                break
-            if starts is not None:
-                starts.append(self._clock())
         self._judge(residuals)
         return (found[0], least, most, steps, *found[4:])
-
-    def _clock(self) -> tuple[tuple[float, float], np.ndarray]:
-        return self.integrator.dtime, self.integrator.state.copy()
 
     def _known(self) -> np.ndarray:
         return np.concatenate([self.integrator.pars, self.targets])
@@ -215,16 +185,14 @@ class ProjectedTaylor:
 class TaylorOutput:
     """Dense output of a run from ``bounds[0]`` to ``bounds[1]``: times and states after the projections."""
 
-    def __init__(self, flow: ProjectedTaylor, starts: Sequence[Any], end: tuple[float, float]) -> None:
+    def __init__(self, flow: ProjectedTaylor, starts: Sequence[Any]) -> None:
         own = flow.integrator
-        self.bounds = float(starts[0][0][0]), float(end[0])
+        self.bounds = float(starts[0][0][0]), float(own.time)
         self._flow, self._starts, self._known = flow, starts, flow._known()
         self._sign = 1.0 if self.bounds[1] >= self.bounds[0] else -1.0
         self._times = np.array([time[0] for time, _ in starts])
-        self._again = heyoka.taylor_adaptive(
-            own.sys, own.state, pars=own.pars, tol=own.tol,
-            high_accuracy=own.high_accuracy, compact_mode=own.compact_mode,
-        )  # fmt: skip
+        alike = {name: getattr(own, name) for name in ("pars", "tol", "high_accuracy", "compact_mode")}
+        self._again = heyoka.taylor_adaptive(own.sys, own.state, **alike)
 
     def __call__(self, t: Any) -> np.ndarray:
         """Return the state (n,) at one time, or states (m, n) at times (m,)."""

@@ -1,8 +1,7 @@
 """qutip: an integrator for `qutip.sesolve` that keeps norm and energy.
 
-The import of this module registers it: ``qutip.sesolve(H, psi0, tlist, options={"method": "eip"})``. qutip (J. R.
-Johansson, P. D. Nation, F. Nori, Computer Physics Communications 183 (2012) 1760-1772) is free software under the BSD
-licence and not distributed with this package; versions from 5.1 are supported.
+The import registers it: ``qutip.sesolve(H, psi0, tlist, options={"method": "eip"})``. qutip (J. R. Johansson, P. D.
+Nation, F. Nori, Computer Physics Communications 183 (2012) 1760-1772) is free software under the BSD licence.
 """
 
 from __future__ import annotations
@@ -29,16 +28,8 @@ class IntegratorEIP(Integrator):
     """Integrator of qutip that keeps the norm and, if the Hamiltonian is constant, its expectation value.
 
     It belongs to ``SESolver`` under the name "eip", for kets and for operators such as propagators, of which the sums
-    over the columns are kept. `options` are ``rtol`` (1e-6), ``atol`` (1e-8), ``first_step`` and ``max_step`` (0: not
-    given), as those of qutip's other adaptive methods.
-
-    Attributes
-    ----------
-    solver_class : type
-        The class that makes the steps, `EIPDOP853`. A subclass with another one is registered by
-        ``qutip.SESolver.add_integrator(Subclass, "name")``.
-    solver : EIPSolver
-        The present solver, whose ``diagnostics`` describe the projections since the state was set.
+    over the columns are kept. ``solver_class`` makes the steps; a subclass with another one than `EIPDOP853` is
+    registered by ``qutip.SESolver.add_integrator(Subclass, "name")``.
 
     Raises
     ------
@@ -58,10 +49,8 @@ class IntegratorEIP(Integrator):
     def options(self) -> dict[str, Any]:
         """Supported options of the method "eip".
 
-        atol : float, default: 1e-8
-            Absolute tolerance.
-        rtol : float, default: 1e-6
-            Relative tolerance.
+        atol, rtol : float, default: 1e-8, 1e-6
+            Absolute and relative tolerance.
         first_step, max_step : float, default: 0
             First and longest step; 0: chosen by the method.
         """  # qutip appends this text to that of the solver's options, and needs it

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.core.inputs import refuse_units
+from eip_scipy.core.inputs import count, refuse_units
 
 try:
     import rebound
@@ -296,7 +296,7 @@ def ias15_steps(
     _set_ias15(sim, "ias15", epsilon, criterion)
     times, states, evaluations = [0.0], [_state(sim)], [0]
 
-    def count(_: Any) -> None:
+    def note(_: Any) -> None:
         evaluations[0] += 1
 
     def look(_: Any) -> None:
@@ -304,7 +304,7 @@ def ias15_steps(
             times.append(sim.t)
             states.append(_state(sim))
 
-    sim.additional_forces = count
+    sim.additional_forces = note
     sim.heartbeat = look
     sim.integrate(t_end, exact_finish_time=1)
     return ReboundSteps(np.array(times), np.array(states).T, evaluations[0])
@@ -338,7 +338,7 @@ def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
     if (n_steps is None) == (t_end is None):
         raise ValueError("give either n_steps or t_end")
     if t_end is None:
-        return _check_count(n_steps, "n_steps")
+        return count("n_steps", n_steps)
     if not (t_end > 0 and math.isfinite(t_end)):
         raise ValueError(f"t_end must be positive and finite, got {t_end!r}")
     n_steps = round(t_end / h)
@@ -351,14 +351,8 @@ def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
     return n_steps
 
 
-def _check_count(value: Any, name: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} must be a positive integer, got {value!r}")
-    return int(value)
-
-
 def _saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:
-    every = n_steps if save_every is None else _check_count(save_every, "save_every")
+    every = n_steps if save_every is None else count("save_every", save_every)
     return np.unique(np.append(np.arange(0, n_steps, every), n_steps))
 
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("galpy", reason='needs galpy: pip install "eip_scipy[galpy]"')
+galpy = pytest.importorskip("galpy", reason='needs galpy: pip install "eip_scipy[galpy]"')
 
-from astropy import units as u
-from galpy.orbit import Orbit
-from galpy.potential import MWPotential2014, SoftenedNeedleBarPotential, evaluatePotentials
+from astropy import units as u  # noqa: E402
+from galpy.orbit import Orbit  # noqa: E402
+from galpy.potential import MWPotential2014, SoftenedNeedleBarPotential, evaluatePotentials  # noqa: E402
 
-from eip_scipy.integrations.galpy import _System, integrate
+from eip_scipy.integrations.galpy import KNOWN_IN_C, _System, integrate  # noqa: E402
 
 START = [1.0, 0.1, 1.1, 0.1, 0.05, 0.3]
 BAR = MWPotential2014 + SoftenedNeedleBarPotential(amp=0.3, a=0.5, b=0.1, c=0.1, omegab=1.3)
@@ -52,7 +52,7 @@ def test_the_orbit_is_galpys():
 def test_forces_of_python_are_those_of_c():
     rng = np.random.default_rng(2)
     system, again = _System(MWPotential2014), _System(MWPotential2014)
-    assert again._derivative is not None
+    assert again._derivative is not None or not galpy.__version__.startswith(KNOWN_IN_C)
     again._derivative = None
     for w in rng.uniform(-1, 1, size=(5, 6)):
         assert np.allclose(system(0.0, w), again(0.0, w), rtol=1e-13)

@@ -180,13 +180,13 @@ def test_simulation_holds_our_state_at_rest():
         ({"y0": DATA.y0[:-1]}, r"shape \(60,\), got \(59,\)"),
         ({"h": 0.0}, "h must be positive"),
         ({"h": -1.0}, "h must be positive"),
-        ({"n_steps": 0}, "n_steps must be a positive integer"),
-        ({"n_steps": 1.0}, "n_steps must be a positive integer"),
+        ({"n_steps": 0}, "n_steps must be an integer >= 1"),
+        ({"n_steps": 1.0}, "n_steps must be an integer >= 1"),
         ({"n_steps": None}, "either n_steps or t_end"),
         ({"t_end": 1.0}, "either n_steps or t_end"),
         ({"n_steps": None, "t_end": -1.0}, "t_end must be positive"),
         ({"n_steps": None, "t_end": 10.5}, "whole number"),
-        ({"save_every": 0}, "save_every must be a positive integer"),
+        ({"save_every": 0}, "save_every must be an integer >= 1"),
     ],
 )
 def test_bad_input_is_named(changes, message):
