@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import Invariant, integrate
+from eip_scipy import EIPDOP853, Invariant, integrate
 
 # A rate of change along the flow, which is computed by a difference, is zero up to this fraction of its terms.
 RATE = 1e-6
@@ -19,14 +19,15 @@ def run_orbits(
     """Integrate the states (q, p) of `starts` (orbits, 2 n); return the states (orbits, m, 2 n) at `times` (m,).
 
     ``system(t, w)`` is the derivative (dH/dp, -dH/dq), and ``system.energy(t, w)`` is H. Without `options` for them,
-    tolerances are 1e-10, and the invariants those of `kept_invariants`.
+    the method is `EIPDOP853`, tolerances are 1e-10, and the invariants those of `kept_invariants`.
 
     Raises
     ------
     RuntimeError
         If a run does not reach its end.
     """
-    options = ({} if "h" in options else {"rtol": 1e-10, "atol": 1e-10}) | options
+    starts = np.ascontiguousarray(starts)
+    options = {"method": EIPDOP853} | ({} if "h" in options else {"rtol": 1e-10, "atol": 1e-10}) | options
     if "invariants" not in options:
         options["invariants"] = kept_invariants(system, starts[0], times, pattern_speed)
     rows = np.empty((len(starts), times.size, starts.shape[1]))
@@ -63,15 +64,13 @@ def kept_invariants(system: Any, w: np.ndarray, times: np.ndarray, pattern_speed
     found: list[tuple[str, Any, Any]] = [("Jacobi" if pattern_speed else "energy", energy, energy_gradient)]
     if n > 1:
         found.append(("L_z", momentum, momentum_gradient))
-    rng = np.random.default_rng(1)
+    rng, distance = np.random.default_rng(1), np.linalg.norm(w[:n]) or 1.0
+    speed = np.linalg.norm(w[n:]) + (distance * np.linalg.norm(system(times[0], w)[n:])) ** 0.5
+    apart = 1e-5 * distance / speed
     for _ in range(STATES):
         t = times[0] + rng.random() * (times[-1] - times[0])
-        turns = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
-        y = np.concatenate([turn @ part for turn, part in zip(turns, (w[:n], w[n:]), strict=True)])
-        y *= np.repeat(rng.uniform(0.5, 1.5, size=2), n)
+        y = np.concatenate([size * rng.normal(size=n) / n**0.5 for size in (distance, speed)])
         f = system(t, y)
-        q, p, a = np.linalg.norm(y[:n]) or 1.0, np.linalg.norm(y[n:]), np.linalg.norm(f[n:])
-        apart = 1e-4 / (p / q + (a / q) ** 0.5)
         changes = [fun(t + apart, y + apart * f) - fun(t - apart, y - apart * f) for _, fun, _ in found]
         sizes = [2 * apart * np.abs(grad(t, y, f) * f).sum() for _, _, grad in found]
         found = [x for x, change, size in zip(found, changes, sizes, strict=True) if abs(change) <= RATE * size]

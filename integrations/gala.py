@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import EIPDOP853
-
 from ._orbits import run_orbits
 
 try:
@@ -55,7 +53,7 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
     units = system.hamiltonian.units
     start = w0 if isinstance(w0, PhaseSpacePosition) else PhaseSpacePosition.from_w(np.asarray(w0, dtype=float), units)
     times = parse_time_specification(units, **time_spec)
-    rows = run_orbits(system, start.w(units).T, times, {"method": EIPDOP853} | (options or {}))
+    rows = run_orbits(system, start.w(units).T, times, options or {})
     w = rows.T if start.shape else rows[0].T
     return Orbit.from_w(w, units=units, t=times * units["time"], hamiltonian=system.hamiltonian)
 

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import EIPDOP853
-
 from ._orbits import run_orbits
 
 try:
@@ -51,7 +49,7 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
     pattern_speed : float, optional
         Angular velocity, in galpy's units, of a potential that rotates about the z axis: Jacobi's integral is kept.
     **options
-        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol``, ``atol`` 1e-10 and these invariants.
+        Options of `eip_scipy.integrate`. Defaults: `EIPDOP853`, ``rtol`` and ``atol`` 1e-10, these invariants.
 
     Raises
     ------
@@ -64,7 +62,6 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
         raise ValueError(f"orbit has {orbit.dim()} dimensions; expected 3. Give an Orbit of [R, vR, vT, z, vz, phi].")
     times = np.asarray(conversion.parse_time(t, ro=orbit._ro, vo=orbit._vo), dtype=float)
     starts = orbit.vxvv if orbit.phasedim() == 6 else np.pad(orbit.vxvv, ((0, 0), (0, 1)))
-    options = {"method": EIPDOP853} | options
     rows = _cylindrical(run_orbits(_System(pot), _rectangular(starts), times, options, pattern_speed))
     vars(orbit).pop("_orbInterp", None)
     orbit.t, orbit._integrate_t_asQuantity = times, hasattr(t, "unit")
