@@ -1,7 +1,7 @@
 """heyoka: its Taylor integrator with the projection onto invariants.
 
 heyoka (F. Biscani, D. Izzo, MNRAS 504 (2021) 2614-2628) is free software under the MPL and not distributed with this
-package; version 7 is tested.
+package; versions from 7.10 are tested.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ def _named(invariants: Any, integrator: Any) -> dict[str, Any]:
     """Return the expressions by name, checked."""
     if not isinstance(invariants, Mapping):
         invariants = {f"invariant {k}": item for k, item in enumerate(invariants)}
-    named = {str(name): heyoka.expression(item) for name, item in invariants.items()}
+    named = {str(name): item for name, item in invariants.items()}
     if not named:
         raise ValueError("ProjectedTaylor: expected at least one invariant; without any, use heyoka's integrator.")
     known = {str(name) for name, _ in integrator.sys}

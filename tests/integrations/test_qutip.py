@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-qutip = pytest.importorskip("qutip", minversion="5.1", reason='needs qutip: pip install "eip_scipy[qutip]"')
+qutip = pytest.importorskip("qutip", minversion="5.1.1", reason='needs qutip: pip install "eip_scipy[qutip]"')
 
 from eip_scipy import EIPRK45  # noqa: E402
 from eip_scipy.integrations.qutip import IntegratorEIP  # noqa: E402
