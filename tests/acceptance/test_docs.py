@@ -118,5 +118,5 @@ def test_notebooks_are_listed():
         text = notebook.read_text(encoding="utf-8")
         assert text.startswith("---\njupytext:\n")
         title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
-        assert f"| [{title}]({notebook.stem}): `{notebook.name}` |" in page
+        assert f"| [{title}]({notebook.stem}) |" in page
         assert f"\n{notebook.stem}\n" in page
