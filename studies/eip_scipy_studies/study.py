@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 # Packages whose comparison is not among the integrations.
-PEERS = {"heyoka": "eip_scipy_studies.comparators.heyoka"}
+PEERS = {"heyoka": "eip_scipy_studies.heyoka_runs"}
 
 Found = TypeVar("Found")
 Rows = Sequence[Mapping[str, Any]]

@@ -46,13 +46,13 @@ def test_the_frontier_names_errors_and_times(two_methods, tmp_path, capsys):
     assert (tmp_path / "frontier.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("name", ["eip_scipy.integrations.rebound", "eip_scipy_studies.comparators.heyoka"])
+@pytest.mark.parametrize("name", ["eip_scipy.integrations.rebound", "eip_scipy_studies.heyoka_runs"])
 def test_a_missing_peer_is_told_at_the_end(name, two_methods, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
     assert main(["solar-system", "frontier", "--years", "1", "--out", str(tmp_path)]) == 0
     captured = capsys.readouterr()
     assert any(
-        line.startswith("eip-scipy: no comparison with") and name.rpartition(".")[2] in line
+        line.startswith("eip-scipy: no comparison with") and name.rpartition(".")[2].removesuffix("_runs") in line
         for line in captured.err.splitlines()
     )
 
@@ -101,7 +101,7 @@ def test_peers_of_the_frontier_are_called():
 
 
 def test_heyoka_on_our_states():
-    heyoka = pytest.importorskip("eip_scipy_studies.comparators.heyoka", exc_type=ImportError)
+    heyoka = pytest.importorskip("eip_scipy_studies.heyoka_runs", exc_type=ImportError)
     problem = solar_system(years=1.0)
     result = heyoka.run(problem.params, problem.y0, t_end=1.0)
     assert np.linalg.norm((result.y - problem.reference(1.0))[:30].reshape(10, 3), axis=1).max() < 1e-12
@@ -111,14 +111,14 @@ def test_heyoka_on_our_states():
 
 @pytest.mark.parametrize(("y0", "options"), [(np.zeros(11), {"t_end": 1.0}), (np.zeros(12), {"t_end": -1.0})])
 def test_heyoka_refuses(y0, options):
-    heyoka = pytest.importorskip("eip_scipy_studies.comparators.heyoka", exc_type=ImportError)
+    heyoka = pytest.importorskip("eip_scipy_studies.heyoka_runs", exc_type=ImportError)
     with pytest.raises(ValueError, match=r"shape|positive"):
         heyoka.run(np.ones(2), y0, **options)
 
 
 def test_heyoka_says_where_it_stopped():
     """Two bodies fall into each other, which stops heyoka."""
-    heyoka = pytest.importorskip("eip_scipy_studies.comparators.heyoka", exc_type=ImportError)
+    heyoka = pytest.importorskip("eip_scipy_studies.heyoka_runs", exc_type=ImportError)
     problem = nbody([1.0, 1.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]], t_span=(0, 3))
     with pytest.raises(ValueError, match="heyoka stopped at"):
         heyoka.run(problem.params, problem.y0, t_end=3.0)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 try:
-    import heyoka
+    heyoka: Any = import_module("heyoka")
 except ModuleNotFoundError as error:
     raise ImportError(
         'the comparison with heyoka needs heyoka: pip install "eip_scipy[heyoka]"', name="heyoka"
