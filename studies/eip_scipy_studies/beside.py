@@ -1,4 +1,4 @@
-"""Other processes that work in parallel to a command: a single one, or as many as there are cores."""
+"""Processes that work in parallel to a command: a single one, or one for each core."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands: location and purpose, by their words; exit statuses. Quick to import, for ``--help``."""
+"""The commands by name, with location and purpose, and exit statuses. The import is quick, for ``--help``."""
 
 from __future__ import annotations
 

@@ -337,7 +337,7 @@ def pendulum() -> CaseEquations:
 
 
 def duffing() -> CaseEquations:
-    """The equation x'' = x - x^3; energy."""
+    """Return the equation x'' = x - x^3; energy."""
 
     def values(t, y):
         q, p = y

@@ -71,7 +71,7 @@ def henon_heiles(sqrt: Any) -> Functions:
 
 
 def rigid_body(sqrt: Any) -> Functions:
-    """A free top with moments of inertia 2, 1, 2/3; Casimir, energy."""
+    """Return a free top with moments of inertia 2, 1, 2/3; Casimir, energy."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         return 0.5 * y[1] * y[2], -y[2] * y[0], 0.5 * y[0] * y[1]
@@ -87,7 +87,7 @@ def rigid_body(sqrt: Any) -> Functions:
 
 
 def particle(sqrt: Any) -> Functions:
-    """A charge in B = r e_z and the potential 0.01 / r; energy, canonical angular momentum."""
+    """Return a charge in B = r e_z and the potential 0.01 / r; energy, canonical angular momentum."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         r2 = y[0] * y[0] + y[1] * y[1]

@@ -154,12 +154,12 @@ def solar() -> list[dict[str, Any]]:
 
 
 def particle() -> list[dict[str, Any]]:
-    """A charge in a plane."""
+    """Return a charge in a plane."""
     return [_case("boris_2d", "charged particle", "particle")]
 
 
 def field() -> list[dict[str, Any]]:
-    """A soliton on a ring, so wide and finely resolved that the closed form is that of the grid to 1e-10."""
+    """Return a soliton on a ring, so wide and finely resolved that the closed form is that of the grid to 1e-10."""
     problem = soliton(points=256, length=50.0, t_end=2.0)
     assert problem.reference is not None
     return [_record("NLS soliton", "nls", problem.y0, problem.reference(2.0), 2.0, length=50.0)]
@@ -229,7 +229,7 @@ def _described() -> tuple[Suite, ...]:
 
 
 def cheap() -> list[dict[str, Any]]:
-    """A rigid body: three components, three products each."""
+    """Return a rigid body: three components, three products each."""
     return [record for record in kepler() if record["title"] == "rigid body, t = 1000"]
 
 

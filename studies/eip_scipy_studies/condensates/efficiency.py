@@ -206,7 +206,7 @@ class Slope(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Return whether they agree."""
+        """Return True if the measured value agrees with the expected one."""
         return abs(self.ours - self.known) <= self.slack
 
 

@@ -107,7 +107,7 @@ def _ratio(a: float, b: float) -> float:
 
 
 def adaptive_methods() -> dict[str, type[EIPSolver]]:
-    """Find the solver classes with adaptive steps, for systems of the first order."""
+    """Return the solver classes with adaptive steps for systems of the first order."""
     return {
         name: method
         for name, method in fixed_step_methods().items()
@@ -179,7 +179,7 @@ def compare(
     metric: str,
     callback: Callable[[], Any] = lambda: None,
 ) -> list[Comparison]:
-    """Run cases with and without projection; those that get worse at neighbouring tolerances, too.
+    """Run cases with and without projection, and cases with a larger error also at neighbouring tolerances.
 
     Parameters
     ----------

@@ -141,7 +141,7 @@ def laplace_loss(t, y, c):
 
 
 def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[str, Any] | None = None) -> Any:
-    """Return a maker of a planet with e = 0.2 and this drag."""
+    """Return a function that makes the case of a planet with e = 0.2 and this drag."""
     energy = Balance(kepler_energy, energy_loss, name="E")
     others = [Balance(spin, spin_loss, name="h"), Balance(laplace, laplace_loss, name="e")]
     sets = {"E": energy, "E, h, e": [energy, *others]}
@@ -160,7 +160,7 @@ def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[st
 
 
 def leo(days: float) -> Any:
-    """Return a maker of this satellite."""
+    """Return a function that makes the case of a satellite in a low orbit."""
     a, e, tilt = EARTH["radius"] + 420, 2e-3, math.radians(51.6)
     speed = math.sqrt(EARTH["mu"] / a * (1 + e) / (1 - e))
     start = np.array([[a * (1 - e), 0, 0], [0, speed * math.cos(tilt), speed * math.sin(tilt)]])
@@ -185,7 +185,7 @@ def bodies(
     names: tuple[str, ...], years: float, h: float, finer: int, data: str = "de440", relativity: bool = False,
     wrong: bool = False,
 ) -> Any:  # fmt: skip
-    """Return a maker of some bodies of DE440; the error is the largest of all but the Sun's."""
+    """Return a function that makes the case of some bodies of DE440; the Sun's error does not count."""
     known = load(data)
     places = [list(known.bodies).index(name) for name in names]
     gm = known.gm[places] * YEAR_D**2
@@ -210,7 +210,7 @@ def bodies(
 
 
 def asteroid(turned: np.ndarray, turn: int) -> Case:
-    """An asteroid with a = 3.7 AU and e = 0.1 inside of Jupiter, for 2000 years (281 revolutions)."""
+    """Return an asteroid with a = 3.7 AU and e = 0.1 inside of Jupiter, for 2000 years (281 revolutions)."""
     sun, gm = 4 * math.pi**2, np.array([4 * math.pi**2, 4 * math.pi**2 / 1047.35, 0.0])
     q = np.array([[0, 0, 0], [0, 5.2 * 0.95, 0], [3.7 * 0.9, 0, 0]])
     speeds = math.sqrt((sun + gm[1]) / 5.2 * 1.05 / 0.95), math.sqrt(sun / 3.7 * 1.1 / 0.9)
@@ -223,7 +223,7 @@ def asteroid(turned: np.ndarray, turn: int) -> Case:
 
 @njit
 def about_the_first(t, y, p):
-    """Energy of the third of three bodies about the first."""
+    """Return the energy of the third of three bodies about the first."""
     r = np.sqrt((y[6] - y[0]) ** 2 + (y[7] - y[1]) ** 2 + (y[8] - y[2]) ** 2)
     v2 = (y[15] - y[9]) ** 2 + (y[16] - y[10]) ** 2 + (y[17] - y[11]) ** 2
     return 0.5 * v2 - (p[0] + p[2]) / r
@@ -231,7 +231,7 @@ def about_the_first(t, y, p):
 
 @njit
 def rate_about_the_first(t, y, p):
-    """Return the rate, by the pulls of the second body on the third and on the first."""
+    """Return the rate of `about_the_first`, from the pulls of the second body on the third and on the first."""
     near = ((y[6] - y[3]) ** 2 + (y[7] - y[4]) ** 2 + (y[8] - y[5]) ** 2) ** 1.5
     far = ((y[0] - y[3]) ** 2 + (y[1] - y[4]) ** 2 + (y[2] - y[5]) ** 2) ** 1.5
     rate = 0.0
@@ -241,7 +241,7 @@ def rate_about_the_first(t, y, p):
 
 
 def encounter(turned: np.ndarray, turn: int) -> Case:
-    """An asteroid that passes the Earth at 5e-4 AU with 10 km/s after a year, and continues for another; rtol 1e-9."""
+    """Return an asteroid that passes the Earth at 5e-4 AU with 10 km/s after the first of two years; rtol 1e-9."""
     gm = 4 * math.pi**2 * np.array([1, 3.003e-6, 0])
     earth, speed = np.array([1.0, 0, 0]), math.sqrt(gm[0] + gm[1])
     q = np.array([[0, 0, 0], earth, earth + [5e-4, 0, 0]])
@@ -301,7 +301,7 @@ def electric_power(t, y, a, b, c, omega):
 
 
 def particle(turned: np.ndarray, turn: int) -> Case:
-    """500 gyrations with 16 steps each."""
+    """Return the case of a charged particle over 500 gyrations with 16 steps each."""
     y0 = np.concatenate([turned @ [1.0, 0, 0], turned @ [0, 0.5, 0.25]])
     run = runner(
         fun=charge, t_span=(0, 500 * TURN), y0=y0, args=(*turned[:, 2].tolist(), 0.01)
@@ -363,7 +363,7 @@ def held(turned: np.ndarray, turn: int) -> Case:
 
 
 def condensate(turned: np.ndarray, turn: int) -> Case:
-    """A packet in a trap, with losses and Pitaevskii's damping, by RK4; it starts at several places."""
+    """Return a packet in a trap, with losses and Pitaevskii's damping, by RK4; it starts at several places."""
     grid = Grid(48, -8, 8)
     equation = DampedGrossPitaevskii(grid, harmonic_trap(1), beta=10.0, damping=1e-4, chemical_potential=3.0, loss=1e-4)
     packet = np.exp(-((grid.points(0) - 1 - 0.05 * turn) ** 2) / 4)
@@ -374,7 +374,7 @@ def condensate(turned: np.ndarray, turn: int) -> Case:
 
 
 def wave(turned: np.ndarray, turn: int) -> Case:
-    """The breather of the sine-Gordon equation, with damping 1e-4."""
+    """Return the breather of the sine-Gordon equation, with damping 1e-4."""
     scene = sine_gordon_breather(frequency=0.5 + 0.05 * turn)
     equation, n = SineGordon(Grid(512, -40, 40), damping=1e-4), scene.y0.size // 2
     problem = equation.problem(scene.y0[:n], scene.y0[n:], 200.0)
@@ -401,7 +401,7 @@ def swing_power(t, y, a, b, c, d, w, phase):
 
 
 def oscillator(a: float, b: float, c: float, d: float, w: float, end: float, h: float = 0.4) -> Any:
-    """Return a maker of an oscillator; the error is that of (x, v)."""
+    """Return a function that makes the case of an oscillator; the error is that of (x, v)."""
 
     def make(turned: np.ndarray, turn: int) -> Case:
         run = runner(fun=swinging, t_span=(0, end), y0=[1.0, 0.3], args=(a, b, c, d, w, float(turn)))
@@ -439,7 +439,7 @@ def partial_power(t, y, c):
 
 
 def chaos(turned: np.ndarray, turn: int) -> Case:
-    """Energy 1/7, from several starts."""
+    """Return a chaotic orbit of Hénon and Heiles with the energy 1/7, from several starts."""
     y = 0.05 * turn - 0.1
     speed = math.sqrt(2 * (1 / 7 - 0.5 * y * y + y**3 / 3))
     run = runner(fun=henon, t_span=(0, 200), y0=[0, y, speed * 0.96, speed * 0.28], args=(1e-5,))
@@ -489,17 +489,17 @@ SYSTEMS = {
 
 
 def runner(**start: Any) -> Callable[..., Any]:
-    """Return ``run(**options)`` of a start."""
+    """Return ``run(**options)``, which integrates from a start."""
     return lambda **options: integrate(method=EIPDOP853, **start, **options)
 
 
 def of(problem: Any, method: Any = EIPDOP853) -> Callable[..., Any]:
-    """Return ``run(**options)`` of a problem."""
+    """Return ``run(**options)``, which integrates a problem."""
     return lambda **options: integrate(problem, method=method, **options)
 
 
 class Row(NamedTuple):
-    """Errors of one set of balances in one rotation, and what the run said."""
+    """Errors of one set of balances in one rotation, and the warnings of the run."""
 
     system: str
     kept: str
@@ -530,7 +530,7 @@ def finer_steps(case: Case, share: float = 1.0) -> dict[str, Any]:
 
 
 def distance(case: Case, a: np.ndarray, b: np.ndarray) -> Any:
-    """Return the largest error of the vectors that count."""
+    """Return the largest error of the vectors at `places`."""
     return np.max([np.linalg.norm((a - b)[part], axis=0) for part in case.places], axis=0)
 
 
@@ -645,7 +645,7 @@ def grouped(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def summary(rows: list[Row]) -> dict[str, float]:
-    """Return medians of the errors and the gain, and the largest of the rest."""
+    """Return medians of the errors and the gain, and the largest values of the other columns."""
     return {
         "without": float(np.median([row.without for row in rows])),
         "with": float(np.median([row.with_balances for row in rows])),
@@ -658,7 +658,7 @@ def summary(rows: list[Row]) -> dict[str, float]:
 
 
 def bars(groups: Mapping[tuple[str, str], list[Row]]) -> list[str]:
-    """Return the conditions that do not hold: too little gained, worse, or worse without a warning."""
+    """Return the conditions that do not hold: too small a gain, a larger error, or one without a warning."""
     lines = []
     for (name, kept), rows in groups.items():
         system, one = SYSTEMS[name], summary(rows)

@@ -106,7 +106,7 @@ def counts():
 
 
 def compare(shape, seconds):
-    """Rows {ranks: (f, step of RK4, step of EIP-ME in ms, relative errors of f and of the state)}, on rank 0."""
+    """Return rows {ranks: (f, step of RK4, step of EIP-ME in ms, relative errors of f and of the state)}, on rank 0."""
     cases = {ranks: Case(shape, ranks) for ranks in counts()}
     results = {}
     for ranks, case in cases.items():

@@ -121,7 +121,7 @@ def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Ou
 
 
 def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """The field of (q, v) with unit masses, and its energy v^2/2 + U(q); `slope(q, out)` is grad U."""
+    """Return the field of (q, v) with unit masses, and its energy v^2/2 + U(q); `slope(q, out)` is grad U."""
 
     @njit
     def fun(t, y, out):
@@ -286,7 +286,7 @@ def round_wall(power: int) -> Case:
 
 
 def ball(stiffness: float) -> Case:
-    """A ball that bounces on a Hertz contact under gravity."""
+    """Return a ball that bounces on a Hertz contact under gravity."""
 
     @njit
     def energy(q):
@@ -301,7 +301,7 @@ def ball(stiffness: float) -> Case:
 
 
 def beads(count: int) -> Case:
-    """A chain of beads in Hertz contact, the first one struck; it ends in soft walls."""
+    """Return a chain of beads in Hertz contact, the first one struck; it ends in soft walls."""
 
     @njit
     def energy(q):
@@ -369,7 +369,7 @@ CHARGE, MASSES = 1.602176634e-19, {"electron": 9.1093837e-31, "proton": 1.672621
 
 
 def magnetic(name: str, momenta: bool) -> Case:
-    """A particle in SI units in a uniform field of 1 T and a Penning trap's potential, in (x, p) or (x, v)."""
+    """Return a particle in SI units in a uniform field of 1 T and a Penning trap's potential, in (x, p) or (x, v)."""
     mass = MASSES[name]
     charge, field_, size = CHARGE, 1.0, 1e-3
     cyclotron = charge * field_ / mass
@@ -409,7 +409,7 @@ def magnetic(name: str, momenta: bool) -> Case:
 
 
 def trap(name: str, exponent: int) -> Case:
-    """A particle in SI units on a line, (x, p), in a trap whose potential grows as x^2 or x^4."""
+    """Return a particle in SI units on a line, (x, p), in a trap whose potential grows as x^2 or x^4."""
     mass, size = MASSES[name], 1e-3
     frequency = 0.1 * CHARGE / mass
     strength = mass * frequency**2 * size ** (2 - exponent)
@@ -437,7 +437,7 @@ def trap(name: str, exponent: int) -> Case:
 def constrained(
     mass: Callable[..., Any], forces: Callable[..., Any], jacobian: Callable[..., Any], bias: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """The field of (q, u), q' = u, with M u' + G^T l = F and G u' = -bias."""
+    """Return the field of (q, u), q' = u, with M u' + G^T l = F and G u' = -bias."""
 
     def fun(t: float, y: np.ndarray) -> np.ndarray:
         n = y.size // 2
@@ -455,7 +455,7 @@ def constrained(
 def levels(
     constraints: Callable[..., Any], jacobian: Callable[..., Any], rates: Callable[..., Any], count: int
 ) -> tuple[Invariant, ...]:
-    """The constraints on positions and on velocities; rates(q, u) is the derivative of G u by q."""
+    """Return the constraints on positions and on velocities; rates(q, u) is the derivative of G u by q."""
 
     def places(t: float, y: np.ndarray) -> np.ndarray:
         return constraints(y[: y.size // 2])
@@ -479,7 +479,7 @@ def levels(
 
 
 def pendulum(links: int) -> tuple[Case, Case]:
-    """A chain of rods without mass in Cartesian coordinates, lengths kept; with and without the energy."""
+    """Return a chain of rods without mass in Cartesian coordinates, lengths kept; with and without the energy."""
     n = 2 * links
 
     def differences(q: np.ndarray) -> np.ndarray:
@@ -527,7 +527,7 @@ def _with_energy(
 
 
 def knife_edge() -> tuple[Case, Case]:
-    """A knife edge on an inclined plane (Chaplygin's sleigh at its centre): x, y, angle; non-holonomic."""
+    """Return a knife edge on an inclined plane (Chaplygin's sleigh at its centre): x, y, angle; non-holonomic."""
 
     def jacobian(q: np.ndarray) -> np.ndarray:
         return np.array([[-np.sin(q[2]), np.cos(q[2]), 0.0]])
@@ -695,7 +695,7 @@ DISC = 1.0, 1.0, 9.81, 0.25, 0.5  # mass, radius, gravity, moments of inertia ab
 
 
 def disc_mechanics() -> tuple[Callable[..., Any], ...]:
-    """Return mass matrix, forces, constraints' matrix and its change for `disc`, as functions of (q[, u])."""
+    """Return the mass matrix, forces, constraints' matrix and its change for `disc`, as functions of (q[, u])."""
     mass, radius, gravity, flat, axial = DISC
 
     # q = (x, y, a, b, c) of the point of contact's track; velocity of the centre: that of (x, y, radius sin b).

@@ -60,7 +60,7 @@ class System(NamedTuple):
 
 
 def by_reference(problem: Problem, size: float = 1.0) -> System:
-    """Make a system of a problem that knows its last state; errors of the positions in units of `size`."""
+    """Make a system from a problem whose last state is known; errors of positions are in units of `size`."""
 
     def error(y: np.ndarray) -> float:
         assert problem.reference is not None

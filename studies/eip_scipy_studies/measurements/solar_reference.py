@@ -190,7 +190,7 @@ class SolarReference(Study[Found]):
         return "\n".join(lines)
 
     def figures(self, found: Found) -> Figures:
-        """Write the file of the states: a file that is not CSV is written as figures are."""
+        """Yield the file of the states. It is written with the figures, because tables are CSV files."""
         about = (
             "Newtonian ten-body solar system from the state of problems.solar_system() in AU and Julian years: all "
             "positions [AU], then all velocities [AU/yr], by time in Julian years; Gauss-Jackson of order 14 in 80 "

@@ -77,7 +77,7 @@ class Chaotic(NamedTuple):
     share: float
 
     def problem(self) -> Any:
-        """Return it as a problem."""
+        """Return the system as a problem."""
         pair = (None, None) if "px" in self.text else ("a b", "p r")
         return hamiltonian(self.text, *pair)
 

@@ -195,7 +195,7 @@ def car_axis() -> MechanicsProblem:
 
 
 def _right_wheel(t: Any) -> np.ndarray:
-    """Return where the right wheel is, at a distance of 1 from the left one."""
+    """Return the position of the right wheel, at a distance of 1 from the left one."""
     height = BUMP * np.sin(BUMPS * t)
     return np.array([np.sqrt(1 - height**2), height])
 
@@ -209,7 +209,7 @@ def _car_forces(t: Any, q: Any, u: Any) -> np.ndarray:
 
 
 def _car_constraints(t: Any, q: Any) -> np.ndarray:
-    """The left spring is perpendicular to the line between the wheels, and the axis has the length 1."""
+    """Return the residuals of the constraints: the left spring is perpendicular to the axis, which has the length 1."""
     axis = q[:2] - q[2:]
     return np.array([q[:2] @ _right_wheel(t), axis @ axis - 1])
 

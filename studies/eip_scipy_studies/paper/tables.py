@@ -83,7 +83,7 @@ class Value:
 
     @property
     def within_roundoff(self) -> bool:
-        """Return whether ours is within round-off of a number that the paper prints so, or of the number in 50 digits.
+        """Return True if our number is within round-off of the paper's number, or of the number in 50 digits.
 
         In the second case the round-off is the paper's.
         """
@@ -209,7 +209,7 @@ def _cells(series: Series, errors: list[float]) -> list[Cell]:
 
 
 def _orders(series: Series, errors: list[float], exact: list[float], roundoff: float) -> list[Value | None]:
-    """Return the order at each step but the first; round-off in two errors changes it in proportion to their size."""
+    """Return the order at each step except the first, and how much round-off in the two errors may change it."""
     refinement = -np.diff(np.log(series.steps))
     observed, expected = (-np.diff(np.log(np.abs(values))) / refinement for values in (errors, exact))
     relative = roundoff / np.where(np.isnan(exact), errors, exact)
@@ -320,7 +320,7 @@ _ERRORS = {1: _multiplier_errors, 2: _last_defects, 3: _differences, 4: _last_de
 
 
 def passed(cells: Iterable[Cell]) -> bool:
-    """Return whether no number differs by more than round-off."""
+    """Return True if no number differs by more than round-off."""
     return all(value.status != "differs" for cell in cells for value in (cell.error, cell.order) if value is not None)
 
 

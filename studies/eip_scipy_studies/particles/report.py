@@ -36,7 +36,7 @@ class RangeCheck(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Return whether it does; nan does not."""
+        """Return True if the number lies between the bounds; nan does not."""
         return self.low <= self.value <= self.high
 
     @property

@@ -48,7 +48,7 @@ class SolarRuns:
     """Name of the run that another core did in parallel; empty if all runs were done one after the other."""
 
     def errors(self, year: float) -> dict[str, PointErrors]:
-        """Return errors of the runs at a time, if they are known."""
+        """Return the errors of the runs at a time, if they are known."""
         found = {run.name: errors_at(self.scene, run, year, self.tight) for run in self.runs}
         return {name: errors for name, errors in found.items() if errors is not None}
 
@@ -67,7 +67,7 @@ def ecliptic(scene: SolarScene, vectors: np.ndarray) -> np.ndarray:
 
 
 def longitude_errors(scene: SolarScene, run: MethodRun, truth: MethodRun) -> np.ndarray:
-    """Errors of the heliocentric ecliptic longitude along a run, with whole turns counted.
+    """Return the errors of the heliocentric ecliptic longitude along a run, with whole turns counted.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
 
 
 def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None) -> PointErrors | None:
-    """Return errors of a run at one of the `report_times`.
+    """Return the errors of a run at one of the `report_times`.
 
     Parameters
     ----------

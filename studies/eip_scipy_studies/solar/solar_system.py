@@ -113,7 +113,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         runs.tight = runs.runs[-1]
 
     def refine(self, found: Found, session: Session) -> bool:
-        """Time several methods and steps, while the second process draws."""
+        """Measure the times of several methods and steps, while the second process draws."""
         runs = found.runs
         if found.beside is not None:
             found.beside.start(partial(images, runs, BESIDE_FIGURES))

@@ -138,7 +138,7 @@ def pyrolysis() -> Case:
 
 
 def enzyme() -> Case:
-    """The reaction of Michaelis and Menten with fast binding; enzyme and substrate."""
+    """Return the reaction of Michaelis and Menten with fast binding; enzyme and substrate."""
 
     def fun(t: float, y: Array) -> Array:
         binding, back, made = 1e6 * y[0] * y[1], 1e3 * y[2], 1e1 * y[2]
@@ -160,7 +160,7 @@ def ozone() -> Case:
 
 
 def magnet() -> Case:
-    """A magnetic moment with strong damping after Landau and Lifshitz in a field that turns; its length."""
+    """Return a magnetic moment with strong damping after Landau and Lifshitz in a field that turns; its length."""
 
     def fun(t: float, m: Array) -> Array:
         field_ = 1e3 * np.array([np.cos(t), np.sin(t), 0.5]) + 1e3 * np.array([0.0, 0.0, m[2]])
@@ -197,7 +197,7 @@ def dumbbell() -> Case:
 
 
 def satellite() -> Case:
-    """A tumbling body with a fluid inside that hardly slips; the length of its angular momentum.
+    """Return a tumbling body with a fluid inside that hardly slips; the length of its angular momentum.
 
     The kinetic energy changes slowly, and is not kept: the length alone then increases the errors of the direction.
     """
@@ -213,7 +213,7 @@ def satellite() -> Case:
 
 
 def separation() -> Case:
-    """The equation of Cahn and Hilliard on a ring of 48 points; mass."""
+    """Return the equation of Cahn and Hilliard on a ring of 48 points; mass."""
     n = 48
     ring = np.roll(np.eye(n), 1, axis=0) + np.roll(np.eye(n), -1, axis=0) - 2 * np.eye(n)
     step = 1.0 / n
@@ -227,7 +227,7 @@ def separation() -> Case:
 
 
 def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> Case:
-    """The chain with dampers, against the same in angles; its constraints."""
+    """Return the chain with dampers, against the same in angles; its constraints."""
     made, (fun, start, state) = chain(angles), chain_by_angles(angles)
 
     def truth() -> Array:
@@ -237,7 +237,7 @@ def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> C
 
 
 def governor_case(end: float = 5.0) -> Case:
-    """The height of the flyball governor's slider, against the same in angles; its constraints and L_z."""
+    """Return the height of the flyball governor's slider, against the same in angles; its constraints and L_z."""
     made, (fun, start, height) = governor(), governor_by_angles()
 
     def truth() -> Array:

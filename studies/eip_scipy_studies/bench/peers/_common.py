@@ -55,12 +55,12 @@ class Peer:
 
     @property
     def keeps(self) -> bool:
-        """Return whether it always gets the problem's invariants."""
+        """Return True if the method always gets the problem's invariants."""
         return self.ours or self.projects
 
     @property
     def ours(self) -> bool:
-        """Return whether it is a method of this package."""
+        """Return True if the method belongs to this package."""
         return self.distribution == "eip_scipy"
 
 

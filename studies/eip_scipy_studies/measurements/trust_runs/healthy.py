@@ -55,7 +55,7 @@ def hard_case(name: str) -> Problem:
 
 
 def short(make: Callable[[], Problem], end: float) -> Problem:
-    """A problem to an earlier end."""
+    """Return a problem with an earlier end."""
     problem = make()
     return replace(problem, t_span=(problem.t_span[0], end))
 
@@ -73,7 +73,7 @@ def two_pendulums() -> Problem:
 
 
 def each(before: str, options: Iterable[str], after: str = "") -> str:
-    """A method with one option after the other."""
+    """Return settings of a method with one option after the other, as text for `runs`."""
     return ", ".join(f"{before} {option} {after}" for option in options)
 
 
@@ -199,7 +199,7 @@ def one_coordinate(
 
 
 def huber(width: float) -> Problem:
-    """A spring whose force does not grow beyond a distance."""
+    """Return a spring whose force does not grow beyond a distance."""
     return one_coordinate(
         "Huber's spring",
         lambda q: min(max(q, -width), width),
@@ -210,7 +210,7 @@ def huber(width: float) -> Problem:
 
 
 def contact(stiffness: float) -> Problem:
-    """A ball that falls onto a spring."""
+    """Return a ball that falls onto a spring."""
     return one_coordinate(
         "contact",
         lambda q: 1 + stiffness * min(q, 0.0),
@@ -221,7 +221,7 @@ def contact(stiffness: float) -> Problem:
 
 
 def hertz(stiffness: float) -> Problem:
-    """A ball that falls onto another."""
+    """Return a ball that falls onto another ball."""
     return one_coordinate(
         "Hertz's contact",
         lambda q: 1 - stiffness * max(-q, 0.0) ** 1.5,
@@ -232,7 +232,7 @@ def hertz(stiffness: float) -> Problem:
 
 
 def dead_zone(width: float) -> Problem:
-    """A spring with backlash."""
+    """Return a spring with backlash."""
     return one_coordinate(
         "backlash",
         lambda q: np.sign(q) * max(abs(q) - width, 0.0),
@@ -243,7 +243,7 @@ def dead_zone(width: float) -> Problem:
 
 
 def cubic_walls(stiffness: float) -> Problem:
-    """Free flight between soft walls."""
+    """Return a body that moves freely between soft walls."""
     return one_coordinate(
         "cubic walls",
         lambda q: stiffness * np.sign(q) * max(abs(q) - 1, 0.0) ** 3,

@@ -41,7 +41,7 @@ def drag_at_pericentre(strength: float) -> Problem:
 
 
 def inelastic_bumper(strength: float) -> Problem:
-    """A ball falls onto a spring, which brakes it too."""
+    """Return a ball that falls onto a spring with friction."""
     return s.mechanics(
         "inelastic bumper",
         lambda t, q, v: -1 - 400 * np.minimum(q, 0.0) - 10 * strength * v * (q < 0),
@@ -54,7 +54,7 @@ def inelastic_bumper(strength: float) -> Problem:
 
 
 def kicks(strength: float) -> Problem:
-    """Three short pushes of a pendulum."""
+    """Return a pendulum that is pushed three times for a short time."""
 
     def push(t):
         return 10 * strength * sum(np.exp(-(((t - at) / 0.2) ** 2)) for at in (6.1, 11.7, 17.3))
@@ -63,21 +63,21 @@ def kicks(strength: float) -> Problem:
 
 
 def one_bead(strength: float) -> Problem:
-    """A chain of eight beads, of which the last one is braked."""
+    """Return a chain of eight beads, of which the last one is braked."""
     friction = np.zeros(8)
     friction[-1] = strength
     return s.fput(n=8, end=60.0, friction=friction)
 
 
 def light_planet(mass: float) -> Problem:
-    """A star, a giant planet at 5.2, and a planet at 0.2, whose period is 0.56."""
+    """Return a star, a giant planet at 5.2, and a planet at 0.2, whose period is 0.56."""
     q = [[0.0, 0.0, 0.0], [5.2, 0.0, 0.0], [0.2, 0.0, 0.0]]
     v = [[0.0, 0.0, 0.0], [0.0, 5.2**-0.5, 0.0], [0.0, 0.2**-0.5, 0.0]]
     return nbody([1.0, 1e-3, mass], q, v, t_span=(0.0, 200.0))
 
 
 def two_oscillators() -> Problem:
-    """Two oscillators of periods 0.25 and 6.3, of which the claimed energy contains the second only."""
+    """Return two oscillators of periods 0.25 and 6.3; the claimed energy contains the second one only."""
     slow = Invariant(
         lambda t, y: 0.5 * (y[0] ** 2 + y[1] ** 2), lambda t, y: np.array([y[0], y[1], 0.0, 0.0]), name="energy"
     )
@@ -87,7 +87,7 @@ def two_oscillators() -> Problem:
 
 
 def late_leaks() -> Iterator[Run]:
-    """Leaks of five kinds."""
+    """Yield faulty runs with leaks of five kinds."""
     leak = partial(runs, LATE)
     for make, more in (
         (friction_from_5, ""),
@@ -102,7 +102,7 @@ def late_leaks() -> Iterator[Run]:
 
 
 def light_bodies() -> Iterator[Run]:
-    """Bodies whose period is two of the steps, or five."""
+    """Yield faulty runs with bodies whose period is two or five steps."""
     light = partial(runs, LIGHT)
     for mass in (1e-9, 0.0):
         yield from light(

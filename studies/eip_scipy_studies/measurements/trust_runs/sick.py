@@ -164,7 +164,7 @@ def henon_turning() -> Problem:
 
 
 def two_false() -> Problem:
-    """A right energy and a false angular momentum together."""
+    """Return a system with a correct energy and a wrong angular momentum."""
     hh = s.henon_heiles()
     return replace(hh, y0=np.array([0.0, 0.3, 0.3, 0.0]), invariants=(*hh.invariants, s.turning()), t_span=(0.0, 20.0))
 
@@ -199,7 +199,7 @@ def other_trap() -> Problem:
 
 
 def wrong_joint() -> Problem:
-    """A condensate that is shaken from t = 0 on, and the joint invariants of one at rest."""
+    """Return a condensate that is shaken from t = 0 on, and the joint invariants of one at rest."""
     grid = Grid((16, 16), -4.0, 4.0)
     x, y = grid.mesh()
     psi = np.exp(-((x - 0.5) ** 2 + y**2) / 2)
@@ -211,7 +211,7 @@ FALLING = np.array([[1.0, 3.0], [-2.0, -1.0], [1.0, -1.0]])
 
 
 def falling_bodies(third: float = 5.0, softening: float = 0.0) -> Problem:
-    """Three bodies that fall from rest, and the energy of plain attraction with another mass of the third."""
+    """Return three bodies that fall from rest, and an energy with a wrong mass of the third body."""
     masses = np.array([3.0, 4.0, 5.0])
     other = n_body([3.0, 4.0, third], 1.0, 2)
 
@@ -280,7 +280,7 @@ def spin_sum() -> Problem:
 
 
 def dragged(drag: float) -> Problem:
-    """A satellite that starts at rest against the air, above a rotating planet: the drag's power is 0 there."""
+    """Return a satellite that starts at rest against the air, above a rotating planet: the drag's power is 0 there."""
 
     def extra(t, y):
         return -drag * (y[2:] - 1.2 * np.array([-y[1], y[0]]))
@@ -327,7 +327,7 @@ def swapped(G, k, m):
 
 
 def spoilt(spoil: Callable[..., None], y0: Any, problem: Problem | None = None, k: int = 1, m: int = 2) -> Problem:
-    """A right energy with `spoil` done to the components k and m of its gradient."""
+    """Return a correct energy whose gradient has wrong components k and m, changed by `spoil`."""
     problem = problem or replace(s.henon_heiles(), y0=np.array(y0), t_span=(0.0, 10.0))
     (energy,) = problem.invariants
 
@@ -340,7 +340,7 @@ def spoilt(spoil: Callable[..., None], y0: Any, problem: Problem | None = None, 
 
 
 def sleeping(spoil: Callable[..., None], k: Any = 4, m: Any = 10) -> Problem:
-    """A chain of which one end moves at first, its gradient spoilt at the other: there y_k = f_k = 0 at the start."""
+    """Return a chain that moves at one end, with a wrong gradient at the other, where y_k = f_k = 0 at first."""
     chain = s.chain("chain", np.expm1, lambda d: np.expm1(d) - d, np.expm1, [0.8, 0.0, 0.0, 0.0, 0.0, 0.0], 20.0)
     return spoilt(spoil, None, chain, k, m)
 
@@ -384,7 +384,7 @@ def until(make: Callable[[], Problem], end: float) -> Problem:
 
 
 def meeting() -> Problem:
-    """Two bodies that fall together from rest, nearly head on."""
+    """Return two bodies that fall together from rest, nearly head on."""
     return nbody(
         [1.0, 1.0], [[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]], [[0.0, 0.02, 0.0], [0.0, -0.02, 0.0]], t_span=(0.0, 3.0)
     )
@@ -399,7 +399,7 @@ def other_inertia() -> Problem:
 
 
 def other_coefficient() -> Problem:
-    """Predators and prey, 3 for 2 in the claim, from u = 1, where the predators' rate vanishes."""
+    """Return predators and prey from u = 1, where the predators' rate vanishes; the claim has 3 in place of 2."""
     return s.claimed(
         "Lotka-Volterra",
         lotka_volterra().fun,
@@ -414,7 +414,7 @@ def other_coefficient() -> Problem:
 
 
 def falling_probe() -> Problem:
-    """A geodesic that starts at a turning point, and the shell's value with another mass."""
+    """Return a geodesic that starts at a turning point, and the mass shell with a wrong mass."""
     shell, scale = schwarzschild(), np.array([1, 1.1, 1, 1, 1, 1])
 
     def value(t, y):

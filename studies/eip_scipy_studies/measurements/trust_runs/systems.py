@@ -1,4 +1,4 @@
-"""Small systems with the quantities claimed of them, which need not be invariants; each function makes a `Problem`."""
+"""Small systems with claimed invariants, which may be wrong; each function returns a `Problem`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = np.ndarray
 
 
 def claimed(name: str, fun: Callable[..., Any], y0: Any, end: float, *kept: Invariant, start: float = 0.0) -> Problem:
-    """A system, and what is claimed of it."""
+    """Return a problem from a system and the quantities that are claimed to be invariants."""
     y0 = np.array(y0)
     return Problem(
         name=name, fun=fun, y0=y0 + (0j if y0.dtype.kind == "c" else 0.0), t_span=(start, end), invariants=kept
@@ -72,12 +72,12 @@ def turning() -> Invariant:
 
 
 def norm() -> Invariant:
-    """Sum of squares."""
+    """Return the sum of squares."""
     return Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="norm")
 
 
 def component(k: int, name: str) -> Invariant:
-    """The component y_k."""
+    """Return the component y_k."""
     return Invariant(lambda t, y: float(y[k]), lambda t, y: np.arange(y.size) == k + 0.0, name=name)
 
 
@@ -131,7 +131,7 @@ def duffing(cubic: float = 1.0, q0: float = 0.5, end: float = 20.0) -> Problem:
 
 
 def falling(drag: float, v0: float = 0.0, end: float = 10.0) -> Problem:
-    """A stone that falls from rest, with the air's resistance."""
+    """Return a stone that falls from rest, with the air's resistance."""
     return mechanics(
         f"fall with drag {drag:g}",
         lambda t, q, v: -1 - drag * v * np.abs(v),
@@ -177,7 +177,7 @@ def kepler_energy() -> Invariant:
 
 
 def laplace_x() -> Invariant:
-    """The component of Laplace's vector towards the pericentre."""
+    """Return the component of Laplace's vector towards the pericentre."""
 
     def value(t, y):
         x, z, u, v = y
@@ -462,7 +462,7 @@ def _doubled_gradient(t, y, out, params):
 
 
 def spring_of_doubled_gradient() -> Problem:
-    """The spring with its energy's gradient doubled, jitted."""
+    """Return the spring with its energy's gradient doubled, jitted."""
     spring = compiled_spring()
     wrong = Invariant(_spring_energy, _doubled_gradient, args=(spring.params,), in_place=True, name="energy")
     return replace(spring, invariants=(wrong,))
