@@ -85,7 +85,7 @@ class LyapunovSpectrum(_Followed):
     y : ndarray, shape (n,)
         The state at the end.
     diagnostics : Diagnostics
-        Of the whole run.
+        Record of the projections in the whole run.
     success, trusted : bool
         As for `integrate`.
     message : str
@@ -290,7 +290,7 @@ def lyapunov_spectrum(
     Raises
     ------
     ValueError, TypeError
-        For wrong values, options that the function sets itself, and as by `integrate`.
+        If a value is wrong, an option is one that the function sets itself, and as for `integrate`.
 
     Notes
     -----
@@ -369,7 +369,7 @@ def megno(
     Raises
     ------
     ValueError, TypeError
-        For wrong values, options that the function sets itself, and as by `integrate`.
+        If a value is wrong, an option is one that the function sets itself, and as for `integrate`.
 
     Notes
     -----
@@ -486,7 +486,7 @@ def periodic_orbit(
     Raises
     ------
     ValueError, TypeError
-        For wrong values, options that the function sets itself, and as by `integrate`.
+        If a value is wrong, an option is one that the function sets itself, and as for `integrate`.
 
     Notes
     -----
@@ -706,7 +706,7 @@ class TrajectoryFit:
     Raises
     ------
     ValueError, TypeError
-        For wrong values, options that the class sets itself, and as by `integrate`.
+        If a value is wrong, an option is one that the class sets itself, and as for `integrate`.
 
     Notes
     -----
@@ -768,9 +768,9 @@ class TrajectoryFit:
         Raises
         ------
         ValueError
-            When x has a wrong shape.
+            If x has a wrong shape.
         RuntimeError
-            When the run does not reach the last of the data.
+            If the run does not reach the last of the data.
         """
         x = np.array(x, float)
         if x.shape != self.x0.shape:

@@ -247,7 +247,7 @@ def to_archive(run: Any, path: str | os.PathLike[str], *, template: rebound.Simu
     FileExistsError
         If `path` exists.
     TypeError, ValueError
-        As by `to_simulation`.
+        As for `to_simulation`.
 
     Notes
     -----

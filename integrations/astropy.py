@@ -131,7 +131,7 @@ def velocities(run: Any, unit: Any = None) -> units.Quantity:
     Raises
     ------
     TypeError
-        As by `positions`.
+        As for `positions`.
     """
     length, time = map(_as_astropy, _units(run))
     return _part(run, 1, length / time, unit)

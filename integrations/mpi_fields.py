@@ -77,7 +77,7 @@ class Transposition:
     Raises
     ------
     ValueError
-        In one dimension, or when there are more ranks than points along x or y.
+        If the grid has one dimension, or there are more ranks than points along x or y.
     """
 
     def __init__(self, grid: Grid, comm: MPI.Comm) -> None:
@@ -162,7 +162,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
     comm : mpi4py.MPI.Comm, optional
         Default: ``MPI.COMM_WORLD``.
     **options
-        Those of `GrossPitaevskii`.
+        Parameters of `GrossPitaevskii`.
 
     Attributes
     ----------
@@ -173,7 +173,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
     Raises
     ------
     ValueError
-        As `GrossPitaevskii` does, in one dimension, and when there are more ranks than points along x or y.
+        As for `GrossPitaevskii`, in one dimension, and if there are more ranks than points along x or y.
 
     Notes
     -----
@@ -212,7 +212,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
         return np.ascontiguousarray(np.reshape(whole, self.grid.whole.shape)[self.grid.part], dtype=complex)
 
     def linear_terms(self) -> list[tuple[Axes, Any]]:
-        """Return `GrossPitaevskii.linear_terms`, but never along all axes at once: along x the field is transposed."""
+        """Return `GrossPitaevskii.linear_terms` with the axis x alone, because x needs a transposition."""
         if self.Omega != 0:
             return super().linear_terms()
         along_x, *others = (self.kinetic_factor(axis) for axis in range(self.grid.dim))

@@ -29,7 +29,7 @@ def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
 
 
 def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
-    """Return what a function returned at t, real and of the expected shape."""
+    """Return the value of a function at t as an array, after a check that it is real and has the expected shape."""
     if isinstance(value, float) and not expected:
         return np.array(float(value))
     refuse_units(**{f"{what} returned": value})
@@ -63,7 +63,7 @@ class Carried:
         All invariants of the run.
     labels : sequence of str
     starts : sequence of int
-        Where the values of each item begin among all values, and their number at the end.
+        Index of the first value of each item among all values, and at the end the number of values.
     shapes : sequence of tuple
         Shapes of the values of each item.
     extra : tuple

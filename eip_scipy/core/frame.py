@@ -24,7 +24,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     Raises
     ------
     ValueError
-        When the shapes disagree or C S is singular.
+        If the shapes disagree or C S is singular.
     """
     if frame is None:
         return NO_FRAME

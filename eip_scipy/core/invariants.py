@@ -724,14 +724,14 @@ class InvariantSet:
         Raises
         ------
         ValueError
-            When a given gradient disagrees with the difference of its invariant, or values have single precision.
+            If a given gradient disagrees with the difference of its invariant, or values have single precision.
 
         Warns
         -----
         UserWarning
-            When an invariant changes along the flow of this system.
+            If an invariant changes along the flow of this system.
         ProjectionWarning
-            When the rate of a balance is wrong.
+            If the rate of a balance is wrong.
         """
         found = list(complaints(self, t, y, f, tau, self.rhs, evaluated))
         for complaint in found:
@@ -760,7 +760,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     invariant : Invariant
     t : float
     y : array_like, shape (n,)
-        Where to compare; real or complex.
+        State at which to compare; real or complex.
     fun : callable, optional
         ``fun(t, y)``, the system, needed by an invariant with ``uses_f=True``.
 
@@ -773,7 +773,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     Raises
     ------
     ValueError
-        When the gradient has the wrong shape, or `fun` is missing for ``uses_f``.
+        If the gradient has the wrong shape, or `fun` is missing for ``uses_f``.
     """
     refuse_units(t=t, y=y)
     y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)

@@ -32,7 +32,7 @@ def rhs_by_duals(
     Raises
     ------
     NotCompilableError
-        When the function does something that dual numbers cannot.
+        If the function does something that dual numbers cannot.
     """
     dual = dual_along(columns)
     lanes = dual.lanes
@@ -153,7 +153,7 @@ def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...], parameters: tup
     Raises
     ------
     NotCompilableError
-        When the function does something that dual numbers cannot.
+        If the function does something that dual numbers cannot.
     """
     swapped = njit(lambda t, params, y: fun(t, y, params))
     grad = gradient_by_duals(swapped, p, shape, True)

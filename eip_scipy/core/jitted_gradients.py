@@ -34,7 +34,7 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     Raises
     ------
     NotCompilableError
-        When the function does something that dual numbers cannot.
+        If the function does something that dual numbers cannot.
     """
     dual = dual_along(n)
     lanes = dual.lanes
@@ -60,7 +60,7 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
     Raises
     ------
     NotCompilableError
-        When the function does something that dual numbers cannot.
+        If the function does something that dual numbers cannot.
     """
     dual = Dual(1)
     call = _with_params(for_duals(fun, dual), has_params, bool(scalars))

@@ -28,7 +28,7 @@ class AtRealTimes(DenseOutput):
         Raises
         ------
         TypeError
-            For times that are not real numbers, or have a unit.
+            If times are not real numbers, or have a unit.
         """
         real = np.asarray(t).dtype.kind in "fiub"
         if not real or type(t) not in (float, np.float64, Array):

@@ -43,7 +43,7 @@ def moved_names(module: str, stacklevel: int = 2) -> Callable[[str], Any]:
     ----------
     module : str
     stacklevel : int
-        Of the warning.
+        Stack level of the warning.
 
     Returns
     -------

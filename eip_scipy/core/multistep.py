@@ -61,7 +61,7 @@ def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping,
     Raises
     ------
     ValueError
-        When the step is longer than what is stable at the start, with one that would do; not with ``check=False``.
+        If the step is longer than what is stable at the start, with one that would do; not with ``check=False``.
     """
     method: Any = run.tableau
     assert stepping.h is not None

@@ -74,7 +74,7 @@ def native_functions(
     Raises
     ------
     NotCompilableError
-        When one of them is neither a function of the library's problems, nor a C function by pointer, nor a lazily
+        If one of them is neither a function of the library's problems, nor a C function by pointer, nor a lazily
         jitted Numba function of the arguments that `integrate` documents.
     """
     n, second_order = y0.size, form.startswith("acceleration")
@@ -128,7 +128,7 @@ def function_alone(
     Raises
     ------
     NotCompilableError
-        As by `native_functions`.
+        As for `native_functions`.
     """
     width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
     rhs = _native(fun, kind, name, math.prod(kind.shape) * width)
@@ -151,7 +151,7 @@ def with_events(
     Raises
     ------
     NotCompilableError
-        As by `native_functions`.
+        As for `native_functions`.
     """
     if not events:
         return functions
@@ -171,7 +171,7 @@ def with_jacobian(
     Raises
     ------
     NotCompilableError
-        As by `native_functions`.
+        As for `native_functions`.
     """
     half = y0.size // 2
     kind, floats = _number(params, y0), half * (2 if y0.dtype.kind == "c" else 1)
@@ -188,7 +188,7 @@ def with_rates(
     Raises
     ------
     NotCompilableError
-        As by `native_functions`.
+        As for `native_functions`.
     """
     if not invariants.balances.items:
         return functions
@@ -210,7 +210,7 @@ def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: byt
     Raises
     ------
     RuntimeError
-        For the status of a C function; for a Numba function what it raises, whatever that is.
+        For the status of a C function; for a Numba function the exception that it raises, of any type.
     """
     function = functions.owner[group][k].function
     if isinstance(function, PointerFunction):

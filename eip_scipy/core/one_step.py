@@ -68,14 +68,14 @@ class OneStep(Ordered):
     Attributes
     ----------
     name, order, error_estimator_order, evaluations
-        Of the method; the estimate's order is None without one.
+        Orders of the method and of its error estimate; None without an estimate.
     b, c, exponent
-        Those of a method of one stage, the derivative at the start, and the exponent of the step control.
+        Attributes of a method with one stage, the derivative at the start, and the exponent of the step control.
 
     Raises
     ------
     TypeError
-        When the object is no `OneStepMethod`.
+        If the object is no `OneStepMethod`.
     ValueError
         If an order is not an integer >= 1.
 
@@ -143,7 +143,7 @@ def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.nd
     TypeError
         If the value is None, is not numeric, or has a unit.
     ValueError
-        For a wrong shape, or complex values where the state is real.
+        If the shape is wrong, or the value is complex but the state is real.
     """
     if value is None:
         raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")

@@ -423,7 +423,7 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
 
 
 def _are_of_bodies(components: np.ndarray, weight: np.ndarray) -> bool:
-    """Return True if directions are those of x, y and z, in which the same bodies move with the same weights."""
+    """Return True if the directions come in triples x, y, z, each with the same bodies and the same weights."""
     if len(components) % 3:
         return False
     alike = (weight.reshape(-1, 3, weight.shape[1]) == weight[::3, None]).all()

@@ -33,9 +33,9 @@ def states(name: str, value: Any) -> np.ndarray:
     Raises
     ------
     TypeError
-        For what holds no numbers, or numbers with a unit.
+        If the value does not consist of numbers, or has a unit.
     ValueError
-        For masked values.
+        If values are masked.
     """
     refuse_units(**{name: value})
     if np.ma.isMaskedArray(value) and np.ma.is_masked(value):

@@ -410,7 +410,7 @@ def ensemble(
     Raises
     ------
     TypeError, ValueError
-        As for `integrate`, if every member would fail.
+        If every member would fail; the errors are those of `integrate`.
     MemoryError
         If results would need more than `max_bytes`.
     CheckpointError

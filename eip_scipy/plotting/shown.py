@@ -46,7 +46,7 @@ class ShownFigure(Figure):
         Raises
         ------
         NotImplementedError
-            With other backends; IPython then uses another representation.
+            If the backend is another one; IPython then uses another representation.
         """
         if INLINE not in _backend():
             raise NotImplementedError

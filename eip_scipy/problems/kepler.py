@@ -21,7 +21,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
     Parameters
     ----------
     eccentricity : float
-        In [0, 1); the start is the pericentre of that orbit of semi-major axis 1.
+        Eccentricity in [0, 1); the start is the pericentre of the orbit with semi-major axis 1.
     relativistic : float
         Coefficient of the perturbation (the paper's 0.005); 0 for the plain Kepler problem.
     t_end, h : float
@@ -35,7 +35,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
     Raises
     ------
     ValueError
-        When the eccentricity is not in [0, 1).
+        If the eccentricity is not in [0, 1).
     """
     refuse_units(eccentricity=eccentricity, relativistic=relativistic, t_end=t_end, h=h)
     e = float(eccentricity)

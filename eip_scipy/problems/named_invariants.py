@@ -28,7 +28,7 @@ def named_invariant(
     Raises
     ------
     ValueError
-        For a name that is not among `made`; the message names those that are `known`, and says `where`.
+        If the name is not in `made`; the message lists the `known` names, and ends with `where`.
     """
     if name not in made:
         raise ValueError(f"unknown invariant {name!r}{where}, expected {', '.join(known)}{nearest(name, known)}")
@@ -46,7 +46,7 @@ def checked_damping(damping: float) -> float:
     Raises
     ------
     ValueError
-        When it is not a finite number >= 0.
+        If it is not a finite number >= 0.
     """
     refuse_units(damping=damping)
     if not (is_number(damping) and np.isfinite(damping) and damping >= 0):

@@ -186,7 +186,7 @@ class ParticleOrbit:
         Raises
         ------
         ValueError
-            When a gyration has fewer than four states, or more than there are.
+            If a gyration has fewer than four states, or more than there are.
         """
         n = self._per_gyration
         values = np.asarray(values, dtype=float)
@@ -201,12 +201,12 @@ class ParticleOrbit:
         Returns
         -------
         Tips
-            Of the guiding centre, averaged; interpolated linearly between two states.
+            Averaged positions of the guiding centre, interpolated linearly between two states.
 
         Raises
         ------
         ValueError
-            As `averaged`.
+            As for `averaged`.
         """
         along = self.averaged(self.parallel_velocity)
         k = np.flatnonzero(np.sign(along[1:]) * np.sign(along[:-1]) < 0)
@@ -225,12 +225,12 @@ class ParticleOrbit:
         Yields
         ------
         slice
-            Of the states; the parts before the first and after the last such passage are left out.
+            Slices of the states; the parts before the first and after the last such passage are left out.
 
         Raises
         ------
         ValueError
-            As `averaged`.
+            As for `averaged`.
         """
         height = self.averaged(self.guiding_centre[2])
         shift = self._per_gyration // 2

@@ -30,7 +30,7 @@ class HardCase:
     ----------
     name, title : str
     problem : Problem
-        With all its invariants as one `Invariant`, whose value is (l,); ``problem.source`` is the citation.
+        The problem; all its invariants are one `Invariant`, whose value is (l,). ``problem.source`` is the citation.
     end : ndarray, shape (n,)
         The exact state at the end of ``problem.t_span``, to the last bit or so.
     invariant_names : tuple of str, length l

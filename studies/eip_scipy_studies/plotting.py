@@ -84,7 +84,7 @@ class Orbits(NamedTuple):
     Attributes
     ----------
     paths : array_like, shape (k, m, 2, points)
-        For each body m curves in the plane.
+        For each body `m` curves in the plane.
     last : array_like, shape (k, 2)
         The final positions.
     """

@@ -165,7 +165,7 @@ class Session:
     written : set of Path
         Files that were made.
     unnamed : list of Path
-        Those of them that no line has printed yet.
+        Files of `written` whose names have not been printed yet.
     open : ExitStack
         Resources to be closed when the command ends.
     """

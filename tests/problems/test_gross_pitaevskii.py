@@ -394,7 +394,7 @@ def test_bad_states_and_names():
         gpe.invariants(["energie"])
     with pytest.raises(ValueError, match="a rotation needs two dimensions"):
         GrossPitaevskii(Grid(8, -1, 1), Omega=0.5)
-    with pytest.raises(ValueError, match="no angular momentum"):
+    with pytest.raises(ValueError, match="angular momentum needs two or three"):
         line.angular_momentum(np.zeros(8))
     with pytest.raises(ValueError, match="beta < 0"):
         soliton(beta=1.0)

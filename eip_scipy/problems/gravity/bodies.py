@@ -57,7 +57,7 @@ def bodies_of(run: Any) -> Bodies:
     Raises
     ------
     TypeError
-        For other problems and runs, and for results that were loaded, which know their problem no more.
+        If it is another kind of problem or run, or a loaded result, which does not know its problem.
     """
     origin = None if isinstance(run, Problem) else getattr(run, "__dict__", {}).get("_origin")
     problem = run if origin is None else origin.request.fun
@@ -111,9 +111,9 @@ def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | N
     Raises
     ------
     TypeError
-        When one has a unit and another has none, or the units of the problem are not known.
+        If one has a unit and another has none, or the units of the problem are not known.
     TypeError and ValueError
-        When dimensions do not fit.
+        If dimensions do not fit.
     """
     given = {"gm": gm, "position": position, "velocity": velocity}
     with_unit = [name for name, value in given.items() if has_unit(_first(value))]

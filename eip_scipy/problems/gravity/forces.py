@@ -97,7 +97,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
     Raises
     ------
     ValueError
-        For an unknown name, or two kinds of relativity at once.
+        If a name is unknown, or there are two kinds of relativity.
     TypeError
         If it is neither a name nor a sequence.
     """
@@ -120,7 +120,7 @@ def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstant
     Raises
     ------
     ValueError
-        When a constant that a force needs is missing or senseless, or the first body has no mass.
+        If a constant that a force needs is missing or senseless, or the first body has no mass.
     """
     known = ForceConstants() if constants is None else constants
     for force in forces:

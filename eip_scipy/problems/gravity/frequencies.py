@@ -25,7 +25,7 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf)
     bodies : ndarray, shape (N,)
         0 for the heaviest body.
     others : float
-        Of pairs that bind each other more than the heaviest body does, a planet and its moon.
+        Frequencies of pairs that bind each other more than the heaviest body does, such as a planet and its moon.
 
     Notes
     -----

@@ -112,9 +112,9 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
     Raises
     ------
     TypeError
-        When masses are missing.
+        If masses are missing.
     ValueError
-        When shapes do not fit, there is no such primary, or it has no mass.
+        If shapes do not fit, there is no such primary, or it has no mass.
 
     Notes
     -----

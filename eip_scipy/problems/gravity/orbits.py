@@ -66,7 +66,7 @@ def orbital_balances(
     Raises
     ------
     ValueError
-        For unknown quantities, wrong masses or states, and sizes that disagree.
+        If a quantity is unknown, masses or states are wrong, or sizes disagree.
 
     Notes
     -----
@@ -138,7 +138,7 @@ def chosen_quantities(given: Any) -> tuple[str, ...]:
     Raises
     ------
     ValueError
-        For unknown quantities.
+        If a quantity is unknown.
     """
     names = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Iterable) else (given,)
     for name in names:

@@ -78,7 +78,7 @@ def satellite(
     Raises
     ------
     ValueError
-        For wrong shapes, a radius or scale height that is not positive, and negative oblateness or drag.
+        If a shape is wrong, the radius or scale height is not positive, or the oblateness or drag is negative.
 
     Examples
     --------

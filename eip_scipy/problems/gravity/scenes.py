@@ -73,7 +73,7 @@ def figure_eight(periods: float = 100.0) -> Problem:
     Raises
     ------
     ValueError
-        When `periods` is not positive.
+        If `periods` is not positive.
 
     References
     ----------

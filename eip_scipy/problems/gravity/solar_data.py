@@ -65,7 +65,7 @@ class SolarSystemData:
     axes : str
         "ICRF" or "ecliptic J2000".
     source : str
-        Where the numbers come from.
+        Source of the numbers.
     units : str
         "AU, day".
     epoch_rest : float
@@ -168,7 +168,7 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
     Raises
     ------
     ValueError
-        For another set, known or not.
+        If there are no reference states for this data set.
 
     Notes
     -----
@@ -200,7 +200,7 @@ def to_barycentre(gm: np.ndarray, position: np.ndarray, velocity: np.ndarray) ->
     ----------
     gm : ndarray, shape (N,)
     position, velocity : ndarray, shape (N, 3)
-        In any units.
+        Positions and velocities, in any units.
 
     Returns
     -------

@@ -66,7 +66,7 @@ def solar_system(
     Raises
     ------
     ValueError
-        For unknown data, units or forces, or "moon-quadrupole" with data that have no EMB.
+        If data, units or forces are unknown, or "moon-quadrupole" is given for data without EMB.
     """
     refuse_units(years=years, h=h)
     known = load(data) if isinstance(data, str) else data

@@ -88,7 +88,7 @@ class Joint:
     ----------
     gpe : GrossPitaevskii
     names : tuple of str
-        Of "mass" and "energy", each once at most, one at least.
+        "mass" or "energy" or both.
     """
 
     def __init__(self, gpe: GrossPitaevskii, names: tuple[str, ...]) -> None:

@@ -35,7 +35,7 @@ class DampedGrossPitaevskii(GrossPitaevskii):
     Raises
     ------
     ValueError
-        As by `GrossPitaevskii`, and for a damping that is negative or not finite.
+        As for `GrossPitaevskii`, and if a damping is negative or not finite.
 
     Notes
     -----
@@ -115,7 +115,7 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         Raises
         ------
         ValueError
-            For other names.
+            If a name is unknown.
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         return tuple(

@@ -79,7 +79,7 @@ class GrossPitaevskii:
     Raises
     ------
     ValueError
-        For wrong values, a potential that is complex, not finite or of another shape, or a rotation in 1D.
+        If a value is wrong, the potential is complex, not finite or of another shape, or there is rotation in 1D.
 
     Notes
     -----
@@ -146,10 +146,10 @@ class GrossPitaevskii:
         Raises
         ------
         ValueError
-            In one dimension.
+            If the grid has one dimension.
         """
         if self.grid.dim == 1:
-            raise ValueError("in one dimension there is no rotation.")
+            raise ValueError("rotation_factors: the grid has one dimension; a rotation needs two or three.")
         x, y, *_ = self.grid.mesh()
         k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
         return [-y * k, x * q]
@@ -157,7 +157,7 @@ class GrossPitaevskii:
     @cached_property
     def _turning(self) -> SpectralSum:
         if self.grid.dim == 1:
-            raise ValueError("in one dimension there is no angular momentum.")
+            raise ValueError("the grid has one dimension; angular momentum needs two or three.")
         terms = [self._multiplier((axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
         return SpectralSum(self.grid, self.transforms, terms)
 
@@ -202,7 +202,7 @@ class GrossPitaevskii:
         Raises
         ------
         ValueError
-            When its shape is neither.
+            If its shape is neither.
         """
         psi = np.ascontiguousarray(psi, dtype=complex)
         if psi.shape not in (self.grid.shape, (self.grid.size,)):
@@ -235,7 +235,7 @@ class GrossPitaevskii:
         Raises
         ------
         ValueError
-            In one dimension.
+            If the grid has one dimension.
         """
         self._turning.apply(psi, out)
 
@@ -266,7 +266,7 @@ class GrossPitaevskii:
         Raises
         ------
         ValueError
-            In one dimension.
+            If the grid has one dimension.
         """
         return float(self.grid.cell * self._total(self._turning.expectation(self.as_field(psi))))
 
@@ -317,7 +317,7 @@ class GrossPitaevskii:
         Raises
         ------
         ValueError
-            For other names.
+            If a name is unknown.
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         items = tuple(self._invariant(name) for name in names)
@@ -359,18 +359,18 @@ class GrossPitaevskii:
         t_end : float
             End of the interval that starts at 0.
         h : float, optional
-            A step; `largest_step` bounds it.
+            Length of the step. An explicit method needs one below `largest_step`.
         name : str, optional
         invariants : sequence of str, optional
             See `invariants`.
         reference : callable, optional
-            ``reference(t) -> y``, flat: a closed form.
+            ``reference(t) -> y``, the exact solution as a flat array.
         source : str, optional
 
         Returns
         -------
         FieldProblem
-            Its metric is "euclidean": the grid's points are alike, and the norm is that of the field. Its method is
+            The problem. Its metric is "euclidean", because all points of the grid are equivalent. Its method is
             `Splitting`, of order 4.
         """
         return FieldProblem(

@@ -24,14 +24,14 @@ class LinearFlow:
     ----------
     gpe : GrossPitaevskii
     time : float
-        Of the free motion.
+        Time of the free motion.
     angle : float, optional
         Default: ``gpe.Omega * time``, the flow of the equation's linear part.
 
     Raises
     ------
     ValueError
-        When the angle is above pi / 4 or the equation has one dimension and the angle is not 0.
+        If the angle is above pi / 4 or the equation has one dimension and the angle is not 0.
 
     Notes
     -----

@@ -38,7 +38,7 @@ def at_rest(problem: FieldProblem) -> FieldProblem:
     Raises
     ------
     ValueError
-        When the potential is not round, or in one dimension.
+        If the potential is not round, or in one dimension.
     """
     gpe = problem.equation
     assert gpe is not None
@@ -64,7 +64,7 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
     Parameters
     ----------
     gpe : GrossPitaevskii
-        In two or three dimensions.
+        An equation in two or three dimensions.
     psi : array_like
         A field or flat state that vanishes towards the ends of the box.
     angle : float
@@ -78,7 +78,7 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
     Raises
     ------
     ValueError
-        In one dimension, or for a field of another shape.
+        If the grid has one dimension, or the field has another shape.
     """
     psi = gpe.as_field(psi).copy()
     angle = remainder(angle, 2 * pi)
@@ -95,7 +95,7 @@ def check_radial(gpe: GrossPitaevskii) -> None:
     Raises
     ------
     ValueError
-        When it has not, or in one dimension.
+        If it has not, or in one dimension.
     """
     if gpe.grid.dim == 1:
         raise ValueError("without a z axis there is no rotation: the problem has one dimension.")

@@ -38,7 +38,7 @@ class Grid:
     Raises
     ------
     ValueError
-        For other shapes, and ends that are not finite or in the wrong order.
+        If shapes disagree, or ends are not finite or in the wrong order.
 
     Examples
     --------
@@ -116,7 +116,7 @@ class Grid:
         Raises
         ------
         ValueError
-            When y does not belong to this grid.
+            If y does not belong to this grid.
         """
         y = np.asarray(y)
         if y.ndim not in (1, 2) or y.shape[0] != self.size:
@@ -208,7 +208,7 @@ class SpectralSum:
         Yields
         ------
         (int, ndarray)
-            Where along x, and what to add to `out` from there on: a buffer. Nothing where there is but one term.
+            Index along x, and a buffer to be added to `out` from there on. With only one term nothing is yielded.
         """
         first, *others = self._terms
         first.apply(self._fft, psi, out)

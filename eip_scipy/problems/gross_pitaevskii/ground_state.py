@@ -71,7 +71,7 @@ def ground_state(
     start : array_like
         A field, normalised or not. See `trap_states` for starts.
     tol : float, optional
-        For the norm of H psi - mu psi.
+        Bound for the norm of H psi - mu psi.
     max_iterations : int, optional
     progress : callable, optional
         ``progress(iteration, energy, residual)`` in each iteration; what is true ends the search.
@@ -84,7 +84,7 @@ def ground_state(
     Raises
     ------
     ValueError
-        When the start is zero or not finite, or an option has a wrong value.
+        If the start is zero or not finite, or an option has a wrong value.
 
     Notes
     -----

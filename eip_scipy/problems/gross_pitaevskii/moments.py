@@ -19,15 +19,15 @@ class Moments(NamedTuple):
     Attributes
     ----------
     mass : float
-        Of ``|psi|^2``.
+        Sum of ``|psi|^2``.
     along : float
-        Of Re(conj(psi) H psi).
+        Sum of Re(conj(psi) H psi).
     square : float
-        Of ``|H psi|^2``.
+        Sum of ``|H psi|^2``.
     quartic : float
-        Of ``|psi|^4``.
+        Sum of ``|psi|^4``.
     sizes : float
-        Of the terms of `along`, without their signs.
+        Sum of the absolute values of the terms of `along`.
     """
 
     mass: float

@@ -30,7 +30,7 @@ def harmonic_trap(*gamma: float) -> Potential:
     Raises
     ------
     ValueError
-        When called with another number of coordinates.
+        If called with another number of coordinates.
     """
     refuse_units(gamma=gamma)
     return lambda *x: 0.5 * _squares(gamma, x)

@@ -38,12 +38,12 @@ def soliton(
     beta : float
         < 0.
     length : float
-        Of the ring; exp(-a length / 2) is the error of the closed form there.
+        Length of the ring; exp(-a length / 2) is the error of the closed form there.
     t_end : float
     h : float, optional
         Default: half of what RK4 allows.
     **options
-        Of `GrossPitaevskii`.
+        Options of `GrossPitaevskii`.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def soliton(
     Raises
     ------
     ValueError
-        When beta is not negative or the amplitude not positive.
+        If beta is not negative or the amplitude not positive.
     """
     refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
     gpe = _focusing("bright soliton", points, length, amplitude, beta, options)
@@ -87,12 +87,12 @@ def breather(
     beta : float
         < 0.
     length : float
-        Of the ring; exp(-a length / 2) is the error of the closed form there.
+        Length of the ring; exp(-a length / 2) is the error of the closed form there.
     t_end : float
     h : float, optional
         Default: 0.005 / a^2, for `Splitting`; `GrossPitaevskii.largest_step` bounds that of other methods.
     **options
-        Of `GrossPitaevskii`.
+        Options of `GrossPitaevskii`.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def breather(
     Raises
     ------
     ValueError
-        When beta is not negative or the amplitude not positive.
+        If beta is not negative or the amplitude not positive.
     """
     refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
     gpe = _focusing("breather", points, length, amplitude, beta, options)
@@ -137,14 +137,14 @@ def plane_wave(
     Parameters
     ----------
     shape : int or sequence of int
-        Of the grid.
+        Numbers of points along the axes.
     modes : int or sequence of int
         k, a whole number along each axis.
     amplitude, beta, t_end : float
     h : float, optional
         Default: half of what RK4 allows.
     **options
-        Of `GrossPitaevskii`.
+        Options of `GrossPitaevskii`.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def plane_wave(
     Raises
     ------
     ValueError
-        When the modes are not whole numbers, one for each axis.
+        If the modes are not whole numbers, one for each axis.
     """
     refuse_units(amplitude=amplitude, beta=beta, t_end=t_end, h=h)
     gpe = GrossPitaevskii(Grid(shape, 0.0, 2 * pi), beta=beta, **options)
@@ -181,10 +181,10 @@ def rotating_packet(
     Omega : float
         Angular velocity; the paper's are 0, 0.5 and 0.9.
     points : int
-        Along each axis.
+        Number of points along each axis.
     t_end, h : float
     **options
-        Of `GrossPitaevskii`; ``nyquist="zero"`` for the paper's numbers.
+        Options of `GrossPitaevskii`; use ``nyquist="zero"`` for the paper's numbers.
 
     Returns
     -------
@@ -206,9 +206,9 @@ def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> Gr
     kappa : float
         The paper's ground state is that of 0.3; its dynamics starts when that becomes 0.7.
     points : int
-        Along each axis; the phase turns by Omega r h = 1.8 from point to point with the paper's 256.
+        Number of points along each axis; with the paper's 256 the phase turns by Omega r h = 1.8 between two points.
     **options
-        Of `GrossPitaevskii`.
+        Options of `GrossPitaevskii`.
 
     Returns
     -------
@@ -228,9 +228,9 @@ def line_condensate(Omega: float = 0.7, points: int = 64, **options: Any) -> Gro
     Omega : float
         0.7 for the paper's ground state, 0.9 for its dynamics.
     points : int
-        Along each axis.
+        Number of points along each axis.
     **options
-        Of `GrossPitaevskii`.
+        Options of `GrossPitaevskii`.
 
     Returns
     -------

@@ -41,7 +41,7 @@ def lowest_state(
     Returns
     -------
     list of GroundState
-        In the order of the starts. The least energy of them bounds that of the ground state from above, no more.
+        States in the order of the starts. The lowest energy is an upper bound for that of the ground state.
     """
     return [ground_state(gpe, s, tol=tol, max_iterations=max_iterations, progress=progress) for s in starts]
 
@@ -60,11 +60,11 @@ def lowest_ring(
     Parameters
     ----------
     gpe : GrossPitaevskii
-        Whose Thomas-Fermi density has a hole.
+        An equation whose Thomas-Fermi density has a hole.
     tol, max_iterations, progress
         For the last search, see `ground_state`.
     seed : int, optional
-        Of the noise that breaks the symmetry of what the walk has found.
+        Seed of the noise that breaks the symmetry of the state that the search has found.
     report : callable, optional
         ``report(count, winding, energy)`` for each pair tried.
 
@@ -75,7 +75,7 @@ def lowest_ring(
     Raises
     ------
     ValueError
-        Where there is no hole.
+        If there is no hole.
 
     Notes
     -----

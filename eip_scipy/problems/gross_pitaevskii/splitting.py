@@ -83,7 +83,7 @@ class Splitting:
     Raises
     ------
     ValueError
-        For another scheme.
+        If the scheme is unknown.
 
     Notes
     -----

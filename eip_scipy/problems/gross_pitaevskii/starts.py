@@ -22,7 +22,7 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     Parameters
     ----------
     gpe : GrossPitaevskii
-        With beta > 0 and a trap that holds against the rotation.
+        An equation with beta > 0 and a trap that confines the condensate in spite of the rotation.
 
     Returns
     -------
@@ -31,7 +31,7 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     Raises
     ------
     ValueError
-        Without repulsion, or where the density reaches the ends of the box.
+        If there is no repulsion, or the density reaches the ends of the box.
     """
     if not gpe.beta > 0:
         raise ValueError(f"a Thomas-Fermi density needs beta > 0, got {gpe.beta:g}; give a start of your own.")
@@ -56,7 +56,7 @@ def imprint(gpe: GrossPitaevskii, positions: Any) -> np.ndarray:
     Parameters
     ----------
     gpe : GrossPitaevskii
-        In two or three dimensions.
+        An equation in two or three dimensions.
     positions : array_like, shape (k, 2)
         x and y of each vortex.
 
@@ -87,7 +87,7 @@ def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
     Parameters
     ----------
     gpe : GrossPitaevskii
-        Whose Thomas-Fermi density has a hole.
+        An equation whose Thomas-Fermi density has a hole.
     count, winding : int
 
     Returns

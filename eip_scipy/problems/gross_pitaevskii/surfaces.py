@@ -37,7 +37,7 @@ def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
     Parameters
     ----------
     gpe : GrossPitaevskii
-        In three dimensions.
+        An equation in three dimensions.
     psi : array_like
         A field or flat state, 0 at the ends of the box. It is evaluated on twice as many points along each axis.
     level : float
@@ -50,9 +50,9 @@ def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
     Raises
     ------
     ValueError
-        In one or two dimensions, or for a level that the density does not reach.
+        If the grid has one or two dimensions, or the density does not reach the level.
     ImportError
-        Without scikit-image.
+        If scikit-image is not installed.
     """
     if gpe.grid.dim != 3:
         raise ValueError(f"a surface needs three dimensions, got {gpe.grid!r}.")

@@ -91,9 +91,9 @@ def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
     Raises
     ------
     ValueError
-        For another name or a number of threads below 1.
+        If the name is unknown, or the number of threads is below 1.
     ImportError
-        When the library asked for is not installed.
+        If the library asked for is not installed.
     """
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
         raise ValueError(f"threads must be an integer >= 1, got {threads!r}.")

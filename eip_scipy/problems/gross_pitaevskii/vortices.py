@@ -43,7 +43,7 @@ def vortices(
     Parameters
     ----------
     gpe : GrossPitaevskii
-        In two or three dimensions.
+        An equation in two or three dimensions.
     psi : array_like
         A field or flat state.
     threshold : float, optional
@@ -52,10 +52,10 @@ def vortices(
         Width of the dips that are filled in (a grey closing). Default: four healing lengths at the largest density,
         three points at least.
     plane : int, optional
-        In three dimensions the index of z; default: the middle.
+        Index of z in three dimensions; default: the middle.
     Omega : float, optional
-        Of the rigid rotation that neighbouring phases are compared in; default: the equation's. Without it, phases
-        that turn by more than pi between two points of the grid would be miscounted.
+        Angular velocity of the rotating frame in which neighbouring phases are compared; default: that of the equation.
+        Without it, phases that turn by more than pi between two points of the grid would be miscounted.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def vortices(
     Raises
     ------
     ValueError
-        In one dimension, or for a field that is zero.
+        If the grid has one dimension, or the field is zero.
 
     Notes
     -----

@@ -56,7 +56,7 @@ def find_invariants(
         Largest rate of what is returned, in units of the sum of its terms, at each fresh point; a thousandth of it in
         units of the sum of all products in it, which is what rounding leaves of zero.
     seed : int, optional
-        Of the random points.
+        Seed of the random points.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def find_invariants(
     Raises
     ------
     ValueError
-        For wrong arguments, and where `fun` is finite at too few points.
+        If an argument is wrong, or `fun` is finite at too few points.
 
     Notes
     -----

@@ -89,7 +89,7 @@ class Surroundings:
         Raises
         ------
         ValueError
-            Where the vector field, or a term, is finite at too few points.
+            If the vector field, or a term, is finite at too few points.
         """
         for spread in SPREADS:
             points, slopes, gradients = [], [], []

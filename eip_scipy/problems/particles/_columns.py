@@ -44,7 +44,7 @@ def variational(
     Raises
     ------
     ValueError
-        For other parameters.
+        If there are other parameters.
     """
     if not set(parameters) <= {MASS, CHARGE}:
         raise ValueError(
@@ -162,7 +162,7 @@ def _by_duals(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
     Raises
     ------
     NotCompilableError
-        When the function does something that dual numbers cannot.
+        If the function does something that dual numbers cannot.
     """
     from ...core.dual_arrays import for_duals, inside
     from ...core.dual_numbers import Dual, seed, slope

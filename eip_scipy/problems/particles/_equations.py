@@ -84,7 +84,7 @@ def compose(field: FieldFunctions, form: str) -> ParticleEquations:
     Parameters
     ----------
     field : FieldFunctions
-        With A, jacobian and E for the canonical form, with B and E for the other; the rest for the invariants.
+        The canonical form needs A, jacobian and E, the other one B and E; the rest is for the invariants.
     form : {"canonical", "velocity"}
 
     Returns

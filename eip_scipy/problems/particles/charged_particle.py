@@ -129,9 +129,9 @@ def charged_particle(
     TypeError
         If `field` is not a ParticleField.
     ValueError
-        For an unknown form, a canonical form without A, a start or functions of the field that are not finite, a mass
-        that is not positive, a charge of 0, functions that contradict each other at the start, or a magnetic field with
-        a divergence there.
+        If the form is unknown, or canonical without A; if the start or a function of the field is not finite; if the
+        mass is not positive or the charge is 0; if functions contradict each other at the start, or the magnetic field
+        has a divergence there.
 
     Notes
     -----
@@ -264,7 +264,7 @@ def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STE
     Raises
     ------
     ValueError
-        For an unknown form.
+        If the form is unknown.
     """
     refuse_units(t_end=t_end, h=h)
     return _paper("uniform", UNIFORM, [0.0, -1.0, 0.0], [0.1, 0.01, 0.0], form, t_end, h)
@@ -291,7 +291,7 @@ def tokamak(
     Raises
     ------
     ValueError
-        For an unknown orbit or form.
+        If the orbit or the form is unknown.
     """
     refuse_units(t_end=t_end, h=h)
     if orbit not in ORBITS:

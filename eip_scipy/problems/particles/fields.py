@@ -166,7 +166,7 @@ class ParticleField:
         Warns
         -----
         UserWarning
-            When B has a small divergence, as one that is interpolated in a table may have.
+            If B has a small divergence, as one that is interpolated in a table may have.
         """
         step, where = self._step, (t, *position)
         found = {key: self._value(key, shape, where) for key, shape in SHAPES.items() if getattr(self, key)}

@@ -30,7 +30,7 @@ class KortewegDeVries:
     Parameters
     ----------
     grid : Grid
-        Of one dimension.
+        Grid of one dimension.
     damping : float, optional
 
     Attributes
@@ -43,7 +43,7 @@ class KortewegDeVries:
     Raises
     ------
     ValueError
-        When the grid has more dimensions than one, or for a damping that is negative or not finite.
+        If the grid has more dimensions than one, or for a damping that is negative or not finite.
 
     Notes
     -----
@@ -163,7 +163,7 @@ class KortewegDeVries:
         Raises
         ------
         ValueError
-            For other names.
+            If a name is unknown.
         """
         if names is None:
             names = ("momentum",) if self.damping else ("momentum", "energy")
@@ -235,7 +235,7 @@ class KortewegDeVries:
         Raises
         ------
         ValueError
-            When the field is not of the grid's shape.
+            If the field is not of the grid's shape.
         """
         start = np.asarray(u0, dtype=float)
         if start.shape != self.grid.shape:

@@ -30,13 +30,13 @@ class Lawson:
     order : int
     error_estimator_order : int or None
     evaluations : int
-        Of the nonlinear term in a step.
+        Number of evaluations of the nonlinear term in a step.
     name : str
 
     Raises
     ------
     TypeError
-        For another kind of tableau.
+        If the tableau is of another kind.
 
     Notes
     -----

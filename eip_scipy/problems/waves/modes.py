@@ -21,7 +21,7 @@ class RealModes:
     ----------
     grid : Grid
     shape : tuple of int
-        Of the modes: along the last axis those with wavenumbers >= 0 alone.
+        Shape of the modes: along the last axis only those with wavenumbers >= 0.
     """
 
     def __init__(self, grid: Grid) -> None:

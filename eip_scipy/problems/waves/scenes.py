@@ -39,7 +39,7 @@ def sine_gordon_breather(
     velocity : float
         Between -1 and 1.
     length : float
-        Of the ring; exp(-b length / 2) is the error of the closed form there.
+        Length of the ring; exp(-b length / 2) is the error of the closed form there.
     t_end : float
     h : float, optional
         Default: half of `SineGordon.largest_step`.
@@ -52,7 +52,7 @@ def sine_gordon_breather(
     Raises
     ------
     ValueError
-        For another frequency or velocity.
+        If the frequency or the velocity is out of range.
     """
     refuse_units(frequency=frequency, velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < frequency < 1 or not -1 < velocity < 1:
@@ -74,7 +74,7 @@ def sine_gordon_kinks(
     velocity : float
         v of the kink, that of the antikink is -v; between 0 and 1.
     length : float
-        Of the ring; the error of the closed form there is exp(-c (length - v t_end) / 2).
+        Length of the ring; the error of the closed form there is exp(-c (length - v t_end) / 2).
     t_end : float
     h : float, optional
         Default: half of `SineGordon.largest_step`.
@@ -87,7 +87,7 @@ def sine_gordon_kinks(
     Raises
     ------
     ValueError
-        For another velocity.
+        If the velocity is out of range.
     """
     refuse_units(velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < velocity < 1:
@@ -140,11 +140,11 @@ def korteweg_de_vries_solitons(
     speeds : float or sequence of float
         c > 0, each another.
     places : float or sequence of float
-        x0 of each; a soliton that others are to the right of stands there, others are shifted.
+        Position x0 of each soliton. Only a soliton to the left of all others is there; the others are shifted.
     points : int
     length : float
-        Of the ring. The closed form is one of the line: all solitons must stay well within half the ring around the
-        point that starts at the mean of the places and moves with the mean of the speeds.
+        Length of the ring. The closed form is that of an infinite line: all solitons must stay well within half of the
+        ring around the point that starts at the mean of the places and moves with the mean of the speeds.
     t_end : float
     h : float, optional
         Default: 1/3 of `KortewegDeVries.largest_step`.
@@ -157,7 +157,7 @@ def korteweg_de_vries_solitons(
     Raises
     ------
     ValueError
-        For speeds that are not positive or not different, and another number of places.
+        If speeds are not positive or not different, or the numbers of speeds and places differ.
     """
     refuse_units(speeds=speeds, places=places, length=length, t_end=t_end, h=h)
     c, x0 = np.atleast_1d(np.asarray(speeds, dtype=float)), np.atleast_1d(np.asarray(places, dtype=float))

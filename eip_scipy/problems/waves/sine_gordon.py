@@ -33,7 +33,7 @@ class SineGordon:
     ----------
     grid : Grid
     damping : float, optional
-        With it, energy and momenta are balances, and Nystrom methods do not apply.
+        With damping, energy and momenta are balances, and Nystrom methods cannot be used.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class SineGordon:
         return f - lost, lost
 
     def _energy_gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
-        """Gradient from f = (p, a): (-w a, w p)."""
+        """Fill `out` with the gradient of the energy, (-w a, w p), from f = (p, a)."""
         n, cell = self.grid.size, self.grid.cell
         np.multiply(f[n:], -cell, out=out[:n])
         np.multiply(y[n:], cell, out=out[n:])
@@ -143,7 +143,7 @@ class SineGordon:
         Raises
         ------
         ValueError
-            For other names.
+            If a name is unknown.
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         return tuple(self._invariant(name) for name in names)
@@ -209,7 +209,7 @@ class SineGordon:
         Raises
         ------
         ValueError
-            When a field is not of the grid's shape.
+            If a field is not of the grid's shape.
         """
         grid, fields = self.grid, [np.asarray(a, dtype=float) for a in (q0, p0)]
         for a in fields:

@@ -43,7 +43,7 @@ def linearly_implicit(
     Raises
     ------
     TypeError, ValueError
-        As `crank_nicolson`.
+        As for `crank_nicolson`.
 
     Notes
     -----

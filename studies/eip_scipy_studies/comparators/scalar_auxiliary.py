@@ -67,7 +67,7 @@ def sav_crank_nicolson(
     Raises
     ------
     TypeError, ValueError
-        As `crank_nicolson`; if `gpe` rotates; and if `shift` is not a finite number or does not make E1 + C positive.
+        As for `crank_nicolson`; if `gpe` rotates; if `shift` is not finite or does not make E1 + C positive.
 
     Notes
     -----

@@ -220,7 +220,7 @@ class Efficiency(Study[Found]):
     Attributes
     ----------
     points : int
-        Along each axis.
+        Number of points along each axis.
     repeats : int
         Runs of each point; the least time counts.
     orders : mapping of str to int

@@ -45,7 +45,7 @@ class VortexLines(QuenchStudy):
     Attributes
     ----------
     points : int
-        Along each axis.
+        Number of points along each axis.
     saved : float
         Time between two saved states.
     energies_known : float

@@ -61,7 +61,7 @@ class ParticleStudy:
     reference_error : float
         Its largest distance from the states stored with the problem; nan if the run has none.
     lines : dict of str to ParticleRun
-        By the methods' names.
+        The runs by the methods' names.
     """
 
     scene: str

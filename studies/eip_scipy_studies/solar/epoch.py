@@ -47,7 +47,7 @@ def parse_epoch(text: str) -> Epoch:
     Raises
     ------
     ValueError
-        For any other text; the message names the accepted forms.
+        If the text has another form; the message lists the accepted forms.
 
     Examples
     --------
