@@ -102,7 +102,7 @@ class Interpolants:
         return record.event[:count], record.t[:count], record.y[:count]
 
     def pending(self) -> tuple[Array, Array]:
-        """Return which events happen in the pending step and when, if the loop left their states to the caller."""
+        """Return the numbers and times of events in the pending step whose states were left to the caller."""
         record = self.record
         count = int(record.counts[2])
         record.counts[2] = 0

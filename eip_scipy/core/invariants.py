@@ -246,7 +246,7 @@ def _as_invariant(item: Any) -> Invariant:
 
 
 def _is_function(item: Any) -> bool:
-    """Return whether an item is a function, not a class such as Invariant itself."""
+    """Return True if an item is a function, and not a class such as Invariant."""
     return callable(item) and not isinstance(item, type)
 
 

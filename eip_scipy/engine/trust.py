@@ -95,7 +95,7 @@ class Trust:
 
     @property
     def sick(self) -> np.ndarray:
-        """Return which invariants have corrections or errors that no correct run has, (l,)."""
+        """Return a mask (l,) of the invariants with corrections or errors that do not occur in correct runs."""
         return sick(self.figures)
 
     @property
@@ -135,7 +135,7 @@ class Trust:
 
     @property
     def reasons(self) -> list[str]:
-        """Return what is wrong with the corrections: a sentence for each of the worst three invariants, and a count."""
+        """Return the reasons against the run: a sentence for each of the worst three invariants, and a count."""
         found = np.flatnonzero(self.sick)
         if not found.size:
             return []
@@ -161,7 +161,7 @@ class Trust:
 
 
 def sick(figures: np.ndarray) -> np.ndarray:
-    """Return which rows of figures (..., N_FIGURES) no correct run has."""
+    """Return a mask of the rows of figures (..., N_FIGURES) that do not occur in correct runs."""
     if _are_calm(figures):
         return np.zeros(figures.shape[:-1], bool)
     far = figures[..., RAW_MANY] > FAR_OFTEN * figures[..., NOTED]
@@ -169,13 +169,13 @@ def sick(figures: np.ndarray) -> np.ndarray:
 
 
 def _are_calm(figures: np.ndarray) -> bool:
-    """Return whether all figures by which rows are judged are those of correct runs, which is the usual case."""
+    """Return True if all figures for the judgement are those of correct runs, which is the usual case."""
     together = figures[..., SUM] > TOGETHER * figures[..., EXPECTED]
     return not (figures[..., UNUSUAL].any() or (figures[..., NU] > BEYOND_DOUBT).any() or together.any())
 
 
 def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:
-    """Return which runs have a step that is worth an examination, from their figures (m, l, N_FIGURES).
+    """Return a mask of the runs with a step that must be examined, from their figures (m, l, N_FIGURES).
 
     `suspect`, (m, ...), holds what the engine has kept of these steps.
     """
@@ -184,7 +184,7 @@ def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:
 
 
 def _large_corrections(figures: np.ndarray) -> np.ndarray:
-    """Return which rows have corrections that the errors of the steps do not explain."""
+    """Return a mask of the rows with corrections that are much larger than the errors of the steps."""
     judged = figures[..., JUDGED]
     often = figures[..., MANY] > np.maximum(1, OFTEN * judged)
     together = figures[..., SUM] > TOGETHER * figures[..., EXPECTED]
@@ -192,29 +192,29 @@ def _large_corrections(figures: np.ndarray) -> np.ndarray:
 
 
 def _extreme(figures: np.ndarray) -> np.ndarray:
-    """Return which rows have a single projection that no correct run has."""
+    """Return a mask of the rows with a single correction that is larger than in any correct run."""
     large = _may_leak(figures) & (figures[..., NU] > BEYOND_DOUBT)
     return large | (figures[..., RAW] > TOO_FAR * figures[..., FAR_FROM]) | (figures[..., SHARE] > 0)
 
 
 def _may_leak(figures: np.ndarray) -> np.ndarray:
-    """Return which rows are of quantities that may change along the flow.
+    """Return a mask of the rows whose quantities may change along the flow.
 
-    Where the rate of change is nothing but rounding, large corrections come from estimates that are too small: those of
-    a step over a kink, or where the derivative depends on time alone.
+    If the rate of change is only rounding, large corrections come from error estimates that are too small, as in a step
+    over a kink, or if the derivative depends on time only.
     """
     by_values, by_gradient = figures[..., EXAMINED] > ROUNDING_OF_DIFFERENCES, figures[..., RATE] > ROUNDING_OF_RATES
     return np.where(figures[..., BY_VALUES] > 0, by_values, by_gradient)
 
 
 def _severity(figures: np.ndarray) -> np.ndarray:
-    """Return how far rows of figures (..., N_FIGURES) are beyond what a correct run has."""
+    """Return the factors by which rows of figures (..., N_FIGURES) exceed the limits of correct runs."""
     corrections = np.maximum(figures[..., NU] / BEYOND_DOUBT, figures[..., RAW] / TOO_FAR)
     return np.maximum(corrections, figures[..., SHARE] / LARGE_SHARE)
 
 
 def _reason(name: str, row: np.ndarray) -> str:
-    """Return what is wrong with the corrections of one invariant."""
+    """Return a sentence about the corrections of one invariant in a faulty run."""
     parts = []
     if _may_leak(row) and row[NU] > LARGE:
         parts.append(

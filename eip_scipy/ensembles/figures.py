@@ -45,7 +45,7 @@ def _states(result: Any) -> tuple[np.ndarray | None, np.ndarray]:
 
 
 def _counts(result: Any) -> dict[str, int]:
-    """Return how many members ended in which way."""
+    """Return the number of members by the way in which they ended."""
     doubtful = (result.status >= 0) & ~result.trusted
     found = {
         "reached the end": (result.status == 0) & ~doubtful,

@@ -104,7 +104,7 @@ def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) 
 
 
 def _has_rows(given: Any) -> bool:
-    """Return whether an argument has a row for each member."""
+    """Return True if an argument has a row for each member."""
     if isinstance(given, np.ndarray) or not isinstance(given, Sequence):
         return np.ndim(given) == 2
     return len(given) > 0 and all(np.ndim(item) == 1 for item in given)

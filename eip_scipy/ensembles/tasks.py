@@ -250,7 +250,7 @@ class Plan:
         return self.task.prepared(y0, None if self.task.request.params is None else params, own)
 
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
-        """Return what identifies an ensemble, in a form for JSON: settings, and values of its functions at a start."""
+        """Return the identity of an ensemble in a form for JSON: settings, and values of its functions at a start."""
         settings = self._ready.identity(starts, params) | {"chunk": chunk}
         settings |= {name: plain(value) for name, value in own.identity.items()}
         return {"settings": settings, "start": self._start_values}

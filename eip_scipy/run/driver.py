@@ -231,7 +231,7 @@ class Driver:
         return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
 
     def pending_events(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return which events happen in the pending step and when, if the loop left them to the caller."""
+        """Return the numbers and times of the events in the pending step, if the loop left them to the caller."""
         assert self._interpolants is not None  # the loop pauses for nothing else
         return self._interpolants.pending()
 

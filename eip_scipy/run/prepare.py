@@ -39,10 +39,10 @@ from .resume import plain, settings
 
 __all__ = ["DEFAULT", "Prepared", "Request", "default_method", "prepared", "started_at"]
 
-CALLED = "fun", "It takes (t, y), then out if in_place=True, then the params or args of the run if there are any."
+CALLED = "fun", "It takes (t, y), then out if in_place=True, then the arguments from params=... or args=(...)."
 CALLED_ACCELERATION = (
     "acceleration",
-    "It takes (t, q), then out if in_place=True, then the params or args of the run if there are any. If accelerations "
+    "It takes (t, q), then out if in_place=True, then the arguments from params=... or args=(...). If accelerations "
     "depend on the velocity, pass the right-hand side fun(t, y) of y = (q, v) instead.",
 )
 
