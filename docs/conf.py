@@ -87,7 +87,8 @@ def show_notebooks():
 def keep_short_cells_whole(app, doctree):
     """Numbers such as 1e-8 in tables are not broken at their hyphens: narrow pages scroll the table."""
     for cell in doctree.findall(nodes.entry):
-        if len(cell.astext()) <= 14:
+        words_of_a_head = isinstance(cell.parent.parent, nodes.thead) and " " in cell.astext()
+        if len(cell.astext()) <= 14 and not words_of_a_head:
             cell["classes"].append("short")
 
 

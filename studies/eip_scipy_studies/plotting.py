@@ -55,6 +55,7 @@ LINE_HEIGHT = 0.19  # height of a line of the legend, inches
 FAINT = {"lw": 1.0, "ms": 4, "alpha": 0.85}
 OURS = {"lw": 2.4, "ms": 6, "zorder": 5}
 DPI = 160
+WIDEST = 9.0  # inches
 POINTS = 250
 LONG_LABEL = 24
 DENSITY = r"density $|\psi|^2$"
@@ -804,8 +805,13 @@ def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) ->
 
 
 def blank_figure(width: float, height: float, title: str = "") -> Figure:
-    """Return an empty figure of this size in inches, in the layout of all figures."""
-    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    """Return an empty figure in the layout of all figures.
+
+    Its size is this one, in inches, or narrower: a page shows all figures in its own width, and text of the same size
+    is too small to read in a wide one. The height shrinks by the root of what the width does, to leave room for text.
+    """
+    scale = min(1.0, WIDEST / width)
+    figure = Figure(figsize=(scale * width, scale**0.5 * height), dpi=DPI, layout="constrained")
     if title:
         figure.suptitle(typeset(title), fontsize="large")
     return figure
@@ -854,8 +860,8 @@ def _plane(axis: Axes, title: str, unit: str) -> None:
     axis.set_title(title, fontsize="medium")
     axis.set_aspect("equal", adjustable="box")
     axis.set_xlabel(f"x [{unit}]")
-    axis.xaxis.set_major_locator(MaxNLocator(5))
-    axis.yaxis.set_major_locator(MaxNLocator(5))
+    axis.xaxis.set_major_locator(MaxNLocator(3))
+    axis.yaxis.set_major_locator(MaxNLocator(3))
     axis.grid(alpha=0.2)
 
 
