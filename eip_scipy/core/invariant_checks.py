@@ -445,4 +445,6 @@ def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Arr
     total = np.where(changed, sum(weight * values[multiple] for multiple, weight in weights.items()), 0.0)
     total[~np.isfinite(total)] = 0.0
     with np.errstate(over="ignore"):
-        return total / step, np.where(fixed & ~changed, hidden, 50 * rounding / step)
+        # A function of the time also has the rounding of its argument, such as of the phase omega t.
+        of_time = EPS * abs(t) * np.abs(total / step)
+        return total / step, np.where(fixed & ~changed, hidden, 50 * (rounding + of_time) / step)

@@ -457,3 +457,31 @@ def test_a_balance_that_is_fast_only_at_the_end_is_pointed_out(solve):
         solve(driven, (0, 200), [1.0, 0.3], method=EIPDOP853, h=0.3, invariants=balance)
     with pytest.warns(UserWarning, match=r"balance 'E' changes at 0\.\d+ of the terms of its rate"):
         solve(driven, (0, 1500), [1.0, 0.3], method=EIPDOP853, h=0.3, invariants=balance)
+
+
+@pytest.mark.filterwarnings("ignore:balance 'energy' changes at:UserWarning")
+def test_a_right_rate_late_in_time_is_not_accused():
+    """The phase omega t of a function of time is rounded, by more the later it is; differences in time see that."""
+    frequency, strength = 1.1, 0.2
+
+    def field(t, phase=1):
+        wave = 0.5 * strength * phase * np.exp(-1j * frequency * t)
+        return np.array([[0, wave], [np.conj(wave), 0]])
+
+    def matrix(t):
+        return field(t) + np.diag([0.5, -0.5])
+
+    def energy(t, psi):
+        return np.vdot(psi, matrix(t) @ psi).real
+
+    def rate(t, psi, factor=1.0):
+        return factor * np.vdot(psi, field(t, -1j * frequency) @ psi).real
+
+    def run(rate):
+        balance = Balance(energy, rate, lambda t, psi: 2 * (matrix(t) @ psi), name="energy")
+        start, options = np.array([1, 0], complex), {"method": EIPDOP853, "rtol": 1e-6, "atol": 1e-6}
+        return integrate(lambda t, psi: -1j * (matrix(t) @ psi), (290, 310), start, invariants=balance, **options)
+
+    assert run(rate).trusted
+    with pytest.warns(ProjectionWarning, match="rate of balance 'energy' is wrong"):
+        run(lambda t, psi: rate(t, psi, 1 + 1e-7))
