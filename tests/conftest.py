@@ -1,7 +1,8 @@
-"""Settings of all tests: order, ``needs_jit``, plotting without a screen, Ctrl-C, the profile of hypothesis."""
+"""Settings of all tests: order, ``needs_jit``, ``posix``, plotting without a screen, Ctrl-C, hypothesis' profile."""
 
 import os
 import signal
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -38,9 +39,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         seconds[item.path] += SLOW if item.get_closest_marker("slow") else FAST
     items.sort(key=lambda item: -seconds[item.path])
-    if not numba.config.DISABLE_JIT:
-        return
-    skip = pytest.mark.skip(reason="needs compiled code; NUMBA_DISABLE_JIT is set")
+    if numba.config.DISABLE_JIT:
+        skip(items, "needs_jit", "needs compiled code; NUMBA_DISABLE_JIT is set")
+    if sys.platform == "win32":
+        skip(items, "posix", "needs signals, processes or files of POSIX")
+
+
+def skip(items: list[pytest.Item], marker: str, reason: str) -> None:
     for item in items:
-        if item.get_closest_marker("needs_jit"):
-            item.add_marker(skip)
+        if item.get_closest_marker(marker):
+            item.add_marker(pytest.mark.skip(reason=reason))

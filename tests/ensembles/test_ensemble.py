@@ -903,6 +903,7 @@ ensemble(oscillator, (0, 1), y0s, h=0.1, invariants=SQUARE, save_every=4, chunk=
 """
 
 
+@pytest.mark.posix
 @both_stores
 def test_a_killed_run_goes_on(where, tmp_path):
     path = str(tmp_path / "kept")

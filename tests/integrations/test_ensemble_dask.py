@@ -99,6 +99,7 @@ def test_functions_without_a_module(pair):
 
 @pytest.mark.nightly
 @slow
+@pytest.mark.posix
 @pytest.mark.parametrize("allowed_failures", [0, 3])
 def test_a_killed_worker_loses_nothing(allowed_failures):
     """One of two workers gets SIGKILL while it computes; its chunks run again, by Dask or, if it gives up, by us."""
@@ -163,6 +164,7 @@ def slow_oscillator(t, y):
 
 @pytest.mark.nightly
 @slow
+@pytest.mark.posix
 def test_all_workers_are_killed_in_the_middle_of_their_tasks(pair):
     y0s = np.random.default_rng(0).standard_normal((12, 2))
     options = {"h": 0.05, "chunk": 3, "compiled": False}

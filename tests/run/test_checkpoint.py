@@ -501,6 +501,7 @@ def test_writing_takes_a_twentieth_of_the_time(tmp_path, monkeypatch):
     assert (gaps <= 0.45).all()
 
 
+@pytest.mark.posix
 @pytest.mark.needs_jit
 def test_control_c_writes_a_checkpoint_within_a_second(tmp_path):
     fun, path = njit(lambda t, y: np.array([y[1], -y[0]])), tmp_path / "run"
@@ -1139,6 +1140,7 @@ def python(code, *arguments):
 
 @pytest.mark.nightly
 @pytest.mark.slow
+@pytest.mark.posix
 def test_sixty_writers_are_killed(tmp_path):
     """kill -9 at any moment leaves the former checkpoint or the new one."""
     code = """
@@ -1182,8 +1184,9 @@ RUN = """
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_a_run_is_killed_again_and_again(number, tmp_path):
+@pytest.mark.posix
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGINT"])
+def test_a_run_is_killed_again_and_again(name, tmp_path):
     options = {"method": EIPRK4, "h": 0.01, "invariants": [H, L], "save_every": 10, "every": "auto"}
     whole, path, steps = integrate(orbit, (0, 3000), Y0, **options), tmp_path / "run", [0]
     for _ in range(3):
@@ -1192,10 +1195,10 @@ def test_a_run_is_killed_again_and_again(number, tmp_path):
         while (not path.exists() or checkpoint.read(path)[0]["step"] <= steps[-1]) and time.monotonic() < deadline:
             time.sleep(0.01)
         time.sleep(0.1)
-        process.send_signal(number)
+        process.send_signal(getattr(signal, name))
         _, err = process.communicate(timeout=60)
         steps.append(checkpoint.read(path)[0]["step"])
-        if number == signal.SIGINT:
+        if name == "SIGINT":
             assert f"KeyboardInterrupt\nthe checkpoint {str(path)!r} holds step {steps[-1]}, t = " in err
     assert 0 < steps[1] < steps[2] < steps[3] < 300_000
     same(whole, integrate(orbit, (0, 3000), Y0, checkpoint=path, resume=True, **options))

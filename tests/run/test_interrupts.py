@@ -140,6 +140,7 @@ except KeyboardInterrupt as error:
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
+@pytest.mark.posix
 @pytest.mark.parametrize("seed", range(30))
 def test_at_any_instant_of_compilation(seed):
     """KeyboardInterrupt within three seconds, nothing on the terminal, and the next run compiles."""

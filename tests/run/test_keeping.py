@@ -1,12 +1,10 @@
 """Exclusive use of files, functions, signals and disks by a run, against other runs."""
 
 import errno
-import fcntl
 import os
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 import warnings
@@ -28,7 +26,7 @@ Y0 = pericentre(0.6)
 SPAN = (0.0, 6.0)
 OPTIONS = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7, "compiled": False}
 needs_zarr = pytest.mark.skipif(find_spec("zarr") is None, reason="needs zarr")
-posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and file systems of POSIX")
+posix = pytest.mark.posix
 
 
 def run(place, fun=orbit, **more):
@@ -282,7 +280,7 @@ def test_where_locks_do_not_work(number, keep, tmp_path, monkeypatch):
     def flock(descriptor, operation):
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr("fcntl.flock", flock)
     with pytest.warns(RuntimeWarning, match=r"kept' could not be locked \(.*\)\. Make sure that") as record:
         whole = keep(tmp_path / "kept")
     assert [warning.filename for warning in record] == [__file__]

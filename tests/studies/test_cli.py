@@ -289,7 +289,7 @@ def test_an_interruption_keeps_what_was_done(tmp_path, capsys, no_rebound, monke
         assert [row["method"] for row in csv.DictReader(stream)] == ["EIPRK4 (error)", "EIPRK4 (euclidean)", "RK4"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.posix
 def test_sigterm_keeps_what_was_done(tmp_path):
     """SIGTERM keeps the results as Ctrl-C does; the process then ends by it, as its sender expects."""
     code = f"""
@@ -385,6 +385,7 @@ def test_an_interruption_anywhere_is_one_line(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.needs_jit
+@pytest.mark.posix
 def test_control_c(tmp_path):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "eip_scipy", "solar-system", "--out", str(out), "--quiet"]

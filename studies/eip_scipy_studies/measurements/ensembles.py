@@ -5,7 +5,7 @@ Next to the wall time is the processor time of the same work, which other load o
 
 1. One thread against the loop of single runs that are already set up (their `wall_time`), per step.
 2. Two threads against one; two Dask workers on the loopback interface against one.
-3. Peak memory of processes with `members`, a tenth and ten times as many, their trajectories reduced.
+3. Peak memory of processes with `members`, a tenth and ten times as many, their trajectories reduced; not on Windows.
 4. The whole job, `members` of `steps` steps each, on all cores.
 5. Time against the number of members, 1e2 to the largest, with `curve_steps` steps each.
 """
@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from ..study import Figures, Measurement, Rows, Session, option
 __all__ = ["Ensembles", "starts"]
 
 H = 0.03
+PEAK_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes in a unit of ru_maxrss
 MEMORY = """
 import resource
 from eip_scipy import ensemble
@@ -110,7 +112,7 @@ def memory(members: int) -> dict[str, float]:
     """Return megabytes of a process: of the states, its peak, and the peak without imports and starts."""
     code = MEMORY.format(members=members, h=H)
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    base, peak = (int(text) / 1024 for text in printed.split())
+    base, peak = (int(text) * PEAK_UNIT / 2**20 for text in printed.split())
     return {"members": members, "states": members * 101 * 32 / 1e6, "peak": peak, "above": peak - base}
 
 
@@ -131,10 +133,14 @@ class Ensembles(Measurement[dict[str, Any]]):
         compared = threads(few, self.steps, self.repeats) | workers(few, self.steps, self.repeats)
         return {
             "compared": compared,
-            "memory": [memory(count) for count in (self.members // 10, self.members, 10 * self.members)],
+            "memory": [memory(count) for count in self._sizes()],
             "whole": seconds(self.members, self.steps, None),
             "curve": [self._point(count) for count in self._counts()],
         }
+
+    def _sizes(self) -> list[int]:
+        # The module resource, which knows the peak, is missing on Windows.
+        return [self.members // 10, self.members, 10 * self.members] if find_spec("resource") else []
 
     def _counts(self) -> list[int]:
         return [10**k for k in range(2, 10) if 10**k <= self.largest] or [self.largest]
