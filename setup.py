@@ -46,6 +46,10 @@ OTHERS_OWN = ["-std=c++20", "-g0", "-w", "-fvisibility=hidden", "-fno-strict-ali
 UNUSED = ["-Wl,-dead_strip" if TARGET.system == "darwin" else "-Wl,--gc-sections"]  # most of it is
 # The stable interface as of Python 3.12.
 STABLE = [("Py_LIMITED_API", "0x030C0000")] if TARGET.stable else []
+# A Python without the global interpreter lock: nanobind locks what it shares, and the modules declare that.
+FREE = [("NB_FREE_THREADED", None)] if not TARGET.tag and sysconfig.get_config_var("Py_GIL_DISABLED") else []
+if FREE and TARGET.system == "win32":
+    FREE += [("Py_GIL_DISABLED", "1")]  # both Pythons have one pyconfig.h there
 MISSING = f"""\
 eip_scipy's engine is written in C++20, and {shlex.join(COMPILER.command)!r} did not build it. g++ 12 or newer, clang 15
 or newer and Xcode's tools do, and so does the package ziglang: set EIP_SCIPY_COMPILER=zig, or to another command."""
@@ -69,7 +73,7 @@ def module(name: str, *flags: str) -> Extension:
         f"eip_scipy.engine.{name}",
         sources=[str(path) for path in sorted(FOLDER.rglob("*.cpp"))],
         depends=[str(path) for path in sorted(FOLDER.rglob("*.hpp"))],
-        define_macros=[("EIP_MODULE", name), ("NB_DOMAIN", name), ("EIP_SOURCES", f'"{stamp()}"'), *STABLE],
+        define_macros=[("EIP_MODULE", name), ("NB_DOMAIN", name), ("EIP_SOURCES", f'"{stamp()}"'), *STABLE, *FREE],
         extra_compile_args=[*FLAGS, *flags],
         extra_link_args=UNUSED,
         language="c++",
@@ -103,7 +107,7 @@ class Build(build_ext):
         if not BUILT and self.extensions:
             if not (PYTHON / "Python.h").exists():
                 raise SystemExit(HEADERS.format(folder=PYTHON))
-            source, macros = NANOBIND / "src" / "nb_combined.cpp", [("NB_COMPACT_ASSERTIONS", None), *STABLE]
+            source, macros = NANOBIND / "src" / "nb_combined.cpp", [("NB_COMPACT_ASSERTIONS", None), *STABLE, *FREE]
             self.binding += self.compiled("nanobind", [str(source)], macros, [*OTHERS_OWN, *OTHERS, QUICK])
         super().build_extensions()
 

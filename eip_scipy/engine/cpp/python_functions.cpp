@@ -79,12 +79,14 @@ void PythonCall::operator()(double t, const double *y, const double *f, double *
     if (!in_place_) take(value.ptr(), time_object.ptr(), out);
 }
 
-// True if a value is a list of the expected number of floats, of Python or NumPy, as most functions return.
-bool PythonCall::takes_list(PyObject *value) const {
+// Copy a list of the expected number of floats, of Python or NumPy, as most functions return; false if it is another value.
+bool PythonCall::take_list(PyObject *value, double *out) const {
+    const nb::ft_object_guard unchanged{nb::handle(value)};  // by other threads, in a Python without a global lock
     if (n_dimensions_ != 1 || value_type_ != NPY_DOUBLE || !PyList_CheckExact(value)) return false;
     if (PyList_Size(value) != dimensions_[0]) return false;
     for (Py_ssize_t k = 0; k < dimensions_[0]; ++k)
         if (!PyFloat_Check(PyList_GetItem(value, k))) return false;
+    for (Py_ssize_t k = 0; k < floats_; ++k) out[k] = PyFloat_AsDouble(PyList_GetItem(value, k));
     return true;
 }
 
@@ -93,10 +95,7 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
         out[0] = PyFloat_AsDouble(value);
         return;
     }
-    if (takes_list(value)) {
-        for (Py_ssize_t k = 0; k < floats_; ++k) out[k] = PyFloat_AsDouble(PyList_GetItem(value, k));
-        return;
-    }
+    if (take_list(value, out)) return;
     const auto plain = [this](PyObject *a) {
         return is_plain(a, value_type_, n_dimensions_) &&
                std::equal(dimensions_, dimensions_ + n_dimensions_, PyArray_DIMS(reinterpret_cast<PyArrayObject *>(a)));

@@ -27,7 +27,7 @@ class PythonCall {
     int64_t floats() const { return floats_; }
 
   private:
-    bool takes_list(PyObject *value) const;
+    bool take_list(PyObject *value, double *out) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
     nb::handle fun_, convert_;

@@ -1,0 +1,114 @@
+"""Runs in several threads at once, with a global interpreter lock and in a Python that has none."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from systems import SQUARE, Verlet, momentum, orbit, oscillator, pericentre
+
+from eip_scipy import EIPDOP853, EIPGJ14, EIPRK4, EIPRK45, Invariant, eip_method, ensemble, integrate, solve_ivp
+from eip_scipy.problems import kepler
+
+THREADS = 4
+# The threads share the invariants, whose gradients are found by complex steps.
+H = Invariant(lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2), name="energy")
+L = Invariant(momentum, name="momentum")
+
+
+def in_a_list(t, y):
+    return [y[2], y[3], *(-y[:2] / np.hypot(y[0], y[1]) ** 3)]
+
+
+def by_python():
+    return integrate(in_a_list, (0, 2), pericentre(0.4), method=EIPRK4, h=0.05, invariants=[H, L], compiled=False).y
+
+
+def by_scipy():
+    run = solve_ivp(orbit, (0, 2), pericentre(0.4), method=EIPRK45, invariants=[H], dense_output=True, rtol=1e-6)
+    return run.sol(np.linspace(0, 2, 20))
+
+
+def by_a_user_defined_method():
+    return integrate(oscillator, (0, 2), [1.0, 0.0], method=eip_method(Verlet()), h=0.05, invariants=SQUARE).y
+
+
+def by_the_library():
+    return integrate(kepler(), (0, 9), method=EIPDOP853, t_eval=np.linspace(0, 9, 30)).y
+
+
+def by_a_multistep_method():
+    return integrate(kepler(), (0, 9), method=EIPGJ14, h=0.02, save_every=50).y
+
+
+def as_an_ensemble():
+    starts = pericentre(0.3) + 1e-3 * np.arange(12)[:, None]
+    return ensemble(kepler(), (0, 3), starts, method=EIPRK4, h=0.05, save_every=10, executor=1).trajectories
+
+
+RUNS = [by_python, by_scipy, by_a_user_defined_method, by_the_library, by_a_multistep_method, as_an_ensemble]
+
+
+def test_runs_in_threads_have_the_bits_of_runs_alone():
+    expected = [run() for run in RUNS]
+    together = threading.Barrier(THREADS)
+
+    def all_runs(first):
+        together.wait()
+        order = np.roll(np.arange(len(RUNS)), first)
+        return {int(k): RUNS[k]() for k in order}
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for found in pool.map(all_runs, range(THREADS)):
+            for k, values in found.items():
+                np.testing.assert_array_equal(values, expected[k], err_msg=RUNS[k].__name__)
+
+
+def test_a_solver_is_stepped_by_one_thread_at_a_time():
+    """The steps of the other thread are refused, and the refused ones leave the solver as it was."""
+    inside, leave = threading.Event(), threading.Event()
+
+    def fun(t, y):
+        if threading.current_thread() is first:
+            inside.set()
+            assert leave.wait(60)
+        return oscillator(t, y)
+
+    first = None
+    solver = EIPRK4(fun, 0.0, np.array([1.0, 0.0]), 1.0, invariants=SQUARE, h=0.1)
+    first = threading.Thread(target=solver.step)
+    first.start()
+    assert inside.wait(60)
+    try:
+        with pytest.raises(RuntimeError, match="two threads at once"):
+            solver.step()
+    finally:
+        leave.set()
+        first.join()
+    assert solver.t == 0.1
+    while solver.status == "running":
+        solver.step()
+    alone = EIPRK4(oscillator, 0.0, np.array([1.0, 0.0]), 1.0, invariants=SQUARE, h=0.1)
+    while alone.status == "running":
+        alone.step()
+    np.testing.assert_array_equal(solver.y, alone.y)
+
+
+@pytest.mark.skipif(not sysconfig.get_config_var("Py_GIL_DISABLED"), reason="needs a free-threaded Python")
+def test_the_global_lock_stays_off():
+    """A module that does not declare that it needs no lock switches the lock on, with a RuntimeWarning."""
+    code = """
+import sys
+from eip_scipy import EIPRK4, integrate
+from eip_scipy.problems import kepler
+assert integrate(kepler(), (0, 1), method=EIPRK4).success
+print(sys._is_gil_enabled())
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHON_GIL"}
+    command = [sys.executable, "-W", "error", "-c", code]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (run.stdout, run.stderr) == ("False\n", "")
