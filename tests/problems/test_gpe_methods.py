@@ -221,7 +221,7 @@ def test_wrong_options():
         at_rest(soliton())
     with pytest.raises(ValueError, match=r"turns by pi / 4 at most, got 1 "):
         Splitting(gpe, "strang").one_step(0.0, noise(grid).ravel(), 2.0)
-    with pytest.raises(ValueError, match="no rotation"):
+    with pytest.raises(ValueError, match="a rotation needs two or three"):
         rotated(GrossPitaevskii(Grid(8, -1, 1)), np.ones(8), 0.1)
     own = Scheme("euler", 1, (1.0, 0.0), (1.0,), "Lie & Trotter")
     assert Splitting(gpe, own).order == 1
