@@ -104,7 +104,7 @@ def test_checks_can_fail():
 
 
 def test_the_linkage_is_drawn(tmp_path):
-    from eip_scipy_studies.plotting import CostPanel, Linkage, linkage_figure
+    from eip_scipy_studies.plotting import CostPanel, Linkage, linkage_figure, linkages_figure
 
     y = np.array([[np.pi / 2, 0.0], [-np.pi / 2, np.pi / 3], [-np.pi / 2, -np.pi / 3], [0, 0], [0, 0], [0, 0]])
     places = joints(y, {"la": 1.0, "lb": 2.0, "lc": 1.0})
@@ -115,6 +115,18 @@ def test_the_linkage_is_drawn(tmp_path):
     figure = linkage_figure({"run": linkage}, [panel], unit="m", time="t", error="error")
     figure.savefig(tmp_path / "linkage.png")
     assert (tmp_path / "linkage.png").read_bytes().startswith(PNG)
+    alone = linkages_figure({"left": linkage, "right": linkage}, unit="m", time="t")
+    assert [axes.get_title() for axes in alone.axes] == ["left", "right", ""]
+    links, gap = alone.axes[0].collections[0].get_segments(), alone.axes[0].lines[2].get_xydata()
+    np.testing.assert_array_equal(links, places)
+    np.testing.assert_array_equal(gap, [places[1][-1], [2, 0]])  # at the last time, from the link to its pivot
+
+
+def test_figures_are_no_wider_than_a_page():
+    from eip_scipy_studies.plotting import blank_figure
+
+    assert tuple(blank_figure(6, 4).get_size_inches()) == (6, 4)
+    assert tuple(blank_figure(36, 4).get_size_inches()) == (9, 2)
 
 
 @pytest.mark.nightly
