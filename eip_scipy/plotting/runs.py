@@ -170,8 +170,6 @@ def _draw_corrections(axis: Axes, corrections: Mapping[str, float], styles: Mapp
     axis.set(yticks=range(len(corrections)), yticklabels=list(corrections), ylim=(len(corrections) + 0.1, -0.6))
     axis.axvline(USUAL, color="0.4", lw=1.0, ls=":")
     log_errors(axis, "largest correction\n[local errors]", "", along="x")
-    text = axis.annotate(
-        "most correct runs stay below", (USUAL, len(corrections) - 0.1), va="center", fontsize="x-small"
-    )
     low, high = np.log(axis.get_xlim())
-    text.set_ha("right" if np.log(USUAL) > 0.5 * (low + high) else "left")
+    side = "right" if np.log(USUAL) > 0.5 * (low + high) else "left"
+    axis.text(USUAL, len(corrections) - 0.1, "most correct runs stay below", va="center", ha=side, fontsize="x-small")

@@ -71,7 +71,7 @@ class Mechanisms(Study[Found]):
     def measure(self, session: Session) -> Found:
         names = list(self.only or EXAMPLES)
         lines: list[Line] = []
-        published = {}
+        published: dict[str, float] = {}
         with session.bar(len(names), "mechanisms", "mechanism") as bar:
             for name in names:
                 problem = EXAMPLES[name]()
