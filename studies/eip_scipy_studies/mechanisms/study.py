@@ -94,6 +94,8 @@ class Mechanisms(Study[Found]):
 
             return run
 
+        for way in found.values():
+            way(self.tolerances[0])  # compiles
         timed = work_precision(
             {method: (runner(method, way), self.tolerances) for method, way in found.items()},
             lambda y: float(np.abs(y[: end.size] - end).max()),
