@@ -4,9 +4,11 @@ import ctypes
 import gc
 import os
 import pickle
+import platform
 import subprocess
 import sys
 import weakref
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -16,7 +18,7 @@ from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPRKN12, Invariant, integrate
 from eip_scipy.core.dense import Interpolants
 from eip_scipy.engine import native
 from eip_scipy.engine.data import CUBIC, POLYNOMIAL, Work
-from eip_scipy.engine.native import Engine
+from eip_scipy.engine.native import BUILD, Engine
 from eip_scipy.run.prepare import Request, prepared
 
 Y0 = np.array([0.4, 0.0, 0.0, 2.0])
@@ -435,6 +437,16 @@ def test_the_builds_give_the_same_bits():
     (plain, bits), (fast, same) = run("_native"), run("_native_v3")
     assert (plain, fast) == ("_native", "_native_v3")
     assert bits == same
+
+
+@pytest.mark.skipif(
+    platform.machine().lower() not in ("x86_64", "amd64") or not Path("/proc/cpuinfo").exists(),
+    reason="needs an x86-64 processor, and a system that lists what it has",
+)
+def test_the_processor_is_asked_right():
+    """The library behind a builtin of the compiler answered False in builds by zig."""
+    words = set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
+    assert ({"avx2", "bmi2", "fma", "xsave"} <= words) == BUILD.HAS_V3
 
 
 def test_a_build_older_than_its_sources_is_refused():
