@@ -1,5 +1,6 @@
 """Exclusive use of files, functions, signals and disks by a run, against other runs."""
 
+import contextlib
 import errno
 import os
 import re
@@ -160,11 +161,13 @@ def test_a_second_call_is_refused(keep, tmp_path, monkeypatch):
     place, seen = tmp_path / "kept", []
     link = tmp_path / "link"
     monkeypatch.chdir(tmp_path)
+    ways = [place, "kept", str(tmp_path / "." / "kept")]
 
     def callback(*_):
         link.unlink(missing_ok=True)
-        link.symlink_to(place)
-        for way in (place, "kept", str(tmp_path / "." / "kept"), link):
+        with contextlib.suppress(OSError):  # Windows asks for a privilege
+            link.symlink_to(place)
+        for way in [*ways, link] if link.is_symlink() else ways:
             for resume in (False, True):
                 with pytest.raises(CheckpointError, match=IN_USE):
                     keep(way, resume=resume)
@@ -172,8 +175,8 @@ def test_a_second_call_is_refused(keep, tmp_path, monkeypatch):
 
     whole = keep(place, callback=callback)
     assert seen
-    assert content(tmp_path) == ["kept", "link"]
-    same(whole, keep(link, resume=True))
+    assert content(tmp_path) == ["kept", "link"] if link.is_symlink() else ["kept"]
+    same(whole, keep(link if link.is_symlink() else place, resume=True))
 
 
 def test_runs_of_different_kinds(tmp_path):
@@ -361,7 +364,7 @@ def test_a_folder_in_the_place_of_the_file(keep, tmp_path):
         place.unlink()
         place.mkdir()
 
-    with pytest.warns(RuntimeWarning, match="cannot write the checkpoint .*: is a directory"):
+    with pytest.warns(RuntimeWarning, match="cannot write the checkpoint .*: (is a directory|access denied)"):
         assert keep(place, callback=at_once(change)).success
     assert content(tmp_path) == ["kept"]
 
