@@ -564,9 +564,13 @@ def test_no_file_yet(tmp_path):
         ({"checkpoint": "a", "checkpoint_every": np.nan}, ValueError, "checkpoint_every .* got nan"),
         ({"checkpoint": "a", "checkpoint_every": "1 min"}, ValueError, "checkpoint_every .* got '1 min'"),
         ({"checkpoints": "a"}, TypeError, "did you mean 'checkpoint'"),
-        ({"checkpoint": "no/such/folder/a"}, CheckpointError, "cannot write .*no/such/folder/a'.* no such file or dir"),
+        ({"checkpoint": "no/such/folder/a"}, CheckpointError, "cannot write .*folder.+a'.* (no such file|path not)"),
         ({"checkpoint": "."}, CheckpointError, "' exists"),
-        ({"checkpoint": ".", "resume": True}, CheckpointError, "cannot read the checkpoint '.*': is a directory"),
+        (
+            {"checkpoint": ".", "resume": True},
+            CheckpointError,
+            "cannot read the checkpoint '.*': (is a dir|permission)",
+        ),
     ],
 )
 def test_bad_options(options, error, match, tmp_path, monkeypatch):
@@ -791,6 +795,7 @@ def test_the_same_content_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
+@pytest.mark.posix
 def test_a_link_stays_a_link(tmp_path):
     target, link = tmp_path / "target", tmp_path / "link"
     link.symlink_to(target)
@@ -799,6 +804,7 @@ def test_a_link_stays_a_link(tmp_path):
     assert checkpoint.read(target) == checkpoint.read(link)
 
 
+@pytest.mark.posix
 def test_a_link_to_nowhere_yet(tmp_path):
     link = tmp_path / "link"
     link.symlink_to(tmp_path / "target")
