@@ -52,16 +52,21 @@ inline void row_sums(const Rows &rows, double *out, int64_t first, int64_t end) 
     });
 }
 
-// out = scale (total + (rest + what the rows add)), to the rows' ends. The scale h^2 is a pair of floats: its rounding would
-// move all bodies along their orbits, by -4 times its relative size.
+// scale (total + (rest + what the rows add)). The scale h^2 is a pair of floats: its rounding would move all bodies along their
+// orbits, by -4 times its relative size.
+template <class Value>
+inline Value scaled(const Pair &scale, const Value &total, const Value &rest, const Value &rows) {
+    const Value sum = total + (rest + rows);
+    return fused(spread<Value>(scale.value), sum, scale.rest * sum);
+}
+
+// The above into `out`, to the rows' ends.
 inline void predict(const Rows &rows, const Pair &scale, const double *total, const double *rest, double *out) {
     in_blocks(rows.stride, [&]<class Value, int COUNT>(int64_t i) {
         Value sums[COUNT];
         row_sums<Value, COUNT>(rows, i, sums);
-        for (int k = 0; k < COUNT; ++k, i += sizeof(Value) / sizeof(double)) {
-            const Value sum = load_as<Value>(total + i) + (load_as<Value>(rest + i) + sums[k]);
-            store_as<Value>(fused(spread<Value>(scale.value), sum, scale.rest * sum), out + i);
-        }
+        for (int k = 0; k < COUNT; ++k, i += sizeof(Value) / sizeof(double))
+            store_as<Value>(scaled(scale, load_as<Value>(total + i), load_as<Value>(rest + i), sums[k]), out + i);
     });
 }
 
@@ -76,17 +81,29 @@ inline double *next_row(const Multistep &ms) {
     return ms.nodes + (at + 1) * ms.pitch;
 }
 
-// S += s + a, s += a; what rounding leaves is accumulated separately. Rows' ends are 0.
-inline void add_to_sums(const Multistep &ms, const double *a) {
+// S += s + a, s += a for the newest node a; what rounding leaves is accumulated separately. Rows' ends are 0. If it PREDICTS, the
+// positions at the next node go into y: the older nodes' part does not wait for the newest one.
+template <bool PREDICTS>
+inline void add_to_sums(const Multistep &ms, double *y) {
     double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
-    for (int64_t i = 0; i < ms.pitch; i += WIDTH) {
-        const PairOf<Vector> first = two_sum(load(s + i), load(a + i)), second = two_sum(load(S + i), first.value);
-        const Vector rest = load(s_rest + i) + first.rest;
-        store(first.value, s + i);
-        store(rest, s_rest + i);
-        store(second.value, S + i);
-        store(load(S_rest + i) + (second.rest + rest), S_rest + i);
-    }
+    const double *a = newest(ms);
+    const Pair square = two_product(ms.h, ms.h);
+    const Rows rows = latest(ms, ms.predict_q, ms.order);
+    in_blocks(ms.pitch, [&]<class Value, int COUNT>(int64_t i) {
+        Value sums[COUNT];
+        if constexpr (PREDICTS) row_sums<Value, COUNT>(rows, i, sums);
+        for (int k = 0; k < COUNT; ++k, i += sizeof(Value) / sizeof(double)) {
+            const PairOf<Value> first = two_sum(load_as<Value>(s + i), load_as<Value>(a + i));
+            const PairOf<Value> second = two_sum(load_as<Value>(S + i), first.value);
+            const Value rest = load_as<Value>(s_rest + i) + first.rest;
+            const Value second_rest = load_as<Value>(S_rest + i) + (second.rest + rest);
+            store_as<Value>(first.value, s + i);
+            store_as<Value>(rest, s_rest + i);
+            store_as<Value>(second.value, S + i);
+            store_as<Value>(second_rest, S_rest + i);
+            if constexpr (PREDICTS) store_as<Value>(scaled(square, second.value, second_rest, sums[k]), y + i);
+        }
+    });
 }
 
 // True if no entry of a row is NaN or infinite, which times 0 are NaN.
@@ -362,9 +379,15 @@ inline void correct_node(const AnyRun &run, double t, double *q, const double *o
     double *change = ms.change;
     for (int64_t i = first; i < end; ++i) change[i] = square * (older[i] + weight * a[i]);
     run.system.jacobian(w, t, q, change, w.f_point, end);
-    // Float by float: they have just been written so, and a load of several would wait until all those stores are done.
+    // They have just been written float by float, and a load of several would wait until all those stores are done: they are
+    // gathered here, for the sums to read `a` in vectors.
     const volatile double *product = w.f_point;
-    for (int64_t i = first; i < end; ++i) a[i] += product[i];
+    for (int64_t i = first - first % WIDTH; i < end; i += WIDTH) {
+        Vector added{};
+        for (int k = 0; k < WIDTH; ++k)
+            if (first <= i + k && i + k < end) added[k] = product[i + k];
+        store(load(a + i) + added, a + i);
+    }
 }
 
 // The velocities that are predicted for the next node, behind the positions y.
@@ -391,14 +414,16 @@ inline void add_rates(const AnyRun &run, double t, double *y) {
     }
 }
 
-// One more node.
+// One more node. The positions predicted for it are in ms.predicted if it `is_predicted`, and are left there for the node
+// after it if this one `predicts`.
 template <class AnyRun>
-inline Code add_node(const AnyRun &run) {
+inline Code add_node(const AnyRun &run, bool is_predicted, bool predicts) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h;
     double *y = ms.predicted, *older = y + 2 * ms.pitch;
-    predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), ms.sums, ms.sums + ms.pitch, y);
+    if (!is_predicted)
+        predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), ms.sums, ms.sums + ms.pitch, y);
     if (ms.uses_v || (ms.balances > 0 && !come_with_pulls(run))) predict_velocities(ms, y);
     if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
     double *a = next_row(ms);
@@ -407,10 +432,10 @@ inline Code add_node(const AnyRun &run) {
     if (run.system.MEMBERS == 1 && !is_finite_row(ms, a)) return NOT_FINITE;
     if (ms.count > 0) correct_node(run, t, y, older, a);
     if (ms.balances > 0) add_rates(run, t, y);
-    add_to_sums(ms, a);
     ++ms.place[NEWEST_ROW];
     ++ms.place[NEWEST];
     ++ms.place[SINCE];
+    predicts ? add_to_sums<true>(ms, y) : add_to_sums<false>(ms, y);
     return OK;
 }
 
@@ -668,12 +693,16 @@ template <class States>
 inline Code advance_history(const States &states, int64_t last) {
     const auto &run = states.run;
     const Multistep &ms = *run.method.multistep;
+    bool predicted = false;
     while (ms.place[NEWEST] < last) {
-        Code status = add_node(run);
+        const int64_t next = ms.place[NEWEST] + 1;
+        const bool projects = next % ms.spacing == 0, predicts = !projects && next < last;
+        Code status = add_node(run, predicted, predicts);
         if (status != OK) return status;
-        if (ms.place[NEWEST] % ms.spacing == 0)
+        predicted = predicts;
+        if (projects)
             status = states.project();
-        else if (ms.place[NEWEST] % ms.order == 0)
+        else if (next % ms.order == 0)
             status = states.look();
         if (status != OK) return status;
     }
