@@ -29,8 +29,8 @@ def assert_output(found, printed):
 
 PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
-    "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/find-invariants",
-    "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
+    "tutorials/pdes", "tutorials/ensembles", "how-to/find-invariants",
+    "how-to/tables-figures-files", "how-to/checkpoints",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
     "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity", "tutorials/satellites",
     "tutorials/galactic-orbits", "tutorials/quantum-states", "how-to/diagnostics", "how-to/other-packages",
@@ -43,7 +43,8 @@ NEEDED = {
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
 NIGHTLY = (
     "results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
-    "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems", "how-to/recommend",
+    "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems", "how-to/recommend", "how-to/multistep",
+    "how-to/variable-steps", "tutorials/own-pde",
 )  # fmt: skip
 
 

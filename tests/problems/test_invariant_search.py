@@ -359,7 +359,9 @@ def test_terms_that_are_polynomials_or_constant():
     assert names(kepler, [1.0, 0.0, 0.0, 1.2], terms=terms) == ["y0*y3 - y1*y2"]
 
 
-@pytest.mark.parametrize("degree", [8, 16, pytest.param(30, marks=[pytest.mark.nightly, pytest.mark.slow])])
+@pytest.mark.parametrize(
+    "degree", [8, *(pytest.param(n, marks=[pytest.mark.nightly, pytest.mark.slow]) for n in (16, 30))]
+)
 def test_high_degrees(degree):
     def damped(t, y):
         return np.array([y[1], -np.sin(y[0]) - 0.01 * y[1]])

@@ -176,13 +176,13 @@ KINDS = {  # as a run names them
     "jvp in C": "jvp",
     "complex step": "complex steps",
 }
-SOME = ("forced Duffing",)  # the others take minutes to compile
+SOME = {("forced Duffing", "SymPy")}  # the others take seconds to minutes to compile
 
 
 def marks(name, source):
     if source == "complex step":
         return ()
-    return (pytest.mark.slow,) if name in SOME else (pytest.mark.slow, pytest.mark.nightly)
+    return (pytest.mark.slow,) if (name, source) in SOME else (pytest.mark.slow, pytest.mark.nightly)
 
 
 CASES = [pytest.param(name, source, marks=marks(name, source)) for name in SYSTEMS for source in SOURCES]
@@ -533,6 +533,7 @@ def test_growth_with_relativity_is_that_of_the_distance_of_orbits(force):
     assert abs(newton.log_size[-1] - expected) > 1e-3
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("a", "regular"), [(1.8, True), (1.38, False)])
 def test_megno_of_planets_is_that_of_rebound(a, regular):

@@ -80,7 +80,7 @@ def _projected(problem: MechanicsProblem, invariants: Any, tolerance: float) -> 
     def too_many(t: float, y: np.ndarray, defects: np.ndarray) -> bool:
         return next(rows, None) is None
 
-    steps = MOST_CALLS // (ROWS * EIPDOP853.TABLEAU.n_stages)
+    steps = max(MOST_CALLS // (ROWS * EIPDOP853.TABLEAU.n_stages), 1)
     began = time.process_time()
     run = kept(problem, invariants, tolerance, save_every=steps, callback=too_many)
     seconds = time.process_time() - began
