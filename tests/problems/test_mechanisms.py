@@ -323,10 +323,9 @@ def test_a_leak_at_singular_positions_is_reported(tolerance):
 
     options = {"q0": right.y0[:4], "u0": right.y0[4:], "t_span": (0, 10), "potential": lambda t, q: G * (q[1] + q[3])}
     leaky = mechanism(M, forces, lengths, **options)
-    assert leaky.energy.is_balance
-    energy = Invariant(leaky.energy.function, leaky.energy.gradient, in_place=True, name="energy")
+    assert not leaky.energy.is_balance  # the drag is not seen near the start
     with pytest.warns(ProjectionWarning, match="energy"):
-        found = run(leaky, tolerance, invariants=[*leaky.constraints, energy])
+        found = run(leaky, tolerance)
     assert not found.trusted
 
 
