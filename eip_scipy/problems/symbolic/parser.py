@@ -151,6 +151,8 @@ class Reader:
         """Return the expression."""
         if not self.text or len(self.text) > LONGEST:
             raise ValueError(f"{self.what}: expected an expression of 1 to {LONGEST} characters, got {len(self.text)}.")
+        if "\0" in self.text:  # Python 3.11 before 3.11.4 and later versions refuse it in different ways
+            raise ValueError(f"{self.what}: {_cut(self.text)} has a null character. Allowed are {ALLOWED}.")
         if "#" in self.text:  # Python would ignore all of the text that follows
             raise ValueError(f"{self.what}: {_cut(self.text)} has a comment. Allowed are {ALLOWED}.")
         try:
