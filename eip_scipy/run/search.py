@@ -249,7 +249,7 @@ class Search:
         """Return the trial with the evaluations that states at the times of output take, and keep it in the table."""
         counted = self.bench.with_output(chosen)
         self.trials[[trial is chosen for trial in self.trials].index(True)] = counted
-        self.kinds[id(counted)] = self.kinds[id(chosen)]
+        self.kinds[id(counted)] = self.kinds.pop(id(chosen))  # an object that is gone may pass its id on
         return counted
 
     def _trial(self, options: Mapping[str, Any]) -> Trial:
