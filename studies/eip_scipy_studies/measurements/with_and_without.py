@@ -146,44 +146,45 @@ class WithAndWithout(Study[Found]):
 
 def comet_figure(found: dict[str, Errors]) -> Any:
     """Draw the errors of the energy and of the place of the comet."""
-    from eip_scipy.plotting import PALETTE
-
-    from ..plotting import blank_figure
-
-    looks = {"RK45": (PALETTE[2], "RK45"), "EIPRK45": (PALETTE[0], "EIPRK45, energy and angular momentum kept")}
-    figure = blank_figure(9, 3.6)
-    energies, places = figure.subplots(1, 2)
-    for name, run in found.items():
-        colour, label = looks[name]
-        energies.semilogy(run.t[1:] / PERIOD, np.maximum(run.energy[1:], 1e-16), color=colour, lw=1.2, label=label)
-        places.semilogy(run.t[1:] / PERIOD, run.place[1:], color=colour, lw=1.2)
-    energies.set(xlabel="periods of the comet", ylabel="error of the energy, |ΔH/H|")
-    places.set(xlabel="periods of the comet", ylabel="error of the place [semi-major axes]", ylim=(1e-7, 1e-1))
-    for axes in (energies, places):
-        axes.grid(alpha=0.3)
-        axes.set_xlim(0, T_END / PERIOD)
+    labels = {"RK45": "RK45", "EIPRK45": "EIPRK45, energy and angular momentum kept"}
+    figure, energies, places, colours = two_panels(
+        "periods of the comet", T_END / PERIOD, "error of the energy, |ΔH/H|"
+    )
+    for (name, run), colour in zip(found.items(), colours, strict=True):
+        t = run.t[1:] / PERIOD
+        energies.semilogy(t, np.maximum(run.energy[1:], 1e-16), color=colour, lw=1.2, label=labels[name])
+        places.semilogy(t, run.place[1:], color=colour, lw=1.2)
+    places.set(ylabel="error of the place [semi-major axes]", ylim=(1e-7, 1e-1))
     figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
 
 
 def satellite_figure(found: dict[str, Flight]) -> Any:
     """Draw the energy of the satellite, which falls, and the error of its place."""
+    labels = {"DOP853": "DOP853", "EIPDOP853": "EIPDOP853, balances kept"}
+    figure, energies, places, colours = two_panels("days", DAYS, "change of the energy [km²/s²]")
+    for (name, run), colour in zip(found.items(), colours, strict=True):
+        places.semilogy(run.t[1:], np.maximum(run.metres[1:], 1e-3), color=colour, lw=1.2, label=labels[name])
+    run = found["EIPDOP853"]
+    energies.plot(run.t, run.energy - run.energy[0], color=colours[1], lw=0.8)
+    places.set_ylabel("error of the place [m]")
+    figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    return figure
+
+
+def two_panels(time: str, end: float, energy: str) -> tuple[Any, Any, Any, tuple[str, str]]:
+    """Return a figure, its panels for energies and places, and the colours of runs without and with invariants.
+
+    The panels go from time 0 to `end`; `time` and `energy` are labels.
+    """
     from eip_scipy.plotting import PALETTE
 
     from ..plotting import blank_figure
 
-    looks = {"DOP853": (PALETTE[2], "DOP853"), "EIPDOP853": (PALETTE[0], "EIPDOP853, balances kept")}
     figure = blank_figure(9, 3.6)
     energies, places = figure.subplots(1, 2)
-    for name, run in found.items():
-        colour, label = looks[name]
-        places.semilogy(run.t[1:], np.maximum(run.metres[1:], 1e-3), color=colour, lw=1.2, label=label)
-    run = found["EIPDOP853"]
-    energies.plot(run.t, run.energy - run.energy[0], color=PALETTE[0], lw=0.8)
-    energies.set(xlabel="days", ylabel="change of the energy [km²/s²]")
-    places.set(xlabel="days", ylabel="error of the place [m]")
     for axes in (energies, places):
         axes.grid(alpha=0.3)
-        axes.set_xlim(0, DAYS)
-    figure.legend(loc="outside upper center", ncols=2, frameon=False)
-    return figure
+        axes.set(xlabel=time, xlim=(0, end))
+    energies.set_ylabel(energy)
+    return figure, energies, places, (PALETTE[2], PALETTE[0])
