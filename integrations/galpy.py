@@ -35,7 +35,7 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
     """Integrate orbits as ``orbit.integrate(t, pot)`` does, with the invariants kept.
 
     The invariants are the energy, or Jacobi's integral, unless it depends on time, and L_z if the potential has this
-    symmetry; both is found out at random positions. Forces are galpy's C functions, called from Python, if all
+    symmetry; their rates are tested at random states. Forces are galpy's C functions, called from Python, if all
     potentials have them and the version of galpy is 1.12.
 
     Parameters
