@@ -26,8 +26,8 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
     """Integrate orbits as ``integrate_orbit`` of gala's potentials does, with the invariants kept.
 
     The invariants are the energy (Jacobi's integral in a rotating frame) unless the potential depends on time, and L_z
-    if the potential and the axis of the frame allow it; their rates are tested at random states. Forces are gala's own C
-    functions, called from Python. gala's own ``integrate_orbit`` accepts no other integrators than gala's.
+    if the potential and the axis of the frame allow it; their rates are tested at random states. Forces are gala's own
+    C functions, called from Python. gala's own ``integrate_orbit`` accepts no other integrators than gala's.
 
     Parameters
     ----------
