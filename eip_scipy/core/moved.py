@@ -1,4 +1,4 @@
-"""Names that have moved: in this version their old places still work, with a warning that names the new place."""
+"""Names that have moved in 0.3: their old places still work, with a warning that names the new place."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-__all__ = ["MOVED", "moved_names"]
+__all__ = ["MOVED", "REMOVED_IN", "moved_names"]
 
+REMOVED_IN = "0.4"
 STUDIES = "eip_scipy_studies"
 RESULTS = (
     "EnsembleResult", "IntegrationResult", "OdeResult", "ProjectionResult", "Recommendation", "plot", "save",
@@ -57,7 +58,9 @@ def moved_names(module: str, stacklevel: int = 2) -> Callable[[str], Any]:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         value = getattr(import_module(home), name)
         warnings.warn(
-            f"{module}.{name} is now {home}.{name}; the old name will be removed.", DeprecationWarning, stacklevel
+            f"{module}.{name} is now {home}.{name}; the old name works in 0.3 and will be removed in {REMOVED_IN}.",
+            DeprecationWarning,
+            stacklevel,
         )
         return value
 

@@ -6,12 +6,12 @@ from importlib.metadata import PackageNotFoundError, version
 
 __all__ = ["VERSION", "installed"]
 
-VERSION = "0.2.0"
-"""The package's own: the one place where it stands (pyproject.toml reads it)."""
+VERSION = "0.3.0"
+"""Version of the package. pyproject.toml reads it from here; a test compares CITATION.cff and CHANGELOG.md with it."""
 
 
 def installed(package: str) -> str | None:
-    """Return the version of a package, None where it is not installed; it is not imported."""
+    """Return the version of a package, or None if it is not installed; it is not imported."""
     try:
         return version(package)
     except PackageNotFoundError:

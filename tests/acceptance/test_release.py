@@ -1,14 +1,18 @@
-"""Statements of a release: one version everywhere, safe reading of data, the page of changes."""
+"""Statements of a release: one version everywhere, safe reading of data, the pages of changes, the wheels."""
 
 import ast
+import importlib
 import re
+import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from test_docs import test_page as run_page
 
 import eip_scipy
+from eip_scipy.core.moved import REMOVED_IN
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted(path for folder in ("eip_scipy", "integrations", "studies") for path in (ROOT / folder).rglob("*.py"))
@@ -17,8 +21,10 @@ UNPICKLES = {"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "j
 
 def test_one_version():
     version = eip_scipy.__version__
-    assert re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)[1] == version
-    assert re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1] == version
+    cited = re.search(r"^version: (.+)\ndate-released: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    logged = re.search(r"^## \[(.+?)\] - (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert cited.groups() == logged.groups()
+    assert cited[1] == version
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["project"]["dynamic"] == ["version"]
     assert project["tool"]["setuptools"]["dynamic"]["version"]["attr"] == "eip_scipy.core.versions.VERSION"
@@ -62,5 +68,25 @@ def test_configuration(capsys):
         eip_scipy.show_config("json")
 
 
-def test_the_page_on_what_changed(capsys, tmp_path, monkeypatch):
-    run_page("docs/changes-0.2.md", capsys, tmp_path, monkeypatch)
+@pytest.mark.parametrize("minor", ["0.2", "0.3"])
+def test_the_pages_on_what_changed(minor, capsys, tmp_path, monkeypatch):
+    run_page(f"docs/changes-{minor}.md", capsys, tmp_path, monkeypatch)
+    assert f"](changes-{minor}.md)" in (ROOT / "docs/index.md").read_text(encoding="utf-8")
+
+
+def test_moved_names_end_with_the_version_that_is_named():
+    """Version 0.4 must not have the table of moved names any more."""
+    here, end = (tuple(map(int, version.split(".")[:2])) for version in (eip_scipy.__version__, REMOVED_IN))
+    assert here == (end[0], end[1] - 1)
+    assert (ROOT / f"docs/changes-{here[0]}.{here[1]}.md").exists()
+
+
+def test_wheels_are_listed(monkeypatch):
+    """The page Installation has a row for each wheel that building/wheels.py makes."""
+    monkeypatch.syspath_prepend(ROOT)
+    monkeypatch.setitem(
+        sys.modules, "lief", ModuleType("lief")
+    )  # which reads libraries, and only the wheels' builder needs
+    made = importlib.import_module("building.wheels").WHEELS
+    page = (ROOT / "docs/install.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^\| `(cp[^`]+)` \|", page, re.MULTILINE)) == sorted(made)
