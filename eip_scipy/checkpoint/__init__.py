@@ -240,9 +240,10 @@ def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, An
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ValueError("its header has another format")
         if header.get("schema") != SCHEMA:
+            version = (header.get("versions") or {}).get("eip_scipy", "unknown")
             raise CheckpointError(
-                f"{_name(path)} has schema {header.get('schema')!r}, expected {SCHEMA}; "
-                "resume with the version of eip_scipy that wrote it."
+                f"{_name(path)} has schema {header.get('schema')!r}, expected {SCHEMA}; resume or load it with the "
+                f"version of eip_scipy that wrote it ({version})."
             )
         if names != [HEADER, *(f"{name}.npy" for name in header["arrays"])]:  # the directory has no checksum
             raise ValueError(f"its members are {names[:10]}, and not those that its header names")

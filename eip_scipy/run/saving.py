@@ -110,7 +110,9 @@ def load(path: str | os.PathLike[str]) -> Any:
     except CheckpointError as error:
         if isinstance(error.__cause__, OSError):
             raise error.__cause__ from None
-        raise ValueError(f"load: {os.fspath(path)!r} is not a result written by save: {error}") from error
+        raise ValueError(
+            f"load: {os.fspath(path)!r} is not a result written by save of this version: {error}"
+        ) from error
     if (kind := header.get("kind")) != KIND:
         name = repr(os.fspath(path))
         again = f"; {kind}(..., checkpoint={name}, resume=True) continues it" if kind in RESUMED else ""

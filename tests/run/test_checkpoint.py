@@ -956,9 +956,10 @@ def test_foreign_archives(tmp_path):
     np.savez(path, x=np.arange(3))
     with pytest.raises(CheckpointError, match=r"not a checkpoint of eip_scipy: its members are \['x\.npy'\]"):
         checkpoint.read(path)
-    forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 5})
-    with pytest.raises(CheckpointError, match="has schema 5, expected 4; resume with the version of eip_scipy"):
-        checkpoint.read(path)
+    for versions, named in (({}, "unknown"), ({"versions": {"eip_scipy": "0.2.0"}}, "0.2.0")):
+        forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 2, **versions})
+        with pytest.raises(CheckpointError, match=rf"has schema 2, expected 4; .* that wrote it \({named}\)\."):
+            checkpoint.read(path)
     forged(path, "x.npy", npy_bytes("<f8", (1, 1), bytes(8), fortran=True))
     with pytest.raises(CheckpointError, match="not a checkpoint"):
         checkpoint.read(path)
