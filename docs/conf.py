@@ -4,6 +4,7 @@ Neither the build nor the pages ask the network for anything: formulas become Ma
 up in ``_inventories``, and the theme's fonts are the reader's.
 """
 
+import re
 import shutil
 from pathlib import Path
 
@@ -56,15 +57,27 @@ html_css_files = ["pages.css"]
 html_math_renderer = "mathml"
 
 
+# docutils reads \frac12 as 12 over what follows, and draws the index of an accented letter below it; Chromium draws the
+# sign of a root too low.
+MISDRAWN = re.compile(r"\\[td]?frac\s*\d\d|\\(?:bar|d?dot|hat|tilde|vec)\s*\{?\\?\w+\}?_|\\sqrt")
+
+
+def mathml(text, **options):
+    """Return a formula as MathML; refuse what would be drawn wrong."""
+    if found := MISDRAWN.search(text):
+        raise ValueError(f"{found[0]} in {text!r}: write \\frac{{1}}{{2}}, \\hat y^{{}}_k and x^{{1/2}}")
+    return tex2mathml(text, **options)
+
+
 def inline_formula(writer, node):
     """A formula within a line."""
-    writer.body.append(tex2mathml(node.astext()))
+    writer.body.append(mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def formula(writer, node):
     """A formula of its own, which scrolls where the page is narrow."""
-    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    writer.body.append(f'<div class="math">{mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode
 
 
