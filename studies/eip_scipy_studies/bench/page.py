@@ -201,7 +201,7 @@ def markdown(found: Found, names: Mapping[Where, str]) -> str:
     """Lay out all tables for the documentation, with the names of the figures next to them."""
 
     def cell(value: str) -> str:
-        return value.replace("|", "\\|").replace("<", "&lt;")
+        return value.replace("|", "\\|").replace("<", "&lt;").replace("__", "\\_\\_")
 
     def lay(each: Table, level: int) -> list[str]:
         # One problem has a table for each kind of function.
