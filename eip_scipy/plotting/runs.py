@@ -106,8 +106,8 @@ def _draw_paths(axis: Axes, paths: Mapping[str, tuple[Any, Any]]) -> None:
     axis.set_xlabel("x")
     axis.set_ylabel("y")
     axis.grid(alpha=0.2)
-    if len(paths) > 1:
-        axis.legend(fontsize="small", loc="upper right")
+    if len(paths) > 1:  # below the orbits, which leave no corner free
+        axis.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False)
     _counted(axis, len(paths))
 
 
