@@ -2,8 +2,8 @@
 
     python -m tests.fuzz.kills --kills 300
 
-Each chain of kills is made from a number. A violation prints the number and the command that runs the chain again; the
-exit status is then 1.
+Needs the signals of POSIX. Each chain of kills is made from a number. A violation prints the number and the command
+that runs the chain again; the exit status is then 1.
 """
 
 from __future__ import annotations
