@@ -60,6 +60,7 @@ COMMANDS = {
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
     ),
+    "study control": Entry("measurements.control:Control", "step control by the error before and after the projection"),
     "study ensembles": Entry(
         "measurements.ensembles:Ensembles", "cost of a member, threads, workers, memory, growth with the size"
     ),

@@ -21,6 +21,7 @@ RUNS = [
     ("balances", "--rotations 1 --system 'drag 1e-2, 5 revolutions' --json run.json", ()),
     ("bodies", "--periods 2 --bodies 10 --json run.json", REBOUND),
     ("charged-particle", "--quick --json run.json", ()),
+    ("control", "--method EIPRK23 --case three_wave --json run.json", ()),
     ("ensembles", "--members 10 --steps 100 --repeats 1 --largest 10 --json run.json", ()),
     ("exoplanets", "--share 0.002 --json run.json", REBOUNDX),
     ("far", "--years 1 --json run.json", REBOUND),
