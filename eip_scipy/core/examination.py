@@ -30,6 +30,8 @@ from ..engine.data import (
     SUSPECT_WAITED,
 )
 from ..methods.runge_kutta import RK4
+from .inputs import are_finite
+from .invariant_checks import complaints
 from .invariants import InvariantSet
 from .resolution import runge_kutta_step
 
@@ -152,12 +154,12 @@ def _complaint(
     If the state is not on the manifold, findings about invariants that depend on others are ignored.
     """
     f = rhs(t, y)
-    if not np.isfinite(f).all():
+    if not are_finite(f.view(float)):
         return None
-    figures = examiner.figures
-    for column, shares in zip((RATE, EXAMINED), known.rate_shares(t, y, f), strict=True):
+    figures, evaluated = examiner.figures, (known.gradients(t, y, f), known.values(t, y))
+    for column, shares in zip((RATE, EXAMINED), known.rate_shares(t, y, f, *evaluated), strict=True):
         np.fmax(figures[:, column], shares, out=figures[:, column])
-    found = known.complaints(t, y, f, examiner.tau, rhs)
+    found = complaints(known, t, y, f, examiner.tau, rhs, evaluated)
     return next((one.text for one in found if on_manifold or not one.dependent), None)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from functools import cached_property
 from itertools import accumulate
@@ -17,8 +17,8 @@ from .arguments import names, scalars
 from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
-from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
-from .invariant_checks import Complaint, complaints, listed, time_derivative
+from .inputs import are_finite, count, filled, flag, reals, refuse_units, require_arguments, shown
+from .invariant_checks import complaints, listed, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
@@ -54,6 +54,13 @@ class OwnArguments:
     def __call__(self, *given: Any) -> Any:
         """Call the function."""
         return self.function(*given, *(self.args if len(given) == self.first else ()))
+
+
+def _copied(original: Any) -> Any:
+    """Return a shallow copy; as a method it makes `copy.copy` about 5 times faster."""
+    new = object.__new__(type(original))
+    vars(new).update(vars(original))
+    return new
 
 
 class Invariant:
@@ -171,6 +178,8 @@ class Invariant:
         if self.gradient is None or not self.args:
             return self.gradient
         return OwnArguments(self.gradient, self.args, 2 + self.uses_f + self.in_place)
+
+    __copy__ = _copied
 
     def __repr__(self) -> str:
         name = self.name or getattr(self.function, "__name__", "?")
@@ -460,6 +469,8 @@ class InvariantSet:
         self.start_gradients = self._gradients_at_start(t0, y0, f0)
         self.balances.check(t0, y0, f0)
 
+    __copy__ = _copied
+
     def _names(self, sizes: list[int]) -> list[str]:
         """Return the names of all values."""
         return [
@@ -535,6 +546,8 @@ class InvariantSet:
     @property
     def fixed_target(self) -> Array:
         """Return the target values (l,) of the whole run; NaN for balances, whose values change."""
+        if not self.balances.items:
+            return self.target.copy()
         return np.where(self.balances.mask, np.nan, self.target)
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
@@ -600,7 +613,7 @@ class InvariantSet:
         return tuple(map(value, range(len(self.items)))), tuple(map(gradient, range(len(self.items))))
 
     def _require_finite(self, values: Array, what: str) -> None:
-        if np.isfinite(values).all():
+        if are_finite(values):
             return
         for name, value in zip(self.names, values, strict=True):
             if not np.isfinite(value):
@@ -631,7 +644,7 @@ class InvariantSet:
         for k, (item, label) in enumerate(zip(self.items, self.labels, strict=True)):
             rows = G[self.starts[k] : self.starts[k + 1]]
             rows[:] = _first_gradient(item, self.calls[1][k], label, (t, y, f), self.extra)
-            if not np.isfinite(rows).all():
+            if not are_finite(rows.view(float)):
                 raise ValueError(f"gradient of invariant {label!r} is not finite at y0.")
         return G
 
@@ -684,16 +697,17 @@ class InvariantSet:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(residual == 0, 0.0, residual / allowed)
 
-    def rate_shares(self, t: float, y: Array, f: Array) -> tuple[Array, Array]:
+    def rate_shares(self, t: float, y: Array, f: Array, G: Array, here: Array) -> tuple[Array, Array]:
         """Return the rates of change (l,) along f by gradients and by values, relative to the terms of these rates.
 
-        The given rate of a balance is subtracted from its rate of change. Balances without a given rate get NaN.
+        `G` and `here` are the gradients and the values at the state. The given rate of a balance is subtracted from its
+        rate of change. Balances without a given rate get NaN.
         """
         own = None
         if self.balances.items:
-            in_time, _ = time_derivative(self, t, y, self.gradients(t, y, f), self.values(t, y), self.tau)
+            in_time, _ = time_derivative(self, t, y, G, here, self.tau)
             own = self.balances.known(t, y, f) - np.where(self.balances.mask, in_time, 0.0)
-        by_gradient, by_values = self.functions.rate_shares(t, y, f, self.target, self.scales, own)
+        by_gradient, by_values = self.functions.rate_shares(t, y, f, G, here, self.target, self.scales, own)
         return by_gradient, by_values
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
@@ -744,12 +758,6 @@ class InvariantSet:
                 stacklevel=users_level(),
             )
         return [complaint.text for complaint in found]
-
-    def complaints(
-        self, t: float, y: Array, f: Array, tau: float, rhs: Callable[[float, Array], Array] | None = None
-    ) -> Iterator[Complaint]:
-        """Yield findings about the invariants at a state with the derivative f; `rhs` defaults to the run's system."""
-        return complaints(self, t, y, f, tau, rhs or self.rhs)
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:

@@ -186,7 +186,7 @@ class Run:
 
     def _is_doubtful(self, ended: bool) -> bool:
         """Return True if the run is unreliable because of its corrections, or certainly will be at its end."""
-        return bool(self.trust.sick.any()) if ended else self.trust.beyond_doubt
+        return self.trust.is_sick if ended else self.trust.beyond_doubt
 
     @cached_property
     def examiner(self) -> Examiner:

@@ -377,6 +377,14 @@ class LibraryFunction:
     def __reduce__(self) -> tuple[Any, ...]: ...
 LIBRARY: dict[Any, Any] = ...
 
+def are_finite(numbers: numpy.typing.NDArray[numpy.float64]) -> bool:
+    """Return True if no number is NaN or infinite."""
+
+def are_calm(figures: numpy.typing.NDArray[numpy.float64], beyond_doubt: float, together: float) -> bool:
+    """
+    Return True if no figure, (..., N_FIGURES), may be that of a faulty run.
+    """
+
 class InvariantFunctions:
     """The invariants of a run and their gradients, each as a `Call`."""
 
@@ -398,7 +406,7 @@ class InvariantFunctions:
         Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink. Rates that are within the rounding of the values are 0.
         """
 
-    def rate_shares(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], own: numpy.typing.NDArray[numpy.float64] | None = None) -> tuple[numpy.ndarray, numpy.ndarray]:
+    def rate_shares(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], own: numpy.typing.NDArray[numpy.float64] | None = None) -> tuple[numpy.ndarray, numpy.ndarray]:
         """
         Return rates of change along f by gradients and by values, without the rates `own`, in units of their terms; (l,) each.
         """

@@ -39,6 +39,7 @@ from .data import (
     SUM,
     TERMS,
 )
+from .native import BUILD
 
 __all__ = ["ProjectionWarning", "Trust"]
 
@@ -54,8 +55,6 @@ TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
 ROUNDING_OF_RATES, ROUNDING_OF_DIFFERENCES = 1e-11, 1e-7
 # Smallest number of projections for which fractions and sums are judged, if more than one correction is LARGE.
 ENOUGH = 5
-# Figures that are 0 in most runs. If all of them are 0, no step of the run stands out.
-UNUSUAL = [SHARE, RAW, RAW_MANY, MANY]
 MOST_REASONS = 3  # largest number of reasons in a message
 PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
@@ -91,7 +90,12 @@ class Trust:
     @property
     def trusted(self) -> bool:
         """True if no step failed, no check found anything and the errors of the steps explain all corrections."""
-        return not (self.failed or self.doubts or self.sick.any())
+        return not (self.failed or self.doubts or self.is_sick)
+
+    @property
+    def is_sick(self) -> bool:
+        """Return True if the corrections or errors of an invariant do not occur in correct runs."""
+        return not are_calm(self.figures) and bool(self.sick.any())
 
     @property
     def sick(self) -> np.ndarray:
@@ -101,7 +105,7 @@ class Trust:
     @property
     def beyond_doubt(self) -> bool:
         """Return True if later projections cannot make the run reliable again."""
-        return bool(_extreme(self.figures).any())
+        return not are_calm(self.figures) and bool(_extreme(self.figures).any())
 
     @property
     def worst(self) -> tuple[str, float, float] | None:
@@ -136,9 +140,9 @@ class Trust:
     @property
     def reasons(self) -> list[str]:
         """Return the reasons against the run: a sentence for each of the worst three invariants, and a count."""
-        found = np.flatnonzero(self.sick)
-        if not found.size:
+        if not self.is_sick:
             return []
+        found = np.flatnonzero(self.sick)
         worst = found[np.argsort(-_severity(self.figures[found]), kind="stable")]
         more = (
             [f"{found.size - MOST_REASONS} more invariants were corrected too much"]
@@ -162,16 +166,15 @@ class Trust:
 
 def sick(figures: np.ndarray) -> np.ndarray:
     """Return a mask of the rows of figures (..., N_FIGURES) that do not occur in correct runs."""
-    if _are_calm(figures):
+    if are_calm(figures):
         return np.zeros(figures.shape[:-1], bool)
     far = figures[..., RAW_MANY] > FAR_OFTEN * figures[..., NOTED]
     return _extreme(figures) | (_may_leak(figures) & _large_corrections(figures)) | far
 
 
-def _are_calm(figures: np.ndarray) -> bool:
+def are_calm(figures: np.ndarray) -> bool:
     """Return True if all figures for the judgement are those of correct runs, which is the usual case."""
-    together = figures[..., SUM] > TOGETHER * figures[..., EXPECTED]
-    return not (figures[..., UNUSUAL].any() or (figures[..., NU] > BEYOND_DOUBT).any() or together.any())
+    return BUILD.are_calm(np.ascontiguousarray(figures), BEYOND_DOUBT, TOGETHER)
 
 
 def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:

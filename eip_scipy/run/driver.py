@@ -256,8 +256,8 @@ class Driver:
     def note(self, values: np.ndarray) -> None:
         """Update the largest invariant errors with the `values` (l, m) at the saved states after the start."""
         largest, target = self.run.work.max_defect, self.run.invariants.fixed_target
-        defects = np.abs(values - target[:, None])[:, self.t[: self.rows] != self.schedule.span.t0]
-        np.fmax(largest, np.fmax.reduce(defects, axis=1, initial=0.0), out=largest)
+        later = values[:, np.count_nonzero(self.t[: self.rows] == self.schedule.span.t0) :]
+        np.fmax(largest, np.fmax.reduce(np.abs(later - target[:, None]), axis=1, initial=0.0), out=largest)
 
     def values(self) -> np.ndarray:
         """Return the invariants of the saved states, (l, m)."""

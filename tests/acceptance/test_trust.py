@@ -660,7 +660,7 @@ def test_errors_of_an_examination_itself_are_not_hidden(monkeypatch):
     """Only the user's functions may refuse a state."""
     from eip_scipy.core.invariants import InvariantSet
 
-    def broken(self, t, y, f):
+    def broken(self, *state):
         raise ArithmeticError("of the examination")
 
     monkeypatch.setattr(InvariantSet, "rate_shares", broken)

@@ -100,15 +100,11 @@ class InvariantFunctions {
 
     // The rates of change along f by gradients and by values, without what the values change by anyway, in units of
     // the terms.
-    std::tuple<Array, Array> rate_shares(double t, State y, State f, Numbers target, Numbers scales,
-                                         std::optional<Numbers> own) {
-        const Array G = gradients(t, y, f), here = values(t, y);
-        Rows rows;
-        Numbers numbers;
-        rows.take(G.ptr()), numbers.take(here.ptr());
-        Array by_values = rates_by_values(t, y, f, rows, numbers, target, scales), by_gradient = new_array({l_});
+    std::tuple<Array, Array> rate_shares(double t, State y, State f, Rows G, Numbers here, Numbers target,
+                                         Numbers scales, std::optional<Numbers> own) {
+        Array by_values = rates_by_values(t, y, f, G, here, target, scales), by_gradient = new_array({l_});
         for (int64_t i = 0; i < l_; ++i) {
-            const double *row = G.floats() + i * m_, expected = own ? known(*own)[i] : 0.0;
+            const double *row = G.data + i * m_, expected = own ? known(*own)[i] : 0.0;
             const double size = terms(row, f.data), unit = size > 0.0 ? size : 1.0;
             by_gradient.floats()[i] = std::abs(dot(row, f.data, m_) - expected) / unit;
             by_values.floats()[i] = std::abs(by_values.floats()[i] - expected) / unit;
@@ -250,9 +246,24 @@ class InvariantFunctions {
     std::vector<PythonCall> inv_, grad_;
 };
 
+bool are_finite(PointsOf<const double, false> numbers) { return all_finite(numbers.data, numbers.points); }
+
+// True if no row of figures has one that may be that of a faulty run, which is the usual case.
+bool are_calm(PointsOf<const double, false> figures, double beyond_doubt, double together) {
+    require(figures.columns == N_FIGURES, "trust: rows of another number of figures");
+    for (const double *row = figures.data; row < figures.data + figures.points; row += N_FIGURES) {
+        const bool none = row[SHARE] == 0.0 && row[RAW] == 0.0 && row[RAW_MANY] == 0.0 && row[MANY] == 0.0;
+        if (!none || row[NU] > beyond_doubt || row[SUM] > together * row[EXPECTED]) return false;
+    }
+    return true;
+}
+
 }  // namespace
 
 void add_examination(nb::module_ &module) {
+    module.def("are_finite", &are_finite, "numbers"_a, "Return True if no number is NaN or infinite.");
+    module.def("are_calm", &are_calm, "figures"_a, "beyond_doubt"_a, "together"_a,
+               "Return True if no figure, (..., N_FIGURES), may be that of a faulty run.");
     using Functions = InvariantFunctions;
     nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
                           "The invariants of a run and their gradients, each as a `Call`.")
@@ -267,7 +278,8 @@ void add_examination(nb::module_ &module) {
              "scales"_a,
              "Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a "
              "kink. Rates that are within the rounding of the values are 0.")
-        .def("rate_shares", &Functions::rate_shares, "t"_a, "y"_a, "f"_a, "target"_a, "scales"_a, "own"_a = nb::none(),
+        .def("rate_shares", &Functions::rate_shares, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a, "scales"_a,
+             "own"_a = nb::none(),
              "Return rates of change along f by gradients and by values, without the rates `own`, in units of their "
              "terms; (l,) each.");
     module.attr("CHECK_STEP") = CHECK_STEP;
