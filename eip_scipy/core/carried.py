@@ -93,15 +93,18 @@ class Carried:
         self.items = {k: item for k, item in enumerate(items) if item.is_balance}
         self._given = {k for k, item in self.items.items() if item.rate_function is not None}
         self.mask = np.zeros(starts[-1], bool)
+        if not self.items:
+            self.places, self.most_slowness = np.zeros(0, np.int64), np.zeros(0)
+            return
         for k in self.items:
             self.mask[starts[k] : starts[k + 1]] = True
         self.places = np.flatnonzero(self.mask).astype(np.int64)
         most = [np.full(starts[k + 1] - starts[k], item.most_slowness) for k, item in self.items.items()]
-        self.most_slowness = np.concatenate(most) if most else np.zeros(0)
+        self.most_slowness = np.concatenate(most)
 
     def compile_rates(self, n: int) -> None:
         """Give jitted balances of a real state of n components rates by dual numbers, if they have none."""
-        numbers = scalars(self._extra)
+        numbers = scalars(self._extra) if self.items else None
         for k, item in self.items.items():
             lacks = item.rate_function is None and not item.args and is_jitted(item.function) and not jit_is_off()
             if not lacks or numbers is None:

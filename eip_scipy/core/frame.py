@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
@@ -14,6 +15,8 @@ from .inputs import refuse_units
 __all__ = ["frame_rows", "spanned"]
 
 SPANNED = 1e-9
+# Frames with at most this many entries in C are kept between runs: the checks take longer than a run of a few steps.
+SMALL = 2**14
 # Rows of a run without a frame.
 NO_FRAME = FrameRows(np.zeros((2, 1), INDEX), np.zeros(0, INDEX), np.zeros(0), np.zeros(0), np.zeros((2, 0, 0)))
 
@@ -28,12 +31,23 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     """
     if frame is None:
         return NO_FRAME
-    C, M = _frame_matrices(frame, n, width)
+    C, S = _given(frame, n)
+    rows = _known_rows if C.size <= SMALL else _rows
+    found = rows((C.tobytes(), C.dtype.str), (S.tobytes(), S.dtype.str), n, width)
+    return found._replace(products=np.zeros_like(found.products))  # which each run writes
+
+
+def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width: int) -> FrameRows:
+    C, S = (np.frombuffer(*given) for given in (given_C, given_S))
+    C, M = _frame_matrices(C.reshape(-1, n), S.reshape(n, -1), width)
     starts, index, value = _sparse_rows(np.concatenate([C, M]))
     k = C.shape[0]
     weights = _by_bodies(C), _by_bodies(M)
     bodies = np.array(weights) if weights[0].size and weights[1].size else np.zeros((2, 0, 0))
     return FrameRows(np.array([starts[: k + 1], starts[k:]]), index, value, np.zeros(k), bodies)
+
+
+_known_rows = lru_cache(maxsize=8)(_rows)
 
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
@@ -45,12 +59,12 @@ def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
 
 def _dense_rows(start: np.ndarray, frame: FrameRows, n: int) -> np.ndarray:
     a = np.zeros((start.size - 1, n))
-    for row, first, last in zip(a, start[:-1], start[1:], strict=True):
-        row[frame.place[first:last]] = frame.value[first:last]
+    held, counts = slice(start[0], start[-1]), (start[1:] - start[:-1]).astype(np.intp)
+    a[np.repeat(np.arange(len(a)), counts), frame.place[held]] = frame.value[held]
     return a
 
 
-def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def _given(frame: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     refuse_units(frame=frame)
     try:
         C, S = (np.atleast_2d(np.asarray(a)) for a in frame)
@@ -59,6 +73,10 @@ def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndar
     k = C.shape[0]
     if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
         raise ValueError(f"frame: C has shape {C.shape} and S {S.shape}; expected (k, {n}) and ({n}, k).")
+    return C, S
+
+
+def _frame_matrices(C: np.ndarray, S: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     if width == 2:
         C, S = _real_form(C), _real_form(S)
     elif C.dtype.kind == "c" or S.dtype.kind == "c":

@@ -32,6 +32,7 @@ from ..engine.data import (
     NO_GROUPS,
     OLD,
     Balances,
+    Grouping,
     Groups,
     Options,
     no_columns,
@@ -201,7 +202,7 @@ class ProjectionOptions:
     @classmethod
     def names(cls) -> tuple[str, ...]:
         """Return the names of the options."""
-        return tuple(option.name for option in fields(cls))
+        return tuple(cls.__dataclass_fields__)
 
     @classmethod
     def of(cls, keywords: Mapping[str, Any]) -> tuple[ProjectionOptions, dict[str, Any]]:
@@ -240,12 +241,11 @@ class ProjectionOptions:
         compensated = self._compensated(method)
         rtol, atol = stepping.rtol, stepping.atol
         groups = blocks_of(self.blocks, n, width)
-        squares = np.repeat(atol, width)[groups.member] ** 2 / width
         check = flag("check", self.check)
         options = Options(
-            rtol=np.repeat(rtol, width),
+            rtol=rtol.repeat(width),
             atol=atol,
-            block_atol=np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp))),
+            block_atol=_of_blocks(atol, groups),
             groups=groups,
             frame=frame_rows(self.frame, n, width),
             balances=_balances(method, known),
@@ -343,6 +343,14 @@ class ProjectionOptions:
                 return (BY_ERROR if method.has_estimate else EUCLIDEAN), None
             raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
         return GIVEN, np.repeat(weights("metric", metric, n), width)
+
+
+def _of_blocks(atol: np.ndarray, groups: Grouping) -> np.ndarray:
+    """Return the absolute tolerances of blocks from those of components."""
+    if groups.size == 1 or not atol.any():
+        return atol[: groups.start.size - 1].copy()
+    squares = np.repeat(atol, groups.width)[groups.member] ** 2 / groups.width
+    return np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
 
 
 def _far_by_tolerances(rtol: np.ndarray) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import singledispatch
+from functools import lru_cache, singledispatch
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +31,8 @@ Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
 
-# The coefficients as the engine reads them. They are copies that compiled code may write to.
+# The coefficients as the engine reads them, which all runs share. They are copies because the engine only takes arrays
+# that can be written to.
 
 
 @singledispatch
@@ -62,6 +63,7 @@ def _(method: GaussJackson) -> Any:
 
 
 @arrays.register
+@lru_cache(maxsize=32)
 def _(method: Tableau) -> Method:
     none = np.zeros(method.b.size)
     return Method(
@@ -82,6 +84,7 @@ def _(method: Tableau) -> Method:
 
 
 @arrays.register
+@lru_cache(maxsize=32)
 def _(method: NystromTableau) -> Method:
     # If the last stage is the first stage of the next step, it is f at the new point and is evaluated after the step.
     s = method.n_stages - method.fsal
