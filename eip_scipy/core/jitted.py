@@ -32,11 +32,9 @@ class NotCompilableError(TypeError):
 
 def is_jitted(fun: Any) -> bool:
     """Return True if a function is a Numba function."""
-    if "numba" not in sys.modules:
-        return False
-    from numba import extending
-
-    return bool(extending.is_jitted(fun))
+    # Not numba.extending.is_jitted, which imports the class in each of its calls.
+    dispatcher = sys.modules.get("numba.core.dispatcher")
+    return dispatcher is not None and isinstance(fun, dispatcher.Dispatcher)
 
 
 def jit_is_off() -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]  # signal without conversions to enumerations, which are slow
 import _thread
 import signal
 import sys
@@ -40,12 +41,12 @@ def kept_ctrl_c() -> Iterator[None]:
         yield
         return
     _Came.ctrl_c = False
-    signal.signal(signal.SIGINT, _note_ctrl_c)
+    _signal.signal(signal.SIGINT, _note_ctrl_c)
     try:
         yield
     finally:
         _Came.put_off = None
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        _signal.signal(signal.SIGINT, signal.default_int_handler)
         _Came.ctrl_c = False
 
 
@@ -94,7 +95,7 @@ def look_for_signals() -> None:
 
 def _is_ours(number: int, usual: object) -> bool:
     """Return True if a signal may be handled here: in the main thread, and without a user-defined handler."""
-    return threading.current_thread() is threading.main_thread() and signal.getsignal(number) is usual
+    return threading.current_thread() is threading.main_thread() and _signal.getsignal(number) == usual
 
 
 def _note_ctrl_c(number: int, frame: FrameType | None) -> None:

@@ -98,7 +98,7 @@ class Request(NamedTuple):
 
     def with_own_events(self) -> Request:
         """Return the request with the events of its problem if no others are given."""
-        has_own = self.events is None and isinstance(self.fun, Problem)
+        has_own = self.events is None and isinstance(self.fun, Problem) and self.fun.events is not None
         return self._replace(events=self.fun.events) if has_own else self
 
     def with_pointers(self) -> Request:
