@@ -2,6 +2,7 @@
 
 #include <nanobind/stl/pair.h>
 
+#include <cstring>
 #include <memory>
 #include <string>
 #include <tuple>
@@ -35,27 +36,35 @@ void *memory(nb::handle object, const char *name, int type, Lengths shape, nb::l
     return PyArray_DATA(array);
 }
 
-double number(nb::handle record, const char *name) {
-    const double value = PyFloat_AsDouble(record.attr(name).ptr());
+namespace {
+
+double as_number(const nb::object &object) {
+    const double value = PyFloat_AsDouble(object.ptr());
     if (value == -1.0 && PyErr_Occurred()) throw nb::python_error();
     return value;
 }
 
-int64_t integer(nb::handle record, const char *name) {
-    const long long value = PyLong_AsLongLong(nb::object(record.attr(name)).ptr());
+int64_t as_integer(const nb::object &object) {
+    const long long value = PyLong_AsLongLong(object.ptr());
     if (value == -1 && PyErr_Occurred()) throw nb::python_error();
     return value;
 }
 
-bool truth(nb::handle record, const char *name) {
-    const int value = PyObject_IsTrue(nb::object(record.attr(name)).ptr());
+bool as_truth(const nb::object &object) {
+    const int value = PyObject_IsTrue(object.ptr());
     if (value < 0) throw nb::python_error();
     return value;
 }
 
+}  // namespace
+
+double number(nb::handle record, const char *name) { return as_number(record.attr(name)); }
+int64_t integer(nb::handle record, const char *name) { return as_integer(record.attr(name)); }
+bool truth(nb::handle record, const char *name) { return as_truth(record.attr(name)); }
+
 namespace {
 
-// Reads the fields of a record.
+// Reads the fields of a record, which is a tuple of them in this order, or has attributes of these names.
 class Reader {
   public:
     Reader(nb::handle record, int type, const Sizes &sizes, nb::list &kept)
@@ -64,9 +73,9 @@ class Reader {
           type_(type),
           kept_(kept) {}
 
-    void operator()(const char *name, double &value) { value = number(record_, name); }
-    void operator()(const char *name, int64_t &value) { value = integer(record_, name); }
-    void operator()(const char *name, bool &value) { value = truth(record_, name); }
+    void operator()(const char *name, double &value) { value = as_number(next(name)); }
+    void operator()(const char *name, int64_t &value) { value = as_integer(next(name)); }
+    void operator()(const char *name, bool &value) { value = as_truth(next(name)); }
 
     template <class T, class... Axes>
         requires(sizeof...(Axes) > 0)
@@ -81,7 +90,7 @@ class Reader {
 
     template <class Record>
     void record(const char *name, const char *, Record &place) {
-        const nb::object inner = record_.attr(name);
+        const nb::object inner = next(name);
         Reader reader(inner, type_, sizes, kept_);
         fields(place, reader);
     }
@@ -90,14 +99,21 @@ class Reader {
     void by_default(const char *name, Value &place, Value) {
         (*this)(name, place);
     }
-    void in_python(const char *, const char *, bool) {}
+    void in_python(const char *, const char *, bool) { ++place_; }
 
     const Sizes sizes;
 
   private:
+    // To look a field up by its name takes most of the time of reading it.
+    nb::object next(const char *name) {
+        const Py_ssize_t place = place_++;
+        if (!PyTuple_Check(record_.ptr()) || place >= PyTuple_GET_SIZE(record_.ptr())) return record_.attr(name);
+        return nb::borrow(PyTuple_GET_ITEM(record_.ptr(), place));
+    }
+
     template <class... Axes>
     void *array(const char *name, int type, Axes... axes) {
-        const nb::object object = record_.attr(name);
+        const nb::object object = next(name);
         int axis = 0;
         const auto length = [&](auto given) -> npy_intp {
             if constexpr (std::is_same_v<decltype(given), Bound>)
@@ -111,6 +127,7 @@ class Reader {
     }
 
     nb::handle record_;
+    Py_ssize_t place_ = 0;
     int type_;
     nb::list &kept_;
 };
@@ -565,14 +582,23 @@ nb::tuple Buffers::state() const {
                           blocks, work.balances, arrays());
 }
 
-const nb::dict &Buffers::arrays() const {
-    if (arrays_.size() > 0) return arrays_;
+void Buffers::add_arrays(const char *only) const {
     Work own = work;
-    for_each_buffer(own, blocks, type, [this](const char *name, auto *place, int type, auto shape) {
+    for_each_buffer(own, blocks, type, [&](const char *name, auto *place, int type, auto shape) {
+        if ((only && std::strcmp(name, only) != 0) || arrays_.contains(name)) return;
         const std::vector<npy_intp> lengths(shape.begin(), shape.end());
         arrays_[name] = view(place, static_cast<int>(lengths.size()), lengths.data(), type, owner_);
     });
+}
+
+const nb::dict &Buffers::arrays() const {
+    add_arrays(nullptr);
     return arrays_;
+}
+
+Array Buffers::array(const char *name) const {
+    if (!arrays_.contains(name)) add_arrays(name);
+    return nb::borrow<Array>(arrays_[name]);
 }
 
 void Buffers::share(const Buffers &other, const nb::set &names) {

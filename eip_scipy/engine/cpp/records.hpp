@@ -24,7 +24,7 @@ class Buffers {
 
     // The arrays over the buffers, by name, or one of them.
     const nb::dict &arrays() const;
-    Array array(const char *name) const { return nb::borrow<Array>(arrays()[name]); }
+    Array array(const char *name) const;
     // Use another run's buffers of these names from now on.
     void share(const Buffers &other, const nb::set &names);
 
@@ -36,8 +36,11 @@ class Buffers {
     nb::handle owner() const { return owner_; }
 
   private:
+    // Makes the array of this name, or all of them.
+    void add_arrays(const char *only) const;
+
     nb::object owner_;
-    mutable nb::dict arrays_;  // empty as long as none is asked for
+    mutable nb::dict arrays_;  // those that were asked for
 };
 
 // Flags of a Python object.
