@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,6 @@ __all__ = ["INDEX", "blocks_of", "kinds_of"]
 
 # Unsigned integers: Numba then omits the test for negative indices, which costs more than the access itself.
 INDEX = np.uint64
-# The groups of states with at most this many floats are kept between runs.
-SMALL = 2**12
 
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
@@ -56,22 +53,15 @@ def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
         return groups
     q_dot, p = f[: n // 2], y[n // 2 :]
     with np.errstate(over="ignore", invalid="ignore"):
-        like = q_dot.any() == p.any() and (q_dot * np.sign(p)).sum() >= 0
+        like = q_dot.any() == p.any() and q_dot @ np.sign(p) >= 0
     return _consecutive(n // 2, n, 1) if like else groups
 
 
 def _consecutive(size: int, n: int, width: int) -> Grouping:
     """Return blocks of `size` consecutive components, without a list of them, because a field has a million."""
-    return (_kept_blocks if n * width <= SMALL else _new_blocks)(size, n, width)
-
-
-def _new_blocks(size: int, n: int, width: int) -> Grouping:
     floats = n * width
     start = np.arange(0, floats + 1, size * width, dtype=INDEX)
     return Grouping(np.arange(floats, dtype=INDEX), start, width, size * width if n else 0)
-
-
-_kept_blocks = lru_cache(maxsize=32)(_new_blocks)
 
 
 def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:

@@ -8,7 +8,6 @@ part of the state is large, which the invariants need not show.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,13 +16,11 @@ import numpy as np
 
 from ..engine.data import (
     CHANGES_ALONG_FLOW,
-    EXAMINED,
     LARGE_CORRECTION,
     LARGE_ERROR,
     N_SUSPECT,
     NOTHING,
     NU,
-    RATE,
     REASON,
     SUSPECT_FROM,
     SUSPECT_TO,
@@ -32,7 +29,7 @@ from ..engine.data import (
 from ..methods.runge_kutta import RK4
 from .inputs import are_finite
 from .invariant_checks import complaints
-from .invariants import InvariantSet
+from .invariants import InvariantSet, copied
 from .resolution import runge_kutta_step
 
 __all__ = ["Examiner", "is_check_due", "steps_to_check"]
@@ -109,7 +106,7 @@ class Examiner:
         The examined states are near those of the run, but the run does not visit them. Therefore an exception at such a
         state says nothing about the run.
         """
-        known = copy.copy(self.invariants)
+        known = copied(self.invariants)
         known.functions = _Guarded(known.functions)
         try:
             with np.errstate(all="ignore"):
@@ -156,9 +153,8 @@ def _complaint(
     f = rhs(t, y)
     if not are_finite(f.view(float)):
         return None
-    figures, evaluated = examiner.figures, (known.gradients(t, y, f), known.values(t, y))
-    for column, shares in zip((RATE, EXAMINED), known.rate_shares(t, y, f, *evaluated), strict=True):
-        np.fmax(figures[:, column], shares, out=figures[:, column])
+    evaluated = known.gradients(t, y, f), known.values(t, y)
+    known.note_rates(examiner.figures, t, y, f, *evaluated)
     found = complaints(known, t, y, f, examiner.tau, rhs, evaluated)
     return next((one.text for one in found if on_manifold or not one.dependent), None)
 

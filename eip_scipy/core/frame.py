@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..engine.data import FrameRows
+from ..engine.native import BUILD
 from .blocks import INDEX
 from .inputs import refuse_units
 
@@ -52,16 +53,7 @@ _known_rows = lru_cache(maxsize=8)(_rows)
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
     """Return a mask of the gradients (rows of G) that are combinations of rows of C, which the frame removes."""
-    C, M = (_dense_rows(start, frame, G.shape[1]) for start in frame.start)
-    size = np.abs(G).max(axis=1)
-    return (size > 0) & (np.abs(G - (G @ M.T) @ C).max(axis=1) <= SPANNED * size)
-
-
-def _dense_rows(start: np.ndarray, frame: FrameRows, n: int) -> np.ndarray:
-    a = np.zeros((start.size - 1, n))
-    held, counts = slice(start[0], start[-1]), (start[1:] - start[:-1]).astype(np.intp)
-    a[np.repeat(np.arange(len(a)), counts), frame.place[held]] = frame.value[held]
-    return a
+    return np.array(BUILD.spanned(frame, G, SPANNED), bool)
 
 
 def _given(frame: Any, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -77,7 +77,7 @@ def _leaves(value: Any) -> Any:
                 yield from _leaves(item)
     elif type(value) is np.ndarray and value.dtype.kind == "O":
         yield from _leaves(value.ravel().tolist())
-    elif type(value) not in PLAIN:
+    elif not is_plain(value):
         yield value
 
 
@@ -138,6 +138,8 @@ def is_number(value: Any) -> bool:
 
 def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
     """Return an integer option; raise ValueError unless it is >= 1."""
+    if type(value) is int and 1 <= value <= most:
+        return value
     refuse_units(**{name: value})
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer >= 1, got {shown(value)}.")

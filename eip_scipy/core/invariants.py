@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from copy import copy
 from functools import cached_property
 from itertools import accumulate
 from typing import Any
@@ -22,7 +21,7 @@ from .invariant_checks import complaints, listed, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
-__all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient", "with_args"]
+__all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient", "copied", "with_args"]
 
 Array = np.ndarray
 FLOAT = np.dtype(float)
@@ -56,8 +55,8 @@ class OwnArguments:
         return self.function(*given, *(self.args if len(given) == self.first else ()))
 
 
-def _copied(original: Any) -> Any:
-    """Return a shallow copy; as a method it makes `copy.copy` about 5 times faster."""
+def copied(original: Any) -> Any:
+    """Return a shallow copy of an object, about 5 times faster than `copy.copy`."""
     new = object.__new__(type(original))
     vars(new).update(vars(original))
     return new
@@ -179,8 +178,6 @@ class Invariant:
             return self.gradient
         return OwnArguments(self.gradient, self.args, 2 + self.uses_f + self.in_place)
 
-    __copy__ = _copied
-
     def __repr__(self) -> str:
         name = self.name or getattr(self.function, "__name__", "?")
         return f"{type(self).__name__}({name})"
@@ -231,6 +228,8 @@ def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
     TypeError
         If `invariants` is anything else.
     """
+    if type(invariants) is tuple and all(isinstance(item, Invariant) for item in invariants):
+        return invariants
     if isinstance(invariants, Invariant | JointInvariants):
         return invariants if isinstance(invariants, JointInvariants) else (invariants,)
     if _is_function(invariants):
@@ -261,7 +260,7 @@ def _is_function(item: Any) -> bool:
 
 def with_args(item: Invariant, args: tuple[Any, ...]) -> Invariant:
     """Return a copy of an invariant with `args` as its own arguments."""
-    new = copy(item)
+    new: Invariant = copied(item)
     new.args = args
     return new
 
@@ -469,8 +468,6 @@ class InvariantSet:
         self.start_gradients = self._gradients_at_start(t0, y0, f0)
         self.balances.check(t0, y0, f0)
 
-    __copy__ = _copied
-
     def _names(self, sizes: list[int]) -> list[str]:
         """Return the names of all values."""
         return [
@@ -561,7 +558,7 @@ class InvariantSet:
         `at_end`: the new run starts at the end of the last step, so that balances continue from the values that this
         run carries. At any other state they start again from their values there.
         """
-        kept = [copy(item) for item in self.items]
+        kept = list(map(copied, self.items))
         for k, item in enumerate(kept):
             if item.is_balance and not at_end:
                 item.target = None
@@ -581,7 +578,7 @@ class InvariantSet:
             return item
         from .jitted_gradients import gradient_by_duals  # which loads Numba
 
-        item = copy(item)
+        item = copied(item)
         try:
             item.gradient, item.in_place = gradient_by_duals(item.function, n, shape, bool(self.extra), numbers), True
         except NotCompilableError as error:
@@ -697,18 +694,17 @@ class InvariantSet:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(residual == 0, 0.0, residual / allowed)
 
-    def rate_shares(self, t: float, y: Array, f: Array, G: Array, here: Array) -> tuple[Array, Array]:
-        """Return the rates of change (l,) along f by gradients and by values, relative to the terms of these rates.
+    def note_rates(self, figures: Array, t: float, y: Array, f: Array, G: Array, here: Array) -> None:
+        """Raise the largest rates of change along f in `figures`, relative to the terms of these rates.
 
         `G` and `here` are the gradients and the values at the state. The given rate of a balance is subtracted from its
-        rate of change. Balances without a given rate get NaN.
+        rate of change. Rates of balances without a given rate are not noted.
         """
         own = None
         if self.balances.items:
             in_time, _ = time_derivative(self, t, y, G, here, self.tau)
             own = self.balances.known(t, y, f) - np.where(self.balances.mask, in_time, 0.0)
-        by_gradient, by_values = self.functions.rate_shares(t, y, f, G, here, self.target, self.scales, own)
-        return by_gradient, by_values
+        self.functions.note_rates(figures, t, y, f, G, here, self.target, self.scales, own)
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
         """Return a message if the start misses given targets, with the worst invariant first; otherwise None."""

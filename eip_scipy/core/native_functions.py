@@ -79,12 +79,10 @@ def native_functions(
     """
     n, second_order = y0.size, form.startswith("acceleration")
     size = n // 2 if second_order else n
-    number = _number(params, y0)
-    kind = number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place"))
-    values = None if params is None else params.values
-    rhs = function_alone(fun, kind, "acceleration" if second_order else "fun", values, second_order=second_order)
+    number, width = _number(params, y0), 2 if y0.dtype.kind == "c" else 1
+    of_rhs = {"shape": (size,), "size": size, "real": False, "in_place": form.endswith("place")}
+    rhs = _native(fun, number, "acceleration" if second_order else "fun", size * width, **of_rhs)
     inv, grad, slopes = list[Native](), list[Native](), list[Native]()
-    width = 2 if y0.dtype.kind == "c" else 1
     for k, (wide, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         item, value = _of_state(wide, number)
         name = f"invariant {label!r}"
@@ -105,12 +103,16 @@ def native_functions(
             p, slope = wide.of_state.parameters, wide.of_state.by_parameters
             slopes.append(_native(slope, value, f"derivatives by parameters of {name}", l_i * p, shape=(*shape, p)))
     by_differences = any(found.function is None for found in grad)
-    return rhs._replace(
+    return NativeFunctions(
+        rhs=rhs.entry,
         inv=_addresses(inv),
         grad=_addresses(grad),
+        event=(),
+        params=np.zeros(0) if params is None else params.values,  # itself: an ensemble writes each member's there
+        second_order=second_order,
         by_parameters=_addresses(slopes),
         floors=invariants.floors if by_differences else None,
-        owner=rhs.owner | {"inv": inv, "grad": grad, "by_parameters": slopes},
+        owner={"rhs": [rhs], "inv": inv, "grad": grad, "event": [], "by_parameters": slopes},
     )
 
 
@@ -137,7 +139,7 @@ def function_alone(
         inv=(),
         grad=(),
         event=(),
-        params=np.zeros(0) if params is None else params,  # itself: an ensemble writes each member's there
+        params=np.zeros(0) if params is None else params,
         second_order=second_order,
         owner={"rhs": [rhs], "inv": [], "grad": [], "event": []},
     )

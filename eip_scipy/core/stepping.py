@@ -164,7 +164,7 @@ class StepOptions:
         rtol, atol = tolerances(self.rtol, 0.0 if unset else self.atol, n)
         if h is not None:
             h = check_fixed_step(h, t0, t_bound, may_be_longer=True)
-        elif np.any(rtol < LEAST_RTOL):
+        elif (rtol < LEAST_RTOL).any():
             message = f"At least one element of `rtol` is too small. Setting `rtol = np.maximum(rtol, {LEAST_RTOL})`."
             warnings.warn(message, stacklevel=stacklevel)
             rtol = np.maximum(rtol, LEAST_RTOL)

@@ -111,6 +111,11 @@ SOURCES: str = ...
 COMPILER: str
 HAS_V3: bool
 
+def spanned(frame: object, G: numpy.typing.NDArray[numpy.float64], share: float) -> list:
+    """
+    Return for each row of G whether the frame removes all but this share of it.
+    """
+
 class Work:
     """
     Buffers of a run, in memory of the engine; each attribute is an array over one.
@@ -406,9 +411,9 @@ class InvariantFunctions:
         Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink. Rates that are within the rounding of the values are 0.
         """
 
-    def rate_shares(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], own: numpy.typing.NDArray[numpy.float64] | None = None) -> tuple[numpy.ndarray, numpy.ndarray]:
+    def note_rates(self, figures: numpy.typing.NDArray[numpy.float64], t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], own: numpy.typing.NDArray[numpy.float64] | None = None) -> None:
         """
-        Return rates of change along f by gradients and by values, without the rates `own`, in units of their terms; (l,) each.
+        Raise the largest rates of change along f, by gradients and by values, in the figures (l, N_FIGURES): without the rates `own`, in units of their terms.
         """
 CHECK_STEP: float = 6e-06
 CHECK_TOLERANCE: float = 0.0001

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,7 +34,6 @@ NO_GROUPS = Groups(
 _none = np.zeros(0)
 
 
-@lru_cache
 def no_columns(values: int) -> Columns:
     """Return the record of a run with this number of invariants and without derivatives."""
     return Columns(kept=np.zeros((values, 0)), size=0, seen=0, half=0, symplectic=False)

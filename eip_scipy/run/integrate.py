@@ -503,9 +503,10 @@ def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
     """Return True if a jitted right-hand side is called from Python only because invariants are not jitted."""
+    if not (isinstance(functions, PythonFunctions) and is_jitted(fun)):
+        return False
     kept = [found for item in run.invariants.items for found in (item.function, item.gradient)]
-    native = all(is_compiled(found) or isinstance(found, PointerFunction) for found in kept)
-    return isinstance(functions, PythonFunctions) and is_jitted(fun) and not native
+    return not all(is_compiled(found) or isinstance(found, PointerFunction) for found in kept)
 
 
 def _compiling(shown: bool) -> Any:

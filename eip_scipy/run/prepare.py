@@ -371,7 +371,8 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     run = spec.build(y0, check_start=check_start)
     schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)
-    record = Diagnostics() if request.diagnostics is None else request.diagnostics
+    # `attach` sets all attributes of a new record.
+    record = Diagnostics.__new__(Diagnostics) if request.diagnostics is None else request.diagnostics
     run.attach(record)
     system.events.fill(t0, run.y0, schedule.g)
     run.work.K[0] = run.start.f
@@ -610,7 +611,7 @@ def _schedule(span: Span, tau: float, request: Request, events: Events) -> Sched
         clock=np.array([span.t0, span.t0, 0.0, tau]),
         g=np.zeros(n_events),
         g_new=np.zeros(n_events),
-        rate=np.full(n_events, np.nan),
+        rate=np.array([math.nan] * n_events),
         rate_new=np.zeros(n_events),
         g_direction=events.directions,
     )

@@ -663,7 +663,7 @@ def test_errors_of_an_examination_itself_are_not_hidden(monkeypatch):
     def broken(self, *state):
         raise ArithmeticError("of the examination")
 
-    monkeypatch.setattr(InvariantSet, "rate_shares", broken)
+    monkeypatch.setattr(InvariantSet, "note_rates", broken)
     with pytest.raises(ArithmeticError, match="of the examination"):
         integrate(pendulum(), (0, 3), [1.0, 0.0], method=EIPRK4, h=0.02, invariants=ENERGY)
 

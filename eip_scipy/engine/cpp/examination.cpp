@@ -98,18 +98,19 @@ class InvariantFunctions {
         return out;
     }
 
-    // The rates of change along f by gradients and by values, without what the values change by anyway, in units of
-    // the terms.
-    std::tuple<Array, Array> rate_shares(double t, State y, State f, Rows G, Numbers here, Numbers target,
-                                         Numbers scales, std::optional<Numbers> own) {
-        Array by_values = rates_by_values(t, y, f, G, here, target, scales), by_gradient = new_array({l_});
+    // Raises the largest rates of change along f that figures hold, by gradients and by values. They are in units of the
+    // terms, without what the values change by anyway.
+    void note_rates(ArrayOf<double, 2> figures, double t, State y, State f, Rows G, Numbers here, Numbers target,
+                    Numbers scales, std::optional<Numbers> own) {
+        require(figures.shape[0] == l_ && figures.shape[1] == N_FIGURES, "invariants: another number of figures");
+        const Array by_values = rates_by_values(t, y, f, G, here, target, scales);
         for (int64_t i = 0; i < l_; ++i) {
             const double *row = G.data + i * m_, expected = own ? known(*own)[i] : 0.0;
             const double size = terms(row, f.data), unit = size > 0.0 ? size : 1.0;
-            by_gradient.floats()[i] = std::abs(dot(row, f.data, m_) - expected) / unit;
-            by_values.floats()[i] = std::abs(by_values.floats()[i] - expected) / unit;
+            double *noted = figures.data + i * N_FIGURES;
+            noted[RATE] = std::fmax(noted[RATE], std::abs(dot(row, f.data, m_) - expected) / unit);
+            noted[EXAMINED] = std::fmax(noted[EXAMINED], std::abs(by_values.floats()[i] - expected) / unit);
         }
-        return {by_gradient, by_values};
     }
 
     nb::handle kept() const { return kept_; }
@@ -278,10 +279,10 @@ void add_examination(nb::module_ &module) {
              "scales"_a,
              "Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a "
              "kink. Rates that are within the rounding of the values are 0.")
-        .def("rate_shares", &Functions::rate_shares, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a, "scales"_a,
-             "own"_a = nb::none(),
-             "Return rates of change along f by gradients and by values, without the rates `own`, in units of their "
-             "terms; (l,) each.");
+        .def("note_rates", &Functions::note_rates, "figures"_a, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a,
+             "scales"_a, "own"_a = nb::none(),
+             "Raise the largest rates of change along f, by gradients and by values, in the figures (l, N_FIGURES): "
+             "without the rates `own`, in units of their terms.");
     module.attr("CHECK_STEP") = CHECK_STEP;
     module.attr("CHECK_TOLERANCE") = CHECK_TOLERANCE;
     module.attr("CHECK_NOISE") = CHECK_NOISE;

@@ -98,7 +98,7 @@ class Engine {
         if (!schedule.is_none()) schedule_ = schedule_of(schedule, kept_);
         System &system = data_.system;
         const int64_t events = schedule_ ? schedule_->n_events : 0;
-        const bool native = truth(functions, "native");
+        const bool native = truth(functions.attr("native"));
         const nb::object python = native ? nb::object(functions.attr("python")) : functions;
         require(data_.work.balances == 0 || data_.options.balances.stages == data_.work.stages,
                 "engine: the balances do not fit the stages");

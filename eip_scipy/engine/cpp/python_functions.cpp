@@ -39,13 +39,13 @@ PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb:
       convert_(kept_attribute(description, "convert", kept)),
       type_(type),
       components_(components),
-      takes_f_(truth(description, "takes_f")),
-      in_place_(truth(description, "in_place")) {
+      takes_f_(truth(description.attr("takes_f"))),
+      in_place_(truth(description.attr("in_place"))) {
     const nb::handle args = kept_attribute(description, "args", kept);
     if (!nb::isinstance<nb::tuple>(args)) throw nb::type_error("engine: args must be a tuple");
     require(nb::len(args) <= MOST_ARGUMENTS, "engine: too many further arguments");
     for (const nb::handle argument : nb::borrow<nb::tuple>(args)) args_.push_back(argument);
-    value_type_ = truth(description, "real") ? static_cast<int>(NPY_DOUBLE) : type;
+    value_type_ = truth(description.attr("real")) ? static_cast<int>(NPY_DOUBLE) : type;
     const nb::object shape = description.attr("shape");
     n_dimensions_ = nb::isinstance<nb::tuple>(shape) ? static_cast<int>(nb::len(shape)) : 3;
     if (n_dimensions_ > 2) throw nb::type_error("engine: shape must be a tuple of at most two lengths");
@@ -111,7 +111,7 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
 PythonFunctions::PythonFunctions(nb::handle functions, nb::handle owner, const Work &sizes, int type, nb::list &kept)
     : owner_(owner),
       m_(sizes.m),
-      second_order_(truth(functions, "second_order")) {
+      second_order_(truth(functions.attr("second_order"))) {
     const int64_t components = second_order_ ? sizes.n / 2 : sizes.n;
     rhs_.emplace(functions.attr("rhs"), type, components, kept);
     const auto calls = [&](const char *name, std::vector<PythonCall> &out, int64_t expected) {
@@ -197,9 +197,9 @@ PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &ru
     one_step_ = given("one_step");
     project_ = given("project");
     agree_ = given("agree");
-    estimates_ = truth(hooks, "estimates");
+    estimates_ = truth(hooks.attr("estimates"));
     raw = one_step_.is_valid();
-    drives = truth(hooks, "drives");
+    drives = truth(hooks.attr("drives"));
     project = project_.is_valid();
     agree = agree_.is_valid();
     const nb::handle joint_invariants = given("joint");

@@ -8,6 +8,7 @@
 #include <tuple>
 #include <utility>
 
+#include "frame.hpp"
 #include "library.hpp"
 
 namespace eip {
@@ -36,31 +37,23 @@ void *memory(nb::handle object, const char *name, int type, Lengths shape, nb::l
     return PyArray_DATA(array);
 }
 
-namespace {
-
-double as_number(const nb::object &object) {
+double number(const nb::object &object) {
     const double value = PyFloat_AsDouble(object.ptr());
     if (value == -1.0 && PyErr_Occurred()) throw nb::python_error();
     return value;
 }
 
-int64_t as_integer(const nb::object &object) {
+static int64_t integer(const nb::object &object) {
     const long long value = PyLong_AsLongLong(object.ptr());
     if (value == -1 && PyErr_Occurred()) throw nb::python_error();
     return value;
 }
 
-bool as_truth(const nb::object &object) {
+bool truth(const nb::object &object) {
     const int value = PyObject_IsTrue(object.ptr());
     if (value < 0) throw nb::python_error();
     return value;
 }
-
-}  // namespace
-
-double number(nb::handle record, const char *name) { return as_number(record.attr(name)); }
-int64_t integer(nb::handle record, const char *name) { return as_integer(record.attr(name)); }
-bool truth(nb::handle record, const char *name) { return as_truth(record.attr(name)); }
 
 namespace {
 
@@ -73,9 +66,9 @@ class Reader {
           type_(type),
           kept_(kept) {}
 
-    void operator()(const char *name, double &value) { value = as_number(next(name)); }
-    void operator()(const char *name, int64_t &value) { value = as_integer(next(name)); }
-    void operator()(const char *name, bool &value) { value = as_truth(next(name)); }
+    void operator()(const char *name, double &value) { value = number(next(name)); }
+    void operator()(const char *name, int64_t &value) { value = integer(next(name)); }
+    void operator()(const char *name, bool &value) { value = truth(next(name)); }
 
     template <class T, class... Axes>
         requires(sizeof...(Axes) > 0)
@@ -293,6 +286,22 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
     return o;
 }
 
+// For each row of G, whether the frame removes all but this share of it.
+static nb::list spanned(nb::handle record, ArrayOf<const double, 2> G, double share) {
+    Frame frame{};
+    nb::list kept, found;
+    const int64_t m = G.shape[1];
+    read(frame, record, NPY_DOUBLE, {}, kept);
+    check_places(frame.start, 2 * frame.starts, frame.place, frame.values, m, "frame");
+    for (const double *row = G.data; row < G.data + G.shape[0] * m; row += m) {
+        std::vector<double> left(row, row + m);
+        remove_sparse(frame, 1, frame.products, left.data());
+        const double size = largest_abs(row, m);
+        found.append(size > 0.0 && all_finite(left.data(), m) && largest_abs(left.data(), m) <= share * size);
+    }
+    return found;
+}
+
 Schedule schedule_of(nb::handle schedule, nb::list &kept) {
     Schedule s{};
     read(s, schedule, NPY_DOUBLE, {}, kept);
@@ -440,9 +449,9 @@ void read_balances(nb::handle functions, const Work &w, System &system) {
         system.balances[given++].is_given = !function.is_none();
     }
     require(total == w.balances && given == system.balances.size(), "engine: the rates do not fit the balances");
-    system.times.low = number(rates, "low");
-    system.times.high = number(rates, "high");
-    system.times.shift = number(rates, "shift");
+    system.times.low = number(rates.attr("low"));
+    system.times.high = number(rates.attr("high"));
+    system.times.shift = number(rates.attr("shift"));
     system.scratch_G.resize(w.l * w.m);
 }
 
@@ -463,7 +472,7 @@ static void read_functions_of_state(nb::handle functions, const Work &w, const C
 void read_pointers(nb::handle functions, const Work &w, const Columns &columns, int64_t events, nb::list &kept,
                    System &system) {
     system.by_pointer = true;
-    system.second_order = truth(functions, "second_order");
+    system.second_order = truth(functions.attr("second_order"));
     const nb::object params = functions.attr("params");
     system.n_params = PyArray_Check(params.ptr()) ? Array(params, nb::detail::borrow_t()).size() : 0;
     system.params = static_cast<double *>(memory(params, "params", NPY_DOUBLE, {system.n_params}, kept));
@@ -582,23 +591,15 @@ nb::tuple Buffers::state() const {
                           blocks, work.balances, arrays());
 }
 
-void Buffers::add_arrays(const char *only) const {
+const nb::dict &Buffers::arrays(const char *only) const {
+    if (only && arrays_.contains(only)) return arrays_;
     Work own = work;
     for_each_buffer(own, blocks, type, [&](const char *name, auto *place, int type, auto shape) {
         if ((only && std::strcmp(name, only) != 0) || arrays_.contains(name)) return;
         const std::vector<npy_intp> lengths(shape.begin(), shape.end());
         arrays_[name] = view(place, static_cast<int>(lengths.size()), lengths.data(), type, owner_);
     });
-}
-
-const nb::dict &Buffers::arrays() const {
-    add_arrays(nullptr);
     return arrays_;
-}
-
-Array Buffers::array(const char *name) const {
-    if (!arrays_.contains(name)) add_arrays(name);
-    return nb::borrow<Array>(arrays_[name]);
 }
 
 void Buffers::share(const Buffers &other, const nb::set &names) {
@@ -629,12 +630,15 @@ void add_records(nb::module_ &module) {
     add_record<Options>(module, "Options");
     add_record<Members>(module, "Members");
     add_record<Samples>(module, "Dense");
+    module.def("spanned", &spanned, "frame"_a, "G"_a, "share"_a,
+               "Return for each row of G whether the frame removes all but this share of it.");
     nb::class_<Buffers> type(module, "Work",
                              "Buffers of a run, in memory of the engine; each attribute is an array over one.");
     type.def(nb::init<int64_t, nb::handle, int64_t, int64_t, int64_t, int64_t>(), "n"_a, "dtype"_a, "stages"_a,
              "n_invariants"_a, "n_blocks"_a, "n_balances"_a = 0)
-        .def("arrays", &Buffers::arrays, nb::sig("def arrays(self) -> dict[str, numpy.typing.NDArray[typing.Any]]"),
-             "Return all arrays by name.")
+        .def(
+            "arrays", [](const Buffers &own) { return own.arrays(); },
+            nb::sig("def arrays(self) -> dict[str, numpy.typing.NDArray[typing.Any]]"), "Return all arrays by name.")
         .def("share", &Buffers::share, "other"_a, "names"_a, "Use the buffers of these names of others from now on.")
         .def("__getstate__", &Buffers::state)
         .def("__setstate__", [](Buffers &own, const nb::tuple &state) { new (&own) Buffers(state); });

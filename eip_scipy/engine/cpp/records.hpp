@@ -22,9 +22,9 @@ class Buffers {
     explicit Buffers(const nb::tuple &state);
     nb::tuple state() const;
 
-    // The arrays over the buffers, by name, or one of them.
-    const nb::dict &arrays() const;
-    Array array(const char *name) const;
+    // The arrays over the buffers, by name, that were asked for: all of them, or the one of this name.
+    const nb::dict &arrays(const char *only = nullptr) const;
+    Array array(const char *name) const { return nb::borrow<Array>(arrays(name)[name]); }
     // Use another run's buffers of these names from now on.
     void share(const Buffers &other, const nb::set &names);
 
@@ -36,9 +36,6 @@ class Buffers {
     nb::handle owner() const { return owner_; }
 
   private:
-    // Makes the array of this name, or all of them.
-    void add_arrays(const char *only) const;
-
     nb::object owner_;
     mutable nb::dict arrays_;  // those that were asked for
 };
@@ -76,9 +73,8 @@ void read_pointers(nb::handle functions, const Work &w, const Columns &columns, 
                    System &system);
 
 // Attributes of a record.
-double number(nb::handle record, const char *name);
-int64_t integer(nb::handle record, const char *name);
-bool truth(nb::handle record, const char *name);
+double number(const nb::object &object);
+bool truth(const nb::object &object);
 // The memory of an array of this type and shape that may be written to.
 void *memory(nb::handle array, const char *name, int type, Lengths shape, nb::list &kept);
 

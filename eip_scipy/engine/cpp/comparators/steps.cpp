@@ -76,8 +76,12 @@ void drive_by_name(std::string_view name, Callee &callee, double constant, const
 FixedSteps steps_of(nb::handle record, const StatesOf<double, 2> &rows, int64_t n) {
     const nb::object numbers = record.attr("saved");
     const auto saved = nb::cast<ArrayOf<const int64_t, 1>>(numbers);
-    const FixedSteps s{number(record, "t0"), number(record, "h"), number(record, "last"),
-                       saved.data,           saved.shape[0],      rows.data};
+    const FixedSteps s{number(record.attr("t0")),
+                       number(record.attr("h")),
+                       number(record.attr("last")),
+                       saved.data,
+                       saved.shape[0],
+                       rows.data};
     bool good = s.rows > 0 && s.saved[0] == 0 && rows.shape[0] == s.rows && rows.shape[1] == n;
     for (int64_t r = 1; good && r < s.rows; ++r) good = s.saved[r] > s.saved[r - 1];
     require(good, "take_steps: the steps to save must rise from 0, with a row for each");
@@ -100,7 +104,7 @@ int64_t take_steps(const char *name, double constant, nb::object functions, cons
     const FixedSteps steps = steps_of(record, rows, work.n);
     System system;
     std::optional<PythonFunctions> in_python;
-    if (truth(functions, "native")) {
+    if (truth(functions.attr("native"))) {
         read_pointers(functions, work, {}, 0, kept, system);
     } else {
         in_python.emplace(functions, buffers.owner(), work, NPY_DOUBLE, kept);
