@@ -26,8 +26,8 @@ from ..engine.data import (
     SUSPECT_TO,
     SUSPECT_WAITED,
 )
+from ..engine.native import BUILD
 from ..methods.runge_kutta import RK4
-from .inputs import are_finite
 from .invariant_checks import complaints
 from .invariants import InvariantSet, copied
 from .resolution import runge_kutta_step
@@ -151,7 +151,7 @@ def _complaint(
     If the state is not on the manifold, findings about invariants that depend on others are ignored.
     """
     f = rhs(t, y)
-    if not are_finite(f.view(float)):
+    if not BUILD.are_finite(f.view(float)):
         return None
     evaluated = known.gradients(t, y, f), known.values(t, y)
     known.note_rates(examiner.figures, t, y, f, *evaluated)

@@ -32,12 +32,20 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     """
     if frame is None:
         return NO_FRAME
-    C, S = _given(frame, n)
-    rows = _known_rows if C.size <= SMALL else _rows
+    refuse_units(frame=frame)
+    try:
+        C, S = (np.atleast_2d(np.asarray(a)) for a in frame)
+    except (TypeError, ValueError):
+        raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).") from None
+    k = C.shape[0]
+    if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
+        raise ValueError(f"frame: C has shape {C.shape} and S {S.shape}; expected (k, {n}) and ({n}, k).")
+    rows = _rows if C.size <= SMALL else _rows.__wrapped__
     found = rows((C.tobytes(), C.dtype.str), (S.tobytes(), S.dtype.str), n, width)
     return found._replace(products=np.zeros_like(found.products))  # which each run writes
 
 
+@lru_cache(maxsize=8)
 def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width: int) -> FrameRows:
     C, S = (np.frombuffer(*given) for given in (given_C, given_S))
     C, M = _frame_matrices(C.reshape(-1, n), S.reshape(n, -1), width)
@@ -48,24 +56,9 @@ def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width:
     return FrameRows(np.array([starts[: k + 1], starts[k:]]), index, value, np.zeros(k), bodies)
 
 
-_known_rows = lru_cache(maxsize=8)(_rows)
-
-
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
     """Return a mask of the gradients (rows of G) that are combinations of rows of C, which the frame removes."""
     return np.array(BUILD.spanned(frame, G, SPANNED), bool)
-
-
-def _given(frame: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    refuse_units(frame=frame)
-    try:
-        C, S = (np.atleast_2d(np.asarray(a)) for a in frame)
-    except (TypeError, ValueError):
-        raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).") from None
-    k = C.shape[0]
-    if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
-        raise ValueError(f"frame: C has shape {C.shape} and S {S.shape}; expected (k, {n}) and ({n}, k).")
-    return C, S
 
 
 def _frame_matrices(C: np.ndarray, S: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

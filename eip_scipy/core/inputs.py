@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.native import BUILD
-
 __all__ = [
-    "are_finite", "count", "filled", "flag", "has_unit", "is_date", "is_number", "is_plain", "real_array", "reals",
-    "refuse_units", "require_arguments", "shown",
+    "count", "filled", "flag", "has_unit", "is_date", "is_number", "is_plain", "real_array", "reals", "refuse_units",
+    "require_arguments", "shown",
 ]  # fmt: skip
 
 PLAIN = (int, float, complex, str, bool, type(None), np.float64, np.complex128)
@@ -123,9 +121,6 @@ def real_array(name: str, value: Any, error: type[Exception] = ValueError) -> np
     if found is None:
         raise error(f"{name} must be an array of numbers, got {shown(value)}; expected real ones.")
     return found
-
-
-are_finite = BUILD.are_finite  # about 10 times faster than np.isfinite(...).all() for small arrays
 
 
 def is_number(value: Any) -> bool:

@@ -16,7 +16,7 @@ from .arguments import names, scalars
 from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
-from .inputs import are_finite, count, filled, flag, reals, refuse_units, require_arguments, shown
+from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
 from .invariant_checks import complaints, listed, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
@@ -610,7 +610,7 @@ class InvariantSet:
         return tuple(map(value, range(len(self.items)))), tuple(map(gradient, range(len(self.items))))
 
     def _require_finite(self, values: Array, what: str) -> None:
-        if are_finite(values):
+        if BUILD.are_finite(values):
             return
         for name, value in zip(self.names, values, strict=True):
             if not np.isfinite(value):
@@ -628,12 +628,9 @@ class InvariantSet:
                     "values. Give one number, or one for each value."
                 )
             part[:] = item.target
-            self._require_finite_target(k, part)
+            if not BUILD.are_finite(part):
+                raise ValueError(f"invariant {self.labels[k]!r}: target must be finite, got {part}.")
         return target
-
-    def _require_finite_target(self, k: int, part: Array) -> None:
-        if not np.all(np.isfinite(part)):
-            raise ValueError(f"invariant {self.labels[k]!r}: target must be finite, got {part}.")
 
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> Array:
         """Return all gradients (l, n) at the start, after a check of their shapes."""
@@ -641,7 +638,7 @@ class InvariantSet:
         for k, (item, label) in enumerate(zip(self.items, self.labels, strict=True)):
             rows = G[self.starts[k] : self.starts[k + 1]]
             rows[:] = _first_gradient(item, self.calls[1][k], label, (t, y, f), self.extra)
-            if not are_finite(rows.view(float)):
+            if not BUILD.are_finite(rows.view(float)):
                 raise ValueError(f"gradient of invariant {label!r} is not finite at y0.")
         return G
 

@@ -33,8 +33,7 @@ class NotCompilableError(TypeError):
 def is_jitted(fun: Any) -> bool:
     """Return True if a function is a Numba function."""
     # Not numba.extending.is_jitted, which imports the class in each of its calls.
-    dispatcher = sys.modules.get("numba.core.dispatcher")
-    return dispatcher is not None and isinstance(fun, dispatcher.Dispatcher)
+    return isinstance(fun, getattr(sys.modules.get("numba.core.dispatcher"), "Dispatcher", ()))
 
 
 def jit_is_off() -> bool:

@@ -32,7 +32,6 @@ from ..engine.data import (
     NO_GROUPS,
     OLD,
     Balances,
-    Grouping,
     Groups,
     Options,
     no_columns,
@@ -241,11 +240,15 @@ class ProjectionOptions:
         compensated = self._compensated(method)
         rtol, atol = stepping.rtol, stepping.atol
         groups = blocks_of(self.blocks, n, width)
+        block_atol = atol[: groups.start.size - 1].copy()
+        if groups.size != 1 and atol.any():
+            squares = np.repeat(atol, width)[groups.member] ** 2 / width
+            block_atol = np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
         check = flag("check", self.check)
         options = Options(
             rtol=rtol.repeat(width),
             atol=atol,
-            block_atol=_of_blocks(atol, groups),
+            block_atol=block_atol,
             groups=groups,
             frame=frame_rows(self.frame, n, width),
             balances=_balances(method, known),
@@ -343,14 +346,6 @@ class ProjectionOptions:
                 return (BY_ERROR if method.has_estimate else EUCLIDEAN), None
             raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
         return GIVEN, np.repeat(weights("metric", metric, n), width)
-
-
-def _of_blocks(atol: np.ndarray, groups: Grouping) -> np.ndarray:
-    """Return the absolute tolerances of blocks from those of components."""
-    if groups.size == 1 or not atol.any():
-        return atol[: groups.start.size - 1].copy()
-    squares = np.repeat(atol, groups.width)[groups.member] ** 2 / groups.width
-    return np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
 
 
 def _far_by_tolerances(rtol: np.ndarray) -> float:

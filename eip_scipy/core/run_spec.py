@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..engine.data import EPS, EUCLIDEAN, NEW, Work
+from ..engine.native import BUILD
 from ..engine.trust import Trust
 from ..methods.orders import AT_REST
 from . import steppers
@@ -17,7 +18,6 @@ from .acceleration import named_accelerations
 from .blocks import kinds_of
 from .failures import projection_failure
 from .frame import spanned
-from .inputs import are_finite
 from .invariants import TARGET_TOLERANCE, InvariantSet
 from .multistep import SecondOrder, attach_history
 from .options import ProjectionOptions
@@ -186,7 +186,7 @@ class RunSpec:
             raise ValueError(
                 f"{violation}; correct y0 or the target, or pass project_initial=True to project y0 first."
             )
-        if run.options.watched and invariants_too and are_finite(run.start.f.view(float)):
+        if run.options.watched and invariants_too and BUILD.are_finite(run.start.f.view(float)):
             known = (run.work.G, run.work.values) if run.start is run.begin else None
             run.trust.doubts += run.invariants.check(*run.start, known)
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from .inputs import are_finite, reals, refuse_units, shown
+from ..engine.native import BUILD
+from .inputs import reals, refuse_units, shown
 from .one_step import as_vector
 
 __all__ = ["as_derivative", "initial_state", "states"]
@@ -22,7 +23,7 @@ def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
     y = states(name, y0)
     if y.ndim != 1:
         raise ValueError(f"`{name}` must be 1-dimensional.")
-    if not are_finite(y.view(float)):
+    if not BUILD.are_finite(y.view(float)):
         raise ValueError(f"All components of the initial state `{name}` must be finite.")
     return y
 

@@ -31,8 +31,7 @@ Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
 
-# The coefficients as the engine reads them, which all runs share. They are copies because the engine only takes arrays
-# that can be written to.
+# The coefficients as the engine reads them: copies, because it only takes arrays that can be written to.
 
 
 @singledispatch

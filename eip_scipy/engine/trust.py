@@ -95,12 +95,7 @@ class Trust:
     @property
     def is_sick(self) -> bool:
         """Return True if the corrections or errors of an invariant do not occur in correct runs."""
-        return not are_calm(self.figures) and bool(self.sick.any())
-
-    @property
-    def sick(self) -> np.ndarray:
-        """Return a mask (l,) of the invariants with corrections or errors that do not occur in correct runs."""
-        return sick(self.figures)
+        return not are_calm(self.figures) and bool(sick(self.figures).any())
 
     @property
     def beyond_doubt(self) -> bool:
@@ -142,7 +137,7 @@ class Trust:
         """Return the reasons against the run: a sentence for each of the worst three invariants, and a count."""
         if not self.is_sick:
             return []
-        found = np.flatnonzero(self.sick)
+        found = np.flatnonzero(sick(self.figures))
         worst = found[np.argsort(-_severity(self.figures[found]), kind="stable")]
         more = (
             [f"{found.size - MOST_REASONS} more invariants were corrected too much"]
