@@ -25,7 +25,7 @@ FOLDER = Path("eip_scipy/engine/cpp")
 COLD = ["complex_step.cpp", "examination.cpp", "frequencies.cpp", "library.cpp", "module.cpp", "python_functions.cpp"]
 COLD += ["records.cpp"]
 # These files do not include Python's headers, so that zig, which keeps what it has compiled, compiles them once.
-NUMBERS = ["engine.cpp", "forces.cpp", "gravity.cpp", "kepler.cpp", "orbits.cpp", "planets.cpp"]
+NUMBERS = ["engine.cpp", "forces.cpp", "gravity.cpp", "kepler.cpp", "orbits.cpp", "planets.cpp", "threads.cpp"]
 # The library of nanobind is compiled once and linked into both modules: what differs between these, the NB_DOMAIN that
 # keeps their types apart, stands in its headers only.
 NANOBIND = Path(nanobind.include_dir()).parent

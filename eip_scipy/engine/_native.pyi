@@ -671,6 +671,14 @@ class gravity:
         """
         Return the largest angular frequency of each body on its orbit about the heaviest one, and that of all other pairs.
         """
+    @staticmethod
+    def work_alone(alone: bool) -> bool:
+        """
+        Keep the calling thread from sharing the sums over many bodies with other threads, or let it share them. Returns the previous setting.
+        """
+    @staticmethod
+    def end_threads() -> None:
+        """End the threads that share these sums, for good."""
 
 class multibody:
     @staticmethod

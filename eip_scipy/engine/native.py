@@ -172,11 +172,19 @@ def _require_current(build: Any) -> None:
         raise ImportError(f"the sources in {folder} have changed since the engine was built. Build it: {AGAIN}")
 
 
+def _is_worker() -> bool:
+    """Return True in a process of `multiprocessing`: there are usually as many of these as processors."""
+    module = sys.modules.get("multiprocessing.process")
+    return module is not None and module.parent_process() is not None
+
+
 if TYPE_CHECKING:
     from . import _native as BUILD  # noqa: N812
 else:
     BUILD = _best()
     _require_current(BUILD)
+if _is_worker() and "OMP_NUM_THREADS" not in os.environ:
+    BUILD.gravity.end_threads()
 Engine = BUILD.Engine
 FailedCallError = BUILD.FailedCallError
 LibraryFunction = BUILD.LibraryFunction

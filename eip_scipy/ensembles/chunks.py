@@ -7,11 +7,13 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..engine.native import BUILD
 from ..run.interrupts import look_for_signals
 from .own_times import OwnTimes
 from .statistics import Statistics, statistics_of
@@ -84,6 +86,17 @@ _plans: OrderedDict[str, Plan] = OrderedDict()
 _making = threading.Lock()
 
 
+@contextmanager
+def _working_alone() -> Iterator[None]:
+    """Keep this thread from starting others: the other processors run other chunks."""
+    before = BUILD.gravity.work_alone(True)
+    try:
+        yield
+    finally:
+        BUILD.gravity.work_alone(before)
+
+
+@_working_alone()
 def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
     """Run a chunk in another process, which creates the plan once and stores it under `key`."""
     with _making:
@@ -135,7 +148,8 @@ class ThreadPool(FuturesPool):
 
     def __init__(self, plan: Plan, workers: int) -> None:
         self._stop = threading.Event()
-        threads = ThreadPoolExecutor(workers, thread_name_prefix="eip-ensemble")
+        alone = partial(BUILD.gravity.work_alone, workers > 1)
+        threads = ThreadPoolExecutor(workers, thread_name_prefix="eip-ensemble", initializer=alone)
         super().__init__(threads, partial(run_chunk, plan, stop=self._stop), workers)
 
     def close(self) -> None:

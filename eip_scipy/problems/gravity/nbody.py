@@ -139,6 +139,11 @@ def nbody(
                                       the start, as in the solar system
     ================================  ======================================================================
 
+    From 128 bodies on the sums over pairs use several threads: as many as the environment variable ``OMP_NUM_THREADS``
+    says when the first run begins, or else as many as there are processors, up to 16. ``OMP_NUM_THREADS=1`` turns that
+    off. The results have the same bits for any number of threads. Members of an ensemble that run at the same time, and
+    processes of `multiprocessing` without that variable, use one thread each.
+
     Newton's momentum and centre of mass are exact invariants of all forces except "eih", whose momentum has further
     terms in 1/c^2; there the frame only keeps corrections from moving the centre of mass. With "1pn", "eih" and "drag"
     the accelerations depend on velocities: `acc` is None, and Nystrom methods do not apply.

@@ -54,6 +54,12 @@ struct Cube {
         const Octet w = m * y * y2;
         return multiply_add(w * h, p, w);
     }
+
+    // x^-3/2, for products with both masses of a pair.
+    Octet alone() const {
+        const Octet w = y * y2;
+        return multiply_add(w * h, p, w);
+    }
 };
 
 // m x^-3/2 as by `Cube`.

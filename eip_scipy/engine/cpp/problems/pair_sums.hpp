@@ -9,13 +9,18 @@
 // The energy, in which large terms nearly cancel, is summed with the rounding errors carried along: what a projection
 // cannot see it cannot correct.
 //
+// From MANY bodies on every pair is taken once, for both bodies, and threads share the rows of pairs (PairRows).
+//
 // With APART the accelerations come with a second sum, of all pulls but those between a body and the first one, for motion about
 // the first body: what is there before its pull is added, which is the last one in its stream, and the reaction in its place.
 // So the perturbations take no second pass, and no difference in which the first body's pulls would have to cancel.
 #pragma once
 
 #include <algorithm>
+#include <memory>
+#include <vector>
 
+#include "../threads.hpp"
 #include "inverse_roots.hpp"
 
 namespace eip {
@@ -324,8 +329,98 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out, T *pulls 
     if constexpr (APART) std::copy(out, out + 3, pulls);
 }
 
+// Number of bodies from which every pair is taken once and threads share the work: with fewer bodies it does not pay.
+constexpr int64_t MANY = 128;
+constexpr int64_t TILE = 32;  // sources whose reactions stay in the fastest cache
+
+// Accelerations of many bodies. The targets, in blocks of eight, form rows. A row takes its pairs with all bodies before
+// them: the pulls stay with the targets, and the reactions are stored for each row. They are added afterwards, always in
+// one order. The first bodies, 8 to 15, meet every body twice instead, so that their pulls, which may be the largest, are
+// the last terms of all sums.
+template <bool APART>
+struct PairRows {
+    const double *q, *gm;
+    int64_t n, first = 8 + n % 8;
+    double *out, *pulls;
+    int64_t length = ((n - first - 1) / (16 * TILE) + 1) * TILE,
+            count = (n - first - 1) / length + 1;                    // at most 16 rows
+    std::unique_ptr<double[]> reactions{new double[3 * n * count]};  // of every row on all bodies
+
+    int64_t start(int64_t row) const { return std::min(first + row * length, n); }
+
+    [[gnu::flatten, gnu::noinline]] void first_bodies() const {
+        accelerate_block<APART, LANES>(q, gm, n, 0, out, pulls);
+        accelerate_block<APART, LANES>(q, gm, n, first - LANES, out, pulls);
+    }
+
+    [[gnu::flatten, gnu::noinline]] void take(int64_t row) const {
+        for (int64_t block = start(row); block < start(row + 1); block += LANES) {
+            Octet own[3], sums[3] = {0.0, 0.0, 0.0};
+            load_targets<LANES>(q, block, own);
+            for (int64_t j = block + LANES - 1; j >= block; --j) add_sources<LANES>(q, gm, own, j, block, sums, 1.0);
+            store_targets<LANES>(sums, out, block);
+        }
+        for (int64_t tile = start(row + 1) - 1 - (start(row + 1) - 1 - first) % TILE; tile >= first; tile -= TILE)
+            meet(row, tile);
+    }
+
+    // The targets of a row with the sources of a tile before them. Of the reactions four lanes are kept.
+    void meet(int64_t row, int64_t tile) const {
+        constexpr int KEPT = VECTORS / 2;
+        Vector kept[TILE][3][KEPT] = {};
+        for (int64_t block = std::max(start(row), tile); block < start(row + 1); block += LANES) {
+            Octet own[3], sums[3];
+            load_targets<LANES>(q, block, own);
+            load_targets<LANES>(out, block, sums);
+            const Octet masses = -Octet::load(gm + block);
+            for (int64_t j = std::min(tile + TILE, block) - 1; j >= tile; --j) {
+                Octet d[3];
+                for (int c = 0; c < 3; ++c) d[c] = Octet(q[3 * j + c]) - own[c];
+                const Octet cube = Cube(squares(d[0], d[1], d[2], 0.0)).alone();
+                const Octet w = cube * gm[j], back = cube * masses;
+                for (int c = 0; c < 3; ++c) {
+                    sums[c] = multiply_add(w, d[c], sums[c]);
+                    Vector *sum = kept[j - tile][c];
+                    for (int v = 0; v < VECTORS; ++v) sum[v % KEPT] = fused(back.part[v], d[c].part[v], sum[v % KEPT]);
+                }
+            }
+            store_targets<LANES>(sums, out, block);
+        }
+        for (int64_t j = tile; j < std::min(tile + TILE, n); ++j)
+            for (int c = 0; c < 3; ++c) {
+                double lane[4];
+                std::memcpy(lane, kept[j - tile][c], sizeof lane);
+                reactions[3 * (n * row + j) + c] = (lane[0] + lane[2]) + (lane[1] + lane[3]);
+            }
+    }
+
+    // Adds the reactions of the later bodies and the pulls of the first ones.
+    [[gnu::flatten, gnu::noinline]] void finish(int64_t row) const {
+        for (int64_t block = start(row); block < start(row + 1); block += LANES) {
+            Octet own[3], sums[3], apart[3];
+            for (int64_t k = count - 1; k >= row; --k)
+                for (int64_t i = 3 * block; i < 3 * (block + LANES); ++i) out[i] += reactions[3 * n * k + i];
+            load_targets<LANES>(q, block, own);
+            load_targets<LANES>(out, block, sums);
+            for (int64_t j = first - 1; j >= (APART ? 1 : 0); --j) add_sources<LANES>(q, gm, own, j, block, sums, 1.0);
+            if constexpr (APART) add_sources<LANES, true>(q, gm, own, 0, block, sums, 1.0, apart);
+            store_targets<LANES>(sums, out, block);
+            if constexpr (APART) store_targets<LANES>(apart, pulls, block);
+        }
+    }
+};
+
+template <bool APART>
+[[gnu::noinline]] inline void accelerate_many(const double *q, const double *gm, int64_t n, double *out,
+                                              double *pulls) {
+    const PairRows<APART> rows{.q = q, .gm = gm, .n = n, .out = out, .pulls = pulls};
+    share(rows.count + 1, [&](int64_t k) { k == 0 ? rows.first_bodies() : rows.take(k - 1); });
+    share(rows.count, [&](int64_t k) { rows.finish(k); });
+}
+
 template <bool APART>
 inline void accelerate_all(const double *q, const double *gm, int64_t n, double *out, double *pulls) {
+    if (n >= MANY) return accelerate_many<APART>(q, gm, n, out, pulls);
     if (n < 4) return accelerate_few<APART>(q, gm, n, out, pulls);
     if (n < 8) {
         accelerate_block<APART, 4>(q, gm, n, 0, out, pulls);
@@ -387,9 +482,23 @@ inline Octet difference(const Octet *q, int64_t i, int64_t j, Octet *d) {
     return multiply_add(d[2], d[2], multiply_add(d[1], d[1], d[0] * d[0]));
 }
 
+// Many bodies of eight members, one member after the other: a vector holds eight bodies of one member then.
+[[gnu::noinline]] inline void accelerate_each(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
+    std::vector<double> one(7 * n);
+    double *place = one.data(), *mass = place + 3 * n, *pull = mass + n;
+    const auto *places = reinterpret_cast<const double *>(q), *masses = reinterpret_cast<const double *>(gm);
+    for (int64_t lane = 0; lane < LANES; ++lane) {
+        for (int64_t i = 0; i < 3 * n; ++i) place[i] = places[LANES * i + lane];
+        for (int64_t i = 0; i < n; ++i) mass[i] = masses[LANES * i + lane];
+        accelerate(place, mass, n, pull);
+        for (int64_t i = 0; i < 3 * n; ++i) reinterpret_cast<double *>(out)[LANES * i + lane] = pull[i];
+    }
+}
+
 // As above, for eight members: every pair once, sums in the same order. Bodies that one state leaves to its last block get
 // their sums in streams: those of body i stand in `sums` from 3 streams (i - first) on.
 inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
+    if (n >= MANY) return accelerate_each(q, gm, n, out);
     if (n < 4) return accelerate_few(q, gm, n, out);
     const Streams streams(n);
     const int64_t start = n % streams.count;
@@ -460,18 +569,23 @@ inline double carried_fold(const Carried &sum) {
 }
 
 // Energy of the bodies first + skip ... first + 7, with the pairs that they make with later ones.
-inline double energy_block(const double *y, const double *gm, int64_t n, int64_t first, int64_t skip) {
+[[gnu::flatten, gnu::noinline]] inline double energy_block(const double *y, const double *gm, int64_t n, int64_t first,
+                                                           int64_t skip) {
     Octet x[3], u[3];
     Carried square, potential;
     load_targets<LANES>(y, first, x);
     load_targets<LANES>(y + 3 * n, first, u);
     for (const Octet &part : u) square.add_product(part, part);
-    for (int64_t j = first + skip + 1; j < n; ++j) {
+    const auto add = [&](int64_t j, const Octet &mass, const Octet &start) {
+        const Octet dx = Octet(y[3 * j]) - x[0], dy = Octet(y[3 * j + 1]) - x[1], dz = Octet(y[3 * j + 2]) - x[2];
+        potential.add_product(mass, over_root(squares(dx, dy, dz, start)));
+    };
+    for (int64_t j = first + skip + 1; j < first + LANES; ++j) {
         // Not the body itself, nor those after it in the block, which meet this one as a source.
         const Octet done = LANES_FROM(j - first);
-        const Octet dx = Octet(y[3 * j]) - x[0], dy = Octet(y[3 * j + 1]) - x[1], dz = Octet(y[3 * j + 2]) - x[2];
-        potential.add_product(multiply_add(Octet(-gm[j]), done, Octet(gm[j])), over_root(squares(dx, dy, dz, done)));
+        add(j, multiply_add(Octet(-gm[j]), done, Octet(gm[j])), done);
     }
+    for (int64_t j = first + LANES; j < n; ++j) add(j, gm[j], 0.0);
     return carried_fold(energy_of(Octet::load(gm + first) * LANES_FROM(skip), square, potential));
 }
 
@@ -493,12 +607,25 @@ inline T energy_of_few(const T *y, const T *gm, int64_t n) {
     return 0.5 * kinetic - potential;
 }
 
-// G times the energy.
-[[gnu::flatten, gnu::noinline]] inline double energy_sum(const double *y, const double *gm, int64_t n) {
+// G times the energy. The blocks' energies are added in one order, whatever threads find them.
+inline double energy_sum(const double *y, const double *gm, int64_t n) {
     if (n < 8) return energy_of_few(y, gm, n);
+    const int64_t blocks = (n + 7) / 8, parts = (blocks + 3) / 4;
+    const auto energy = [&](int64_t block) {
+        const int64_t first = std::min(8 * block, n - 8);
+        return energy_block(y, gm, n, first, 8 * block - first);
+    };
     double total = 0.0;
-    for (int64_t first = 0; first < n - 7; first += 8) total += energy_block(y, gm, n, first, 0);
-    if (n % 8 > 0) total += energy_block(y, gm, n, n - 8, 8 - n % 8);
+    if (n < MANY) {
+        for (int64_t block = 0; block < blocks; ++block) total += energy(block);
+        return total;
+    }
+    std::vector<double> energies(blocks);
+    share(parts, [&](int64_t k) {  // the first blocks have most pairs, and the last parts begin first
+        for (int64_t block = 4 * (parts - 1 - k); block < std::min(4 * (parts - k), blocks); ++block)
+            energies[block] = energy(block);
+    });
+    for (const double one : energies) total += one;
     return total;
 }
 
