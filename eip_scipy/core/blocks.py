@@ -52,8 +52,8 @@ def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
     if len(groups.start) - 1 < n or n % 2 or n == 0 or y.dtype.kind == "c":
         return groups
     q_dot, p = f[: n // 2], y[n // 2 :]
-    with np.errstate(over="ignore", invalid="ignore"):
-        like = q_dot.any() == p.any() and q_dot @ np.sign(p) >= 0
+    with np.errstate(over="ignore", invalid="ignore"):  # not by BLAS, whose rounding differs between processors
+        like = q_dot.any() == p.any() and (q_dot * np.sign(p)).sum() >= 0
     return _consecutive(n // 2, n, 1) if like else groups
 
 
