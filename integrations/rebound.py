@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
@@ -398,8 +398,8 @@ def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nda
     """Return relative errors of energy and angular momentum along y (m, 6 N); absolute ones if the first value is 0."""
     q, v = np.moveaxis(y.reshape(len(y), 2, -1, 3), 1, 0)
     energy = 0.5 * (v**2).sum(axis=2) @ gm
-    for i, j in combinations(range(gm.size), 2):
-        energy -= gm[i] * gm[j] / np.linalg.norm(q[:, i] - q[:, j], axis=1)
+    for i in range(gm.size - 1):
+        energy -= gm[i] * (1 / np.linalg.norm(q[:, i + 1 :] - q[:, i : i + 1], axis=2) @ gm[i + 1 :])
     momentum = (gm[:, None] * np.cross(q, v)).sum(axis=1)
     energy_error = np.abs(energy - energy[0])
     momentum_error = np.linalg.norm(momentum - momentum[0], axis=1)

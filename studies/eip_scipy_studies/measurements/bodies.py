@@ -1,31 +1,52 @@
-"""``eip-scipy study bodies``: cost against the number of bodies, EIPRKN12 and REBOUND's IAS15.
+"""``eip-scipy study bodies``: cost and error against the number of bodies, EIPRKN12, REBOUND's IAS15 and its leapfrog.
 
 A star with N - 1 light planets (G m = 1e-9 of the star's) on nearly circular, nearly coplanar orbits of semi-major axes
-from 1 to 30, random phases. EIPRKN12 takes 25 steps in the innermost period, every=10, compensated; IAS15 its own
-steps. Wall times per innermost period, the least of three, one core; the relative error of the energy, and the largest
-distance between the two final states as a measure of agreement.
+from 1 to 30, random phases. EIPRKN12 takes 25 steps in the innermost period, and 4, with every=10, compensated; IAS15
+takes its own steps; leapfrog takes 400 and 800 in a period. All use one thread, as REBOUND does without OpenMP, except
+in the row that says so. Times are the least of three or more (of one for REBOUND with more than 300 bodies). Errors are
+the largest distance of a body from its place in a run of EIPRKN12 with 50 steps. The steps that leapfrog needs for
+the error of the run with 4 steps are extrapolated by its order, 2: the more accurate runs are beyond its rounding
+errors. The share of the projection is that of the processor time, compared with runs without invariants; with few
+bodies it contains the start of a run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from eip_scipy import EIPRKN12, integrate
+from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import Problem, nbody
 
 from ..report import needed, table
 from ..study import Measurement, Session, option
+from ..timing import clocked, least
 
 __all__ = ["Bodies"]
 
-REPEATS = 3
+REPEATS, SECONDS = 3, 4.0
 PERIOD = 2 * np.pi
-STEPS = 25
-Found = dict[int, dict[str, float]]
+STEPS, COARSE, REFERENCE = 25, 4, 50
+LEAPFROG = 400, 800
+SHARED = 128  # from this number of bodies on threads share the sums
+FEW = 300  # with fewer bodies the runs are longer
+Found = dict[int, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Row:
+    """An integrator: steps in a period, milliseconds for a step and for a period, and its error."""
+
+    steps: float
+    step: float
+    period: float
+    error: float
 
 
 def system(bodies: int, periods: float) -> Problem:
@@ -45,34 +66,115 @@ def system(bodies: int, periods: float) -> Problem:
 class Bodies(Measurement[Found]):
     """The command."""
 
-    periods: int = option(20, "length of the runs in innermost periods (%(default)s)", type=int, metavar="N")
-    bodies: Sequence[int] = option((10, 30, 100, 300), "numbers of bodies", type=int, nargs="+", metavar="N")
+    periods: int = option(
+        5,
+        "length of the runs in innermost periods from 300 bodies on, 300 / N times as many with fewer (%(default)s)",
+        type=int,
+        metavar="N",
+    )
+    bodies: Sequence[int] = option((10, 30, 100, 300, 1000), "numbers of bodies", type=int, nargs="+", metavar="N")
 
     def measure(self, session: Session) -> Found:
         rebound = needed("eip_scipy.integrations.rebound")
+        found = {}
         with session.bar(len(self.bodies), "bodies") as bar:
-            return {n: self._compare(system(n, self.periods), rebound, bar) for n in self.bodies}
-
-    def _compare(self, problem: Problem, rebound: Any, bar: Any) -> dict[str, float]:
-        start = problem.y0
-        own = [integrate(problem, method=EIPRKN12, every=10, compensated=True) for _ in range(REPEATS)]
-        peers = [rebound.run(problem.params, start, "ias15", h=problem.t_span[1], n_steps=1) for _ in range(REPEATS)]
-        seconds, theirs = (min(run.wall_time for run in runs) / self.periods for runs in (own, peers))
-        end = own[0].y[:, -1]
-        energy = [problem.invariants[0].fun(0.0, y, problem.params) for y in (start, end)]
-        apart = (end - peers[0].y[:, -1])[: start.size // 2].reshape(-1, 3)
-        bar.update()
-        return {
-            "EIPRKN12 [ms]": 1e3 * seconds,
-            "IAS15 [ms]": 1e3 * theirs,
-            "ratio": theirs / seconds,
-            "dH/H": abs(energy[1] / energy[0] - 1),
-            "IAS15 dE/E": peers[0].energy_error[-1],
-            "distance": float(np.linalg.norm(apart, axis=1).max()),
-        }
+            for n in self.bodies:
+                found[n] = _compare(n, self.periods * max(1, FEW // n), rebound)
+                bar.update()
+        return found
 
     def table(self, found: Found) -> str:
-        forms = (".3f", ".3f", ".1f", ".1e", ".1e", ".1e")
-        names = list(next(iter(found.values())))
-        body = [(f"N = {n}", [f"{row[k]:{f}}" for k, f in zip(names, forms, strict=True)]) for n, row in found.items()]
-        return "Milliseconds per innermost period\n\n" + table([[name] for name in names], body)
+        body: list[tuple[str, list[str]]] = []
+        for n, item in found.items():
+            shares = ", ".join(f"{100 * share:.1f} % with {name}" for name, share in item["projection"].items())
+            body.append((f"{n} bodies; share of the projection {shares}", []))
+            body += [
+                (f"  {name}", [f"{row[k]:{form}}" for k, form in FORMS.items()]) for name, row in item["rows"].items()
+            ]
+        head = [["steps", "a period"], ["ms", "a step"], ["ms", "a period"], ["error"]]
+        return table(head, body)
+
+
+FORMS = {"steps": ".3g", "step": ".3g", "period": ".3g", "error": ".1e"}
+
+
+def _compare(n: int, periods: int, rebound: Any) -> dict[str, Any]:
+    problem = system(n, periods)
+    reference = _run(problem, h=PERIOD / REFERENCE).y[:, -1]
+
+    def row(seconds: float, steps: int, end: np.ndarray) -> Row:
+        return Row(steps / periods, 1e3 * seconds / steps, 1e3 * seconds / periods, _distance(end, reference))
+
+    rows, shares = _ours(problem, periods, row)
+    rows |= _theirs(problem, periods, row, rebound)
+    last = rows[f"leapfrog, {LEAPFROG[1]} steps"]
+    error = rows[f"EIPRKN12, {COARSE} steps"].error
+    steps = last.steps * np.sqrt(last.error / error)
+    rows["leapfrog, extrapolated"] = Row(steps, last.step, steps * last.step, error)
+    return {"rows": {name: vars(item) for name, item in rows.items()}, "projection": shares}
+
+
+def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict[str, Row], dict[str, float]]:
+    """Return the rows, and the shares of the projection."""
+    coarse, h = f"EIPRKN12, {COARSE} steps", PERIOD / COARSE
+    shared = problem.y0.size >= 6 * SHARED
+    actions = {"EIPRKN12": partial(_alone, partial(_seconds, problem))}
+    if shared:
+        actions["EIPRKN12, all threads"] = partial(_seconds, problem)
+    actions[coarse] = partial(_alone, partial(_seconds, problem, h=h))
+    seconds = least(actions, seconds=SECONDS)
+    ends = {coarse: _run(problem, h=h).y[:, -1], "EIPRKN12": _run(problem).y[:, -1]}
+    rows = {
+        name: row(seconds[name], periods * (COARSE if name == coarse else STEPS), ends.get(name, ends["EIPRKN12"]))
+        for name in actions
+    }
+    return rows, _shares(problem)
+
+
+def _shares(problem: Problem) -> dict[str, float]:
+    """Return the shares of the projection, from processor times: other programs do not change these."""
+    cases: dict[str, dict[str, Any]] = {
+        "every=10": {"every": 10},
+        "every=1": {"every": 1},
+        "none": {"every": None, "invariants": ()},
+    }
+    actions = {
+        name: partial(_alone, clocked(partial(_run, problem, check=False, **options), time.process_time))
+        for name, options in cases.items()
+    }
+    seconds = least(actions, seconds=SECONDS)
+    return {name: 1 - seconds["none"] / seconds[name] for name in cases if name != "none"}
+
+
+def _theirs(problem: Problem, periods: int, row: Callable[..., Row], rebound: Any) -> dict[str, Row]:
+    run = partial(rebound.run, problem.params, problem.y0)
+    calls = {"IAS15": partial(run, "ias15", h=problem.t_span[1], n_steps=1)}
+    for steps in LEAPFROG:
+        calls[f"leapfrog, {steps} steps"] = partial(run, "leapfrog", h=PERIOD / steps, n_steps=steps * periods)
+    rows = {}
+    for name, call in calls.items():
+        runs = [call() for _ in range(REPEATS if problem.y0.size <= 6 * FEW else 1)]
+        rows[name] = row(min(item.wall_time for item in runs), runs[0].steps, runs[0].y[:, -1])
+    return rows
+
+
+def _run(problem: Problem, *, every: int | None = 10, **options: Any) -> Any:
+    return integrate(problem, method=EIPRKN12, every=every, compensated=True, **options)
+
+
+def _seconds(problem: Problem, **options: Any) -> float:
+    return float(_run(problem, **options).wall_time)
+
+
+def _alone(action: Callable[[], float]) -> float:
+    """Run it with one thread."""
+    before = BUILD.gravity.work_alone(True)
+    try:
+        return action()
+    finally:
+        BUILD.gravity.work_alone(before)
+
+
+def _distance(end: np.ndarray, reference: np.ndarray) -> float:
+    apart = (end - reference)[: end.size // 2].reshape(-1, 3)
+    return float(np.linalg.norm(apart, axis=1).max())
