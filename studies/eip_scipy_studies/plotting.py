@@ -341,7 +341,7 @@ def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figu
         for axis, (panel, curves) in zip(line, row.orbits.items(), strict=False):
             for path in curves.paths.values():
                 axis.plot(*np.asarray(path), color=PALETTE[0], lw=0.35, rasterized=True)
-            axis.set_title(f"{name}: {panel}", fontsize="medium")
+            axis.set_title(f"{name}\n{panel}", fontsize="medium")
             axis.set_xlabel(curves.x)
             axis.set_ylabel(curves.y)
             axis.set_aspect("equal", adjustable="box")
