@@ -41,6 +41,7 @@ __all__ = [
     "gains_figure",
     "linkage_figure",
     "linkages_figure",
+    "log_x",
     "longitude_figure",
     "orbit_in_time_figure",
     "orbits_figure",
@@ -170,7 +171,7 @@ def longitude_figure(
             continue
         for method, values in errors.items():
             _envelope(axis, t, np.asarray(values)[k], styles[method], log=True)
-        _log_x(axis)
+        log_x(axis)
         log_errors(axis, time if k + columns >= len(planets) else "", "")
         axis.set_title(planets[k], fontsize="medium")
     figure.supylabel(error, fontsize="medium")
@@ -495,7 +496,7 @@ def cost_figure(
                 axis.sharex(first[panel.cost])
             _draw_costs(axis, panel, styles, largest)
     for panel, axis in drawn:
-        _log_x(axis)
+        log_x(axis)
         log_errors(axis, panel.cost, error if shared and axis in axes[:, 0] else "")
         for name, slope in panel.slopes.items():
             cost, errors = panel.curves[name]
@@ -566,7 +567,7 @@ def linkage_figure(
     styles = method_styles(dict.fromkeys(name for panel in panels for name in panel.curves))
     for axis, panel in zip(below, panels, strict=True):
         _draw_costs(axis, panel, styles, largest)
-        _log_x(axis)
+        log_x(axis)
         log_errors(axis, panel.cost, error)
     _legend_below(figure, below[0])
     return figure
@@ -839,8 +840,14 @@ def _marked(scale: np.ndarray, count: int = 6) -> list[int]:
     return sorted({int(np.argmin(np.abs(scale - at))) for at in wanted})
 
 
-def _log_x(axis: Axes) -> None:
-    """Make x a log axis with labels at powers of ten; in a short range also at 2 and 5 times those."""
+def log_x(axis: Axes) -> None:
+    """Make x a log axis with labels at powers of ten; in a short range also at 2 and 5 times those.
+
+    Parameters
+    ----------
+    axis : matplotlib.axes.Axes
+        Axes in which the curves are drawn already.
+    """
     axis.set_xscale("log")
     low, high = axis.get_xlim()
     if high / low < 100:
@@ -924,7 +931,7 @@ def side_by_side_figure(
     for level in levels:
         axes[0].axhline(level, color="0.6", lw=0.8, ls=":")
     for axis, label in zip(axes, panels, strict=True):
-        _log_x(axis)
+        log_x(axis)
         log_errors(axis, time if axis is axes[-1] else "", label)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(
