@@ -850,6 +850,8 @@ def log_x(axis: Axes) -> None:
     """
     axis.set_xscale("log")
     low, high = axis.get_xlim()
+    if high / low < 5:  # two labels at least, or matplotlib chooses others
+        axis.set_xlim(low / 1.6, high * 1.6)
     if high / low < 100:
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.xaxis.set_major_formatter(FuncFormatter(_short))
