@@ -2,8 +2,8 @@
 
 Other packages, such as `eip_scipy_studies.comparators`, use these loops through this module.
 `run_in_place` and `run_second_order` run a scheme over a function of the user, compiled if it has an address; `fields`
-holds loops over the points of a complex field, one call for each part of a step of the Gross-Pitaevskii equation. The
-schemes follow the engine and may change with it.
+holds loops over the points of a complex field, one call for each part of a step of the Gross-Pitaevskii equation. In
+`working_alone` a thread computes sums over many bodies by itself. The schemes follow the engine and may change with it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .core.native_functions import Kind, function_alone, raise_again
 from .core.pointers import by_pointer, is_pointer
 from .core.stepping import check_fixed_step, fixed_steps, saved_steps
 from .engine.data import Work
-from .engine.native import BUILD, Call, FailedCallError, NativeFunctions, PythonFunctions, call
+from .engine.native import BUILD, Call, FailedCallError, NativeFunctions, PythonFunctions, call, working_alone
 
 __all__ = [
     "FixedStepResult",
@@ -32,6 +32,7 @@ __all__ = [
     "refuse_units",
     "run_in_place",
     "run_second_order",
+    "working_alone",
 ]
 
 fields = BUILD.fields

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +27,7 @@ __all__ = [
     "call",
     "library",
     "library_function",
+    "working_alone",
 ]
 
 # Names one of the builds, _native or _native_v3, to use instead of the best one for the processor.
@@ -185,6 +187,18 @@ else:
     _require_current(BUILD)
 if _is_worker() and "OMP_NUM_THREADS" not in os.environ:
     BUILD.gravity.end_threads()
+
+
+@contextmanager
+def working_alone() -> Iterator[None]:
+    """Keep the calling thread from sharing sums over many bodies with other threads."""
+    before = BUILD.gravity.work_alone(True)
+    try:
+        yield
+    finally:
+        BUILD.gravity.work_alone(before)
+
+
 Engine = BUILD.Engine
 FailedCallError = BUILD.FailedCallError
 LibraryFunction = BUILD.LibraryFunction

@@ -7,13 +7,12 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..engine.native import BUILD
+from ..engine.native import BUILD, working_alone
 from ..run.interrupts import look_for_signals
 from .own_times import OwnTimes
 from .statistics import Statistics, statistics_of
@@ -86,17 +85,7 @@ _plans: OrderedDict[str, Plan] = OrderedDict()
 _making = threading.Lock()
 
 
-@contextmanager
-def _working_alone() -> Iterator[None]:
-    """Keep this thread from starting others: the other processors run other chunks."""
-    before = BUILD.gravity.work_alone(True)
-    try:
-        yield
-    finally:
-        BUILD.gravity.work_alone(before)
-
-
-@_working_alone()
+@working_alone()  # the other processors run other chunks
 def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
     """Run a chunk in another process, which creates the plan once and stores it under `key`."""
     with _making:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from eip_scipy import EIPRKN12, integrate
-from eip_scipy.engine.native import BUILD
+from eip_scipy.native_kernels import working_alone
 from eip_scipy.problems import Problem, nbody
 
 from ..report import needed, table
@@ -168,11 +168,8 @@ def _seconds(problem: Problem, **options: Any) -> float:
 
 def _alone(action: Callable[[], float]) -> float:
     """Run it with one thread."""
-    before = BUILD.gravity.work_alone(True)
-    try:
+    with working_alone():
         return action()
-    finally:
-        BUILD.gravity.work_alone(before)
 
 
 def _distance(end: np.ndarray, reference: np.ndarray) -> float:
