@@ -100,12 +100,17 @@ def _equal_error(found: Found, suite: str) -> list[Table]:
     return tables
 
 
+def _factor(value: float) -> str:
+    """Format a ratio above 1, so that it does not read 1."""
+    return f"{value:.3g}" if value < 1.1 else f"{value:.2g}"
+
+
 def _losses(group: list[Standing]) -> list[str]:
     """Make a line for each reason: the packages that are faster for it, the place and the ratio."""
     by_reason: dict[str, list[str]] = {}
     for each in group:
         if each.lost:
-            ahead = f"ahead by {1 / each.ratio:.2g}" if each.ratio else "the only one that arrives"
+            ahead = f"ahead by {_factor(1 / each.ratio)}" if each.ratio else "the only one that arrives"
             told = by_reason.setdefault(reason(each), [])
             told.append(f"{each.peer} is {ahead} at {compact(each.level, 1)}")
     return [f"{'; '.join(told)}. {why}".strip() for why, told in by_reason.items()]
