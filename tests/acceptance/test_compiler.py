@@ -1,6 +1,7 @@
 """Choice of the compiler that builds the engine, and of its target."""
 
 import importlib
+import re
 import sys
 import sysconfig
 from pathlib import Path
@@ -95,3 +96,12 @@ def test_a_platform_that_is_not_known_is_named(compiler, monkeypatch):
     monkeypatch.setenv("EIP_SCIPY_TARGET", "cp312-abi3-beos")
     with pytest.raises(SystemExit, match="'beos'; expected one of manylinux"):
         compiler.target()
+
+
+def test_wheels_for_all_versions_of_python_can_be_built():
+    """The macros of CPython that look into its objects, such as PyTuple_GET_SIZE, are not in the stable interface."""
+    inside = re.compile(r"\bPy(?:ByteArray|Bytes|CFunction|Float|List|Set|Tuple|Unicode)_(?:AS|GET|READ|SET)_[A-Z_]+\(")
+    found = [inside.findall(path.read_text()) for path in (ROOT / "eip_scipy/engine/cpp").rglob("*.[ch]pp")]
+    assert sum(map(len, found)) == 0, found
+    assert len(found) > 40
+    assert inside.search("PyTuple_GET_SIZE(x)")

@@ -100,8 +100,8 @@ class Reader {
     // To look a field up by its name takes most of the time of reading it.
     nb::object next(const char *name) {
         const Py_ssize_t place = place_++;
-        if (!PyTuple_Check(record_.ptr()) || place >= PyTuple_GET_SIZE(record_.ptr())) return record_.attr(name);
-        return nb::borrow(PyTuple_GET_ITEM(record_.ptr(), place));
+        if (!PyTuple_Check(record_.ptr()) || place >= PyTuple_Size(record_.ptr())) return record_.attr(name);
+        return nb::borrow(PyTuple_GetItem(record_.ptr(), place));
     }
 
     template <class... Axes>
