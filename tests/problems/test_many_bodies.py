@@ -36,7 +36,7 @@ def end(n, steps=4):
     return integrate(problem(n), (0, steps * 1e-3), method=EIPRK4).y[:, -1].tobytes()
 
 def threads():
-    return len(os.listdir("/proc/self/task")) if os.path.isdir("/proc/self/task") else 0
+    return len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0
 """
 
 
