@@ -117,11 +117,11 @@ def _compare(n: int, periods: int, rebound: Any) -> dict[str, Any]:
 def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict[str, Row], dict[str, float]]:
     """Return the rows, and the shares of the projection."""
     coarse, h = f"EIPRKN12, {COARSE} steps", PERIOD / COARSE
-    shared = problem.y0.size >= 6 * SHARED
-    actions = {"EIPRKN12": partial(_alone, partial(_seconds, problem))}
+    shared, alone = problem.y0.size >= 6 * SHARED, working_alone()
+    actions = {"EIPRKN12": alone(partial(_seconds, problem))}
     if shared:
         actions["EIPRKN12, all threads"] = partial(_seconds, problem)
-    actions[coarse] = partial(_alone, partial(_seconds, problem, h=h))
+    actions[coarse] = alone(partial(_seconds, problem, h=h))
     seconds = least(actions, seconds=SECONDS)
     ends = {coarse: _run(problem, h=h).y[:, -1], "EIPRKN12": _run(problem).y[:, -1]}
     rows = {
@@ -139,7 +139,7 @@ def _shares(problem: Problem) -> dict[str, float]:
         "none": {"every": None, "invariants": ()},
     }
     actions = {
-        name: partial(_alone, clocked(partial(_run, problem, check=False, **options), time.process_time))
+        name: working_alone()(clocked(partial(_run, problem, check=False, **options), time.process_time))
         for name, options in cases.items()
     }
     seconds = least(actions, seconds=SECONDS)
@@ -164,12 +164,6 @@ def _run(problem: Problem, *, every: int | None = 10, **options: Any) -> Any:
 
 def _seconds(problem: Problem, **options: Any) -> float:
     return float(_run(problem, **options).wall_time)
-
-
-def _alone(action: Callable[[], float]) -> float:
-    """Run it with one thread."""
-    with working_alone():
-        return action()
 
 
 def _distance(end: np.ndarray, reference: np.ndarray) -> float:
