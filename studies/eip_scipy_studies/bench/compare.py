@@ -117,9 +117,7 @@ def _cost(runs: Sequence[Row], level: float) -> float:
 
 # Reasons why a package is faster, by the beginnings of suite, problem and package, and the kind of function. The first
 # that fits is printed, and only with a measured loss.
-CHECKS = (
-    "Each call of ours begins with checks of invariants and gradients, 0.3 to 0.5 ms, a large part of so short a run."
-)
+CHECKS = "Each call of ours begins with checks of invariants and gradients, a large part of so short a run."
 CHEAP = (
     "Its loop is compiled and calls nothing but the function; ours calls the invariants and their gradients too, and "
     "where errors grow as slowly without projection that is not earned back."
