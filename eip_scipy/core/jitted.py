@@ -8,7 +8,9 @@ from functools import cache
 from importlib.util import find_spec
 from typing import Any, cast
 
-from ..engine.native import LibraryFunction
+import numpy as np
+
+from ..engine.native import Call, LibraryFunction
 
 __all__ = [
     "ChangedShapeError",
@@ -19,6 +21,7 @@ __all__ = [
     "is_jitted",
     "jit_is_off",
     "jitted",
+    "with_entry",
 ]
 
 
@@ -34,6 +37,15 @@ def is_jitted(fun: Any) -> bool:
     """Return True if a function is a Numba function."""
     # Not numba.extending.is_jitted, which imports the class in each of its calls.
     return isinstance(fun, getattr(sys.modules.get("numba.core.dispatcher"), "Dispatcher", ()))
+
+
+def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
+    """Return a `Call` with the code that Numba has compiled for states of type `dtype`, if there is any."""
+    if not is_jitted(call.fun):
+        return call
+    from . import numba_entries
+
+    return numba_entries.with_entry(call, dtype)
 
 
 def jit_is_off() -> bool:

@@ -42,6 +42,7 @@ from .examination import is_check_due
 from .failures import failure
 from .inputs import refuse_units, shown
 from .invariants import InvariantSet, as_invariants
+from .jitted import with_entry
 from .multistep import times
 from .names import nearest
 from .one_step import OneStep, OneStepMethod
@@ -281,11 +282,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._work.K[0] = self.f
         self._schedule = bare_schedule(self._spec.stepping.span, float(self.h_abs or 0.0))
         self._schedule.place[PENDING] = 1  # the solver shows the end of the last step
-        calls, jacobian = self._run.invariants.calls, None
+        (values, gradients), jacobian = self._run.invariants.calls, None
         if callable(self._jacobian):
             jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
         rates = self._run.invariants.rates(self._run.options.adaptive)
-        functions = PythonFunctions(self._call, *calls, (), second_order=False, jacobian=jacobian, rates=rates)
+        rhs, *calls = (with_entry(call, self.y.dtype) for call in (self._call, *values, *gradients))
+        inv, grad = tuple(calls[: len(values)]), tuple(calls[len(values) :])
+        functions = PythonFunctions(rhs, inv, grad, (), second_order=False, jacobian=jacobian, rates=rates)
         self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
 
     def _settle(self) -> None:

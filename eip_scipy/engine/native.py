@@ -35,11 +35,32 @@ VARIABLE = "EIP_SCIPY_ENGINE"
 AGAIN = "python -m pip install --no-build-isolation --no-deps --editable ."
 
 
+class NumbaEntry(NamedTuple):
+    """The code that Numba compiled for ``fun(t, y)``, in Numba's calling convention.
+
+    Attributes
+    ----------
+    address : int
+        Address of the code.
+    release : int
+        Address of the function that gives up a reference to the memory of a returned array.
+    owner : object
+        Keeps the code in memory.
+    """
+
+    address: int
+    release: int
+    owner: Any
+
+
 class Call(NamedTuple):
     """A user's function in Python: ``fun(t, y[, f][, out], *args)``.
 
     Its value is used directly if it is an array of the right shape (a float for ``()``) and type: that of the state, or
     float if it is `real`. Otherwise ``convert(value, t)`` converts it to such an array, or raises an error.
+
+    `entry` is the machine code of a Numba function, which is called instead of the function: see `NumbaEntry`. The
+    function itself is called where the code raises an exception or returns another shape.
     """
 
     fun: Callable[..., Any]
@@ -49,9 +70,10 @@ class Call(NamedTuple):
     real: bool = False
     takes_f: bool = False
     in_place: bool = False
+    entry: NumbaEntry | None = None
 
 
-def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: bool) -> Call:
+def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: Any) -> Call:
     """Return a `Call` with the given further arguments."""
     if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)

@@ -13,6 +13,12 @@ namespace eip {
 // Further arguments of a function at most.
 constexpr int MOST_ARGUMENTS = 8;
 
+// A function fun(t, y) that Numba has compiled: it returns 0, or another number after an exception. An array is passed as
+// the owner of its memory, its Python object, its number of items, their size, data, shape and strides.
+using NumbaCode = int32_t(void *value, void **exception, double t, void *memory, void *parent, int64_t items,
+                          int64_t item_size, const double *data, int64_t shape, int64_t stride);
+using NumbaRelease = void(void *memory);
+
 // One function: fun(t, y[, f][, out], *args). What it returns is taken as it is where it is an array of the right kind,
 // or a float; else `convert(value, t)` makes that of it,
 // or raises.
@@ -27,10 +33,13 @@ class PythonCall {
     int64_t floats() const { return floats_; }
 
   private:
+    bool by_numba(double t, const double *y, double *out) const;
     bool take_list(PyObject *value, double *out) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
     nb::handle fun_, convert_;
+    NumbaCode *code_ = nullptr;
+    NumbaRelease *release_ = nullptr;
     std::vector<nb::handle> args_;
     npy_intp dimensions_[2];
     int n_dimensions_, type_, value_type_;

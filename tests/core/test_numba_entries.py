@@ -1,0 +1,171 @@
+"""Numba's compiled code in `solve_ivp`: the same states as through Python, its errors, its memory."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, Invariant
+from eip_scipy.core.jitted import with_entry
+from eip_scipy.engine.native import Call
+
+numba = pytest.importorskip("numba")
+njit = numba.njit
+pytestmark = pytest.mark.needs_jit
+
+Y0 = np.array([0.4, 0.0, 0.0, 2.0])
+MATRIX = np.array([[0.0, 1.0], [-1.0, 0.0]])
+
+
+@njit
+def rhs(t, y):
+    r3 = (y[0] ** 2 + y[1] ** 2) ** 1.5
+    y[0], y[1] = -y[0] / r3, -y[1] / r3  # the argument is a copy that a function may overwrite
+    return np.array([y[2], y[3], y[0], y[1]])
+
+
+@njit
+def both(t, y):
+    energy = 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
+    return np.array([energy, y[0] * y[3] - y[1] * y[2]])
+
+
+@njit
+def both_gradients(t, y):
+    r3 = (y[0] ** 2 + y[1] ** 2) ** 1.5
+    return np.array([[y[0] / r3, y[1] / r3, y[2], y[3]], [y[3], -y[2], -y[1], y[0]]])
+
+
+@njit
+def spin(t, y):
+    return -1j * np.array([y[1], y[0]])
+
+
+@njit
+def norm(t, y):
+    return abs(y[0]) ** 2 + abs(y[1]) ** 2
+
+
+@njit
+def norm_gradient(t, y):
+    return 2 * y
+
+
+def in_python(fun):
+    return lambda t, y: fun(t, y)
+
+
+def entry_of(fun, shape, dtype=float, **kind):
+    return with_entry(Call(fun, (), shape, None, **kind), np.dtype(dtype)).entry
+
+
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
+@pytest.mark.parametrize(
+    ("fun", "y0", "invariant"),
+    [(rhs, Y0, (both, both_gradients)), (spin, np.array([0.6, 0.8j]), (norm, norm_gradient))],
+)
+def test_states_are_those_of_python_calls(method, fun, y0, invariant):
+    step = {"h": 0.03} if method is EIPRK4 else {"rtol": 1e-6}
+    runs = [
+        solve_ivp(wrap(fun), (0, 3), y0, method=method, invariants=[Invariant(*map(wrap, invariant))], **step)
+        for wrap in (lambda f: f, in_python)
+    ]
+    assert (runs[0].y == runs[1].y).all()
+    assert [runs[0].nfev, runs[0].njev, runs[0].nlu] == [runs[1].nfev, runs[1].njev, runs[1].nlu]
+
+
+def test_python_is_not_called_in_the_steps(monkeypatch):
+    solver = EIPRK4(rhs, 0.0, Y0, 10.0, h=0.03, invariants=[Invariant(both, both_gradients)])
+    # From here on the functions refuse calls from Python.
+    for fun in (rhs, both, both_gradients):
+        monkeypatch.setattr(fun, "overloads", {})
+        fun._reset_overloads()
+        monkeypatch.setattr(fun, "_can_compile", False)
+        with pytest.raises(TypeError, match="No matching definition"):
+            fun(0.0, Y0)
+    for _ in range(10):
+        solver.step()
+    assert solver.status == "running"
+
+
+@njit
+def of_integers(t, y):
+    return 1
+
+
+@njit
+def of_a_list(t, y):
+    return [y[0], y[1]]
+
+
+@njit
+def backwards(t, y):
+    return y[::-1]
+
+
+@njit
+def maybe(t, y):
+    if y[0] > 0:
+        return y[0]
+    return None
+
+
+@pytest.mark.parametrize(
+    ("fun", "shape"), [(of_integers, ()), (of_a_list, (2,)), (backwards, (4,)), (maybe, ()), (both, ())]
+)
+def test_other_values_go_through_python(fun, shape):
+    fun(0.0, Y0)
+    assert entry_of(fun, shape, real=True) is None
+
+
+def test_nothing_is_compiled_for_it():
+    fresh = njit(lambda t, y: y[0])
+    assert entry_of(fresh, ()) is None
+    assert not fresh.overloads
+    fresh(0.0, Y0)
+    assert entry_of(fresh, ()).address > 0
+
+
+@njit
+def late(t, y):
+    if t > 1.0:
+        raise ValueError("too late")
+    return np.array([y[1], -y[0]])
+
+
+@njit
+def shrinks(t, y):
+    return np.array([y[1], -y[0]]) if t < 1.0 else np.array([y[1]])
+
+
+@njit
+def divides(t, y):
+    return np.array([1.0 / (y[0] - y[0] * (t > 1.0)), -y[0]])
+
+
+@pytest.mark.parametrize("fun", [late, shrinks, divides])
+def test_errors_are_those_of_python_calls(fun):
+    raised = []
+    for called in (fun, in_python(fun)):
+        with pytest.raises((ValueError, ZeroDivisionError)) as caught:
+            solve_ivp(called, (0, 3), [1.0, 0.5], method=EIPRK4, h=0.1)
+        raised.append((caught.type, str(caught.value)))
+    assert raised[0] == raised[1]
+
+
+def test_returned_arrays_are_freed():
+    from numba.core.runtime import _nrt_python, rtsys
+
+    _nrt_python.memsys_enable_stats()
+
+    def in_use():
+        stats = rtsys.get_allocation_stats()
+        return stats.alloc - stats.free
+
+    options = {"method": EIPRK4, "h": 0.01, "invariants": [Invariant(both, both_gradients)]}
+    solve_ivp(rhs, (0, 1), Y0, **options)
+    before = in_use()
+    solve_ivp(rhs, (0, 10), Y0, **options)
+    with pytest.raises(ValueError, match="shape"):
+        solve_ivp(shrinks, (0, 3), [1.0, 0.5], method=EIPRK4, h=0.1)
+    assert in_use() == before
+    _nrt_python.memsys_disable_stats()
