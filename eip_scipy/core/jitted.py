@@ -70,7 +70,7 @@ def jitted(fun: Any) -> Any:
         return fun
     from numba import njit
 
-    return njit(fun, error_model="numpy")
+    return njit(fun, error_model="numpy", forceinline=True)
 
 
 def is_compiled(fun: Any) -> bool:

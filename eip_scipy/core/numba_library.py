@@ -1,4 +1,4 @@
-"""Use of the library's functions inside Numba functions: a user's compiled code may call `problem.rhs`.
+"""Use of the functions of the ready problems inside Numba functions: a user's jitted code may call `problem.rhs`.
 
 Numba finds `register` through the package's entry point ``numba_extensions``.
 """
@@ -11,8 +11,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit, types
-from numba.extending import typeof_impl
+from numba import carray, njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic, overload, typeof_impl
 
 from ..engine.native import LibraryFunction
 
@@ -24,60 +25,127 @@ FUNCTION = ctypes.CFUNCTYPE(
 FITS = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_int64] * 2)
 
 
+# Inlined, because only then the compiler sees that arrays need no counting of references.
+INLINED = {"forceinline": True}
+_inlined = njit(**INLINED)
+
+
 def register() -> None:
-    """Make functions of the library, such as ``problem.rhs``, callable from functions that Numba compiles."""
+    """Make each `LibraryFunction`, such as ``problem.rhs``, callable from functions that Numba compiles."""
     typeof_impl.register(LibraryFunction)(lambda function, context: types.Dispatcher(_jitted(function)))
 
 
 @cache
 def _jitted(function: Any) -> Any:
-    """Return a library function as a Numba function that copies its arguments, which may be of any layout."""
+    """Return a jitted function that calls a `LibraryFunction` with arguments of any layout."""
     if function.own or function.numbers < 0:
         raise TypeError(f"{function.__name__} cannot be called by jitted functions.")
-    value = njit(_value_of(function))
+    fill = _inlined(_filling(function))
     if function.in_place and function.takes_f:
-        return njit(lambda t, y, f, out, params: _fill(out, value(t, y, f, params)))
+        return _inlined(lambda t, y, f, out, params: fill(t, y, f, out, params))
     if function.in_place:
-        return njit(lambda t, y, out, params: _fill(out, value(t, y, y, params)))
+        return _inlined(lambda t, y, out, params: fill(t, y, y, out, params))
+    value = _inlined(_value_of(function, fill))
     if function.takes_f:
-        return njit(lambda t, y, f, params: value(t, y, f, params))
-    if function.numbers == 1 and not function.fills_states:
-        return njit(lambda t, y, params: value(t, y, y, params)[0])
-    return njit(lambda t, y, params: value(t, y, y, params))
+        return _inlined(lambda t, y, f, params: value(t, y, f, params))
+    return _inlined(lambda t, y, params: value(t, y, y, params))
 
 
-def _value_of(function: Any) -> Callable[..., Any]:
+def _value_of(function: Any, fill: Any) -> Callable[..., Any]:
+    """Return a function that returns what `fill` writes: a number if there is only one, otherwise an array."""
+    numbers, of_state = function.numbers, function.fills_states
+
+    def number(t, y, f, params):
+        out = carray(_room_for_a_number(), 1)
+        fill(t, y, f, out, params)
+        return out[0]
+
+    def array(t, y, f, params):
+        out = np.empty(numbers * (y.size if of_state else 1))
+        fill(t, y, f, out, params)
+        return out
+
+    return number if numbers == 1 and not of_state and not function.takes_f else array
+
+
+def _filling(function: Any) -> Callable[..., None]:
     call, fits, handle = FUNCTION(function.call_address), FITS(function.fits_address), function.handle
     numbers, of_state = function.numbers, function.fills_states
     no_memory = f"{function.__name__} could not get the memory that it needs"
-    wrong = f"{function.__name__} takes another number of states or parameters"
+    wrong = f"{function.__name__} was called with a state, derivative or params of the wrong size"
+    wrong_out = f"{function.__name__} was called with an array out of another size than its value"
 
-    def value(t, y, f, params):
+    def fill(t, y, f, out, params):
         n, p = y.size, params.size
         if not (fits(n, p) and f.size == n):
             raise ValueError(wrong)
-        out = np.empty(numbers * (n if of_state else 1))
-        state, slope, parameters = _floats(y), _floats(f), _floats(params)
-        pointers = state.ctypes.data, slope.ctypes.data, out.ctypes.data, parameters.ctypes.data
+        if out.size != numbers * (n if of_state else 1):
+            raise ValueError(wrong_out)
+        values, parameters = _floats(out), _floats(params)
+        state, slope = _apart(_floats(y), values), _apart(_floats(f), values)
+        pointers = state.ctypes.data, slope.ctypes.data, values.ctypes.data, parameters.ctypes.data
         if call(handle, t, *pointers, n, p) != 0:
             raise MemoryError(no_memory)
+        _write_back(values, out)
+
+    return fill
+
+
+@intrinsic
+def _room_for_a_number(context):
+    """Return a pointer to a number on the stack, which takes less time than an array."""
+
+    def code(context, builder, signature, arguments):
+        return cgutils.alloca_once(builder, context.get_value_type(types.float64))
+
+    return types.CPointer(types.float64)(), code
+
+
+def _is_plain(array: Any) -> bool:
+    return bool(array.layout == "C" and array.dtype == types.float64)
+
+
+def _floats(values: Any) -> Any:
+    """Return an array itself if its memory is that of C floats, otherwise a copy; for jitted functions."""
+    raise NotImplementedError
+
+
+@overload(_floats, jit_options=INLINED)
+def _floats_of(values):
+    if _is_plain(values):
+        return lambda values: values
+
+    def copied(values):
+        out, flat = np.empty(values.size), values.flat
+        for i in range(out.size):
+            out[i] = flat[i]
         return out
 
-    return value
+    return copied
 
 
-@njit
-def _floats(values):
-    out = np.empty(values.size)
-    for i in range(out.size):
-        out[i] = values[i]
-    return out
+def _write_back(values: Any, out: Any) -> None:
+    """Write the values to `out`, if they are not in its memory already; for jitted functions."""
+    raise NotImplementedError
 
 
-@njit
-def _fill(out, values):
-    if out.size != values.size:
-        raise ValueError("out has another shape than what a function of eip_scipy fills")
-    flat = out.flat
-    for i in range(values.size):
-        flat[i] = values[i]
+@overload(_write_back, jit_options=INLINED)
+def _write_back_to(values, out):
+    if _is_plain(out):
+        return lambda values, out: None
+
+    def written(values, out):
+        flat = out.flat
+        for i in range(values.size):
+            flat[i] = values[i]
+
+    return written
+
+
+@_inlined
+def _apart(values, out):
+    """Return `values`, or a copy if `out` shares memory with them, because the library's functions read them again."""
+    distance = out.ctypes.data - values.ctypes.data
+    if -8 * out.size < distance < 8 * values.size:
+        return values.copy()
+    return values

@@ -207,6 +207,40 @@ def test_accelerations_inside_another_compiled_function():
     np.testing.assert_array_equal(inside, acc(0.0, y[:15], gm))
 
 
+@njit
+def _filled(y, out, gm):
+    rhs(0.0, y, out, gm)
+    return out
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("arrange", ["strided", "of floats of half the size", "shared", "partly shared"])
+def test_arrays_of_any_memory_inside_a_compiled_function(arrange):
+    gm, y = bodies(3)
+    if arrange == "of floats of half the size":
+        y = y.astype(np.float32)
+    expected = np.empty(y.size)
+    rhs(0.0, y.astype(float), expected, gm)
+    room = np.empty(3 * y.size, y.dtype)
+    start, out = {
+        "strided": (room[::3], room[1::3]),
+        "of floats of half the size": (room[: y.size], room[y.size : 2 * y.size]),
+        "shared": (room[: y.size], room[: y.size]),
+        "partly shared": (room[: y.size], room[1 : y.size + 1]),
+    }[arrange]
+    start[:] = y
+    np.testing.assert_array_equal(_filled(start, out, gm), expected.astype(y.dtype))
+
+
+@pytest.mark.needs_jit
+def test_wrong_sizes_inside_a_compiled_function():
+    gm, y = bodies(3)
+    with pytest.raises(ValueError, match=r"gravity\.rhs was called with an array out of another size"):
+        _filled(y, np.empty(4), gm)
+    with pytest.raises(ValueError, match=r"gravity\.rhs was called with a state, derivative or params"):
+        _filled(y[:-1], np.empty(y.size - 1), gm)
+
+
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("options", [{}, {"compensated": True, "every": 3}])
 def test_ten_bodies_compiled_and_interpreted(options):
