@@ -40,7 +40,7 @@ class Bench(Study[Found]):
         nargs="+",
         metavar="PEER",
     )
-    repeats: int = 4
+    repeats: int = 16
     enough: float = 0.12
     patience: float = 0.4
     limit: float = 90.0

@@ -131,7 +131,7 @@ def solar() -> list[dict[str, Any]]:
     both = (PYTHON, COMPILED, OWN)
     few = (1e-9, 1e-13)  # heyoka compiles for ten seconds at each tolerance
     outer_steps = {
-        "EIPRKN12": _geometric(200, 900, 5), "EIPGJ12": _geometric(4700, 12000, 4),
+        "EIPRKN12": _geometric(150, 900, 6), "EIPGJ12": _geometric(4700, 12000, 4),
         "WHFast": _geometric(250, 16000, 6), "heyoka": few,
     }  # fmt: skip
     records = [_record("outer solar system", "bodies", outer.problem.y0, outer.end, 2e5, outer_steps, both, gm=gm)]
