@@ -1,4 +1,4 @@
-"""Use of the library's functions inside Numba functions: a user's compiled code may call `problem.rhs`.
+"""Use of the functions of the ready problems inside Numba functions: a user's jitted code may call `problem.rhs`.
 
 Numba finds `register` through the package's entry point ``numba_extensions``.
 """
@@ -25,13 +25,13 @@ FITS = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_int64] * 2)
 
 
 def register() -> None:
-    """Make functions of the library, such as ``problem.rhs``, callable from functions that Numba compiles."""
+    """Make each `LibraryFunction`, such as ``problem.rhs``, callable from functions that Numba compiles."""
     typeof_impl.register(LibraryFunction)(lambda function, context: types.Dispatcher(_jitted(function)))
 
 
 @cache
 def _jitted(function: Any) -> Any:
-    """Return a library function as a Numba function that copies its arguments, which may be of any layout."""
+    """Return a jitted function that calls a `LibraryFunction` with copies of its arguments, of any layout."""
     if function.own or function.numbers < 0:
         raise TypeError(f"{function.__name__} cannot be called by jitted functions.")
     value = njit(_value_of(function))
@@ -50,7 +50,7 @@ def _value_of(function: Any) -> Callable[..., Any]:
     call, fits, handle = FUNCTION(function.call_address), FITS(function.fits_address), function.handle
     numbers, of_state = function.numbers, function.fills_states
     no_memory = f"{function.__name__} could not get the memory that it needs"
-    wrong = f"{function.__name__} takes another number of states or parameters"
+    wrong = f"{function.__name__} was called with a state, derivative or params of the wrong size"
 
     def value(t, y, f, params):
         n, p = y.size, params.size
@@ -77,7 +77,7 @@ def _floats(values):
 @njit
 def _fill(out, values):
     if out.size != values.size:
-        raise ValueError("out has another shape than what a function of eip_scipy fills")
+        raise ValueError("out has another size than the value that a function of eip_scipy writes to it")
     flat = out.flat
     for i in range(values.size):
         flat[i] = values[i]
