@@ -1,4 +1,4 @@
-"""The build backend: setuptools' own, which also asks for a compiler from the package index where there is none."""
+"""Build backend: that of setuptools, which also requires the package ziglang if zig compiles the engine."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ __all__ = [
 
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
-    """Return what a wheel is built with."""
+    """Return the packages that building a wheel requires: those of setuptools, and perhaps a compiler."""
     return [*build_meta.get_requires_for_build_wheel(config_settings), *_compiler()]
 
 
 def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
-    """Return what an editable install is built with."""
+    """Return the packages that an editable install requires: those of setuptools, and perhaps a compiler."""
     return [*build_meta.get_requires_for_build_editable(config_settings), *_compiler()]
 
 

@@ -1,4 +1,4 @@
-"""The C++ compiler of a build: the machine's own, or the clang in the package ziglang where there is none."""
+"""Choice of the C++ compiler of a build: one that is installed, or else the clang in the package ziglang."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Compiler(NamedTuple):
     ----------
     command : tuple of str
     own : bool
-        Whether setuptools takes it by itself, with the flags that Python was built with.
+        True if setuptools calls this command anyway, with the flags that Python was built with.
     every : tuple of str
-        Flags for code that all processors of this kind run.
+        Flags for code that has to run on all processors of the target's kind.
     v3 : tuple of str
         Flags for x86-64 processors with AVX2 and FMA.
     """
@@ -50,7 +50,7 @@ class Compiler(NamedTuple):
 
     @property
     def executables(self) -> dict[str, list[str]]:
-        """Return what setuptools' compiler is to call, by its names for them."""
+        """Return the commands for setuptools to call, by the names that it has for them; empty if `own`."""
         if self.own:
             return {}
         system = target().system
@@ -71,7 +71,7 @@ class Compiler(NamedTuple):
 
 @cache
 def chosen() -> Compiler:
-    """Return the compiler of this build."""
+    """Return the compiler of this build: that of EIP_SCIPY_COMPILER, one that is installed, or zig."""
     given, triple = os.environ.get(VARIABLE, ""), target().triple
     if given and given != ZIG:
         return Compiler(tuple(shlex.split(given)))

@@ -17,7 +17,7 @@ HEADERS = "EIP_SCIPY_HEADERS"
 
 
 class Platform(NamedTuple):
-    """Names of a kind of machine: `sys.platform`, the processor, and the target that zig is given."""
+    """Names of a kind of machine: its `sys.platform`, its processor, and its target triple for zig."""
 
     system: str
     machine: str
@@ -46,7 +46,7 @@ class Target(NamedTuple):
     tag : tuple of str or None
         The three parts of the wheel's tag: Python, binary interface, platform. None: a build for this machine.
     triple : str
-        The target that zig is given. Empty: this machine.
+        The target triple for zig. Empty: this machine.
     headers : Path or None
         The folder with the headers of the platform's Python (`python`) and NumPy (`numpy`), and for Windows with
         Python's import library (`libs`). None: those of this Python.
@@ -78,7 +78,7 @@ class Target(NamedTuple):
 
 
 def target() -> Target:
-    """Return the platform that the variable names, or this machine."""
+    """Return the platform that the environment variable EIP_SCIPY_TARGET names, or this machine."""
     if tag := os.environ.get(VARIABLE):
         python, abi, name = tag.split("-")
         if name not in PLATFORMS:

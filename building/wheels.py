@@ -1,4 +1,4 @@
-"""Builds the wheels of all platforms on this machine, and checks their size, tag, modules and libraries.
+"""Build the wheels of all platforms on this machine, and check their size, tag, modules and libraries.
 
     python -m building.wheels [--to FOLDER] [TAG ...]
 
@@ -90,7 +90,7 @@ def headers(tag: str, cache: Path) -> Path:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack the headers of an archive, and the libraries that are linked."""
+    """Unpack the headers (.h) and the import libraries (.lib) of an archive."""
     with zipfile.ZipFile(archive) as file:
         file.extractall(folder, [name for name in file.namelist() if Path(name).suffix in (".h", ".lib")])
 
@@ -127,7 +127,11 @@ def built(tag: str, unpacked: Path, to: Path, cache: Path) -> Path:
 
 
 def checked(wheel: Path) -> str:
-    """Return a row of the table, or stop if a wheel is too large or needs something that its platform may lack."""
+    """Check a wheel, and return its row of the table.
+
+    Stops the program if the wheel is too large, has another tag or other modules than expected, or needs something that
+    its platform may lack.
+    """
     *_, python, abi, platform = wheel.stem.split("-")
     size = wheel.stat().st_size / 1e6
     if size > MEGABYTES:
@@ -138,7 +142,7 @@ def checked(wheel: Path) -> str:
             file.extractall(room)
         (tag,) = [line for line in next(Path(room).glob("*.dist-info/WHEEL")).read_text().splitlines() if "Tag" in line]
         if tag != f"Tag: {python}-{abi}-{platform}":
-            raise SystemExit(f"{wheel.name} says {tag!r} in WHEEL")
+            raise SystemExit(f"{wheel.name} has {tag!r} in its file WHEEL; expected 'Tag: {python}-{abi}-{platform}'")
         modules = sorted([*Path(room).rglob("*.so"), *Path(room).rglob("*.pyd")])
         if {module.name.split(".")[0] for module in modules} != expected:
             raise SystemExit(f"{wheel.name} has the modules {[module.name for module in modules]}; expected {expected}")
@@ -147,7 +151,7 @@ def checked(wheel: Path) -> str:
 
 
 def need(module: Path, platform: str) -> str:
-    """Return the oldest system that a module works on, or the newest symbol that it needs."""
+    """Return the oldest system on which a module works; for Linux the newest symbol of glibc that it needs."""
     system = PLATFORMS[platform].system
     binary = lief.parse(str(module))
     foreign = [name for name in libraries(binary) if not name.startswith(SYSTEM[system])]
@@ -159,7 +163,7 @@ def need(module: Path, platform: str) -> str:
         unknown = [name for name in sought(binary) if not name.startswith(("_Py", "__Py"))]
         if unknown:
             raise SystemExit(
-                f"{module.name} for {platform} looks for {unknown}, which are not Python's and have no library"
+                f"{module.name} for {platform} needs the symbols {unknown}, which neither Python nor a library provides"
             )
         return "macOS " + ".".join(str(number) for number in binary.build_version.minos[:2])
     return "the C runtime of Windows 10"
@@ -177,7 +181,7 @@ def libraries(binary: lief.Binary) -> Iterator[str]:
 
 
 def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
-    """Return the newest symbol of glibc, with its version."""
+    """Return the newest symbol of glibc that a module needs, with its version."""
     found = []
     for symbol in binary.imported_symbols:
         if symbol.symbol_version and symbol.symbol_version.has_auxiliary_version:
@@ -191,7 +195,7 @@ def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
 
 
 def sought(binary: lief.MachO.Binary) -> Iterator[str]:
-    """Yield the symbols of no library, which are looked up in the process, as Python's are."""
+    """Yield the symbols that no linked library provides: they are looked up in the process, such as Python's own."""
     own = {symbol.name for symbol in binary.symbols if symbol.numberof_sections}
     for binding in binary.bindings:
         if binding.has_symbol and not binding.has_library and binding.symbol.name not in own:
@@ -201,8 +205,11 @@ def sought(binary: lief.MachO.Binary) -> Iterator[str]:
 def main() -> None:
     """Build the wheels, and print a table of them."""
     parser = argparse.ArgumentParser(prog="python -m building.wheels", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("tags", nargs="*", default=WHEELS, metavar="TAG", help=f"which ones, of {', '.join(WHEELS)}")
-    parser.add_argument("--to", type=Path, default=Path("dist"), metavar="FOLDER", help="folder (default: dist)")
+    known = f"wheels to build (default: all of {', '.join(WHEELS)})"
+    parser.add_argument("tags", nargs="*", default=WHEELS, metavar="TAG", help=known)
+    parser.add_argument(
+        "--to", type=Path, default=Path("dist"), metavar="DIR", help="folder of the wheels (default: dist)"
+    )
     parser.add_argument("--cache", type=Path, default=ROOT / "build" / "headers", help="folder for headers and sources")
     options = parser.parse_args()
     lief.logging.disable()

@@ -1,9 +1,11 @@
 """Compiled loops of the engine for methods with fixed steps, with which the projection is compared.
 
-Other packages, such as `eip_scipy_studies.comparators`, use these loops through this module.
-`run_in_place` and `run_second_order` run a scheme over a function of the user, compiled if it has an address; `fields`
-holds loops over the points of a complex field, one call for each part of a step of the Gross-Pitaevskii equation. In
-`working_alone` a thread computes sums over many bodies by itself. The schemes follow the engine and may change with it.
+Other packages, such as `eip_scipy_studies.comparators`, use these loops through this module. `run_in_place` and
+`run_second_order` make all steps of a named scheme with a user's function. They do not call Python if the function has
+an address, that is, if it is jitted by Numba or a C function by pointer. `fields` holds loops over the points of a
+complex field, one call for each part of a step of the Gross-Pitaevskii equation. Within the context manager
+`working_alone` the calling thread computes sums over many bodies without the help of other threads. The names of the
+schemes belong to the engine and may change with it.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ __all__ = [
 ]
 
 fields = BUILD.fields
-"""Loops over the points of a field, see engine/cpp/comparators/fields.cpp."""
+"""Functions that loop over the points of a field, see engine/cpp/comparators/fields.cpp."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,11 @@ class FixedStepResult:
     y : ndarray, shape (n, m)
         States at `t`.
     nfev : int
-        Evaluations of the function.
+        Number of evaluations of the user's function.
     wall_time : float
         Time of the integration in seconds, without compilation.
     message : str
-        "compiled", or "interpreted" and the reason; and where the states stop being finite, if they do.
+        "compiled", or "interpreted" and the reason. If saved states are not finite, the first such time is added.
     """
 
     t: np.ndarray
@@ -74,12 +76,12 @@ def _check_span(t_span: Any) -> tuple[float, float]:
 
 
 def _real_vector(values: Any, name: str) -> np.ndarray:
-    """Copy a 1-D array of real numbers to contiguous float64."""
+    """Copy a 1-D array of real numbers to contiguous float64; `name` is the argument's name for error messages."""
     refuse_units(**{name: values})
     if np.iscomplexobj(values):
         raise TypeError(f"{name} must be real, got complex numbers")
     if np.ma.is_masked(values):
-        raise ValueError(f"masked values in {name}")
+        raise ValueError(f"masked values in {name}; fill or drop them first.")
     vector = np.array(values, dtype=float, order="C")
     if vector.ndim != 1:
         raise ValueError(f"{name} must be 1-dimensional, got shape {vector.shape}")
@@ -109,7 +111,7 @@ class FixedSteps(NamedTuple):
 
     @classmethod
     def of(cls, t_span: Any, h: Any, save_every: Any) -> FixedSteps:
-        """Make the steps from the user's arguments after checks."""
+        """Check the user's arguments `t_span`, `h` and `save_every`, and return the steps that they define."""
         t0, t_bound = _check_span(t_span)
         h = check_fixed_step(h, t0, t_bound)
         if save_every is None:
@@ -149,22 +151,24 @@ def run_in_place(
     fills: int,
     constant: float = 0.0,
 ) -> FixedStepResult:
-    """Run a scheme over a function that fills an array.
+    """Make all steps of a scheme with a function that writes its value into an array.
 
     Parameters
     ----------
     scheme : str
         Name of a scheme in engine/cpp/comparators.
     fun : callable
-        ``fun(t, x, out[, params])`` with the first `takes` components of the state, which fills `fills` numbers. A
-        function jitted by Numba and a C function by pointer run compiled, any other callable interpreted.
+        ``fun(t, x, out[, params])``, which writes its value into `out`. A function jitted by Numba and a C function by
+        pointer run compiled, any other callable interpreted.
     steps : FixedSteps
     y : ndarray, shape (n,)
-        The start, which is overwritten.
+        The state at the start, which is overwritten.
     params : array_like or None
+        Last argument of `fun`; None if it has none.
     name : str
         Name of `fun` in messages.
     takes, fills : int
+        Sizes of x, the first components of the state, and of `out`.
     constant : float, optional
         A number that the scheme uses, such as the charge per mass.
 
@@ -188,7 +192,7 @@ def run_in_place(
 def run_second_order(
     scheme: str, acc: Callable[..., Any], steps: FixedSteps, y: np.ndarray, params: Any
 ) -> FixedStepResult:
-    """Run a scheme over an acceleration, ``acc(t, q[, params]) -> (n/2,)``; see `run_in_place`.
+    """Make all steps of a scheme for q'' = acc(t, q[, params]) with the state y = (q, q'); see `run_in_place`.
 
     The acceleration is called once before the run to check the shape of its value.
     """
@@ -204,7 +208,7 @@ def run_second_order(
 
 
 def _converter(size: int) -> Callable[[Any, float], np.ndarray]:
-    """Return a converter for values of `acc`: NumPy would silently broadcast scalars or drop imaginary parts."""
+    """Return a function that checks values of `acc`: NumPy would silently broadcast scalars or drop imaginary parts."""
 
     def convert(value: Any, t: float) -> np.ndarray:
         if value is None:
@@ -231,7 +235,7 @@ def _run(
     constant: float = 0.0,
     second_order: bool = False,
 ) -> FixedStepResult:
-    """Make all steps from y, which is overwritten, with the function's address or, if it has none, with `in_python`."""
+    """Make all steps from y, which is overwritten; call `fun` by its address or, if it has none, call `in_python`."""
     functions: NativeFunctions | PythonFunctions
     try:
         functions, reason = function_alone(fun, kind, name, params, second_order=second_order), ""

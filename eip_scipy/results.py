@@ -1,4 +1,4 @@
-"""Results of runs, of ensembles and of projections, and what is done with them: tables, files, figures, pages."""
+"""Results of runs, ensembles and projections, and functions that make tables, files, figures and pages of them."""
 
 from .core.results import Diagnostics, Multipliers, ProjectionResult
 from .ensembles.ensemble import EnsembleResult

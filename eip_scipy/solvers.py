@@ -1,4 +1,4 @@
-"""Base class of the solvers, and functions that make one from a tableau or a user-defined one-step method."""
+"""Base class of the solvers, and the function that makes one from a tableau or a user-defined one-step method."""
 
 from .core.one_step import OneStepMethod
 from .core.solvers import EIPSolver, eip_method

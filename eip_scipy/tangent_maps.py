@@ -1,6 +1,6 @@
-"""Chaos indicators, periodic orbits and fits, from derivatives that runs integrate (``variations=`` of `integrate`).
+"""Chaos indicators, periodic orbits and fits, from derivatives of the state (``variations=`` of `integrate`).
 
-Each function takes what `integrate` takes: a function or a `Problem`, and all of its options.
+Each function here takes a function or a `Problem`, and options of `integrate`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ OWN = ("variations", "dense_output", "t_eval", "checkpoint", "checkpoint_every",
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Followed:
-    """Fields that results of whole runs have in common; the docstrings of the results describe them."""
+    """Fields that `LyapunovSpectrum` and `Megno` have in common; the docstrings of these classes describe them."""
 
     y: Array = field(repr=False)
     diagnostics: Diagnostics = field(repr=False)
@@ -75,20 +75,19 @@ class LyapunovSpectrum(_Followed):
     Attributes
     ----------
     exponents : ndarray, shape (k,)
-        The estimates at the end of the run, the largest first.
+        Estimates of the Lyapunov exponents at the end of the run, the largest first.
     t : ndarray, shape (m,)
         Times of the orthonormalisations.
     running : ndarray, shape (m, k)
-        The estimates at these times, in the order of the columns.
+        Estimates at these times, in the order of the columns.
     columns : ndarray, shape (n, k)
-        The orthonormal columns at the end.
+        The orthonormal tangent vectors at the end, as columns.
     y : ndarray, shape (n,)
         The state at the end.
     diagnostics : Diagnostics
         Record of the projections in the whole run.
-    success, trusted : bool
+    success, trusted, message : bool, bool, str
         As for `integrate`.
-    message : str
     """
 
     exponents: Array
@@ -111,21 +110,22 @@ class Megno(_Followed):
     Attributes
     ----------
     megno : float
-        The mean MEGNO at the end: 2 for a regular orbit; it grows by half the exponent times t for a chaotic one.
+        The mean MEGNO at the end: 2 for a regular orbit; for a chaotic one it grows like half the largest Lyapunov
+        exponent times t.
     lyapunov : float
         Estimate of the largest Lyapunov exponent: twice the slope of the mean MEGNO against t, by least squares.
     t : ndarray, shape (m,)
         Saved times.
     Y, mean : ndarray, shape (m,)
-        MEGNO and its mean at these times.
+        MEGNO at these times, and its mean from the start to these times.
     log_size : ndarray, shape (m,)
         Logarithm of the size of the tangent vector, 0 at the start.
     y : ndarray, shape (n,)
         The state at the end.
     diagnostics : Diagnostics
-    success, trusted : bool
+        Record of the projections in the whole run.
+    success, trusted, message : bool, bool, str
         As for `integrate`.
-    message : str
     """
 
     megno: float
@@ -149,23 +149,27 @@ class PeriodicOrbit:
     Attributes
     ----------
     y0 : ndarray, shape (n,)
+        A state on the orbit, at which the period starts.
     period : float
     monodromy : ndarray, shape (n, n)
         State-transition matrix M over one period.
     multipliers : ndarray, shape (n,)
-        Its eigenvalues. Where they come in pairs with the product 1, each is followed by its partner, the pairs by
-        decreasing modulus; otherwise all by decreasing modulus. The unit pair of a Hamiltonian system belongs to a
-        Jordan block, and is known to the square root of the error of M only.
+        The Floquet multipliers, which are the eigenvalues of M, by decreasing modulus. If they form pairs with the
+        product 1, each multiplier is followed by its reciprocal, and the pairs are sorted. The pair of ones of a
+        Hamiltonian system belongs to a Jordan block, so that its error is about the square root of the error of M.
     closure : float
-        Largest component of ``y(period) - y0``, relative to the size of `y0`.
+        Largest component of ``|y(period) - y0|``, relative to the largest component of ``|y0|``.
     flow_residual : float
         ``|M f - f| / (|M| |f|)`` with the derivative f at the start, in the 2-norm: 0 for an exact M.
     invariant_residual : float
-        ``|G M - G| / (|G| |M|)``, with the gradients G of the invariants, the largest; nan without invariants.
+        Largest value of ``|g M - g| / (|g| |M|)`` for the gradients g of the invariants at `y0`, in the 2-norm: 0 for
+        an exact M; nan without invariants.
     iterations : int
+        Number of corrections.
     success : bool
         Whether `closure` is at most `tol`.
     message : str
+        A description of the closure.
     run : IntegrationResult
         The run over the last period.
     """
@@ -187,7 +191,7 @@ class _Piece(NamedTuple):
     """A part of a run between two orthonormalisations.
 
     `run` ends with the piece; its first row is the start of the piece. `growth` and `columns` are R and Q of the QR
-    factorisation at its end.
+    factorisation of the tangent vectors at the end of the piece.
     """
 
     run: IntegrationResult
@@ -196,9 +200,13 @@ class _Piece(NamedTuple):
 
 
 def _refuse(function: str, options: dict[str, Any], also: Sequence[str] = ()) -> None:
+    """Raise TypeError if `options` contains an option in OWN or `also`, or one that `integrate` does not have."""
     for name in (*OWN, *also):
         if name in options:
-            raise TypeError(f"{function}() does not take {name!r}: the option is set or not supported there.")
+            raise TypeError(
+                f"{function}() does not take {name!r}, because it sets this option itself or does not support it; "
+                "omit it."
+            )
     known = {*Request._fields, *ProjectionOptions.names()} - {*OWN, *also, "projection"}
     for name in options:
         if name not in known:
@@ -211,7 +219,10 @@ def _start(fun: Any, t_span: Any, y0: Any, options: dict[str, Any]) -> Prepared:
 
 
 def _length(every: Any, start: Prepared, pieces: int) -> float:
-    """Return the time between two orthonormalisations, by default a whole number of steps if these are equal."""
+    """Return the time between two orthonormalisations after a check of `every`.
+
+    If `every` is None, this is 1 / `pieces` of the interval, rounded up to a whole number of steps if they are equal.
+    """
     h, (t0, t_bound) = abs(start.schedule.span.h), _ends(start)
     span = abs(t_bound - t0)
     if every is None:
@@ -224,7 +235,8 @@ def _length(every: Any, start: Prepared, pieces: int) -> float:
 def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: float, options: Any) -> Iterator[_Piece]:
     """Run from t[0] to t[1] with columns that are orthonormal at the start of each piece.
 
-    A piece is halved if its columns grow too differently. A piece that fails for another reason is the last one.
+    A piece is repeated with half its length if its columns become too long, too different in length, or not finite. A
+    piece that fails for another reason is the last one.
     """
     begin, end = t
     now, sign, run = begin, np.sign(end - begin), None
@@ -256,7 +268,7 @@ def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: fl
 
 
 def _orthonormal(n: int, k: int) -> Array:
-    """Return k random directions, the same in each call."""
+    """Return k random orthonormal columns (n, k), which are the same in each call."""
     return np.linalg.qr(np.random.default_rng(1).standard_normal((n, k)))[0]
 
 
@@ -269,17 +281,17 @@ def lyapunov_spectrum(
     every: float | None = None,
     **options: Any,
 ) -> LyapunovSpectrum:
-    """Compute Lyapunov exponents by the growth of tangent vectors that are orthonormalised on the way.
+    """Compute Lyapunov exponents from the growth of tangent vectors that are orthonormalised repeatedly.
 
     Parameters
     ----------
     fun, t_span, y0
         As for `integrate`.
     count : int, optional
-        How many exponents, the largest ones. Default: all n.
+        Number of exponents to compute, which are the largest ones. Default: all n.
     every : float, optional
-        Time between two orthonormalisations; with a fixed step best a multiple of it. Default: a thousandth of the
-        interval. The time is halved where the columns grow apart by more than 1e8.
+        Time between two orthonormalisations. With a fixed step, choose a multiple of the step. Default: a thousandth of
+        the interval. The time is halved if the lengths of the tangent vectors grow apart by a factor above 1e8.
     **options
         Options of `integrate`: method, steps, params, invariants, jvp and so on.
 
@@ -290,13 +302,13 @@ def lyapunov_spectrum(
     Raises
     ------
     ValueError, TypeError
-        If a value is wrong, an option is one that the function sets itself, and as for `integrate`.
+        If a value is wrong or an option is one that the function sets itself; also the errors of `integrate`.
 
     Notes
     -----
-    The estimates converge as 1/t, with fluctuations: look at ``running``. Over a backward run the exponents are those
-    of the reversed flow. The columns are projected with the state, so that a Hamiltonian system's pair of zeros
-    belongs to the energy and to the flow exactly.
+    The estimates converge as 1/t, with fluctuations, which ``running`` shows. In a backward run the exponents are those
+    of the reversed flow. The tangent vectors are projected together with the state, so that the pair of zero exponents
+    of a Hamiltonian system belongs exactly to the energy and to the direction of the flow.
 
     References
     ----------
@@ -330,9 +342,10 @@ def lyapunov_spectrum(
 
 
 def _ends(start: Prepared) -> tuple[float, float]:
+    """Return the start and the end of the interval of a run; raise ValueError if the end is infinite."""
     span = start.schedule.span
     if not np.isfinite(span.t_bound):
-        raise ValueError("t_span must be a finite interval here.")
+        raise ValueError("t_span must be a finite interval; these functions do not support runs without an end.")
     return float(span.t0), float(span.t_bound)
 
 
@@ -355,10 +368,10 @@ def megno(
     deviation : array_like, shape (n,), optional
         The tangent vector at the start; its length does not matter. Default: a random direction, the same each time.
     every : float, optional
-        Time after which the vector is made a unit vector again. Default: a hundredth of the interval. Halved
-        where the vector grows by more than 1e100.
+        Time after which the vector is scaled to length 1 again. Default: a hundredth of the interval. The time is
+        halved if the vector grows by more than 1e100.
     save_every : int, optional
-        Steps from one saved point to the next. The integrals are those of cubic splines through these points.
+        Number of steps from one saved point to the next. The integrals are those of cubic splines through these points.
     **options
         Options of `integrate`: method, steps, params, invariants, jvp and so on.
 
@@ -369,16 +382,16 @@ def megno(
     Raises
     ------
     ValueError, TypeError
-        If a value is wrong, an option is one that the function sets itself, and as for `integrate`.
+        If a value is wrong or an option is one that the function sets itself; also the errors of `integrate`.
 
     Notes
     -----
     With the tangent vector d, ``Y(t) = (2/t) int_0^t s (d' . d)/(d . d) ds``, and the mean is ``(1/t) int_0^t Y ds``,
-    with t from the start of the run. By parts, ``Y = 2 (L(t) - (1/t) int_0^t L ds)`` with L = log(size of d), so no
-    derivative is needed: the error is that of the splines, of order 4 in the distance of the saved points. The mean
-    tends to 2 for regular orbits, 0 for a harmonic oscillator, and to half the largest exponent times t for chaotic
-    ones. REBOUND returns the mean, from all positions and velocities without masses; its
-    ``Simulation.lyapunov()`` is the slope of the mean, half of ``lyapunov`` here.
+    with t from the start of the run. Integration by parts gives ``Y = 2 (L(t) - (1/t) int_0^t L ds)`` with
+    L = log(size of d), so that no derivative is needed; the error is that of the splines, of order 4 in the distance
+    between saved points. The mean tends to 2 for regular orbits (to 0 for a harmonic oscillator), and to half the
+    largest exponent times t for chaotic ones. REBOUND returns the mean too, computed from all positions and velocities
+    without weighting by the masses; its ``Simulation.lyapunov()`` is the slope of the mean, half of ``lyapunov`` here.
 
     References
     ----------
@@ -416,6 +429,7 @@ def megno(
 
 
 def _unit(deviation: Any, n: int) -> Array:
+    """Return `deviation`, by default a random direction, as a column (n, 1) of length 1, after a check of its value."""
     if deviation is None:
         return _orthonormal(n, 1)
     given = _numbers(deviation)
@@ -425,7 +439,7 @@ def _unit(deviation: Any, n: int) -> Array:
 
 
 def _numbers(given: Any) -> Array:
-    """Return a value as an array of floats, an empty one if it does not consist of real numbers."""
+    """Return a value as an array of floats, or an empty array if it does not consist of real numbers."""
     found = reals(given)
     return np.zeros(0) if found is None else found
 
@@ -458,26 +472,29 @@ def periodic_orbit(
     Parameters
     ----------
     fun : callable or Problem
-        As for `integrate`; the equations must not depend on t, or ``"period"`` be fixed at the period of the forcing.
+        As for `integrate`. If the equations depend on t, `period` must be the period of the forcing, and ``"period"``
+        must be in `fixed`.
     y0 : array_like, shape (n,)
         A state near the orbit.
     period : float
-        An estimate of its period, > 0.
+        An estimate of the period of the orbit, > 0.
     fixed : sequence of str or int, optional
-        Components of the start, by name or place, that the correction leaves as they are, and ``"period"``. In a family
-        of orbits they choose one; otherwise it is the one that least corrections lead to.
+        Components of the initial state, by name or index, that the correction does not change, and ``"period"`` if the
+        period must not change. They select one orbit of a family. Without them the result is the orbit to which the
+        smallest corrections lead.
     symmetry : array_like of ±1, shape (n,), optional
-        The signs that the components take under a reversing symmetry of the equations: (x, y, z, vx, vy, vz) of the
-        restricted three-body problem has (1, -1, 1, -1, 1, -1). The orbit then starts with all components of
-        sign -1 at 0, and is corrected to have them at 0 after half the period again, which halves the error that an
-        unstable orbit multiplies.
+        Sign of each component under a time-reversal symmetry of the equations; (1, -1, 1, -1, 1, -1) for the state
+        (x, y, z, vx, vy, vz) of the restricted three-body problem. The components of sign -1 are then 0 at the start,
+        and the orbit is corrected so that they are 0 again after half the period. The runs of the corrections are
+        therefore only half as long, and the errors of an unstable orbit grow less in them.
     tol : float, optional
-        Bound on ``|y(period) - y0|``, the largest component, relative to that of `y0`, of a result that is a success.
-        Corrections go on while they bring more.
+        Largest `closure` of a result that counts as a success. Corrections continue below this value as long as they
+        reduce the closure.
     max_iterations : int, optional
+        Largest number of corrections.
     **options
-        Options of `integrate`: method, steps, params, invariants, jvp and so on. A fixed step is shortened so that a
-        whole number of steps makes the period.
+        Options of `integrate`: method, steps, params, invariants, jvp and so on. A fixed step is shortened so that the
+        period is a whole number of steps.
 
     Returns
     -------
@@ -486,13 +503,13 @@ def periodic_orbit(
     Raises
     ------
     ValueError, TypeError
-        If a value is wrong, an option is one that the function sets itself, and as for `integrate`.
+        If a value is wrong or an option is one that the function sets itself; also the errors of `integrate`.
 
     Notes
     -----
-    Newton's method on y(T; y0) - y0 = 0, in y0 and T, by least-norm corrections from the state-transition matrix: the
-    directions in which the equations leave the correction open, along the flow and along a family of orbits, are not
-    moved along. A step that does not reduce the residual is halved.
+    Newton's method solves y(T; y0) - y0 = 0 for y0 and T with the state-transition matrix. Each correction is the one
+    of smallest norm, because the equations do not determine it along the flow and along a family of orbits. A
+    correction that does not reduce the residual is halved.
 
     References
     ----------
@@ -550,14 +567,18 @@ def _component(item: Any, names: Sequence[str]) -> int | None:
 
 
 def _place(item: Any, names: Sequence[str]) -> int:
+    """Return the index of an item of `fixed` among the unknowns: all components, then the period."""
     place = len(names) if item == "period" else _component(item, names)
     if place is None:
-        raise ValueError(f'fixed: {shown(item)} is neither "period" nor one of the components {", ".join(names)}.')
+        raise ValueError(
+            f'fixed: {shown(item)} is neither "period" nor the name or index of one of the components '
+            f"{', '.join(names)}."
+        )
     return place
 
 
 def _odd(symmetry: Any, y: Array) -> Array:
-    """Return a mask of the components whose sign is -1, and set these components of y to 0."""
+    """Return a mask of the components whose sign in `symmetry` is -1, and set these components of y to 0."""
     if symmetry is None:
         return np.zeros(y.size, bool)
     signs = np.asarray(symmetry)
@@ -565,16 +586,16 @@ def _odd(symmetry: Any, y: Array) -> Array:
         raise ValueError(f"symmetry must be {y.size} signs 1 or -1, got {shown(symmetry)}.")
     odd = signs == -1
     if not odd.any():
-        raise ValueError("symmetry must have a component of sign -1, which is 0 at the start.")
+        raise ValueError("symmetry has no sign -1; give -1 for each component that is 0 at the start.")
     if np.abs(y[odd]).max() > 1e-3 * np.abs(y).max():
-        raise ValueError("symmetry: y0 is not symmetric; its components of sign -1 must be 0.")
+        raise ValueError("symmetry: y0 is not symmetric; the components of y0 whose sign is -1 must be 0.")
     y[odd] = 0.0
     return odd
 
 
 @dataclass(frozen=True)
 class _Shooting:
-    """Runs of one period, or of half of it."""
+    """Function of (y, T) that integrates from y over the time `share` * T, with the state-transition matrix."""
 
     fun: Any
     options: dict[str, Any]
@@ -589,7 +610,7 @@ class _Shooting:
             options["h"] = end / np.ceil(end / h * (1 - 1e-12))
         run = integrate(self.fun, (0.0, end), y, variations="state", **options)
         if not run.success:
-            raise RuntimeError(f"periodic_orbit: the run over {end:.6g} failed: {run.message}")
+            raise RuntimeError(f"periodic_orbit: the run from t = 0 to {end:.6g} failed: {run.message}")
         return _Reached(self, y, T, run)
 
 
@@ -610,11 +631,11 @@ class _Reached:
 
     @property
     def size(self) -> float:
-        """Return the size of the residual, relative to that of the start."""
+        """Return the largest component of the residual, relative to the largest component of the start."""
         return float(np.abs(self.residual).max() / np.abs(self.y0).max())
 
     def begun_at(self, y: Array) -> Prepared:
-        """Return the prepared run that starts at a state."""
+        """Return the run that starts at a state, before its first step; it holds the derivative at that state."""
         return _start(self.shooting.fun, (0.0, self.period), y, {**self.shooting.options, "project_initial": False})
 
     def correction(self, free: Array) -> Array:
@@ -631,13 +652,14 @@ class _Reached:
         return move
 
     def result(self, iterations: int, tol: float) -> PeriodicOrbit:
+        """Return the result, with the multipliers and residuals of the state-transition matrix."""
         M = self.run.stm[-1]
         start = self.begun_at(self.y0).run
         f, G = start.start.f, start.invariants.gradients(0.0, self.y0, start.start.f)
         size = np.linalg.norm(M, 2)
         invariants = [np.linalg.norm(g @ M - g) / (np.linalg.norm(g) * size) for g in G if g.any()]
         closed = self.size <= tol
-        found = "the orbit closes" if closed else "no correction made the orbit close better"
+        found = "the orbit closes" if closed else "the orbit does not close within tol"
         return PeriodicOrbit(
             y0=self.y0,
             period=self.period,
@@ -648,7 +670,7 @@ class _Reached:
             invariant_residual=float(max(invariants, default=np.nan)),
             iterations=iterations,
             success=closed,
-            message=f"{found}: to {self.size:.1e} of the size of y0 ({iterations} iterations)",
+            message=f"{found}: |y(period) - y0| is {self.size:.1e} of the size of y0 ({iterations} iterations)",
             run=self.run,
         )
 
@@ -671,23 +693,23 @@ def _in_pairs(values: Array) -> Array:
 class TrajectoryFit:
     """Residuals of a trajectory against data, and their Jacobian, for `scipy.optimize.least_squares`.
 
-    Both come from one run for each x, which also integrates the derivatives by x.
+    The residuals and the Jacobian come from the same run for each x, the vector of the fitted quantities.
 
     Parameters
     ----------
     fun : callable or Problem
         As for `integrate`.
     t : array_like, shape (m,)
-        Times of the data, on one side of `t0`, in order from there.
+        Times of the data, all on one side of `t0`, in the order in which a run from `t0` reaches them.
     data : array_like, shape (d, m)
         Data at these times; nan if a value was not measured.
     y0 : array_like, shape (n,), optional
-        First guess of the state at `t0`, or its known value. Default: that of the problem.
+        First guess of the state at `t0`, or its known value. Default: the initial state of the problem.
     free : sequence of str or int, optional
         The quantities to fit: ``"state"`` for the initial state, and names or indices of parameters, as in
         ``variations=`` of `integrate`.
     t0 : float, optional
-        Time of `y0`. Default: the first of `t`.
+        Time of `y0`. Default: the first time in `t`.
     observe : sequence of str or int, or (callable, callable), optional
         Components that are measured, by name or index; or a function ``g(t, y) -> (d,)`` and its Jacobian
         ``dg(t, y) -> (d, n)``. Default: all components.
@@ -706,12 +728,12 @@ class TrajectoryFit:
     Raises
     ------
     ValueError, TypeError
-        If a value is wrong, an option is one that the class sets itself, and as for `integrate`.
+        If a value is wrong or an option is one that the class sets itself; also the errors of `integrate`.
 
     Notes
     -----
-    Between two steps the derivatives come from the method's interpolant. Where the data need more than its accuracy,
-    choose steps that end at the times of the data.
+    Between two steps the derivatives come from the method's interpolant. If the data need a higher accuracy, choose
+    steps that end at the times of the data.
 
     Examples
     --------
@@ -763,14 +785,14 @@ class TrajectoryFit:
         self._last: tuple[Array, IntegrationResult] | None = None
 
     def run(self, x: Any) -> IntegrationResult:
-        """Return the run from x, with its derivatives, at the distinct times of the data.
+        """Return the run with the fitted quantities x, and its derivatives, at the distinct times of the data.
 
         Raises
         ------
         ValueError
             If x has a wrong shape.
         RuntimeError
-            If the run does not reach the last of the data.
+            If the run does not reach the time of the last data.
         """
         x = np.array(x, float)
         if x.shape != self.x0.shape:
@@ -786,19 +808,19 @@ class TrajectoryFit:
         run = integrate(self._fun, self._span, y, t_eval=self._t, variations=self._free, **options)
         self.evaluations += 1
         if run.t.size < self._t.size:
-            raise RuntimeError(f"TrajectoryFit: the run does not reach the last of the data: {run.message}")
+            raise RuntimeError(f"TrajectoryFit: the run does not reach the time of the last data: {run.message}")
         self._last = x, run
         return run
 
     def residuals(self, x: Any) -> Array:
-        """Return (model - data) / sigma of the measured values, ordered by component and then by time."""
+        """Return (model - data) / sigma of the measured values, sorted by measured quantity and then by time."""
         run = self.run(x)
         model = np.array([self._g(t, y) for t, y in zip(run.t, run.y.T, strict=True)]).T[:, self._from]
         found: Array = ((model - self._data) / self._sigma)[self._kept]
         return found
 
     def jacobian(self, x: Any) -> Array:
-        """Return the derivatives of the residuals by x."""
+        """Return the derivatives of the residuals with respect to x, (residuals, size of x)."""
         run = self.run(x)
         slopes = [self._dg(t, y) @ M for t, y, M in zip(run.t, run.y.T, run.variations, strict=True)]
         by_x = np.array(slopes).transpose(1, 0, 2)[:, self._from] / self._sigma[..., None]
@@ -807,23 +829,25 @@ class TrajectoryFit:
 
 
 def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
-    """Return the interval, its distinct times, and for each datum the index of its time."""
+    """Return the interval of the run, the distinct times of the data, and for each column of data its time's index."""
     times = _numbers(t)
     if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all():
-        raise ValueError(f"t must be an array of finite times, one for each of the data, got {shown(t)}.")
+        raise ValueError(f"t must be a 1-D array of finite times, one for each column of data, got {shown(t)}.")
     if t0 is not None and not is_number(t0):
         raise ValueError(f"t0 must be the time of y0, got {shown(t0)}.")
     begin, end = float(times[0] if t0 is None else t0), float(times[-1])
     sign = np.sign(end - begin)
     steps = sign * np.diff(times, prepend=begin)
     if sign == 0 or (steps < 0).any():
-        raise ValueError(f"t must go from t0 = {begin:.10g} on in one direction, to another time.")
+        raise ValueError(
+            f"t must be in order, with all times on one side of t0 = {begin:.10g} and at least one time other than t0."
+        )
     distinct, places = np.unique(sign * times, return_inverse=True)
     return (begin, end), sign * distinct, places
 
 
 def _observed(observe: Any, names: Sequence[str]) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return g(t, y) and its Jacobian."""
+    """Return the measured quantities as a function g(t, y), and the Jacobian of g."""
     if isinstance(observe, tuple | list) and len(observe) == 2 and all(callable(item) for item in observe):
         return observe[0], observe[1]
     if callable(observe):
@@ -833,7 +857,9 @@ def _observed(observe: Any, names: Sequence[str]) -> tuple[Callable[..., Any], C
     for item in items:
         place = _component(item, names)
         if place is None:
-            raise ValueError(f"observe: {shown(item)} is none of the components {', '.join(names)}.")
+            raise ValueError(
+                f"observe: {shown(item)} is not the name or index of one of the components {', '.join(names)}."
+            )
         rows.append(place)
     chosen = np.eye(len(names))[rows]
     return lambda t, y: y[rows], lambda t, y: chosen
@@ -845,8 +871,8 @@ def _data(data: Any, shape: tuple[int, int]) -> Array:
         found = found[None]
     if found.shape != shape or np.isinf(found).any() or np.isnan(found).all():
         raise ValueError(
-            f"data must be an array {shape}, one row for each measured quantity and one column for each time, with nan "
-            f"for what was not measured, got {shown(data)}."
+            f"data must be an array of shape {shape}, one row for each measured quantity and one column for each time, "
+            f"with nan for values that were not measured, got {shown(data)}."
         )
     return found
 
@@ -857,5 +883,7 @@ def _sigma(sigma: Any, shape: tuple[int, ...]) -> Array:
     except (TypeError, ValueError):
         found = np.zeros(shape)
     if not ((found > 0) & np.isfinite(found)).all():
-        raise ValueError(f"sigma must be standard deviations > 0 that broadcast to {shape}, got {shown(sigma)}.")
+        raise ValueError(
+            f"sigma must be standard deviations > 0 that broadcast to the shape {shape} of data, got {shown(sigma)}."
+        )
     return found

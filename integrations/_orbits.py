@@ -18,8 +18,9 @@ def run_orbits(
 ) -> np.ndarray:
     """Integrate the states (q, p) of `starts` (orbits, 2 n); return the states (orbits, m, 2 n) at `times` (m,).
 
-    ``system(t, w)`` is the derivative (dH/dp, -dH/dq), and ``system.energy(t, w)`` is H. Without `options` for them,
-    the method is `EIPDOP853`, tolerances are 1e-10, and the invariants those of `kept_invariants`.
+    ``system(t, w)`` is the derivative (dH/dp, -dH/dq), and ``system.energy(t, w)`` is H. `options` are those of
+    `integrate`; by default the method is `EIPDOP853`, the tolerances are 1e-10, and the invariants are those that
+    `kept_invariants` finds.
 
     Raises
     ------
@@ -40,9 +41,9 @@ def run_orbits(
 
 
 def kept_invariants(system: Any, w: np.ndarray, times: np.ndarray, pattern_speed: float) -> list[Invariant]:
-    """Return the energy, or Jacobi's integral, and L_z, if they do not change at random states near w = (q, p).
+    """Return those of the energy and L_z whose rates of change are 0 at random states of the size of w = (q, p).
 
-    Jacobi's integral is the energy minus `pattern_speed` times L_z.
+    If `pattern_speed` is not 0, Jacobi's integral, the energy minus `pattern_speed` times L_z, replaces the energy.
     """
     n = w.size // 2
 

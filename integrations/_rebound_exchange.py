@@ -98,7 +98,7 @@ def problem_from_simulation(
     if not isinstance(sim, rebound.Simulation):
         raise TypeError(
             f"problem_from_simulation: expected a rebound.Simulation, got {sim!r}; "
-            "one in an archive is rebound.Simulation(path)"
+            "read one from an archive by rebound.Simulation(path)"
         )
     _refuse_unsupported(sim)
     if sim._heartbeat:
@@ -110,7 +110,9 @@ def problem_from_simulation(
         )
     chosen, known = (check_forces(forces), constants) if forces is not None else _attached(sim)
     if forces is None and constants is not None:
-        raise ValueError("problem_from_simulation: constants belong to forces=...; REBOUNDx's forces bring their own.")
+        raise ValueError(
+            "problem_from_simulation: constants= needs forces=...; forces that REBOUNDx has attached have their own."
+        )
     if t_span is not None and isinstance(t_span[0], int | float) and t_span[0] != sim.t:
         raise ValueError(
             f"problem_from_simulation: t_span starts at {t_span[0]:.10g}, but the state is that of t={sim.t:.10g}. "
@@ -137,7 +139,11 @@ def problem_from_simulation(
 
 
 class _Exit:
-    """Terminal event that is 0 if the largest or smallest distance has the value at which a simulation ends."""
+    """Terminal event that is 0 when a distance reaches the limit at which a simulation ends.
+
+    The distance is the largest from the origin if `name` is "exit_max_distance", and the smallest between two bodies
+    otherwise.
+    """
 
     terminal, direction = True, 0.0
 
@@ -162,9 +168,10 @@ def exit_events(sim: rebound.Simulation) -> list[_Exit]:
     Returns
     -------
     list of callable
-        The events of `problem_from_simulation`, for runs that have further ones: one event if the largest distance of a
-        particle from the origin reaches ``sim.exit_max_distance``, and one if two particles come as near as
-        ``sim.exit_min_distance``, if these are set. REBOUND checks them after each step; an event is located in it.
+        The events that `problem_from_simulation` sets, to be combined with further events: one for a particle whose
+        distance from the origin reaches ``sim.exit_max_distance``, and one for two particles that come as near as
+        ``sim.exit_min_distance``, if these are set. REBOUND checks the distances after each step, while an event is
+        located within the step.
     """
     given = {name: float(getattr(sim, name)) for name in ("exit_max_distance", "exit_min_distance")}
     return [_Exit(name, limit) for name, limit in given.items() if limit > 0]
@@ -183,7 +190,7 @@ def to_simulation(
     Parameters
     ----------
     run : Problem or IntegrationResult
-        Of `nbody`, `solar_system`, `problem_from_simulation` and the like, or a run of one by `integrate`.
+        A problem by `nbody`, `solar_system`, `problem_from_simulation` and the like, or a run of one by `integrate`.
     y : array_like, shape (6 N,), optional
         The state (q, v); default: the start of a problem, the `row` of a run.
     row : int, optional
@@ -192,15 +199,16 @@ def to_simulation(
         The simulation's time; default: that of the row, or the start of the problem. If `y` is a state of a run, the
         default is the time of the row that equals it.
     template : rebound.Simulation, optional
-        A simulation of as many bodies. A copy of it gets the state and the time and keeps its integrator, step, units,
-        names, radii, and the masses of test particles.
+        A simulation of the same bodies. The result is a copy of it with the state and the time set; it keeps the
+        template's integrator, step, units, names, radii, and masses of test particles.
 
     Returns
     -------
     rebound.Simulation
-        With the bodies' names (REBOUND 5; hashes before). Without a `template` masses and G are those of the simulation
-        that the problem came from. Otherwise they are in solar masses if the problem has units that REBOUND knows, and
-        G = 1 and m = G m if not. ``N_active`` excludes trailing bodies without mass. The centre of mass is not moved.
+        A simulation whose particles have the bodies' names (REBOUND 5; hashes before). Without a `template`, G and the
+        masses are those of the simulation that the problem came from, if it came from one. For other problems masses
+        are in solar masses if REBOUND knows the problem's units, and otherwise G is 1 and masses are G m. ``N_active``
+        excludes trailing bodies without mass. The centre of mass is not moved.
 
     Raises
     ------
@@ -219,8 +227,8 @@ def to_simulation(
     if bodies.forces and template is None:
         theirs = ", ".join(f"{name} (REBOUNDx: {OURS.get(name, 'none')})" for name in bodies.forces)
         warnings.warn(
-            f"to_simulation: the simulation has Newton's gravitation only, the problem also {theirs}. Attach it by "
-            "REBOUNDx for a run that is to have it.",
+            f"to_simulation: the simulation has Newton's gravitation only, but the problem also has {theirs}. If a run "
+            "needs these forces, attach them to the simulation by REBOUNDx.",
             UserWarning,
             stacklevel=2,
         )
@@ -256,7 +264,7 @@ def to_archive(run: Any, path: str | os.PathLike[str], *, template: rebound.Simu
     """
     place = os.fspath(path)
     if os.path.lexists(place):
-        raise FileExistsError(f"to_archive: {place} is there already; REBOUND would add to it. Give a new path.")
+        raise FileExistsError(f"to_archive: {place} is there already, and REBOUND would append to it. Give a new path.")
     if not (hasattr(run, "t") and hasattr(run, "y")):
         raise TypeError(f"to_archive: expected a run by integrate, got {shown(run)}.")
     sim = to_simulation(run, row=0, template=template)
@@ -314,7 +322,7 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
             first = (gm, _units(sim)) if first is None else first
             if not np.array_equal(gm, first[0]):
                 raise ValueError(
-                    f"read_archive: bodies or masses at snapshot {k} of {place} are others than at the first."
+                    f"read_archive: bodies or masses in snapshot {k} of {place} differ from those in the first one."
                 )
             times.append(sim.t)
             states.append(state(sim))
@@ -380,7 +388,7 @@ def _archived_names(archive: rebound.Simulationarchive) -> tuple[str, ...]:
 
 
 def _units(sim: rebound.Simulation) -> str:
-    """Return the units of length and time as a `Problem` knows them."""
+    """Return the simulation's units of length and time in the form of `Problem.units`."""
     names = sim.units
     if names["length"] is None or names["time"] is None:
         return UNKNOWN_UNITS
@@ -394,33 +402,36 @@ def _named(size: float, known: dict[str, float], base: str) -> str:
 
 
 def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
-    """Return our names of the forces that REBOUNDx adds, and their constants."""
+    """Return the names that `nbody` has for the forces that REBOUNDx has attached, and their constants."""
     if not sim._additional_forces:
         return (), None
     extras = getattr(sim, "_extras_ref", None)
     if extras is None:
         raise ValueError(
-            "the simulation has what an N-body problem of eip_scipy does not support: additional forces that are not "
-            "REBOUNDx's, whose invariants are unknown. If they are one of nbody's, say so: forces='gr-potential', "
-            "constants=ForceConstants(c=...); forces=() leaves them out."
+            "the simulation has a feature that an N-body problem of eip_scipy does not support: additional forces that "
+            "are not REBOUNDx's, whose invariants are unknown. If nbody has these forces, name them: "
+            "forces='gr-potential', constants=ForceConstants(c=...); forces=() leaves them out."
         )
     names = _force_names(extras)
     unknown = [name for name in names if name not in REBOUNDX]
     if unknown or len(names) > 1:
         raise ValueError(
-            "the simulation has what an N-body problem of eip_scipy does not support: REBOUNDx's additional forces "
-            f"{', '.join(names)}; known: one of {', '.join(REBOUNDX)}. Say forces=... to have others in their place."
+            "the simulation has a feature that an N-body problem of eip_scipy does not support: REBOUNDx's additional "
+            f"forces {', '.join(names)}; expected one of {', '.join(REBOUNDX)}. Give forces=... to replace them."
         )
     if not names:
         return (), None
     for k in range(1, sim.N):
         if _parameter(sim.particles[k], "gr_source") is not None:
-            raise ValueError(f"REBOUNDx's {names[0]}: particle {k} is its source; only the first one is supported.")
+            raise ValueError(
+                f"REBOUNDx's {names[0]}: particle {k} is its source (gr_source); only the first particle is supported "
+                "as a source."
+            )
     return (REBOUNDX[names[0]],), ForceConstants(c=_parameter(extras.get_force(names[0]), "c"))
 
 
 def _parameter(thing: Any, name: str) -> Any:
-    """Return a parameter of REBOUNDx, or None if it is not set."""
+    """Return a parameter that REBOUNDx keeps for a particle or a force, or None if it is not set."""
     try:
         return thing.params[name]
     except AttributeError:
@@ -440,14 +451,14 @@ def _force_names(extras: Any) -> list[str]:
 
 
 def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) -> tuple[float, np.ndarray]:
-    """Return the requested time and state."""
+    """Return the time and the state that the arguments of `to_simulation` select."""
     refuse_units(y=y, t=t)
     problem = bodies.problem
     rows = 0 if run is problem else len(run.t)
     if row is not None and y is not None:
         raise ValueError("to_simulation: give y or row, not both.")
     if row is not None and run is problem:
-        raise ValueError("to_simulation: row is for runs; a problem has its start only.")
+        raise ValueError("to_simulation: row selects a state of a run, but a problem has only its start; omit row.")
     if row is not None and not -rows <= row < rows:
         raise ValueError(f"to_simulation: no row {row}, the run has {rows} saved states.")
     if y is None:
@@ -457,7 +468,8 @@ def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) 
         at = problem.t_span[0] if run is problem else _time_of(run, y, t)
     y = np.array(y, dtype=float)
     if y.shape != (6 * bodies.gm.size,):
-        raise ValueError(f"to_simulation: the state of {bodies.gm.size} bodies is (6 N,), got {y.shape}.")
+        n = bodies.gm.size
+        raise ValueError(f"to_simulation: y has the shape {y.shape}; expected ({6 * n},) for {n} bodies.")
     return float(at if t is None else t), y
 
 
@@ -471,7 +483,7 @@ def _time_of(run: Any, y: Any, t: float | None) -> float:
 
 
 def _new(bodies: Bodies) -> rebound.Simulation:
-    """Return a simulation with the masses and names, at rest in the origin."""
+    """Return a simulation of particles with the masses and names of the bodies, all at rest in the origin."""
     sim, n = rebound.Simulation(), bodies.gm.size
     G = bodies.problem.G
     if names := _rebound_units(bodies.problem, G):
@@ -509,7 +521,7 @@ def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | 
 
 
 def _like(template: rebound.Simulation, bodies: Bodies) -> rebound.Simulation:
-    """Return a copy of the template if it has these bodies."""
+    """Return a copy of the template, after checking that it has these bodies."""
     if not isinstance(template, rebound.Simulation):
         raise TypeError(f"to_simulation: template must be a rebound.Simulation, got {shown(template)}.")
     own = template.G * _attracting_masses(template)
@@ -546,4 +558,6 @@ def _refuse_unsupported(sim: rebound.Simulation) -> None:
     )
     for present, what in obstacles:
         if present:
-            raise ValueError(f"the simulation has what an N-body problem of eip_scipy does not support: {what}")
+            raise ValueError(
+                f"the simulation has a feature that an N-body problem of eip_scipy does not support: {what}"
+            )

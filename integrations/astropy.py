@@ -1,10 +1,10 @@
-"""Conversion of quantities and times of astropy.
+"""Conversion from and to astropy's quantities (numbers with a unit) and times.
 
 Input: `eip_scipy.problems.nbody` takes masses, positions, velocities, spans and steps with units, and epochs;
 `integrate` and `Problem.solve_ivp` take them for ``t_span``, ``t_eval``, ``h``, ``first_step``, ``max_step`` and ``y0``
-of a problem that knows its units, and times (`astropy.time.Time`, in any scale) of a problem that has an epoch;
-`eip_scipy.integrations.jpl.initial_data` takes a time. This needs no import of this module. Elsewhere a value with a
-unit is a TypeError that names the argument: no unit is dropped.
+of a problem that knows its units, and times (`astropy.time.Time`, in any scale) for a problem that has an epoch;
+`eip_scipy.integrations.jpl.initial_data` takes a time. This works without importing this module. Elsewhere a value with
+a unit raises a TypeError that names the argument: no unit is dropped silently.
 
 Output: `times`, `positions` and `velocities` of a run. `span` makes a ``t_span`` of Julian dates on a stated scale.
 """
@@ -44,7 +44,7 @@ def span(start: Any, end: Any, *, scale: str | None = None) -> tuple[Time, Time]
     Returns
     -------
     (Time, Time)
-        For ``t_span`` of `eip_scipy.integrate`, which converts it to TDB.
+        Start and end, for ``t_span`` of `eip_scipy.integrate`, which converts them to TDB.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def times(run: Any, *, scale: str = "tdb") -> Time:
     Parameters
     ----------
     run : IntegrationResult or OdeResult
-        A run by `integrate` or `Problem.solve_ivp` of a `Problem` that has an `epoch`; it may have been loaded.
+        A run by `integrate` or `Problem.solve_ivp` of a `Problem` that has an `epoch`, or loaded from a file.
     scale : str, optional
         "tdb" (the default), "utc" or another that astropy knows.
 
@@ -141,7 +141,10 @@ def _part(run: Any, part: int, own: Any, unit: Any) -> units.Quantity:
     names = getattr(run, "component_names", None) or ()
     half = len(names) // 2
     if half % 3 or not half or any(f"v{a}" != b for a, b in zip(names[:half], names[half:], strict=False)):
-        raise TypeError("expected a run of bodies, whose components are x_..., y_..., z_... and then vx_... and so on.")
+        raise TypeError(
+            "the run has no positions and velocities in space: expected a run of bodies, whose components are x_..., "
+            "y_..., z_... of each body, and then vx_..., vy_..., vz_..."
+        )
     rows = np.asarray(run.y).reshape(2, half // 3, 3, -1)[part]
     found = units.Quantity(rows, own)
     return found if unit is None else found.to(unit)

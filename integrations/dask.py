@@ -47,7 +47,7 @@ KEPT = (
 
 
 class DaskExecutor:
-    """Pair a client with its permissions, for ``ensemble(..., executor=)``.
+    """Dask client together with a permission, for ``ensemble(..., executor=)``.
 
     Parameters
     ----------
@@ -69,16 +69,17 @@ class DaskExecutor:
 
 
 def local_client(workers: int | None = None) -> distributed.Client:
-    """Start a client of processes on this machine, one thread each, that listen on its loopback interface only.
+    """Start worker processes on this machine, one thread each, that listen on its loopback interface only.
 
     Parameters
     ----------
     workers : int, optional
-        Default: as many as there are cores. Close the client and its ``cluster`` after use.
+        Number of processes; default: as many as there are cores.
 
     Returns
     -------
     distributed.Client
+        The client of these workers. Close it and its ``cluster`` after use.
 
     Raises
     ------
@@ -105,12 +106,12 @@ def local_client(workers: int | None = None) -> distributed.Client:
 
 
 def require_secure(client: distributed.Client) -> None:
-    """Refuse a cluster that listens beyond this machine without TLS.
+    """Raise an error if the client's cluster listens beyond this machine without TLS.
 
     Raises
     ------
     PermissionError
-        If it does; the message names the address and says what to do.
+        If a scheduler or worker does; the message names the address and says what to do.
     RuntimeError
         If the client is closed.
     """
@@ -167,7 +168,7 @@ def pool(executor: Any, task: Task, key: str) -> DaskPool:
 
 
 class DaskPool:
-    """Run chunks as tasks of Dask, which runs the tasks of a lost worker again on another one."""
+    """Pool that runs the chunks of an ensemble as tasks of Dask, which repeats the tasks of lost workers on others."""
 
     def __init__(self, client: distributed.Client, task: Task, key: str, *, own: bool) -> None:
         self._client, self._task, self._key, self._own = client, task, key, own
@@ -176,7 +177,7 @@ class DaskPool:
         self._warned = False
 
     def capacity(self) -> int:
-        """Return the number of threads of the present workers, at least one, for workers that are still starting."""
+        """Return the number of threads of the present workers; at least 1, because workers may still be starting."""
         with self._connected():
             return max(1, sum(self._client.nthreads().values()))
 
@@ -203,7 +204,7 @@ class DaskPool:
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """Raise errors that say that the cluster is gone, if it is."""
+        """Replace errors in the block that a lost or closed cluster causes by a RuntimeError that says so."""
         try:
             yield
         except Exception as error:
@@ -240,7 +241,8 @@ class DaskPool:
     def _look_after_workers(self) -> bool:
         """Return whether there are any workers; start new processes if all local ones are gone.
 
-        A nanny gives up on a process that dies while it starts, and Dask then waits without end.
+        Dask's supervisor of a worker (its "nanny") gives up on a process that dies while it starts, and Dask then waits
+        without end.
         """
         if self._client.nthreads():
             return True
@@ -265,7 +267,10 @@ class DaskPool:
         return False
 
     def _wait_for_workers(self) -> None:
-        """Replace workers that died before their nanny knew that they had started, which it does not do itself."""
+        """Wait until there is a worker, and replace local ones that died before their nanny knew that they had started.
+
+        The nanny does not do so itself.
+        """
         until = time.monotonic() + PATIENCE
         while not self._client.nthreads():
             if time.monotonic() > until:
@@ -275,7 +280,10 @@ class DaskPool:
         time.sleep(GRACE)
 
     def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Iterable[Members]:
-        """Bisect a chunk that killed its workers: the member that does it is found, the others run."""
+        """Run a chunk that killed its workers in halves, again and again, to find the member that kills them.
+
+        Return the results: that member has failed, and the others have been run.
+        """
         m = len(chunk.y0s)
         if m == 1:
             members = plan.empty(1)

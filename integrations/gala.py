@@ -1,4 +1,4 @@
-"""gala: orbits in its potentials that keep the energy, or Jacobi's integral, and L_z.
+"""gala: orbits in gala's potentials, with the energy (or Jacobi's integral) and L_z kept.
 
 gala (A. M. Price-Whelan, Journal of Open Source Software 2 (2017) 388) is free software under the MIT licence and not
 distributed with this package; version 1.11 is tested.
@@ -25,9 +25,10 @@ __all__ = ["integrate_orbit"]
 def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None = None, **time_spec: Any) -> Orbit:
     """Integrate orbits as ``integrate_orbit`` of gala's potentials does, with the invariants kept.
 
-    The invariants are the energy (Jacobi's integral in a rotating frame) unless the potential depends on time, and L_z
-    if the potential and the axis of the frame allow it; their rates are tested at random states. Forces are gala's own
-    C functions, called from Python. gala's own ``integrate_orbit`` accepts no other integrators than gala's.
+    The energy (Jacobi's integral in a rotating frame) is kept unless the potential depends on time, and L_z if the
+    potential is symmetric about the z axis and the frame does not rotate about another axis. To find out, the rates of
+    change of both are computed at random states. Forces come from gala's C functions, called from Python, if the
+    potential has them. gala's own ``integrate_orbit`` accepts only gala's integrators.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
         One position or several, each of which is integrated by itself. An array has the units of the potential.
     options : dict, optional
         Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10 (as gala's
-        integrator "dopri853" in C), and these invariants.
+        integrator "dopri853" in C), and the invariants above.
     **time_spec
         Times as gala takes them: ``dt, n_steps``; ``dt, t1, t2``; ``t``.
 

@@ -1,4 +1,4 @@
-"""galpy: orbits in its potentials that keep the energy, or Jacobi's integral, and L_z.
+"""galpy: orbits in galpy's potentials, with the energy (or Jacobi's integral) and L_z kept.
 
 galpy (J. Bovy, Astrophysical Journal Supplement 216 (2015) 29) is free software under the BSD licence and not
 distributed with this package; version 1.12 is tested.
@@ -34,22 +34,25 @@ ROOM = 8192  # bytes for galpy's description of one potential in C, which are mo
 def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **options: Any) -> None:
     """Integrate orbits as ``orbit.integrate(t, pot)`` does, with the invariants kept.
 
-    The invariants are the energy, or Jacobi's integral, unless it depends on time, and L_z if the potential has this
-    symmetry; their rates are tested at random states. Forces are galpy's C functions, called from Python, if all
-    potentials have them and the version of galpy is 1.12.
+    The energy (or Jacobi's integral, see `pattern_speed`) is kept unless the potential makes it change in time, and L_z
+    if the potential is symmetric about the z axis. To find out, the rates of change of both are computed at random
+    states. Forces come from galpy's C functions, called from Python, if all potentials have them and the version of
+    galpy is 1.12, and otherwise from its Python functions.
 
     Parameters
     ----------
     orbit : galpy.orbit.Orbit
-        One orbit in three dimensions or several, each of which is integrated by itself. It holds the result as after
-        its own method, so that all its other methods work; an earlier integration is replaced.
+        One orbit in three dimensions or several, each of which is integrated by itself. The orbit holds the result as
+        after ``orbit.integrate``, so that all its other methods work; an earlier integration is replaced.
     t : array_like or Quantity, shape (m,)
         Times, of which the first is that of the initial conditions.
     pot : galpy.potential.Potential or sum of potentials
     pattern_speed : float, optional
-        Angular velocity, in galpy's units, of a potential that rotates about the z axis: Jacobi's integral is kept.
+        Angular velocity, in galpy's units, of a potential that rotates about the z axis. If it is not 0, Jacobi's
+        integral is kept in place of the energy.
     **options
-        Options of `eip_scipy.integrate`. Defaults: `EIPDOP853`, ``rtol`` and ``atol`` 1e-10, these invariants.
+        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10, and the
+        invariants above.
 
     Raises
     ------
@@ -111,14 +114,14 @@ class _System:
 
 
 def _rectangular(rows: np.ndarray) -> np.ndarray:
-    """Return (q, v) of (R, vR, vT, z, vz, phi)."""
+    """Convert rows (R, vR, vT, z, vz, phi) to Cartesian (q, v)."""
     R, vR, vT, z, vz, phi = np.moveaxis(rows, -1, 0)
     c, s = np.cos(phi), np.sin(phi)
     return np.stack([R * c, R * s, z, vR * c - vT * s, vR * s + vT * c, vz], axis=-1)
 
 
 def _cylindrical(rows: np.ndarray) -> np.ndarray:
-    """Return (R, vR, vT, z, vz, phi) of (q, v)."""
+    """Convert rows of Cartesian (q, v) to (R, vR, vT, z, vz, phi)."""
     x, y, z, vx, vy, vz = np.moveaxis(rows, -1, 0)
     R = np.hypot(x, y)
     return np.stack([R, (x * vx + y * vy) / R, (x * vy - y * vx) / R, z, vz, np.arctan2(y, x)], axis=-1)

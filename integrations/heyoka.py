@@ -36,16 +36,17 @@ TIME_LIMIT, STEP_LIMIT = heyoka.taylor_outcome.time_limit, heyoka.taylor_outcome
 
 
 class ProjectedTaylor:
-    """Taylor integrator of heyoka whose state is projected onto invariants after every few steps.
+    """Taylor integrator of heyoka whose state is projected onto invariants after every `every` steps.
 
     heyoka makes the steps, with its own events and dense output, and compiles the projection, which is one Newton step.
-    Rows of `propagate_grid` and values of the dense output are projected, too. Dependent gradients reduce the rank. The
-    methods warn with a `ProjectionWarning` if invariant errors are too large to be errors of the steps.
+    Rows of `propagate_grid` and values of the dense output are projected, too. Where gradients are linearly dependent,
+    the projection has a smaller rank. The methods warn with a `ProjectionWarning` if invariant errors are too large to
+    be errors of accurate steps.
 
     Parameters
     ----------
     integrator : heyoka.taylor_adaptive
-        In double precision, at the state at which the invariants have their targets. It is used, not copied.
+        Integrator in double precision. Its present state defines the values that are kept. It is used, not copied.
     invariants : sequence or mapping of heyoka.expression
         Expressions of the state variables and of the integrator's parameters; a mapping gives them names.
     every : int, optional
@@ -55,7 +56,7 @@ class ProjectedTaylor:
     Attributes
     ----------
     targets : ndarray, shape (l,)
-        Values that are kept. After you have changed the state of the integrator, assign `values` to it.
+        Values that are kept. After you have changed the state of the integrator, assign ``targets = values``.
     max_residual : ndarray, shape (l,)
         Largest magnitude of each invariant error before a projection.
     n_projections : int
@@ -63,7 +64,8 @@ class ProjectedTaylor:
     Raises
     ------
     TypeError, ValueError
-        If the integrator is of another kind, or an invariant has other variables, depends on time, or is not finite.
+        If the integrator is of another kind, or an invariant contains unknown variables, depends on time, or is not
+        finite at the present state.
     """
 
     def __init__(self, integrator: Any, invariants: Any, *, every: int | None = None) -> None:
@@ -84,7 +86,9 @@ class ProjectedTaylor:
         self.n_projections, self.max_residual = 0, np.zeros(len(expressions))
         self.targets = self.values
         if not np.isfinite(self.targets).all():
-            raise ValueError(f"the invariants {self.names} have the values {self.targets} at the start.")
+            raise ValueError(
+                f"the invariants {self.names} have the values {self.targets} at the start; expected finite numbers."
+            )
 
     @property
     def values(self) -> np.ndarray:
@@ -140,7 +144,10 @@ class ProjectedTaylor:
         return self._function(np.ascontiguousarray(z))[: y.shape[1]].T.copy()
 
     def _run(self, advance: Any, starts: list[Any] | None) -> tuple[Any, ...]:
-        """Call `advance` and project until it does not end by its number of steps; return what heyoka returns."""
+        """Alternate calls of `advance` and projections until the end of the run; return what heyoka returns.
+
+        The run ends when a call of `advance` ends for another reason than its number of steps.
+        """
         state, function = self.integrator.state, self._function
         z, out = np.concatenate([state, self._known()]), np.empty(state.size + len(self.names))
         at, projected, residuals = z[: state.size], out[: state.size], out[state.size :]
@@ -167,7 +174,11 @@ class ProjectedTaylor:
         return self._checked(np.concatenate([self.integrator.state, self.integrator.pars]))
 
     def _judge(self, before: np.ndarray) -> None:
-        """Warn if the errors `before` the last projection, or of the run, are not those of accurate steps."""
+        """Warn about invariants whose errors are not those of accurate steps.
+
+        These are errors that the last projection did not reduce from `before`, and errors in the run that were a large
+        share of the terms of the invariant.
+        """
         values, terms = np.split(self._examined(), 2)
         after = np.abs(self.targets - values)
         for k, name in enumerate(self.names):
@@ -212,7 +223,7 @@ class TaylorOutput:
 
 
 def _named(invariants: Any, integrator: Any) -> dict[str, Any]:
-    """Return the expressions by name, checked."""
+    """Check the invariants, and return their expressions by name."""
     if not isinstance(invariants, Mapping):
         invariants = {f"invariant {k}": item for k, item in enumerate(invariants)}
     named = {str(name): item for name, item in invariants.items()}
@@ -233,9 +244,10 @@ def _named(invariants: Any, integrator: Any) -> dict[str, Any]:
 
 
 def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
-    """Compile the Newton step: of a state, parameters and targets, the projected state and the residuals.
+    """Compile a function of state, parameters and targets that returns the projected state and the residuals.
 
-    The correction x has the smallest norm with G x = residuals; the rows of G are made orthogonal one after the other.
+    It takes one Newton step: the correction x of smallest norm with G x = residuals, where the rows of G are the
+    gradients. They are made orthogonal one after the other.
     """
     targets = _variables("__target", len(expressions))
     basis: list[list[Any]] = []
@@ -261,7 +273,10 @@ def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> An
 
 
 def _examination(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
-    """Compile the invariants and the sizes of their terms, which are those of their gradients times the state."""
+    """Compile a function of state and parameters that returns the invariants, and the sizes of their terms.
+
+    The size is the norm of (gradient component times state component).
+    """
     terms = [_dot(row := [heyoka.diff(item, name) * name for name in names], row) for item in expressions]
     return heyoka.cfunc(
         [*expressions, *map(heyoka.sqrt, terms)], [*names, *pars], compact_mode=len(names) > MOST_PRODUCTS

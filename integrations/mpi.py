@@ -1,8 +1,8 @@
 """States of one run on the ranks of an MPI communicator: each rank holds a part, and the step runs on all of them.
 
-``over_ranks(EIPRK4)`` is a class for `scipy.integrate.solve_ivp`, as `EIPRK4` is. The given right-hand side fills a
-rank's part of the derivative; an invariant returns the same number on every rank and its part of the gradient. The step
-and its projection are those of `EIPSolver`.
+``over_ranks(EIPRK4)`` is a class for `scipy.integrate.solve_ivp`, as `EIPRK4` is. The user's right-hand side returns
+the part of the derivative that belongs to its rank. An invariant returns the same number on every rank, and its
+gradient returns the rank's part. The step and its projection are those of `EIPSolver`.
 
 Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
 """
@@ -40,16 +40,17 @@ OPTIONS = ("h", "vectorized", "invariants", "metric", "iterations", "every", "re
 
 
 class RankError(RuntimeError):
-    """Error on another rank; the message is that of the error, with the rank's number."""
+    """Error that another rank raised; the message has the number of that rank and its error message."""
 
 
 def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
-    """Return an array of floats of every rank, in the order of the ranks; its shape is the same on all.
+    """Return the arrays `a` of all ranks, in the order of the ranks, on every rank.
 
     Parameters
     ----------
     comm : mpi4py.MPI.Comm
     a : array_like
+        Real numbers, in the same shape on all ranks.
 
     Returns
     -------
@@ -86,18 +87,18 @@ def _raise_that_of_another(comm: MPI.Comm) -> None:
 def together(comm: MPI.Comm) -> Iterator[None]:
     """Run a block on all ranks: an error that one rank raises ends it on all, instead of letting the others wait.
 
-    The flag travels with the sums of `total` and `gathered`, one of which also ends the block. Steps of
-    `over_ranks` are such blocks already.
+    Each call of `total` and `gathered` also tells the other ranks whether this one has failed, and the end of the block
+    makes one more such call. Steps of the classes of `over_ranks` are such blocks already.
 
     Parameters
     ----------
     comm : mpi4py.MPI.Comm
-        The communicator of the sums.
+        The communicator that `total` and `gathered` use in the block.
 
     Raises
     ------
     RankError
-        On the ranks that have no error themselves, at their next sum.
+        On the ranks that have no error themselves, at their next call of `total` or `gathered`.
 
     Examples
     --------
@@ -121,7 +122,9 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 
 def total(comm: MPI.Comm, a: Any) -> Any:
-    """Sum over the ranks in their order; all ranks get the same bits, which a reduction by MPI does not promise.
+    """Return the sum of `a` over all ranks, in their order.
+
+    All ranks get the same bits, which a reduction by MPI does not promise.
 
     Parameters
     ----------
@@ -144,7 +147,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     Parameters
     ----------
     method : type
-        `EIPRK4` or another, on a tableau.
+        `EIPRK4` or another explicit Runge-Kutta method of the package.
     comm : mpi4py.MPI.Comm, optional
         Default: ``MPI.COMM_WORLD``.
 
@@ -153,12 +156,13 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     type
         A subclass of `method`. It steps with a fixed `h`, in the Euclidean metric, and takes the options `h`,
         `invariants`, `iterations`, `every` (a number), `reuse_f`, `check` and `diagnostics`. The check at the start
-        compares invariants between ranks, and with their gradients; it does not check that they are conserved.
+        compares the invariants of all ranks with each other, and with their gradients; it does not check that they are
+        conserved.
 
     Raises
     ------
     TypeError
-        If `method` is not such a class.
+        If `method` is not the class of an explicit Runge-Kutta method.
 
     Notes
     -----
@@ -186,7 +190,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     if method.TABLEAU.in_python:
         raise TypeError(f"over_ranks: {method.__name__} is not a Runge-Kutta method; its step would see one rank only.")
     if issubclass(method, SolverOfParts):
-        raise TypeError(f"over_ranks: {method.__name__} is on ranks already.")
+        raise TypeError(f"over_ranks: {method.__name__} is a class for ranks already.")
     members = {"COMM": MPI.COMM_WORLD if comm is None else comm, "__doc__": f"`{method.__name__}` over ranks."}
     return type(f"{method.__name__}OverRanks", (_OverRanks, method), members)
 
@@ -219,19 +223,19 @@ class _OverRanks(SolverOfParts):
     def _dense_output_impl(self) -> Any:
         raise NotImplementedError(
             f"{type(self).__name__} has no dense output, which t_eval, events and dense_output=True need; choose h so "
-            "that steps end where you look."
+            "that steps end at the times that you need."
         )
 
 
 def _refuse(name: str, options: dict[str, Any]) -> None:
-    """Reject options that a state on several ranks does not have.
+    """Reject options and values that a run on several ranks does not support.
 
     Raises
     ------
     TypeError
-        If an option is unknown, or is one of `EIPSolver` that is not among them.
+        If an option is not in `OPTIONS`.
     ValueError
-        If a value needs the whole state on one rank.
+        If `h` is missing, or a value is not supported for a state on several ranks.
     """
     for option in options:
         if option not in OPTIONS:

@@ -1,8 +1,9 @@
 """The rotating Gross-Pitaevskii equation with its field cut into slabs, one for each rank of an MPI communicator.
 
-A rank holds the field at some of the points x, for all y and z. It transforms along y and z where the field lies, and
-along x after a transposition, in which each rank sends to every other rank the points that both hold. A right-hand
-side takes two transpositions. An energy takes two as well, unless the right-hand side is known, as for a raw result.
+A rank holds the field at some of the points x, for all y and z. It transforms along y and z directly, and along x after
+a transposition, after which it holds some of the points y, for all x and z. For this each rank sends a part of its
+points to every other rank. A right-hand side takes two transpositions. An energy takes two as well, unless the
+right-hand side at the same state is known already.
 
 Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
 """
@@ -23,21 +24,21 @@ __all__ = ["Slab", "SlabGrossPitaevskii", "Transposition"]
 
 
 class Slab(Grid):
-    """Consecutive points of a grid along one axis, all along the others.
+    """Part of a grid: consecutive points along one axis, and all points along the others.
 
     Parameters
     ----------
     whole : Grid
     axis : int
     part : slice
-        The points, from a start to a stop.
+        Range of the points along `axis`; it must have a start and a stop.
 
     Attributes
     ----------
     whole, part
         As given.
     shape : tuple of int
-        Shape of the part. The other attributes are those of the whole grid.
+        Number of points of the part along each axis. The other attributes are those of the whole grid.
     """
 
     def __init__(self, whole: Grid, axis: int, part: slice) -> None:
@@ -59,7 +60,7 @@ class Slab(Grid):
 
 
 class Transposition:
-    """Distribution of a field over the ranks, in slabs of x or transposed, in slabs of y, and the ways between them.
+    """Distribution of a field over the ranks in slabs of x, or transposed in slabs of y, and the exchange between both.
 
     Parameters
     ----------
@@ -70,9 +71,10 @@ class Transposition:
     Attributes
     ----------
     slab, turned : Slab
-        The parts of this rank, (j, K[, L]) and (J, k[, L]).
+        This rank's part of the grid (J, K[, L]): j of the points x, (j, K[, L]), and transposed k of the points y,
+        (J, k[, L]).
     here, image : ndarray
-        Two transposed fields of this rank, because transforms go from one array to another.
+        Buffers in the shape of `turned`: the field that `turn` fills, and the one that `turn_back` reads.
 
     Raises
     ------
@@ -82,7 +84,10 @@ class Transposition:
 
     def __init__(self, grid: Grid, comm: MPI.Comm) -> None:
         if grid.dim == 1 or comm.size > min(grid.shape[:2]):
-            raise ValueError(f"{comm.size} ranks need as many points along x and along y, got {grid!r}.")
+            raise ValueError(
+                f"{comm.size} ranks need at least {comm.size} points along x and along y, got {grid!r}. Use fewer "
+                "ranks or a larger grid, of two or three dimensions."
+            )
         self._comm = comm
         xs, ys = ([slice(*ends) for ends in pairwise(_cuts(n, comm.size))] for n in grid.shape[:2])
         self.slab, self.turned = Slab(grid, 0, xs[comm.rank]), Slab(grid, 1, ys[comm.rank])
@@ -106,7 +111,7 @@ class Transposition:
         ]
 
     def turn(self, field: np.ndarray) -> None:
-        """Fill `here` with the transposed field if no rank has failed."""
+        """Fill `here` with the transposed field, after checking that no rank has failed."""
         gathered(self._comm, ())
         for y, block in self._blocks:
             np.copyto(block, field[:, y])
@@ -122,12 +127,15 @@ class Transposition:
 
 
 def _cuts(n: int, ranks: int) -> list[int]:
-    """Return the places at which n points are cut, as evenly as possible."""
+    """Return the indices (ranks + 1) at which n points are cut into parts of equal sizes, as far as possible."""
     return [n * rank // ranks for rank in range(ranks + 1)]
 
 
 class _TurnedMultiplier(Multiplier):
-    """Real factor of the modes along x, which may vary with y and z: applied between two transpositions."""
+    """Multiplier of the modes along x by a real factor, which may vary with y and z.
+
+    It is applied between two transpositions.
+    """
 
     def __init__(self, way: Transposition, factor: np.ndarray) -> None:
         self._way = way
@@ -141,7 +149,7 @@ class _TurnedMultiplier(Multiplier):
         self._way.turn_back(out)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
-        """Return this rank's part of the sum."""
+        """Return this rank's part of the expectation value, which is a sum over all modes."""
         self._way.turn(psi)
         return super().expectation(fft, self._way.here, self._way.image)
 
@@ -192,7 +200,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
     >>> psi = (x + 1j * y) * np.exp(-(x**2 + y**2) / 2)
     >>> sol = solve_ivp(gpe.fun, (0, 0.1), psi.ravel(), method=over_ranks(EIPRK4), h=0.01, invariants=gpe.invariants())
     >>> whole = gpe.gather(sol.y[:, -1])
-    >>> whole is None or whole.shape == (32, 32)  # None but on rank 0
+    >>> whole is None or whole.shape == (32, 32)  # None except on rank 0
     True
     """
 
@@ -212,7 +220,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
         return np.ascontiguousarray(np.reshape(whole, self.grid.whole.shape)[self.grid.part], dtype=complex)
 
     def linear_terms(self) -> list[tuple[Axes, Any]]:
-        """Return `GrossPitaevskii.linear_terms` with the axis x alone, because x needs a transposition."""
+        """Return the terms of `GrossPitaevskii.linear_terms`, with a separate one for x, which needs transpositions."""
         if self.Omega != 0:
             return super().linear_terms()
         along_x, *others = (self.kinetic_factor(axis) for axis in range(self.grid.dim))

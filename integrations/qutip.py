@@ -1,7 +1,9 @@
 """qutip: an integrator for `qutip.sesolve` that keeps norm and energy.
 
-The import registers it: ``qutip.sesolve(H, psi0, tlist, options={"method": "eip"})``. qutip (J. R. Johansson, P. D.
-Nation, F. Nori, Computer Physics Communications 183 (2012) 1760-1772) is free software under the BSD licence.
+Importing this module registers the integrator: ``qutip.sesolve(H, psi0, tlist, options={"method": "eip"})``.
+
+qutip (J. R. Johansson, P. D. Nation, F. Nori, Computer Physics Communications 183 (2012) 1760-1772) is free software
+under the BSD licence.
 """
 
 from __future__ import annotations
@@ -25,16 +27,17 @@ __all__ = ["IntegratorEIP"]
 
 
 class IntegratorEIP(Integrator):
-    """Integrator of qutip that keeps the norm and, if the Hamiltonian is constant, its expectation value.
+    """Integrator of qutip that keeps the norm and, if the Hamiltonian is constant, the energy.
 
-    It belongs to ``SESolver`` under the name "eip", for kets and for operators such as propagators, of which the sums
-    over the columns are kept. ``solver_class`` makes the steps; a subclass with another one than `EIPDOP853` is
-    registered by ``qutip.SESolver.add_integrator(Subclass, "name")``.
+    ``SESolver`` knows it under the name "eip". States are kets, or operators such as propagators: for these the sums of
+    the norms and of the energies of all columns are kept. The attribute ``solver_class`` is the class that makes the
+    steps, `EIPDOP853`; a subclass of this integrator with another one is registered by
+    ``qutip.SESolver.add_integrator(Subclass, "name")``.
 
     Raises
     ------
     ValueError
-        If the system is not -i times a Hermitian operator at the start: norm and energy are not kept then.
+        If the system is not -i times a Hermitian operator at the start, because norm and energy then change.
     qutip.solver.IntegratorException
         If a step fails.
     """
@@ -53,6 +56,7 @@ class IntegratorEIP(Integrator):
             Absolute and relative tolerance.
         first_step, max_step : float, default: 0
             First and longest step; 0: chosen by the method.
+
         """  # qutip appends this text to that of the solver's options, and needs it
         return self._options
 
@@ -64,7 +68,7 @@ class IntegratorEIP(Integrator):
         self.name = self.solver_class.__name__
 
     def set_state(self, t: float, state0: Any) -> None:
-        """Start anew from the state (N, columns) at time t."""
+        """Discard the present run, and start from the state `state0` (N, columns) at time `t`."""
         if not (1j * self.system(t)).isherm:
             raise ValueError(
                 'method "eip": the system is not -i times a Hermitian operator, so that norm and energy change. Use '
@@ -84,13 +88,13 @@ class IntegratorEIP(Integrator):
         self._is_set = True
 
     def get_state(self, copy: bool = True) -> tuple[float, Any]:
-        """Return time and state."""
+        """Return the present time, and the state as qutip's data layer has it; `copy`: do not share memory."""
         if not self._is_set:
             raise IntegratorException("The state is not set: call set_state first.")
         return self._t, Dense(self._y.reshape(self._shape), copy=copy)
 
     def integrate(self, t: float, copy: bool = True) -> tuple[float, Any]:
-        """Integrate to t, which is not before the last step's start; return time and state."""
+        """Integrate to `t`, which must not be before the start of the last step; return time and state."""
         solver = self.solver
         while solver.t < t:
             message = solver.step()

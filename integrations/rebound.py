@@ -1,9 +1,9 @@
 """REBOUND: its simulations as problems, our runs as simulations and archives, and its integrators as references.
 
-REBOUND's integrators run on our states, so that a comparison is fair. Masses enter as G m with G = 1, the Sun
-first, in the frame of the centre of mass. Fixed steps are counted, not timed: REBOUND's own clock accumulates
-rounding errors, which at 1000 years exceed WHFast's own error. WHFast and SABA run without safe mode and are
-synchronised before each reading, in a way that does not change the run itself.
+REBOUND's integrators start from the states of this package, so that a comparison is fair. Masses enter as G m with
+G = 1, the Sun first, in the frame of the centre of mass. A run with fixed steps ends after a number of steps, not at a
+time: REBOUND's own clock accumulates rounding errors, which at 1000 years exceed WHFast's own error. WHFast and SABA
+run without safe mode and are synchronised before each reading of the state, in a way that does not change the run.
 
 REBOUND (H. Rein, S.-F. Liu, Astronomy & Astrophysics 537 (2012) A128) is free software under the GPL and is not
 distributed with this package; versions 4.6 and 5 are supported.
@@ -61,7 +61,7 @@ class ReboundRun:
     y : ndarray, shape (n, m)
         States (q, v) at `t`, in the frame of the centre of mass.
     wall_time : float
-        Seconds spent in the integration and its synchronisations, without reading and the invariants.
+        Seconds spent in the integration and its synchronisations, without reading states and computing invariants.
     steps : int
         Number of steps; for "ias15" the number of accepted ones.
     energy_error : ndarray, shape (m,)
@@ -130,7 +130,7 @@ def simulation(gm: Any, y: Any) -> rebound.Simulation:
 
 
 def megno(gm: Any, y: Any, *, t_end: float, dt: float, seed: int = 1) -> tuple[float, float, np.ndarray]:
-    """Compute MEGNO by WHFast and REBOUND's variational particles.
+    """Compute the chaos indicator MEGNO by WHFast and REBOUND's variational particles.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def megno(gm: Any, y: Any, *, t_end: float, dt: float, seed: int = 1) -> tuple[f
     megno : float
         The mean MEGNO at the end.
     slope : float
-        Slope of `megno` against t (``Simulation.lyapunov()``), half of the exponent.
+        Slope of `megno` against t (``Simulation.lyapunov()``), half of the largest Lyapunov exponent.
     deviation : ndarray, shape (6 N,)
         The tangent vector at the start.
     """
@@ -211,7 +211,7 @@ def run(
     Returns
     -------
     ReboundRun
-        States, errors of the invariants and the time it took.
+        States, errors of the invariants, and the time that the run took.
 
     Raises
     ------
@@ -328,7 +328,10 @@ def _check_integrator(integrator: str, gm: np.ndarray) -> None:
     if integrator not in INTEGRATORS:
         raise ValueError(f"unknown integrator {integrator!r}: expected one of {', '.join(map(repr, INTEGRATORS))}")
     if integrator.startswith(("whfast", "saba")) and gm.argmax() != 0:
-        raise ValueError(f"{integrator} splits off the orbits around body 0: put the heaviest body (the Sun) first")
+        raise ValueError(
+            f"{integrator} follows orbits around body 0, which is not the heaviest; put the heaviest body (the Sun) "
+            "first"
+        )
 
 
 def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
@@ -345,8 +348,8 @@ def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
     # The looser bound is for long runs, in which the rounding of h alone moves t_end / h away from an integer.
     if n_steps < 1 or abs(t_end / h - n_steps) > max(1e-9, 8 * np.finfo(float).eps * n_steps):
         raise ValueError(
-            f"t_end = {t_end!r} is {t_end / h!r} steps of h = {h!r}: a whole number is needed, for a shortened "
-            "step would spoil a symplectic method"
+            f"t_end = {t_end!r} is {t_end / h!r} steps of h = {h!r}: expected a whole number of steps, "
+            "because a shortened step would spoil a symplectic method. Change h or t_end"
         )
     return n_steps
 

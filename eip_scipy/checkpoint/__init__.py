@@ -35,15 +35,15 @@ LEFT_OVER = 3600.0
 
 
 class CheckpointError(Exception):
-    """Error of a checkpoint that cannot be written, is damaged, or belongs to another run."""
+    """Error for a checkpoint that cannot be written or read, is damaged, or belongs to another run."""
 
 
 def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write a checkpoint; an existing file at `path` is replaced in one step, or stays unchanged.
 
-    The bytes are written to a temporary file in the same folder, flushed to the disk, and then replace `path`. If the
-    process is killed meanwhile, the previous checkpoint remains, and a file ``.NAME-*.tmp`` that the first `write` an
-    hour later removes.
+    The bytes are written to a temporary file in the same folder, which is flushed to the disk and then replaces `path`.
+    If the process is killed meanwhile, the previous checkpoint remains, next to the temporary file ``.NAME-*.tmp``. Any
+    `write` to the same path more than an hour later removes that file.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
 
 
 def existing(name: str, what: str) -> CheckpointError:
-    """Return the error for an existing place without ``resume=True``."""
+    """Return the error for a run without ``resume=True`` whose file or group `name` exists; `what` is a kind of run."""
     return CheckpointError(
         f"{name!r} exists. Pass resume=True to continue the {what} that it holds; for a new {what}, use another "
         "place or delete this one."
@@ -136,7 +136,7 @@ def existing(name: str, what: str) -> CheckpointError:
 
 
 def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, Any]) -> None:
-    """Compare the settings in a header with those of the run that is to be resumed.
+    """Compare the settings `there` in a checkpoint with the settings `here` of the run that resumes it.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def _difference(name: str, there: Any, here: Any) -> str:
     values = [json.dumps(value) for value in (there, here)]
     if sum(map(len, values)) > 120:
         return f"{name} differs"
-    return f"{name} is {values[0]} there and {values[1]} here"
+    return f"{name} is {values[0]} in the checkpoint and {values[1]} in this run"
 
 
 def _name(path: str | os.PathLike[str]) -> str:
@@ -185,7 +185,7 @@ def _name(path: str | os.PathLike[str]) -> str:
 
 
 def reason(error: OSError) -> str:
-    """Return the message of the operating system."""
+    """Return the operating system's message for an error, in lower case."""
     return (error.strerror or str(error)).lower()
 
 
@@ -200,14 +200,14 @@ def _machine() -> str:
 
 
 def origin() -> dict[str, Any]:
-    """Return versions and machine for the header of a checkpoint."""
+    """Return the versions of the packages and the kind of machine, for the header of a checkpoint."""
     # The version of Numba only if it is loaded: otherwise it has compiled no function of the run.
     decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
     return {"versions": decide, "machine": _machine()}
 
 
 def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write header and arrays."""
+    """Write the header `text` and the arrays to `stream` as a zip archive."""
     with zipfile.ZipFile(stream, "w") as archive:
         archive.writestr(
             zipfile.ZipInfo(HEADER), text
@@ -235,10 +235,10 @@ def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, An
             raise ValueError("its members claim more bytes than it has")
         names = [m.filename for m in members]
         if HEADER not in names:
-            raise ValueError(f"its members are {names[:10]}")
+            raise ValueError(f"it has no member {HEADER!r}; its members are {names[:10]}")
         header = json.loads(archive.read(HEADER))
         if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise ValueError("its header has another format")
+            raise ValueError(f"its header does not name the format {FORMAT!r}")
         if header.get("schema") != SCHEMA:
             version = (header.get("versions") or {}).get("eip_scipy", "unknown")
             raise CheckpointError(
@@ -246,17 +246,17 @@ def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, An
                 f"version of eip_scipy that wrote it ({version})."
             )
         if names != [HEADER, *(f"{name}.npy" for name in header["arrays"])]:  # the directory has no checksum
-            raise ValueError(f"its members are {names[:10]}, and not those that its header names")
+            raise ValueError(f"its members are {names[:10]}, which are not the arrays that its header names")
         return header, dict(zip(header["arrays"], (_array(archive, m) for m in members[1:]), strict=True))
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as stream:
         if npy.read_magic(stream) != (1, 0):
-            raise ValueError(f"{member.filename} has another format")
+            raise ValueError(f"{member.filename} does not have version 1.0 of the npy format")
         shape, fortran, dtype = npy.read_array_header_1_0(stream)
         if dtype.kind not in "biufc" or fortran or any(k < 0 for k in shape):
-            raise ValueError(f"{member.filename} holds {dtype} of shape {shape}")
+            raise ValueError(f"{member.filename} holds {dtype} of shape {shape}, expected numbers in C order")
         n_bytes = math.prod(shape) * dtype.itemsize
         if n_bytes != member.file_size - stream.tell():
             raise ValueError(f"{member.filename} declares {n_bytes} bytes and has {member.file_size - stream.tell()}")

@@ -1,4 +1,4 @@
-"""A lock on a place that only one run at a time may write to; it ends with the process that holds it."""
+"""A lock on a file or folder to which only one run at a time may write; it ends with the process that holds it."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class Lock:
 
     The lock is held on a separate file next to the place, because a checkpoint is replaced by another file each time it
     is written. The lock file names its holder, and `close` removes it. Processes that are started or forked do not
-    inherit the lock. A file system without locks causes a RuntimeWarning; without permission to write nothing is
-    locked.
+    inherit the lock. A file system without locks causes a RuntimeWarning. If the user may not create the lock file,
+    nothing is locked.
 
     Parameters
     ----------
     place : path-like
-        Place to lock; it need not exist.
+        File or folder to lock; it need not exist.
 
     Attributes
     ----------
     name : str
-        Absolute path of the place.
+        Absolute path of `place`.
     path : Path
         Absolute path with links resolved.
 
@@ -59,7 +59,7 @@ class Lock:
             self._lock.acquire()
         except Timeout:
             raise CheckpointError(
-                f"{self.name!r} is in use by another run, of {_holder(self._file)}. Wait until it ends, stop it, "
+                f"{self.name!r} is in use by another run ({_holder(self._file)}). Wait until that run ends, stop it, "
                 "or use another place."
             ) from None
         except OSError as error:

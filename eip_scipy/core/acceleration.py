@@ -1,4 +1,4 @@
-"""Accelerations a(t, q) as right-hand sides of y = (q, v), and functions given as such that are accelerations."""
+"""Right-hand sides of y = (q, v) made from accelerations a(t, q); detection of accelerations given in their place."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from .pointers import PointerFunction
 
 __all__ = ["BY_NAME", "AccelerationField", "is_acceleration", "named_accelerations"]
 
-BY_NAME = "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...), or eip_scipy.solve_ivp"
+BY_NAME = (
+    "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...), or "
+    "eip_scipy.solve_ivp(acceleration=fun, t_span=..., y0=..., ...)"
+)
 
 
 class AccelerationField:
@@ -49,12 +52,15 @@ class AccelerationField:
 def named_accelerations(
     method: str, fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray
 ) -> Iterator[None]:
-    """Explain an error in the first call of `fun` if it is an acceleration that was given as a right-hand side.
+    """Run the body of a ``with`` statement, and explain its error if `fun` is an acceleration, not a right-hand side.
+
+    The body calls `fun` for the first time. `method` is the name of the method, and `extra` are further arguments of
+    `fun`.
 
     Raises
     ------
     ValueError
-        If `fun` is an acceleration. The message names the argument for accelerations.
+        If the body fails and `fun` is an acceleration. The message names the argument for accelerations.
     """
     try:
         yield
@@ -71,9 +77,9 @@ def named_accelerations(
 def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray) -> bool:
     """Return True if `fun` is not a right-hand side of y = (q, v) but returns n/2 accelerations.
 
-    The function is called with y and with q. Numba functions are called as Python code, and C functions with y only,
-    because compiled code could read or write beyond the end of a shorter array. For the same reason q is passed as the
-    first half of an array as long as y.
+    The function is called with y, and then with q in place of y. Numba functions are called as Python code, and C
+    functions with y only, because compiled code could read or write beyond the end of a shorter array. For the same
+    reason q is passed as the first half of an array as long as y.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
 
 
 def are_same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
-    """Return True if two tuples contain the same arguments, or equal numbers."""
+    """Return True if two tuples have the same length and their items are pairwise the same object, or equal numbers."""
     pairs = zip(one, other, strict=False)
     return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in pairs)
 
@@ -57,13 +57,16 @@ def parameter_values(params: Any) -> np.ndarray:
         raise TypeError(
             f"params must be an array of numbers, got {shown(params)}. Give the values in the order in which fun reads "
             "them, params=[1.0, 2.0], or pass the mapping as args=(mapping,); fun is then called from Python. Problems "
-            "made by hamiltonian or equations accept names."
+            "made by hamiltonian or equations accept a mapping from names to values."
         )
     return real_array("params", params, TypeError)
 
 
 def scalars(extra: tuple[Any, ...]) -> str | None:
-    """Return the types of the numbers in `extra`, see `Packed`; "" for one array, None if only Python can pass them."""
+    """Return the types of the numbers in `extra`, see `Packed`; "" for one array or no arguments.
+
+    Return None if `extra` contains anything else, which only Python can pass.
+    """
     if _is_array(extra):
         return ""
     types = [_type(item) for item in extra]
@@ -71,7 +74,7 @@ def scalars(extra: tuple[Any, ...]) -> str | None:
 
 
 def floats(extra: tuple[Any, ...]) -> np.ndarray:
-    """Return the array of floats for native functions; empty if `extra` contains anything else."""
+    """Return `extra`, one array or some numbers, as the array of floats for native functions; else an empty array."""
     if _is_array(extra):
         return np.asarray(extra[0])
     return np.array(extra if scalars(extra) else (), float)

@@ -20,8 +20,8 @@ class Balance(Invariant):
     """A quantity F that changes slowly and at a known rate, such as an energy with friction; or several at once.
 
     Add it to the list of invariants of a run. The run integrates the rate with the stages of each step and projects the
-    state onto the resulting value. If the rate is small, the error of this value is smaller than that of F of a state
-    without projection by about the same factor.
+    state onto the resulting value. If the rate is small compared with its terms, the error of this value is about this
+    fraction of the error that F has without projection.
 
     Parameters
     ----------
@@ -56,18 +56,20 @@ class Balance(Invariant):
     Balances need a Runge-Kutta method (`EIPRK1` to `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, or one that
     `eip_method` makes from a tableau), which evaluates the rates at its stages, or a multistep method (`EIPGJ12`,
     `EIPGJ14`), which sums them as it sums accelerations. Nystrom methods cannot be used because their stages have no
-    velocities. The integrated value starts as F at the start, and again if the state is set between two steps of a
-    solver. It is a compensated sum, is not part of the error control, and is not changed by the projection. Between
-    the steps it is interpolated as the state is, and states between the steps are projected onto it.
+    velocities. The integrated value starts as F at the start of the run. It is set to F again if a user sets the state
+    between two steps of a solver. It is a compensated sum, is not part of the error control, and is not changed by the
+    projection. Between the steps it is interpolated as the state is, and states between the steps are projected onto
+    the interpolated value.
 
     A given rate is compared with ``grad @ f + dF/dt`` at the start and during the run. A wrong rate is reported by a
     `ProjectionWarning`. `Diagnostics.slowness` is the size of the rate, compared with the terms of ``grad @ f``. If
-    it is above 0.05, a balance hardly helps, and there is a warning. Balances do not help in chaotic motion and with
-    strong driving.
+    the slowness is above 0.05, the balance hardly helps, and there is a warning. Balances do not help in chaotic motion
+    and with strong driving.
 
-    The derivative in time is a difference of order 6, within the interval of the run, over 3/32 of a fixed step or 3/8
-    of the first adaptive step to both sides (to one side next to the ends of the interval). It is exactly zero if `fun`
-    does not depend on t. For jitted functions dual numbers are used instead, which are exact.
+    The partial derivative dF/dt is computed as a difference of order 6, within the interval of the run, over 3/32 of a
+    fixed step or 3/8 of the first adaptive step to both sides (to one side next to the ends of the interval). The
+    difference is exactly zero if `fun` does not depend on t. For jitted functions dual numbers are used instead, which
+    are exact.
 
     A C function for the rate has the signature of a gradient,
     ``int r(double t, const double *y, const double *f, double *values, const double *params)``.
@@ -144,7 +146,7 @@ class Balance(Invariant):
 
 
 def _directions(components: Any, weights: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return components as integers (s, k) and their weights (s, k), or None."""
+    """Return components as integers (s, k) and their weights (s, k); None if no components are given."""
     if components is None:
         if weights is not None:
             raise ValueError("Balance: weights are given without components; give both, or omit weights.")

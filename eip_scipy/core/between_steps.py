@@ -20,7 +20,10 @@ N_LEFT = 7
 
 
 class Settings(NamedTuple):
-    """The attributes of a solver that may be set between its steps, with their objects after the last step."""
+    """The values, after the last step, of the attributes of a solver that a user may set between two steps.
+
+    An attribute whose value is not the same object any more has been set since then.
+    """
 
     t: float
     y: np.ndarray
@@ -54,7 +57,7 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
     TypeError
         If `value` does not hold numbers.
     ValueError
-        If it has another shape, is not finite, or is complex where the state was real.
+        If `value` has another shape than `like`, is not finite, or is complex although `like` is real.
     """
     found = initial_state(value, name)
     if found.shape != like.shape:
@@ -65,12 +68,15 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
 
 
 def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: int) -> Stepping:
-    """Return the step control with which a solver continues from its present time, from its present attributes.
+    """Return the step control for the next steps of a solver, made from its present attributes.
+
+    `was` contains the values of the attributes after the last step.
 
     Raises
     ------
     TypeError, ValueError
-        If an attribute has a wrong value, or belongs to the other kind of steps.
+        If an attribute has a wrong value, or if one was set that this solver does not use: options of adaptive steps on
+        a solver with a fixed step, or the reverse.
     """
     _check_kind_of_steps(solver, was)
     t, t_bound, sign = (

@@ -58,7 +58,7 @@ def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
 
 
 def _consecutive(size: int, n: int, width: int) -> Grouping:
-    """Return blocks of `size` consecutive components, without a list of them, because a field has a million."""
+    """Return blocks of `size` consecutive components, without a loop, because a field may have a million components."""
     floats = n * width
     start = np.arange(0, floats + 1, size * width, dtype=INDEX)
     return Grouping(np.arange(floats, dtype=INDEX), start, width, size * width if n else 0)

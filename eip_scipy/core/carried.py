@@ -1,4 +1,4 @@
-"""Balances among the invariants of a run: their places, their rates, and how the engine calls these."""
+"""Balances among the invariants of a run: indices of their values, their rates, and how the engine calls the rates."""
 
 from __future__ import annotations
 
@@ -38,16 +38,23 @@ def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None
     except ValueError:  # rows of different lengths
         found = np.asarray(None)
     if found.dtype.kind == "c":
-        raise ValueError(f"{what} returned complex values at t={t:g}; expected a real number or a real array (l,).")
+        raise ValueError(
+            f"{what} returned complex values at t={t:g}; expected a real number or a real array of shape (l,)."
+        )
     if found.dtype.kind not in "fiub":
-        raise TypeError(f"{what} returned {shown(value)} at t={t:g}; expected a real number or a real array (l,).")
+        raise TypeError(
+            f"{what} returned {shown(value)} at t={t:g}; expected a real number or a real array of shape (l,)."
+        )
     if expected is not None and found.shape != expected:
         raise ValueError(f"{what} returned shape {found.shape} at t={t:g}, expected {expected}.")
     return found
 
 
 def time_shift(tau: float, adaptive: bool, t_span: tuple[float, float]) -> float:
-    """Return the shift of differences in time, a power of two; 0 if the interval is empty."""
+    """Return the shift in time, a power of two, for differences that give dF/dt of balances; 0 for an empty interval.
+
+    `tau` is the length of a step, and `adaptive` says whether it is that of the first adaptive step.
+    """
     t0, length = t_span[0], abs(t_span[1] - t_span[0])
     wanted = tau * (OF_FIRST if adaptive else OF_FIXED) if 0 < tau < math.inf else math.inf
     shift = max(min(wanted, length / PARTS), ROUNDINGS * float(np.spacing(abs(t0))))
@@ -67,16 +74,17 @@ class Carried:
     shapes : sequence of tuple
         Shapes of the values of each item.
     extra : tuple
-        Further arguments of the run, behind those of an item.
+        Further arguments of the run. In each call they follow the item's own arguments.
 
     Attributes
     ----------
     items : dict of int to Invariant
-        The balances by their places among the items, with a compiled rate where a jitted one has none.
+        The balances, by their indices among all items. After `compile_rates` a jitted balance without a given rate has
+        a compiled one, if it can be compiled.
     places : ndarray of int64, shape (b,)
-        Places of the balances' values among all values.
+        Indices of the balances' values among all values.
     most_slowness : ndarray, shape (b,)
-        The slowness of each of these values above which a run warns.
+        For each of these values, the bound for `Diagnostics.slowness` above which a run warns.
     mask : ndarray of bool, shape (l,)
         Which values are those of balances.
     """
@@ -103,7 +111,7 @@ class Carried:
         self.most_slowness = np.concatenate(most)
 
     def compile_rates(self, n: int) -> None:
-        """Give jitted balances of a real state of n components rates by dual numbers, if they have none."""
+        """Compile rates by dual numbers for jitted balances without a rate; the state is real and has n components."""
         numbers = scalars(self._extra) if self.items else None
         for k, item in self.items.items():
             lacks = item.rate_function is None and not item.args and is_jitted(item.function) and not jit_is_off()
@@ -120,14 +128,14 @@ class Carried:
             self.items[k] = item
 
     def check(self, t: float, y: Array, f: Array) -> None:
-        """Check the shapes of given rates, and that they are finite, at the start."""
+        """Check at the start that the given rates have the expected shapes and are finite."""
         for k in sorted(self._given):
             value = self._rate(k, t, y, f)
             if not np.isfinite(value).all():
                 raise ValueError(f"{self._what(k)} is not finite at y0: it returned {value}.")
 
     def known(self, t: float, y: Array, f: Array) -> Array:
-        """Return the known rates (l,) of the values: 0 for invariants, NaN for balances without a rate."""
+        """Return the known rates (l,) of all values: 0 for invariants, NaN for balances whose rate is not given."""
         rates = np.where(self.mask, np.nan, 0.0)
         for k in self._given:
             rates[self._starts[k] : self._starts[k + 1]] = self._rate(k, t, y, f)
@@ -135,15 +143,18 @@ class Carried:
 
     @property
     def given_places(self) -> Array:
-        """Return the places of the values whose rates are given."""
+        """Return the indices, among all values, of the values whose rates are given."""
         return np.array([p for k in sorted(self._given) for p in range(self._starts[k], self._starts[k + 1])], np.intp)
 
     def given(self, t: float, y: Array, f: Array) -> Array:
-        """Return the given rates in the order of their places."""
+        """Return the given rates, in the order of `given_places`."""
         return self.known(t, y, f)[self.given_places]
 
     def rates(self, low: float, high: float, shift: float, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the rates in the form that the engine calls: `functions`, or functions of Python."""
+        """Return the rates in the form that the engine calls: `functions` if they are given, else Python functions.
+
+        `low` and `high` are the ends of the run's interval; `shift` comes from `time_shift`.
+        """
         items = tuple((k, self._starts[k + 1] - self._starts[k]) for k in self.items)
         return Rates(items, tuple(map(self._call, self.items) if functions is None else functions), low, high, shift)
 

@@ -1,4 +1,4 @@
-"""Coefficients as attributes of solver classes, as in SciPy's RungeKutta classes: set on ours, read from others."""
+"""Coefficients as class attributes, as in SciPy's RungeKutta: set on EIP classes, read from those of other packages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEAST_ORDER = 2  # of dense output
 
 
 def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str, Any]:
-    """Return the attributes of SciPy's RungeKutta classes for a method, NotImplemented where it has none.
+    """Return the attributes that SciPy's RungeKutta classes have for a method; NotImplemented for those that it lacks.
 
     Parameters
     ----------
@@ -55,18 +55,19 @@ def tableau_of(solver: type[OdeSolver]) -> Tableau:
     Raises
     ------
     TypeError
-        If the class has no coefficients of an explicit Runge-Kutta method, or does in its steps what they do not show.
+        If the class has no coefficients of an explicit Runge-Kutta method, or if its steps or its error estimate do not
+        follow from the coefficients alone.
     ValueError
-        If the coefficients miss an order condition.
+        If the coefficients or the dense output violate an order condition.
     """
     name = solver.__name__
     A, b, c = (_array(solver, attribute) for attribute in "ABC")
     order = getattr(solver, "order", None)
     if A is None or b is None or c is None or not isinstance(order, int):
         raise TypeError(
-            f"eip_method: {name} has no coefficients A, B, C and order, by which explicit Runge-Kutta methods are "
-            "projected, and of other solvers only SciPy's Radau and BDF can take up a projected state: EIPRadau and "
-            f"EIPBDF do so. Give one of these, {WANTED}, or a Tableau."
+            f"eip_method: {name} has no coefficients A, B, C and order, which define an explicit Runge-Kutta method. "
+            "Of the other solvers only SciPy's Radau and BDF can be projected, as EIPRadau and EIPBDF. Use one "
+            f"of these two, or give {WANTED}, or a Tableau."
         )
     if _array(solver, "Bp") is not None:
         raise TypeError(f"eip_method: {name} is a Runge-Kutta-Nystrom method; give its coefficients as NystromTableau.")
@@ -75,12 +76,15 @@ def tableau_of(solver: type[OdeSolver]) -> Tableau:
     given: dict[str, Any] = {"c": _floats(c), "reference": reference}
     if weights is None and _array(solver, "E5") is not None:
         raise TypeError(
-            f"eip_method: the estimate of {name} has two parts, E5 and E3, as that of SciPy's DOP853, whose class is "
-            "EIPDOP853; give other coefficients as Tableau(..., b_hat=..., e_low=...)."
+            f"eip_method: the estimate of {name} has two parts, E5 and E3, as that of SciPy's DOP853. Use EIPDOP853 "
+            "for DOP853, and give other coefficients as Tableau(..., b_hat=..., e_low=...)."
         )
     if weights is not None:
         if not weights.any():
-            raise TypeError(f"eip_method: the error weights E of {name} are 0; its estimate is made elsewhere.")
+            raise TypeError(
+                f"eip_method: the error weights E of {name} are all 0, so {name} does not compute its error estimate "
+                "from E. Give a Tableau with the weights b_hat of the embedded method."
+            )
         b_hat = np.append(b, np.zeros(weights.size - b.size)) + weights
         given["b_hat"] = _floats(b_hat if weights[-1] != 0 else b_hat[: b.size])
         orders = (getattr(solver, attribute, None) for attribute in EMBEDDED)
@@ -94,7 +98,7 @@ def tableau_of(solver: type[OdeSolver]) -> Tableau:
 
 
 def is_same(solver: type[OdeSolver], own: type[OdeSolver]) -> bool:
-    """Return True if a subclass of `own` makes the same steps."""
+    """Return True if `solver` is a subclass of `own` with the same coefficients and the same functions `STEP`."""
     if not issubclass(solver, own) or _own_functions(solver, own):
         return False
     pairs: Any = ((getattr(solver, name, None), getattr(own, name, None)) for name in NAMES)
@@ -116,8 +120,9 @@ def _require_plain_steps(solver: type[OdeSolver]) -> None:
     own = _own_functions(solver, base) if issubclass(solver, base) and _array(solver, "E5") is None else []
     if own:
         raise TypeError(
-            f"eip_method: {solver.__name__} has its own {own[0]}, and eip_method reads only the coefficients, so that "
-            "the steps would be others. Give a Tableau, or an object with one_step(t, y, h) and order."
+            f"eip_method: {solver.__name__} has its own {own[0]}, but eip_method reads only the coefficients, so that "
+            "its steps would differ from those of the class. Give a Tableau, or an object with one_step(t, y, h) and "
+            "order."
         )
 
 
@@ -126,17 +131,17 @@ def _own_functions(solver: type[OdeSolver], base: type[OdeSolver]) -> list[str]:
 
 
 def _check_dense_output(tableau: Tableau, P: np.ndarray) -> None:
-    """Check that a polynomial ends in the step's result, and its order conditions up to LEAST_ORDER on the way.
+    """Check that the dense output `P` gives the step's result at its end, and has order LEAST_ORDER inside the step.
 
     Raises
     ------
     ValueError
-        If it does not.
+        If one of these conditions is violated.
     """
     if max(_misses(tableau, P)) > np.sqrt(FLOAT_TOLERANCE):
         raise ValueError(
-            f"eip_method: the dense output P of {tableau.name} does not belong to its steps: it misses a condition by "
-            f"{max(_misses(tableau, P)):.3g}."
+            f"eip_method: the dense output P of {tableau.name} does not belong to its steps: it violates one of its "
+            f"conditions by {max(_misses(tableau, P)):.3g}. Correct P."
         )
 
 

@@ -1,4 +1,4 @@
-"""Quantities that a system conserves only if others hold, such as constraints and energies of constrained systems."""
+"""Quantities that a system conserves only while constraints hold, such as the energy of a constrained system."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ VANISHES, UNSEEN = 0.05, 1e-8
 
 
 def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Derivative) -> Array | None:
-    """Return the state nearest to y, in units of `span`, on which all invariants have their targets.
+    """Move y by Newton's method towards the targets of all invariants, and return the state with the least residuals.
 
-    None if y itself is such a state, or if none is found.
+    Each Newton step is the shortest one in units of `span`. The function returns None if y itself is that state, for
+    instance because all invariants have their target values there.
     """
     state, best, nearest = y, np.inf, None
     weights = np.repeat(span, state.view(float).size // span.size)
@@ -60,17 +61,19 @@ def is_kept_on_a_surface(
 ) -> bool:
     """Return True if the rate of invariant k vanishes on a surface near y that the flow does not leave.
 
-    The rate of a length is the velocity along it, and a system with that constraint keeps both together: the rate is 0
-    near y, and there its own rate is 0. Friction, a driving force or a wrong term do neither.
+    For example, the rate of change of a length is the velocity along it, and a system that constrains the length keeps
+    it while that velocity is 0. Near y there are states where this rate is 0, and there the flow does not change the
+    rate. If the invariant changes because of friction, a driving force or a wrong term, there is no such surface.
 
     Parameters
     ----------
     known : InvariantSet
     k : int
     held : ndarray of bool, shape (l,)
-        The invariants that the system keeps. The surface is looked for where they have their values at y, because a
-        constraint that is violated a little does the work that makes up for friction; or where some of them are 0,
-        which they are not at y if it violates a constraint.
+        Mask of the invariants that the system keeps. The surface is first looked for at states where these invariants
+        have the same values as at y. Otherwise a small violation of a constraint could do the work that compensates
+        friction. If there is no such surface, it is looked for at any state where at least one of these invariants
+        becomes 0, which it is not at y if y violates a constraint.
     t : float
     y, f : ndarray, shape (n,)
         A state and its derivative there.
@@ -95,7 +98,7 @@ def is_kept_on_a_surface(
 
 
 class _Rate:
-    """The rate of change of an invariant as a function of the state's floats, and its slopes in units of `weights`."""
+    """The rate of change of invariant k as a function of the state's floats, and its derivatives times `weights`."""
 
     def __init__(self, known: InvariantSet, k: int, t: float, y: Array, span: Array, rhs: Derivative) -> None:
         self._known, self._k, self._t, self._rhs, self._dtype = known, k, t, rhs, y.dtype
@@ -108,7 +111,7 @@ class _Rate:
         return float(self._known.gradients(self._t, state, f)[self._k].view(float) @ f.view(float))
 
     def slopes(self, floats: Array) -> Array:
-        """Return the slopes by central differences, (m,)."""
+        """Return the derivatives by the m floats, each times its weight, from central differences."""
         found = np.zeros(floats.size)
         for j in np.flatnonzero(self.weights):
             ends = []
@@ -120,9 +123,10 @@ class _Rate:
         return found
 
     def root(self, G: Array) -> Array | None:
-        """Return the nearest state at which the rate vanishes and the invariants of gradients G do not change, or None.
+        """Return the floats of the nearest state at which the rate vanishes, or None.
 
-        The function also returns None if Newton's method finds no such state, or finds it far away.
+        Newton's method moves only in directions in which invariants with the gradients G do not change. The function
+        returns None if the method does not find such a state, or finds it far away.
         """
         floats, first = self.floats, self(self.floats)
         value = first
@@ -149,7 +153,10 @@ class _Rate:
         return bool(abs(changes.sum()) <= share * np.abs(changes).sum())
 
     def _newton_step(self, slope: Array, value: float, G: Array) -> Array | None:
-        """Return the shortest move, in units of the weights, that makes the linear rate 0; None if there is none."""
+        """Return the shortest move, in units of the weights, that makes the linearised rate 0; None if there is none.
+
+        The move leaves the invariants with the gradients G unchanged, to first order.
+        """
         rows = np.vstack([slope, G.view(float) * self.weights])
         lengths = np.linalg.norm(rows, axis=1)
         if not (0 < lengths[0] < np.inf and np.isfinite(lengths).all()):

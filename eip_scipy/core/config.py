@@ -45,9 +45,10 @@ def show_config(mode: str = "stdout") -> dict[str, Any] | None:
     Returns
     -------
     dict or None
-        With "dicts": ``versions`` of the package, Python and the required packages; ``engine`` with its ``build``, True
-        for ``AVX2 and FMA`` if it uses these instructions, and its ``compiler``; ``extras`` with the ``version`` of
-        each module (None if it is not installed), the ``extra`` that installs it and what it is ``for``; ``folder`` and
+        None with "stdout". With "dicts" a dictionary with the keys ``versions`` (of the package, Python and the
+        required packages), ``engine`` (its ``build``; ``AVX2 and FMA``, which is True if the engine uses these
+        instructions; its ``compiler``), ``extras`` (for each optional module its ``version``, or None if it is not
+        installed, the ``extra`` that installs it, and its purpose, ``for``), ``folder`` (of the installed package) and
         ``system``.
 
     Raises

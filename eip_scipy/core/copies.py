@@ -1,6 +1,6 @@
-"""Copies of solvers in the middle of a run, in memory or by pickle, which continue to the same bits.
+"""Copies of solvers in the middle of a run, in memory or by pickle, which continue with bit-identical results.
 
-The engine and what is bound to the user's functions are made again; everything that a step left is copied.
+The engine and the objects that call the user's functions are made again; all values that steps change are copied.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class RunParts(NamedTuple):
 def parts_of(run: Run) -> RunParts:
     """Return the parts from which `run_of` makes a run again.
 
-    They contain the values of a solver of SciPy, but not a one-step method of the user.
+    If a solver of SciPy makes the steps, the parts contain its values. They do not contain a user-defined one-step
+    method.
     """
     values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
     values["options"] = run.options._replace(joint=None)
@@ -50,10 +51,10 @@ def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: boo
     ----------
     parts : RunParts
     invariants : InvariantSet
-        The same invariants, made at the same start.
+        A new set of the same invariants, made at the same start.
     method : Tableau, NystromTableau, GaussJackson, OneStep or Driven
     joint : bool
-        Whether the run's options hold the invariants that are projected jointly.
+        Whether the run projects `JointInvariants` with their functions `moments` and `shift`.
     """
     values, work = copy.deepcopy(parts.values), copy.deepcopy(parts.work)
     if method.in_python:

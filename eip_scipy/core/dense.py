@@ -1,4 +1,4 @@
-"""Dense output: interpolants of SciPy's orders that agree with the projected states and stay on the manifold."""
+"""Dense output: interpolants of the same orders as SciPy's that meet the projected states and stay on the manifold."""
 
 from __future__ import annotations
 
@@ -36,10 +36,12 @@ MOST_ROOTS, ROOT_NUMBERS = 1024, 2**17
 class Interpolants:
     """Interpolants of a run, created and evaluated by its engine.
 
-    States between two projections are returned as projected copies. An interpolant is projected onto levels of the
-    invariants between those at the two ends of the step. The levels are linear between the errors at the two ends,
-    which are 1e-15 to 1e-12 after a projection, and larger if the step was not projected; the ends themselves are met
-    exactly. The change of balances between the ends is added to the levels, by an interpolant of the same kind.
+    If the run does not project each step, the states after unprojected steps are returned as projected copies.
+    Interpolated states are projected too, onto levels of the invariants between those at the two ends of the step. The
+    levels differ from the targets by invariant errors that are interpolated linearly between the two ends, where they
+    are 1e-15 to 1e-12 after a projection, and larger if the step was not projected. The states at the ends are met
+    exactly. The change of balances between the ends is interpolated in the same way as the state, and is added to their
+    levels.
 
     Parameters
     ----------
@@ -49,7 +51,8 @@ class Interpolants:
     events : int
         Number of events that the loop checks.
     errors : callable
-        Context that translates errors of calls by pointer, as `Driver.own_errors`.
+        ``errors()`` returns a context manager that replaces the engine's error in a compiled function by the user's
+        exception, such as `Driver.own_errors`.
     """
 
     def __init__(
@@ -95,7 +98,7 @@ class Interpolants:
         return out.T
 
     def roots(self) -> tuple[Array, Array, Array]:
-        """Return the events that the loop has found since the last call, their times and states."""
+        """Return three arrays for the events found since the last call: their numbers, times and states."""
         record = self.record
         count = int(record.counts[0])
         record.counts[0] = 0
@@ -109,7 +112,7 @@ class Interpolants:
         return record.pending_event[:count], record.pending_t[:count]
 
     def warn(self) -> None:
-        """Warn about states that were not projected since the last call."""
+        """Warn if projections of interpolated states have failed since the last call of this function."""
         missed = self.record.missed
         if missed[0] > 0:
             others = f", and {missed[0] - 1:.0f} more" if missed[0] > 1 else ""
@@ -235,7 +238,9 @@ class _AtRest(AtRealTimes):
 
 
 def solution(interpolants: Interpolants, pieces: Array, t_end: float, y_end: Array) -> OdeSolution:
-    """Return the dense output over a run from its interpolants (m, floats); `y_end` is the state at its end.
+    """Return the dense output over a run from the interpolants of its steps, `pieces` (m, floats).
+
+    `t_end` and `y_end` are the time and the state at the end of the run.
 
     If an event ended the run at the beginning of a step, the dense output extends to the end of that step.
     """

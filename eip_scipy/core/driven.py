@@ -100,7 +100,7 @@ class Driven(Ordered):
 
 
 class Stepper:
-    """The solver of one run, made in its first step.
+    """Maker of the steps of one run, by a solver of SciPy that is created in the first step.
 
     Attributes
     ----------
@@ -123,12 +123,12 @@ class Stepper:
         self._counted = dict.fromkeys(COUNTERS, 0)
 
     def begin(self, rhs: Derivative, start: Any, stepping: Stepping, jacobian: Jacobian | None) -> None:
-        """Prepare the steps of a run that starts at (t, y, f, length of the first step).
+        """Prepare the steps of a run; `start` consists of t, y, f and the length of the first step.
 
         Raises
         ------
         ValueError
-            If SciPy's solver does not take such a state or tolerance.
+            If the state is complex or `rtol` differs between components, and SciPy's solver does not accept that.
         """
         (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
         if y.dtype.kind == "c" and not self.method.takes_complex:
@@ -159,7 +159,7 @@ class Stepper:
         if lacking:
             raise NotImplementedError(
                 f"EIP{self.method.name} uses attributes of scipy.integrate.{self.method.name} that SciPy "
-                f"{scipy.__version__} does not have: {', '.join(lacking)}. Use another version of SciPy, or report it."
+                f"{scipy.__version__} does not have: {', '.join(lacking)}. Use another version of SciPy."
             )
         self._watch(solver)
         return solver
@@ -167,8 +167,9 @@ class Stepper:
     def fill(self, w: Work, t: float, y: Array, again: bool) -> tuple[float, float] | None:
         """Make a step from the state y into the buffers `w`.
 
-        `again`: the step replaces the last one, whose projection has failed, and has half its length. The function
-        returns the end of the step and the length of the next one, or None if the solver finds no step short enough.
+        With `again` the step replaces the last one, whose projection has failed, and is at most half as long. The
+        function returns the time at the end of the step and the length of the next step, or None if the solver of SciPy
+        fails because the step would become too short.
         """
         if self.solver is None:
             self.solver = self._made()
@@ -218,7 +219,7 @@ class Stepper:
         return [name for name in vars(self.solver) if name.startswith("LU")]
 
     def state(self) -> dict[str, Any] | None:
-        """Return the values from which another solver continues to the same bits; None before the first step."""
+        """Return the values from which another stepper continues with the same bits; None before the first step."""
         if self.solver is None:
             return None
         values = {
@@ -241,7 +242,7 @@ class Stepper:
         """Change the solver so that it keeps values of a step that `_error` needs."""
 
     def _move(self, y: Array) -> None:
-        """Put the solver into the projected state y."""
+        """Set the state of SciPy's solver to the projected state y."""
         raise NotImplementedError
 
     def _error(self, h: float) -> Array:

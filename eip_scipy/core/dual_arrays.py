@@ -45,7 +45,10 @@ def for_duals(fun: Any, dual: Dual) -> Any:
 
 
 def _replaced(item: Any, others: dict[int, Any]) -> Any:
-    """Return the replacement of a global or closure variable in a copied function; `others` contains earlier ones."""
+    """Return the replacement of a global or closure variable in a copied function, or the variable if there is none.
+
+    `others` maps the id of each object to its replacement. Copies of jitted functions are added to it.
+    """
     if id(item) in others or not is_jitted(item):
         return others.get(id(item), item)
     source = item.py_func

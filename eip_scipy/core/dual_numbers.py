@@ -129,7 +129,7 @@ def _times(builder: Any, number: Any, vector: Any) -> Any:
 
 @intrinsic
 def seed(typingctx, kind, value, lane):
-    """Return the dual whose derivative is 1 in `lane` and 0 in the others; 0 everywhere if there is no such lane."""
+    """Return the dual of `value` whose derivative is 1 in `lane`, if that lane exists, and 0 in all others."""
     dual = kind.instance_type
 
     def emit(context, builder, sig, args):
@@ -142,7 +142,7 @@ def seed(typingctx, kind, value, lane):
 
 @intrinsic
 def directed(typingctx, kind, value, slope):
-    """Return the dual whose derivative is `slope` in its only lane."""
+    """Return the dual of `value` whose derivative is `slope` in its only lane."""
     dual = kind.instance_type
 
     def emit(context, builder, sig, args):
@@ -199,7 +199,7 @@ def _is_dual(*kinds: Any) -> bool:
 def _define(emit: Callable[..., Any], *functions: Any, compares: bool = False) -> None:
     """Define frequent operations directly in LLVM, because Numba takes longer to compile those written in Python.
 
-    ``emit(builder, *values)`` returns the value and the derivative by each argument; for a comparison only the value.
+    ``emit(builder, *values)`` returns the value and the derivative by each argument; with `compares` only the value.
     """
 
     def lower(context, builder, sig, args):
@@ -318,7 +318,7 @@ def _define_binary(function: Any, slope: Callable[..., Any], other: Callable[...
 
 
 def _define_flat(function: Any, arguments: int, *names: Any) -> None:
-    """Define a function whose derivative is 0 almost everywhere or undefined: it is applied to the values."""
+    """Define a function whose derivative is 0 almost everywhere or undefined, as the plain function of the values."""
 
     def typed(x, y):
         return (lambda x, y: function(value_of(x), value_of(y))) if _is_dual(x, y) else None

@@ -2,8 +2,8 @@
 
 At the start a rate or a gradient may vanish, or a function may take another branch than later. So the invariants are
 checked again after 10, 100, 1000, ... steps and at the end. Steps that the engine suspects are examined, too (`suspect`
-in engine/cpp/trust.hpp): an invariant changes along the flow there, a correction is large, or the local error of some
-part of the state is large, which the invariants need not show.
+in engine/cpp/trust.hpp): steps in which an invariant changes along the flow, a correction is large, or the local error
+of some part of the state is large. The invariants need not show such an error.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Examiner:
     figures : ndarray, shape (l, N_FIGURES)
         The figures of the run's corrections, in which the examiner also stores rates of change.
     resolution : callable
-        ``resolution(rhs, t, h, y, end_of_run)``: see `unresolved`.
+        ``resolution(rhs, t, h, y, end_of_run)``: `resolution.unresolved` with the method and the groups of the run.
     largest : float
         The largest correction at the time of the last examination of a large correction.
     """
@@ -88,7 +88,10 @@ class Examiner:
         return self._unless_refused(_complaint, rhs, t, y, True)
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
-        """Return a finding about the step that the engine suspects, or None. The engine may then suspect another."""
+        """Return a finding about the step that the engine suspects, or None.
+
+        `suspect` is the engine's record of that step. It is cleared, so that the engine may record another step.
+        """
         reason, t_old, t_new = suspect[REASON], float(suspect[SUSPECT_FROM]), float(suspect[SUSPECT_TO])
         suspect[REASON] = NOTHING
         old, new = np.split(suspect[N_SUSPECT:].copy().view(self.invariants.dtype), 2)
@@ -172,9 +175,10 @@ def _along_chord(
     ends: tuple[Array, Array],
     waited: int,
 ) -> str | None:
-    """Return a finding between the two ends of a step with a large correction, or in the steps before it, or None.
+    """Return a finding about states between the ends of a step with a large correction, or in steps before it, or None.
 
-    The `waited` steps before it were not projected, and each of them may be the cause of the correction.
+    The `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing
+    is examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
     """
     largest = float(examiner.figures[:, NU].max(initial=0.0))
     if largest < GROWTH * examiner.largest:
@@ -192,7 +196,10 @@ def _along_chord(
 def _on_the_way(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, start: tuple[float, Array], h: float, steps: int
 ) -> str | None:
-    """Return a finding on the trajectory that led to a state, or None; it is followed back for about `steps` steps."""
+    """Return a finding about the trajectory that led to `start`, or None.
+
+    The trajectory is followed backwards for about `steps` steps of length h.
+    """
     (t, y), part = start, h / BACK
     begin = known.t_span[0]
     # More than `steps` steps of length h are followed, because earlier steps may have been longer.

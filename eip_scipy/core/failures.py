@@ -15,26 +15,31 @@ __all__ = ["failure", "projection_failure"]
 
 
 def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
-    """Return the message for a failed projection, with the invariant that has the largest residual, and the rank."""
+    """Return the message for a failed projection: the largest residual, and the rank of the gradients.
+
+    Residuals are compared in units of the dead bands within which they are not corrected.
+    """
     excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
     broken = [name for name, row in zip(invariants.names, work.G, strict=True) if not np.isfinite(row).all()]
     because = f"; the gradient of {broken[0]!r} is not finite there" if broken else ""
     return (
-        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
-        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}{because}"
+        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r} has a residual of "
+        f"{work.defect[worst]:.3g}; the gradients have rank {int(work.counters[LAST_RANK])} of {invariants.size}"
+        f"{because}"
     )
 
 
 def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
-    """Return the message for a failed step."""
+    """Return the message for a failed step, from the status code and the clock of the engine."""
     if status == NOT_FINITE:
         return _not_finite(run, clock[TIME], clock[LENGTH])
     if status == TOO_SMALL:
         return OdeSolver.TOO_SMALL_STEP
     if status == UNSTABLE:
         return _unstable(run)
-    return projection_failure(run.invariants, run.work, clock[TIME_NEW])
+    message = projection_failure(run.invariants, run.work, clock[TIME_NEW])
+    return f"{message}. Use a shorter step or tighter tolerances"
 
 
 def _unstable(run: Run) -> str:
@@ -43,8 +48,8 @@ def _unstable(run: Run) -> str:
     assert history is not None  # only multistep methods return this code
     t = history.t0 + int(history.place[NEWEST]) * history.h
     return (
-        f"the step is too long, or the motion not smooth, at t={t:.10g}: differences of the accelerations of order "
-        f"{history.predict_q.size} are not small compared with the accelerations for h={abs(history.h):g}. "
+        f"the step is too long, or the motion not smooth, at t={t:.10g}: with h={abs(history.h):g} the differences "
+        f"of order {history.predict_q.size} of the accelerations are not small compared with the accelerations. "
         "Use a shorter step, or a one-step method such as EIPRKN12 if there are close encounters or forces that jump"
     )
 

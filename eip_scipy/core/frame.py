@@ -1,4 +1,4 @@
-"""The frame (C, S): linear invariants that corrections must not change."""
+"""The frame (C, S): linear constraints that the correction leaves unchanged."""
 
 from __future__ import annotations
 
@@ -23,12 +23,14 @@ NO_FRAME = FrameRows(np.zeros((2, 1), INDEX), np.zeros(0, INDEX), np.zeros(0), n
 
 
 def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
-    """Return the frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1, over float views.
+    """Return the frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1.
+
+    The rows act on the floats of the state, `width` of which represent a component: 2 for a complex state, else 1.
 
     Raises
     ------
     ValueError
-        If the shapes disagree or C S is singular.
+        If the shapes disagree, C S is singular, or C or S is complex for a real state.
     """
     if frame is None:
         return NO_FRAME
@@ -39,7 +41,10 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).") from None
     k = C.shape[0]
     if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
-        raise ValueError(f"frame: C has shape {C.shape} and S {S.shape}; expected (k, {n}) and ({n}, k).")
+        raise ValueError(
+            f"frame: C has shape {C.shape} and S {S.shape}; expected real or complex numbers of shapes (k, {n}) and "
+            f"({n}, k)."
+        )
     rows = _rows if C.size <= SMALL else _rows.__wrapped__
     found = rows((C.tobytes(), C.dtype.str), (S.tobytes(), S.dtype.str), n, width)
     return found._replace(products=np.zeros_like(found.products))  # which each run writes
@@ -57,7 +62,10 @@ def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width:
 
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
-    """Return a mask of the gradients (rows of G) that are combinations of rows of C, which the frame removes."""
+    """Return a mask of the gradients (rows of G) that are linear combinations of rows of C.
+
+    The frame removes corrections along such gradients.
+    """
     return np.array(BUILD.spanned(frame, G, SPANNED), bool)
 
 
@@ -84,7 +92,7 @@ def _real_form(a: np.ndarray) -> np.ndarray:
 
 
 def _by_bodies(a: np.ndarray) -> np.ndarray:
-    """Return weights (k, b) of b bodies if `a` (3 k, 3 k b) sums x, y and z of k groups of them; otherwise none."""
+    """Return weights (k, b) if `a` (3 k, 3 k b) sums x, y and z of b bodies in each of k groups; else (0, 0) zeros."""
     groups = a.shape[0] // 3
     if groups == 0 or a.shape[1] % (3 * groups):
         return np.zeros((0, 0))

@@ -45,9 +45,9 @@ class NumericalGradient:
     takes_complex : bool
         False for functions that cannot be called with complex states.
     t, y
-        The start.
+        Time and state at the start.
     floors : ndarray, shape (n,)
-        See `typical_sizes`.
+        Sizes of small components, see `typical_sizes`.
     extra : tuple
         The run's arguments.
     """
@@ -85,7 +85,7 @@ class NumericalGradient:
     def _takes_complex_steps(self, t: float, y: Array, extra: tuple) -> bool:
         """Return True if the function accepts complex states and is analytic near the start.
 
-        It is evaluated near y, because derivatives of abs(y_k) and similar terms may happen to vanish at y itself.
+        The test states are near y, because derivatives of abs(y_k) and similar terms may happen to vanish at y itself.
         """
         real = self._fun(t, y, extra)
         try:
@@ -112,8 +112,8 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
     """Return the gradient of value(y) by central differences of order 6, with shifts in units of |y_k| + floor_k.
 
     If differences of order 4 disagree, as near a singularity that is closer than the state's size, the shifts are
-    shortened until both agree. If they never agree, the shift with the best agreement is used. The engine computes
-    the same bits (engine/cpp/differences.hpp).
+    shortened until both agree. If they never agree, the shift with the best agreement is used. The engine's
+    differences (engine/cpp/differences.hpp) have the same bits.
     """
 
     def along(k: int, unit: complex) -> Any:
@@ -137,7 +137,10 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
 
 
 def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: complex) -> tuple[Array, float]:
-    """Return the differences of order 6 for y_k, and the excess of their disagreement with those of order 4."""
+    """Return the differences of order 6 for y_k, not yet divided by the shift, and how far those of order 4 disagree.
+
+    The disagreement is the largest one among the values, as a multiple of what is allowed.
+    """
     sums, lower, largest = np.zeros(()), np.zeros(()), np.zeros(())
     for (multiple, weight), lower_weight in zip(DIFFERENCE_WEIGHTS, LOWER_WEIGHTS, strict=True):
         ends = [y.copy(), y.copy()]
@@ -153,9 +156,10 @@ def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: comple
 
 
 def typical_sizes(y: Array, f: Array, tau: float) -> Array:
-    """Return for each component its motion in a step, which is used as its size if the component is smaller.
+    """Return for each component a size that is added to |y_k|, so that shifts do not vanish with the component.
 
-    Components without any motion get the largest size of the others, or 1.
+    The size is the motion of the component in a step, and at least 1e-3 |y_k|. If both are 0, it is the largest size of
+    the other components, or 1 if all are 0.
     """
     floors = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
     floors = np.maximum(floors, 1e-3 * np.abs(y))
@@ -165,7 +169,10 @@ def typical_sizes(y: Array, f: Array, tau: float) -> Array:
 
 @lru_cache
 def random_directions(n: int, is_complex: bool) -> Array:
-    """Return two directions, the same in each run. They are cached, because making a generator takes long."""
+    """Return two random directions (2, n), which are the same in each run.
+
+    They are cached, because it takes long to make a generator of random numbers.
+    """
     rng = np.random.default_rng(20220)
     parts = rng.standard_normal((2, 2 if is_complex else 1, n))
     return parts[:, 0] + 1j * parts[:, 1] if is_complex else parts[:, 0]

@@ -132,7 +132,7 @@ def is_number(value: Any) -> bool:
 
 
 def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
-    """Return an integer option; raise ValueError unless it is >= 1."""
+    """Return an integer option; raise ValueError unless it is from 1 to `most`."""
     if type(value) is int and 1 <= value <= most:
         return value
     refuse_units(**{name: value})
@@ -172,7 +172,7 @@ def require_arguments(fun: Callable[..., Any], given: Sequence[str], what: str, 
 
 
 def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool:
-    """Return True if a function accepts the given arguments without the time."""
+    """Return True if a function accepts all given arguments except the time, and its first argument is not the time."""
     try:
         signature.bind(*given[1:])
     except TypeError:
@@ -182,12 +182,12 @@ def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool
 
 
 def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any, what: str, t: float) -> np.ndarray:
-    """Return the array that a user's in-place function fills, starting from NaN.
+    """Return the array that a user's in-place function fills; it is filled with NaN before the call.
 
     Raises
     ------
     TypeError
-        If the function returns a value.
+        If the function returns anything but None or the array itself.
     ValueError
         If the function does not fill the whole array, or reads it before it fills it.
     """

@@ -50,8 +50,8 @@ RATE_ROUNDINGS = 100.0
 ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
 DOUBLE = (
-    "Compute it in double precision: with JAX jax.config.update('jax_enable_x64', True), with PyTorch by tensors and "
-    "parameters of torch.float64"
+    "Compute it in double precision: with JAX call jax.config.update('jax_enable_x64', True), with PyTorch use tensors "
+    "and parameters of torch.float64"
 )
 WRONG = "Projecting on it gives a wrong solution"
 MISSING = "Add that constraint to the invariants, and start on it"
@@ -84,8 +84,10 @@ class Complaint(NamedTuple):
 class _Samples(NamedTuple):
     """A state, its derivative, and the invariants at and near the state.
 
-    `directions` are the test directions (2, n), scaled by the motion of the components; `ends` holds the values
-    (2, 2, l) at distances of the first of `CHECK_STEPS` to both sides. `G` and `here` are the gradients and values.
+    `tau` is the length of a step, and `span` (n,) the distance that each component moves in about a step. `directions`
+    are the test directions (2, n), scaled by `span`. `G` (l, n) and `here` (l,) are the gradients and values at the
+    state. `ends` (2, 2, l) are the values at y + s * directions and y - s * directions, where s is the first of
+    `CHECK_STEPS`.
     """
 
     t: float
@@ -108,7 +110,10 @@ def complaints(
     rhs: Derivative | None,
     evaluated: tuple[Array, Array] | None = None,
 ) -> Iterator[Complaint]:
-    """Yield findings about the precision of invariants, or else their gradients, or else their rates of change.
+    """Yield findings about the invariants at a state.
+
+    Their precision is checked first. If there is no finding, their gradients are checked, and then, if there is no
+    finding again, their rates of change.
 
     Parameters
     ----------
@@ -163,7 +168,7 @@ def _blurred(at: _Samples) -> list[Array]:
 
 
 def _rounding(known: InvariantSet, at: _Samples, ways: Array) -> Array:
-    """Return the changes (k, l) of the derivatives along `ways` when the state changes by roundings."""
+    """Return the changes (k, l) of the derivatives along k vectors, `ways`, when the state changes by roundings."""
     blurred = [known.gradients(at.t, state, at.f) - at.G for state in _blurred(at)]
     return BLUR * np.abs(np.array(blurred)[:, None] * ways[:, None]).sum(axis=3).max(axis=0)
 
@@ -183,7 +188,7 @@ def _rounding_of_rates(known: InvariantSet, at: _Samples, unit: float, rhs: Deri
 
 
 def _are_single(values: Array) -> Array:
-    """Return a mask of the columns of `values` (m, k) in single precision that use more than half of its bits."""
+    """Return a mask of the columns of `values` (m, k) that are exact in float32 and use more than half of its bits."""
     values = np.ascontiguousarray(values, float)
     with np.errstate(over="ignore", invalid="ignore"):
         exact = values.astype(np.float32).astype(float) == values
@@ -239,7 +244,7 @@ def _vary_in_single(found: list[Array]) -> bool:
 
 
 def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
-    """Yield a finding for each gradient that disagrees with differences, along the first direction with such a one."""
+    """Yield a finding for each gradient that is wrong in the first test direction in which any gradient is wrong."""
     along, terms = (at.directions @ at.G.conj().T).real, np.abs(at.directions) @ np.abs(at.G).T
     # The terms inside an invariant may be larger than its value and than the products of gradient and state.
     inner = known.norm_products(at.G, at.span)
@@ -268,14 +273,15 @@ def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
 
 
 def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, along: float) -> Complaint:
-    name, where = known.names[k], f"along a test direction at t={t:.6g} its derivative is {difference:.6g}"
+    name = known.names[k]
+    where = f"the derivative of the invariant along a test direction at t={t:.6g} is {difference:.6g}"
     if known.computed[k]:
         return Complaint(
             False,
             f"the gradient of invariant {name!r}, which is computed from its values, is not accurate: {where} by short "
             f"differences and {along:.6g} by the gradient. The function is not smooth there, or its values have few "
             "digits",
-            "Give Invariant its gradient, grad=",
+            "Pass the gradient to Invariant as grad=",
         )
     return Complaint(
         True,
@@ -288,7 +294,9 @@ def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, al
 
 
 class _Rates(NamedTuple):
-    """Rates of change (l,), the sums of their terms, their explicit time derivatives, and a mask of the wrong ones.
+    """Rates of change (l,), the sums of their terms' absolute values, the partial time derivatives, the wrong rates.
+
+    `in_time` is divided by the largest component of the state's derivative; `wrong` is a mask.
 
     The given rate of a balance is subtracted from its rate of change. Balances without a given rate have NaN.
     """
@@ -362,7 +370,8 @@ def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wro
     rate = known.balances.known(at.t, at.y, at.f)[worst]
     text = (
         f"the rate of balance {known.names[worst]!r} is wrong: at t={at.t:.6g} rate returned {rate:.10g}, and "
-        f"grad @ f + dF/dt is {rate + found.rate[worst]:.10g}, where the terms sum to {found.terms[worst]:.3g}"
+        f"grad @ f + dF/dt is {rate + found.rate[worst]:.10g}, and the absolute values of the terms of this sum add up "
+        f"to {found.terms[worst]:.3g}"
     )
     text += f"; the same holds for {listed(others)}" if others else ""
     return Complaint(False, text, "Correct rate, or omit it to have it computed", category=ProjectionWarning)
@@ -370,16 +379,16 @@ def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wro
 
 def _no_invariant(name: str, t: float, rate: float, terms: float) -> str:
     return (
-        f"{name!r} is not an invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, where the terms "
-        f"of that rate sum to {terms:.3g}"
+        f"{name!r} is not an invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, and the "
+        f"absolute values of the terms of that rate sum to {terms:.3g}"
     )
 
 
 def _depends_on_others(name: str, t: float, rate: float, terms: float) -> str:
     return (
-        f"{name!r} is kept only where its rate of change is 0, as a length is while the velocity along it is 0, and at "
-        f"t={t:.6g} that rate is {rate:.3g}, where its terms sum to {terms:.3g}: a constraint on which it depends is "
-        "missing or not met, such as the velocity constraint that belongs to a length"
+        f"{name!r} is kept only where its rate of change is 0, as a length is while the velocity along it is 0, but at "
+        f"t={t:.6g} that rate is {rate:.3g}, and the absolute values of its terms sum to {terms:.3g}: a constraint on "
+        f"which {name!r} depends is missing or not met, such as the velocity constraint that belongs to a length"
     )
 
 
@@ -415,9 +424,8 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
 def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Array, tau: float) -> tuple[Array, Array]:
     """Return the partial time derivatives (l,) of the invariants and their rounding errors (l,).
 
-    Only times inside the run's interval are used.
-
-    The rounding is infinite if the interval has no other time, because the derivative is then unknown.
+    Only times inside the run's interval are used. If the interval contains no time other than t, the rounding errors
+    are infinite, because the derivatives are then unknown.
     """
     none = np.zeros(known.size)
     low, high = min(known.t_span), max(known.t_span)

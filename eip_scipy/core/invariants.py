@@ -88,8 +88,8 @@ class Invariant:
     name : str, optional
         Name in messages and diagnostics. Default: the name of the function.
     scale : float or array_like, shape (l_i,), optional
-        Size of the terms that cancel in `fun`, in the unit of `fun`: residuals below four rounding errors of it are not
-        corrected. Needed only if neither the value nor ``sum_k |G_k y_k|`` has that size.
+        Size of the terms that cancel in `fun`, in the unit of `fun`: residuals below four rounding errors of this size
+        are not corrected. Needed only if neither the value nor ``sum_k |G_k y_k|`` has that size.
     in_place : bool, optional
         ``grad(t, y, out, *args)`` fills ``out``, (n,) for a scalar invariant, else (l_i, n).
     uses_f : bool, optional
@@ -103,8 +103,8 @@ class Invariant:
 
     C functions are given as `scipy.LowLevelCallable`, ctypes or cffi function pointers, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
-    ``int G(double t, const double *y, const double *f, double *out, const double *params)``; f is the derivative with
-    ``uses_f=True`` and holds nothing else. See :doc:`/tutorials/c-functions`.
+    ``int G(double t, const double *y, const double *f, double *out, const double *params)``; f is the derivative of
+    the state only with ``uses_f=True``; otherwise its content is undefined. See :doc:`/tutorials/c-functions`.
 
     Examples
     --------
@@ -187,9 +187,9 @@ class JointInvariants(tuple[Invariant, ...]):
     """Tuple of scalar invariants whose projection needs two passes over the state and stores no gradients.
 
     It is meant for large fields, whose gradients would fill memory. Pass it as ``invariants=``. Interpreted runs with
-    the euclidean metric, ``direction="new"``, one Newton step and no frame call `moments` and `shift` in place of the
-    invariants' values and gradients. All other runs, and steps whose gradients are nearly parallel, call the values
-    and gradients.
+    the euclidean metric, ``direction="new"`` and one Newton step, without a frame, balances, compensated summation or
+    ``every="auto"``, call `moments` and `shift` in place of the invariants' values and gradients. All other runs, and
+    steps whose gradients are nearly parallel, call the values and gradients.
 
     Parameters
     ----------
@@ -271,9 +271,9 @@ def _of_function(fun: Callable[..., Any]) -> Invariant:
 
 
 def _apart(fun: Any, grad: Any, args: Sequence[Any]) -> tuple[Any, Any, Sequence[Any]]:
-    """Return `fun`, `grad` and `args`, with functions of another invariant freed of its arguments.
+    """Return `fun`, `grad` and `args`, where one function or both come from the attributes of another invariant.
 
-    The arguments of the other invariant are used if `args` is empty.
+    Such functions are returned without that invariant's arguments, which take the place of `args` if it is empty.
     """
     functions = [found.function if isinstance(found, OwnArguments) else found for found in (fun, grad)]
     own = next(found.args for found in (fun, grad) if isinstance(found, OwnArguments))
@@ -281,7 +281,7 @@ def _apart(fun: Any, grad: Any, args: Sequence[Any]) -> tuple[Any, Any, Sequence
 
 
 def _lacks_gradient(item: Invariant) -> bool:
-    """Return True if an invariant is jitted and lacks a gradient, which a compiled run needs."""
+    """Return True if an invariant is jitted without `grad` and without `args`, so that a gradient can be compiled."""
     return item.gradient is None and not item.args and is_jitted(item.function) and not jit_is_off()
 
 
@@ -303,7 +303,7 @@ def _scale(scale: Any) -> Any:
 
 
 def _labels(items: Sequence[Invariant]) -> list[str]:
-    """Return the names in messages: the given ones, else those of the functions if they are distinct."""
+    """Return the names of the items in messages: given names, else unique names of functions, else "invariant k"."""
     found = [item.name or getattr(item.function, "__name__", "<lambda>") for item in items]
     return [
         name if item.name or (name.isidentifier() and found.count(name) == 1) else f"invariant {k}"
@@ -374,8 +374,8 @@ def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype
 
 def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple, extra: tuple) -> None:
     given = (*first, *(f"args[{k}]" for k in range(len(args))), *names(extra))
-    last = f"take the run's {names(extra)[0].partition('[')[0]} as its last arguments" if extra else "those of the call"
-    advice = f"It must take t, y, its own arguments, Invariant(..., args=(...,)), and {last}."
+    last = f"the {names(extra)[0].partition('[')[0]} of the run" if extra else "those of the call"
+    advice = f"It must accept {', '.join(first)}, then its own arguments, Invariant(..., args=(...,)), then {last}."
     require_arguments(fun, given, what, advice)
 
 
@@ -390,18 +390,18 @@ class InvariantSet:
     t0, y0, f0, tau
         The start: time, state, derivative, and the length of a step.
     extra : tuple
-        The run's further arguments (its `params`, if any).
+        The run's further arguments: its `args`, or its `params` as one array.
     tell : bool
         Whether to warn of the cost and the accuracy of gradients that are not given.
     t_bound : float, optional
         The end of the run. Invariants are evaluated only at times from t0 to t_bound. Default: only at t0.
     rhs : callable, optional
-        ``rhs(t, y) -> (n,)``, the system, for checks.
+        ``rhs(t, y) -> (n,)``, the right-hand side of the system, for checks.
 
     Attributes
     ----------
     balances : Carried
-        The balances among the invariants. Their entries of `target` are the values that the run carries.
+        The balances among the invariants. Their entries of `target` are the values that the run integrates.
     kinds : Grouping or None
         Groups of components that have the same unit, see `kinds_of`. None if the units are unknown.
     given : ndarray of bool, shape (l,)
@@ -478,7 +478,7 @@ class InvariantSet:
 
     @cached_property
     def floors(self) -> Array:
-        """Return the sizes (n,) below which components count as this large, see `typical_sizes`."""
+        """Return the sizes (n,) that are added to those of the components, see `typical_sizes`."""
         return typical_sizes(*self._start)
 
     @property
@@ -512,7 +512,7 @@ class InvariantSet:
             if isinstance(grad, NumericalGradient) and not grad.complex_step and label not in self.by_differences:
                 warnings.warn(
                     f"invariant {label!r} has no grad and allows no complex step: its gradient comes from central "
-                    "differences of order 6 (about 1e-12 relative). Give grad for full accuracy and speed.",
+                    "differences of order 6 (relative error about 1e-12). Give grad for full accuracy and speed.",
                     UserWarning,
                     stacklevel=users_level(),
                 )
@@ -548,15 +548,15 @@ class InvariantSet:
         return np.where(self.balances.mask, np.nan, self.target)
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the rates of the balances in the form that the engine calls: `functions`, or functions of Python."""
+        """Return the rates of the balances in the form that the engine calls: `functions` if given, else in Python."""
         low, high = min(self.t_span), max(self.t_span)
         return self.balances.rates(low, high, time_shift(self.tau, adaptive, self.t_span), functions)
 
     def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
         """Return the invariants with the values that the run keeps as their targets, for a run that continues it.
 
-        `at_end`: the new run starts at the end of the last step, so that balances continue from the values that this
-        run carries. At any other state they start again from their values there.
+        With `at_end` the new run starts at the end of the last step, and balances continue from the values that this
+        run has integrated. Otherwise it starts at another state, and balances start again from their values there.
         """
         kept = list(map(copied, self.items))
         for k, item in enumerate(kept):
@@ -586,7 +586,10 @@ class InvariantSet:
         return item
 
     def _calls(self, shapes: list[tuple[int, ...]], y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
-        """Return the functions of values, of the given shapes, and of gradients in the form that the engine calls."""
+        """Return the functions of values and those of gradients in the form that the engine calls.
+
+        `shapes` contains the shape of the values of each item.
+        """
 
         def value(k: int) -> Call:
             label, shape = self.labels[k], shapes[k]
@@ -683,7 +686,7 @@ class InvariantSet:
         return ~(self._excess(t, y, f) <= 1.0)
 
     def _excess(self, t: float, y: Array, f: Array) -> Array:
-        """Return the distances (l,) from the targets, as multiples of the distances that are allowed."""
+        """Return the distances (l,) from the targets, as multiples of the distances that `misses` allows."""
         G, values = self.gradients(t, y, f), self.values(t, y)
         allowed = TARGET_TOLERANCE * self.sizes_of_terms(y, G, values)
         allowed += TARGET_ROUNDINGS * EPS * self.norm_products(G, y)
@@ -692,7 +695,7 @@ class InvariantSet:
             return np.where(residual == 0, 0.0, residual / allowed)
 
     def note_rates(self, figures: Array, t: float, y: Array, f: Array, G: Array, here: Array) -> None:
-        """Raise the largest rates of change along f in `figures`, relative to the terms of these rates.
+        """Update the largest rates of change along f in `figures`, relative to the terms of these rates.
 
         `G` and `here` are the gradients and the values at the state. The given rate of a balance is subtracted from its
         rate of change. Rates of balances without a given rate are not noted.
@@ -731,7 +734,7 @@ class InvariantSet:
         Raises
         ------
         ValueError
-            If a given gradient disagrees with the difference of its invariant, or values have single precision.
+            If a given gradient disagrees with differences of its invariant's values, or values have single precision.
 
         Warns
         -----
@@ -763,7 +766,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     y : array_like, shape (n,)
         State at which to compare; real or complex.
     fun : callable, optional
-        ``fun(t, y)``, the system, needed by an invariant with ``uses_f=True``.
+        ``fun(t, y)``, the right-hand side of the system, needed for an invariant with ``uses_f=True``.
 
     Returns
     -------
@@ -779,7 +782,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     refuse_units(t=t, y=y)
     y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)
     if invariant.uses_f and fun is None:
-        raise ValueError("check_gradient: this invariant's grad uses f; pass fun=.")
+        raise ValueError("check_gradient: this invariant's grad uses f, the derivative of the state; pass fun=.")
     f = np.asarray(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)
     size = np.where(y == 0, np.max(np.abs(y), initial=0.0) or 1.0, np.abs(y))
     G = InvariantSet(invariant, t, y, f, 0.0).gradients(t, y, f)

@@ -1,4 +1,4 @@
-"""Recognition of Numba functions without an import of Numba: if it is not imported, there are none."""
+"""Recognition of Numba functions without importing Numba: before Numba is imported, there are none."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def jitted(fun: Any) -> Any:
 
 
 def is_compiled(fun: Any) -> bool:
-    """Return True if Numba functions can call `fun`, which is a Numba function or one of the library."""
+    """Return True if Numba functions can call `fun`: if it is a Numba function or a `LibraryFunction` of the engine."""
     return is_jitted(fun) or isinstance(fun, LibraryFunction)
 
 

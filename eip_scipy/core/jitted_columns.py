@@ -27,7 +27,10 @@ __all__ = [
 def rhs_by_duals(
     fun: Any, form: str, n: int, parameters: tuple[int, ...], columns: int, has_params: bool, scalars: str
 ) -> Any:
-    """Return the in-place right-hand side of a state with columns, by dual numbers: exact up to rounding.
+    """Return ``rhs(t, Y, out, ...)``, the in-place right-hand side of a state with columns, for a jitted `fun`.
+
+    The derivatives of `fun` are computed with dual numbers and are exact up to rounding. `form` is that of `fun`, see
+    `native_functions`. If `scalars` is not empty, `fun` takes numbers of these types instead of params, see `Packed`.
 
     Raises
     ------
@@ -72,7 +75,7 @@ def rhs_by_duals(
 
 
 def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) -> Any:
-    """Return a function that copies the parameters as duals, for derivatives with respect to some of them."""
+    """Return ``copied(params, Y, first)``, params as duals whose slopes are the columns of Y from `first` on."""
     if not parameters:
         return inside(lambda params, Y, first: params)
     places, lanes = np.array(parameters, np.int64), dual.lanes
@@ -89,7 +92,7 @@ def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) 
 
 
 def _with_out(fun: Any, form: str, has_params: bool, one_by_one: bool) -> Any:
-    """Return a function of (t, x, out, params) that returns the derivative; it may use `out` for it."""
+    """Return ``call(t, x, out, params)``, which returns the value of `fun`, which has this `form`; it may use out."""
     if form.endswith("place"):
         if one_by_one:
             return inside(lambda t, x, out, numbers: _second(fun(t, x, out, *numbers), out))
@@ -110,7 +113,7 @@ def _second(first, second):
 
 @lru_cache(maxsize=256)
 def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
-    """Return the in-place right-hand side of a state with columns, from a jitted ``jvp(t, y, dy, ...) -> (n,)``."""
+    """Return the in-place right-hand side of a state with columns, from jitted `fun` and ``jvp(t, y, dy, ...)``."""
     taken = n // 2 if form.startswith("acceleration") else n
     offset, in_place = n - taken, form.endswith("place")
 
@@ -148,7 +151,9 @@ def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
 
 @lru_cache(maxsize=256)
 def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...], parameters: tuple[int, ...]) -> Any:
-    """Return the derivatives ``slopes(t, y, params) -> (..., k)`` of a jitted invariant by k of its p parameters.
+    """Return ``slopes(t, y, params) -> (*shape, k)``, the derivatives of a jitted invariant by k of its p parameters.
+
+    `parameters` are the indices of the k parameters; `shape` is the shape of the value of the invariant.
 
     Raises
     ------

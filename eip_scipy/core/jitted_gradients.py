@@ -27,9 +27,10 @@ SAYING = ("No implementation", "Cannot", "Unknown")
 
 @lru_cache(maxsize=256)
 def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
-    """Return the gradient ``grad(t, y, out[, params])`` of a jitted invariant, by dual numbers: exact up to rounding.
+    """Return the gradient ``grad(t, y, out[, params])`` of a jitted invariant whose value has this `shape`.
 
-    With `scalars`, the types of some numbers, it is ``grad(t, y, out, *numbers)``.
+    It is computed with dual numbers and exact up to rounding. If `scalars` is not empty, the gradient takes numbers of
+    these types instead of params, ``grad(t, y, out, *numbers)``; see `Packed`.
 
     Raises
     ------
@@ -53,9 +54,10 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
 
 @lru_cache(maxsize=256)
 def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
-    """Return the rate ``rate(t, y, f[, params])`` of a jitted balance: its derivative along (1, f), up to rounding.
+    """Return the rate ``rate(t, y, f[, params])`` of a jitted balance whose value has this `shape`.
 
-    With `scalars`, the types of some numbers, it is ``rate(t, y, f, *numbers)``.
+    The rate is the derivative of the balance along (1, f) in (t, y), exact up to rounding. If `scalars` is not empty,
+    it takes numbers of these types instead of params, ``rate(t, y, f, *numbers)``; see `Packed`.
 
     Raises
     ------
@@ -76,18 +78,18 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
 
 
 def dual_along(directions: int) -> Dual:
-    """Return the dual type that gives derivatives along `directions` directions in the fewest equal passes."""
+    """Return the dual type that gives derivatives along `directions` directions in the fewest calls of equal size."""
     passes = -(-directions // LANES)
     return Dual(-(-directions // passes))
 
 
 def new_state(dual: Any, n: int) -> Any:
-    """Return a function that allocates a state of duals."""
+    """Return a function that allocates a state of `n` duals, on the stack if they are few."""
     return inside((lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n)), forceinline=True)
 
 
 def _slopes_of(shape: tuple[int, ...]) -> Callable[..., Any]:
-    """Return the derivatives of a value of this shape."""
+    """Return a function that returns the derivatives, along one direction, of a dual value of this shape."""
     if shape == ():
         return lambda value: slope(value, 0)
 
@@ -107,9 +109,10 @@ def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
 
 
 def compiled_for(function: Callable[..., Any], ndim: int, has_params: bool, scalars: str) -> Any:
-    """Return a function of (t, y, a, params), with a of `ndim` dimensions, compiled for real states.
+    """Compile ``function(t, y, a, params)`` for real states and an array `a` of `ndim` dimensions, and return it.
 
-    Python calls it with the parameters that the user's function takes, and the engine with the same types.
+    The compiled function takes the parameters as the user's function does: the array params, or nothing, or numbers
+    of the types `scalars`.
     """
     function = inside(function)
     floats, third = (types.Array(types.float64, dimensions, "C") for dimensions in (1, ndim))
@@ -122,7 +125,7 @@ def compiled_for(function: Callable[..., Any], ndim: int, has_params: bool, scal
 
 
 def _by_signature(function: Callable[..., Any], arguments: list[Any]) -> Any:
-    """Return a function compiled for t and these arguments."""
+    """Return `function` compiled for a float t and for further arguments of the Numba types `arguments`."""
     compiled = njit(function)
     try:
         compiled.compile((types.float64, *arguments))
@@ -133,7 +136,10 @@ def _by_signature(function: Callable[..., Any], arguments: list[Any]) -> Any:
 
 
 def put_slopes(value, out, first, count):
-    """Write derivatives of an invariant to columns of its gradient; only compiled code can call this."""
+    """Write the `count` slopes of the dual `value` to columns of the gradient `out`, starting at the column `first`.
+
+    Only compiled code can call this function.
+    """
 
 
 @overload(put_slopes)

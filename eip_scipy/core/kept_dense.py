@@ -1,4 +1,4 @@
-"""Dense output without a run's functions: the polynomial through a step's states that a pickle holds."""
+"""Dense output that can be pickled without the functions of its run: a polynomial through states of a step."""
 
 from __future__ import annotations
 
@@ -39,15 +39,16 @@ class AtRealTimes(DenseOutput):
 
 
 class KeptDenseOutput(AtRealTimes):
-    """The polynomial through states of one step, in barycentric form; the states at both ends are met exactly.
+    """The polynomial through states of one step, in barycentric form; at both ends it returns exactly the given states.
 
     Parameters
     ----------
     t_old, t : float
         Ends of the step.
     shares : ndarray, shape (k,)
-        Distinct times as shares of the step, 0 and 1 first and last.
+        Distinct times in units of the step, in increasing order: 0 is `t_old` and comes first, 1 is `t` and comes last.
     states : ndarray, shape (k, n)
+        States at these times.
     """
 
     def __init__(self, t_old: float, t: float, shares: Array, states: Array) -> None:
@@ -65,7 +66,7 @@ class KeptDenseOutput(AtRealTimes):
 
 
 def kept(t_old: float, t: float, states: Callable[[Array], Array]) -> KeptDenseOutput:
-    """Return the polynomial that approximates the states (n, m) at times (m,) over a step."""
+    """Return a polynomial that approximates ``states(times) -> (n, m)`` over the step from `t_old` to `t`."""
 
     def polynomial() -> KeptDenseOutput:
         return KeptDenseOutput(t_old, t, (times - t_old) / (t - t_old), found)
@@ -98,14 +99,18 @@ def _times(t_old: float, t: float, degree: int) -> Array:
 
 
 def _barycentric_weights(nodes: Array) -> Array:
-    """Return the barycentric weights of distinct nodes of [0, 1], whose capacity of 1/4 keeps them near 1."""
+    """Return the barycentric weights of distinct nodes in [0, 1].
+
+    A common factor of the weights has no effect. The differences are multiplied by 4, the inverse of the capacity of
+    [0, 1], so that the weights neither overflow nor underflow.
+    """
     differences = 4.0 * (nodes[:, None] - nodes)
     np.fill_diagonal(differences, 1.0)
     return 1.0 / differences.prod(axis=1)
 
 
 def _polynomial(nodes: Array, weights: Array, values: Array, at: Array) -> Array:
-    """Return the values (m, n) of the polynomial through `values` (k, n) at `nodes`."""
+    """Return the values (m, n), at the points `at` (m,), of the polynomial that has `values` (k, n) at `nodes` (k,)."""
     differences = at[:, None] - nodes
     met = differences == 0.0
     shares = weights / np.where(met, 1.0, differences)

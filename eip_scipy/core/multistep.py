@@ -33,8 +33,9 @@ DIFFERENCE = 1e-6
 class SecondOrder(NamedTuple):
     """A system q'' = a(t, q[, v]) in the form that a multistep method needs.
 
-    `jacobian`: ``jacobian(t, q, dq) -> (n/2,)``, the derivative of the accelerations along dq, or None. `frequencies`:
-    see `Problem`, or None where only the accelerations are known.
+    ``rhs(t, y) -> (n,)`` is the right-hand side of y = (q, v). ``jacobian(t, q, dq) -> (n/2,)`` is the derivative of
+    the accelerations along dq, or None. `frequencies` are the largest frequencies, as returned by the function of this
+    name of a `Problem`, or None if they are not known.
     """
 
     rhs: Callable[[float, Array], Array]
@@ -44,7 +45,7 @@ class SecondOrder(NamedTuple):
 
 
 def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Array, Array], Array]:
-    """Return a function of the product with dq, made from a user's in-place ``jacobian(t, q, dq, out, *extra)``."""
+    """Return ``product(t, q, dq)``, the Jacobian times dq, made from a user's ``jacobian(t, q, dq, out, *extra)``."""
 
     def product(t: float, q: Array, dq: Array) -> Array:
         out = np.empty_like(q)
@@ -56,19 +57,22 @@ def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Arra
 
 
 def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping, *, level: bool) -> None:
-    """Give a run of a multistep method its history, after a check of its step.
+    """Check the step of a run of a multistep method, and give the run its history.
+
+    `level` is that of `RunSpec`.
 
     Raises
     ------
     ValueError
-        If the step is longer than what is stable at the start, with one that would do; not with ``check=False``.
+        If the step is not stable at the start (not checked with ``check=False``); the message gives a stable one.
+        Also if a run with balances has too few steps for a history.
     """
     method: Any = run.tableau
     assert stepping.h is not None
     brief = stepping.span.n_steps - 1 < method.order
     if brief and run.work.level.size:
         raise ValueError(
-            f"{name} carries a Balance in its history, which takes more than {method.order} steps; this run has "
+            f"{name} carries a Balance in its history, which needs more than {method.order} steps, but this run has "
             f"{stepping.span.n_steps}. Take a shorter step, or a Runge-Kutta method such as EIPDOP853."
         )
     check = run.options.limit < math.inf  # the option of this name bounds the shares of corrections
@@ -77,7 +81,10 @@ def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping,
 
 
 def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, check: bool) -> slice:
-    """Return a mask of the floats of the accelerations that the Jacobian corrects; `check`: reject an unstable step."""
+    """Return the slice of the floats of the accelerations that the Jacobian corrects.
+
+    With `check`, raise a ValueError if the step h is not stable at the start.
+    """
     y0 = system.start.y
     half = y0.size // 2
     plain = stability_limit(method.order, False)
@@ -96,17 +103,17 @@ def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, chec
         fastest, limit = (planets, limit) if planets * plain >= moons * limit else (moons, plain)
     if check and not h * fastest <= limit:
         raise ValueError(
-            f"{name}: h = {h:g} is not stable for a motion as fast as the fastest one at the start, of frequency "
-            f"{fastest:.4g} (period {2 * np.pi / fastest:.4g}). Take h <= {limit / fastest:.3g}, or a method whose "
-            "steps are less bound, such as EIPRKN12."
+            f"{name}: h = {h:g} is not stable for the fastest motion at the start, of angular frequency {fastest:.4g} "
+            f"(period {2 * np.pi / fastest:.4g}). Take h <= {limit / fastest:.3g}, or a method that is stable with "
+            "longer steps, such as EIPRKN12."
         )
     if method.velocities:
         strongest, limit = _largest_damping(system), damping_limit(method.order)
         if check and not h * strongest <= limit:
             raise ValueError(
-                f"{name}: h = {h:g} is not stable for accelerations that change with the velocity as much as here, by "
-                f"{strongest:.4g} per unit of time at the start. Take h <= {limit / strongest:.3g}, or a Runge-Kutta "
-                "method such as EIPDOP853."
+                f"{name}: h = {h:g} is not stable, because the derivative of the accelerations with respect to the "
+                f"velocity is too large: its largest eigenvalue at the start has the size {strongest:.4g}. Take h <= "
+                f"{limit / strongest:.3g}, or a Runge-Kutta method such as EIPDOP853."
             )
     width = 2 if y0.dtype.kind == "c" else 1
     places = np.flatnonzero(corrected)
@@ -114,7 +121,7 @@ def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, chec
 
 
 def _largest_frequency(system: SecondOrder) -> float:
-    """Return the largest frequency of small motions at the start, from the Jacobian's most negative eigenvalue."""
+    """Return the largest angular frequency of small motions at the start, from the Jacobian's least eigenvalue."""
     t, y, _, _ = system.start
     half = y.size // 2
 
@@ -131,13 +138,13 @@ def _largest_frequency(system: SecondOrder) -> float:
 
 
 def _largest_damping(system: SecondOrder) -> float:
-    """Return the eigenvalue of largest modulus of the accelerations' derivative by the velocities at the start."""
+    """Return the largest modulus of an eigenvalue of the accelerations' derivative by the velocities at the start."""
     y = system.start.y
     return _largest(lambda d: _difference(system, d, slice(y.size // 2, None)), y)
 
 
 def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
-    """Return the change of the accelerations along a change d of a part of the state."""
+    """Return the derivative of the accelerations along d in the `part` of the state, positions or velocities."""
     t, y, f, _ = system.start
     half, length = y.size // 2, DIFFERENCE * (float(np.linalg.norm(y[part])) or 1.0)
     moved = y.copy()
@@ -146,7 +153,10 @@ def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
 
 
 def _largest(product: Callable[[Array], Array], y: Array) -> float:
-    """Return the eigenvalue of largest modulus of a matrix, to a few per cent, from its products with vectors."""
+    """Return the largest modulus of an eigenvalue of a matrix, to a few per cent.
+
+    ``product(d)`` is the matrix times d. The vectors d have the type of y and half its size.
+    """
     d, found = np.random.default_rng(0).standard_normal(y.size // 2).astype(y.dtype), 0.0
     for _ in range(ROUNDS):
         d = product(d / np.sqrt(np.vdot(d, d).real))

@@ -1,4 +1,4 @@
-"""The user's functions by address, in the form that the native engine needs: C functions and Numba functions."""
+"""Addresses of the user's functions, which the native engine calls: C functions and compiled Numba functions."""
 
 from __future__ import annotations
 
@@ -20,15 +20,30 @@ if TYPE_CHECKING:
 __all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events", "with_jacobian", "with_rates"]
 
 
-NO_DUALS = "only jitted functions of real states get one compiled"
+NO_DUALS = "a gradient is compiled only for jitted functions of real states"
 
 
 class Kind(NamedTuple):
     """Signature of a function.
 
-    `shape` of its value, () for a number; `size` of the state it gets; `p` of its params, -1 where it takes none; the
-    type of the state's numbers; whether the value is real, the function takes f, fills an argument `out`, or is a
-    gradient. `scalars`: the types of the numbers that it takes instead of params, see `Packed`.
+    Attributes
+    ----------
+    shape : tuple of int
+        Shape of the value, () for a number.
+    size : int
+        Number of components of the state that the function receives.
+    p : int
+        Number of its params; -1 if it takes none.
+    dtype : str
+        Type of the components of the state.
+    real : bool
+        Whether the value is real even if the state is complex.
+    takes_f, in_place : bool
+        Whether the user's function takes f, and whether it fills an argument `out`.
+    gradient : bool
+        Whether the engine calls it with the arguments of a gradient, which include f.
+    scalars : str
+        Types of the numbers that it takes instead of params, see `Packed`.
     """
 
     shape: tuple[int, ...]
@@ -43,14 +58,17 @@ class Kind(NamedTuple):
 
 
 class Native(NamedTuple):
-    """A function that has an address, and the number of floats that it fills; None for a gradient by differences."""
+    """A function that has an address, and the number of floats that it fills.
+
+    `function` is None for a gradient, or the rate of a balance, that the engine computes itself.
+    """
 
     function: PointerFunction | Compiled | LibraryFunction | None
     floats: int
 
     @property
     def entry(self) -> Any:
-        """The form for the engine: a function of the library itself, the address of any other function."""
+        """The form for the engine: a `LibraryFunction` or None itself, the address of any other function."""
         if self.function is None or isinstance(self.function, LibraryFunction):
             return self.function
         return self.function.address
@@ -67,7 +85,7 @@ def native_functions(
         The right-hand side, of the `form` "value", "in place", "acceleration" or "acceleration in place".
     form : str
     params : Packed or None
-        Their last arguments, where they take any; the functions read its array.
+        Last arguments of the functions, or None. The engine passes the array of `params` itself, not a copy.
     invariants : InvariantSet
     y0 : ndarray, shape (n,)
 
@@ -117,7 +135,11 @@ def native_functions(
 
 
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
-    """Return the `OfState` of a function of a state with columns of derivatives; return other functions unchanged."""
+    """Return the function that the engine calls for `fun`, and its signature.
+
+    For a function of a state with columns of derivatives both come from its `OfState`; otherwise they are `fun` and
+    `number` themselves.
+    """
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
 
@@ -207,7 +229,7 @@ def with_rates(
 
 
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:
-    """Raise the exception of a failed call in the engine, from the arguments of its `FailedCallError`.
+    """Raise the exception of a call that failed in the engine; the other arguments are those of its `FailedCallError`.
 
     Raises
     ------
@@ -227,7 +249,11 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
 
 
 def _native(fun: Any, kind: Kind, name: str, floats: int, **others: Any) -> Native:
-    """Return a function with its address; it fills `floats` floats, and has the signature of `kind` and `others`."""
+    """Return a function with its address.
+
+    `name` is its name in messages, and `floats` the number of floats that it fills. Its signature is `kind`, of which
+    `others` replaces some fields.
+    """
     if isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)
     if jit_is_off():

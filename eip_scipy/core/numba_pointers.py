@@ -36,7 +36,7 @@ class Pointer(NamedTuple):
 
 
 class Compiled(NamedTuple):
-    """A function that C can call, with all arguments."""
+    """A Numba function compiled as a C function, with its name in messages and its signature."""
 
     pointer: Pointer
     fun: Any
@@ -49,7 +49,7 @@ class Compiled(NamedTuple):
         return self.pointer.address
 
     def failure(self, t: float, y: bytes, f: bytes, params: np.ndarray) -> RuntimeError:
-        """Raise the exception of the function in a second call; return an error if it raises nothing then."""
+        """Call the function again, so that its exception propagates; return an error if it raises nothing then."""
         kind = self.kind
         state = np.frombuffer(y, kind.dtype)[: kind.size].copy()
         slope = np.frombuffer(f or bytes(len(y)), kind.dtype).copy()
@@ -63,7 +63,9 @@ class Compiled(NamedTuple):
 
 
 def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
-    """Compile a Numba function for states of one kind, with the type of numbers in `kind`, or `number`.
+    """Compile a Numba function of the signature `kind`, and return it as a C function.
+
+    `number` replaces the Numba type of the components of the state; default: the type in `kind`.
 
     Raises
     ------
@@ -84,7 +86,7 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
 
 @lru_cache(maxsize=256)
 def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
-    """Compile a function once in a process for the same kind of state."""
+    """Compile a function; the same function, signature and `number` are compiled once in a process."""
     call = _with_all_arguments(fun, kind, _inlined)
 
     def array(scalar: Any, ndim: int) -> Any:
@@ -105,7 +107,7 @@ def _c_function(compiled: Any, kind: Kind) -> Pointer:
     """Wrap a function compiled for (t, y, f, out, params) as a C function that returns 0, or -1 after an exception.
 
     The wrapper is written in LLVM's language, because Numba's `cfunc` would take twice as long to compile, and each
-    call would consist of two.
+    call would go through another function.
     """
     name = f"eip_scipy.{next(_serial)}"
     context = compiled.target_context
@@ -128,7 +130,7 @@ def _c_function(compiled: Any, kind: Kind) -> Pointer:
 
 
 def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tuple[int, ...]) -> Any:
-    """Return a C array at `data` as a value of Numba's array type without an owner."""
+    """Return the C array of this shape at `data` as a value of Numba's array type `kind`, without an owner."""
     array = context.make_array(kind)(context, builder)
     item = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     strides = np.cumprod((item, *shape[:0:-1]))[::-1].tolist()
@@ -140,7 +142,7 @@ def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tupl
 
 
 def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
-    """Return ``call(t, y, f, out, params)``, which writes the value of `fun` to out."""
+    """Return ``call(t, y, f, out, params)``, compiled by `jit`, which writes the value of `fun` to out."""
     has_params = kind.p >= 0
     numbers = _numbers(kind.scalars, jit)
     bare = jit(

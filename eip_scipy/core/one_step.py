@@ -27,11 +27,11 @@ class OneStepMethod(Protocol):
     order : int
         Order p: the error of one step is O(h^(p + 1)).
     error_estimator_order : int, optional
-        Order of the second result whose difference from the first is the error estimate. Only where `one_step`
-        returns an estimate; without one the step is fixed and the default metric euclidean.
+        Order of the second, less accurate result, whose difference from y_hat is the error estimate. It is required if
+        `one_step` returns an estimate. Without an estimate the step is fixed and the default metric is euclidean.
     evaluations : int, optional
-        Evaluations of the right-hand side, or of a part of it, in one step: what a step adds to ``nfev``. Default: 0,
-        as a method that is not ours does not show what it evaluates.
+        Evaluations of the right-hand side, or of a part of it, in one step: each step adds this number to ``nfev``.
+        Default: 0, because evaluations inside a user-defined method cannot be counted.
     name : str, optional
         Default: the name of the object's class.
     """
@@ -68,21 +68,24 @@ class OneStep(Ordered):
     Attributes
     ----------
     name, order, error_estimator_order, evaluations
-        Orders of the method and of its error estimate; None without an estimate.
-    b, c, exponent
-        Attributes of a method with one stage, the derivative at the start, and the exponent of the step control.
+        As in `OneStepMethod`; `error_estimator_order` is None without an estimate.
+    b, c : ndarray, shape (1,)
+        Coefficients of a method with one stage, the derivative at the start of the step.
+    exponent : float
+        Exponent of the step control.
 
     Raises
     ------
     TypeError
-        If the object is no `OneStepMethod`.
+        If the object is not a `OneStepMethod`.
     ValueError
         If an order is not an integer >= 1.
 
     Notes
     -----
-    f is evaluated only if a gradient takes it, because the steps themselves do not, and in a few steps by which the
-    projections are judged. ``nfev`` counts the former and the method's `evaluations`, in each step that is tried.
+    The steps do not use the right-hand side f. It is evaluated only for gradients that take f, and in a few steps to
+    judge the projections. ``nfev`` counts the evaluations for gradients and, for each step that is tried, the
+    `evaluations` of the method.
     """
 
     in_python = True
@@ -119,8 +122,8 @@ class OneStep(Ordered):
     def _pair(self, result: Any) -> tuple[Any, Any]:
         if not isinstance(result, tuple) or len(result) != 2:
             raise TypeError(
-                f"{self.name}.one_step returned {type(result).__name__}, expected the pair (y_hat, err): "
-                f"it has error_estimator_order."
+                f"{self.name}.one_step returned {type(result).__name__}, expected the pair (y_hat, err), "
+                "because the method has error_estimator_order; return both, or remove this attribute."
             )
         return result
 
@@ -136,7 +139,9 @@ def _integer(name: str, what: str, value: Any, least: int = 1) -> int:
 
 
 def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
-    """Return the value of a user's function at t as an array (n,), or raise an error that describes `came`.
+    """Return the value of a user's function at t as an array (n,).
+
+    `came` is the beginning of the error messages, such as "fun returned"; `dtype` is that of the state.
 
     Raises
     ------

@@ -98,9 +98,10 @@ def _text(kind: str, text: str) -> dict[str, str]:
 
 
 class Settled(NamedTuple):
-    """Options checked for one run: in the form for the step, given weights of the metric, and the identity of the run.
+    """The options of the projection after the checks for one run.
 
-    `identity` contains the effective value of each option that affects the bits of a run, with its name.
+    `options` are in the form that the step needs. `sigma` are the weights of the metric if the user gave an array, else
+    None. `identity` maps the name of each option that affects the bits of a run to its effective value.
     """
 
     options: Options
@@ -135,8 +136,9 @@ class ProjectionOptions:
         default=None,
         metadata=_text(
             "(C, S)",
-            """Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and the shifts S,
-            (n, k), that compensate for it; C S must be invertible.""",
+            """Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and S, of shape
+            (n, k), whose columns are the directions in which the correction is shifted for this; C S must be
+            invertible.""",
         ),
     )
     direction: str = field(
@@ -438,7 +440,7 @@ def _starts(sizes: list[int]) -> np.ndarray:
 
 
 def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
-    """Return True if `JointInvariants` can shorten the projection of this step."""
+    """Return True if `JointInvariants` can make the projections of a run with these options cheaper."""
     plain = (options.metric, options.direction, options.iterations) == (EUCLIDEAN, NEW, 1)
     free = options.frame.products.size == 0 and options.every != AUTO and not options.compensated
     return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items

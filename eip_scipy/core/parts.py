@@ -1,6 +1,8 @@
-"""Solvers of a state that is distributed over several processes: each makes the step of its part, all project together.
+"""Solvers of a state that is distributed over several processes.
 
-A subclass connects this module to a library for messages: it defines the number of the process and gathers numbers.
+Each process makes the step of its part of the state, and all processes compute the projection together.
+
+A subclass connects this module to a library for messages: it defines `place` and `gathered`.
 """
 
 from __future__ import annotations
@@ -22,10 +24,11 @@ SCALARS = {"values", "g", "band", "before", "defect", "max_defect", "max_correct
 
 
 class SolverOfParts(EIPSolver):
-    """Wrapper of a method that every process calls with its part of the state.
+    """Base class of solvers that every process makes with its part of the state.
 
     The right-hand side fills a part of the derivative. An invariant returns the same number on every process, and its
-    gradient the part of the process. Only fixed steps and the Euclidean metric are supported.
+    gradient returns only the components of this process's part. Only fixed steps and the Euclidean metric are
+    supported.
 
     Attributes
     ----------
@@ -44,7 +47,7 @@ class SolverOfParts(EIPSolver):
         raise NotImplementedError
 
     def gathered(self, a: Any) -> np.ndarray:
-        """Return the arrays `a` of all processes, stacked in the order of the processes."""
+        """Return the arrays `a` that all processes pass to this method, stacked in the order of the processes."""
         raise NotImplementedError
 
     @property
@@ -58,7 +61,10 @@ class SolverOfParts(EIPSolver):
         return {"agree": self._all_agree, "project": _Coordinates(self).project}
 
     def _all_agree(self, here: bool) -> bool:
-        """Return True if the step succeeded on all processes; otherwise it must fail on all, because all must agree."""
+        """Return True if the step succeeded on all processes; `here`: whether it did so on this one.
+
+        A step that fails on one process must fail on all of them, because they must take the same steps.
+        """
         agreed = bool(self.gathered(here).all())
         self._fails_elsewhere = here and not agreed
         return agreed
@@ -103,7 +109,7 @@ class _Coordinates:
         self._begins = False
 
     def project(self, t_old: float, t: float, last: bool, y_new: np.ndarray) -> int:
-        """Project the unprojected state of the run, write the result to `y_new`, and return the engine's code."""
+        """Project the unprojected state of the run, write the result to `y_new`, and return the engine's status."""
         self._begins = True
         status: int = self._engine.project(t_old, self._origin, t, last, self._moved)
         y_new[:] = self._at(self._moved)
@@ -149,7 +155,7 @@ def _given(value: Any, t: float) -> np.ndarray:
 
 
 def _orthonormal_rows(rows: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` with an orthonormal basis of the rows' space, zeros for rows that depend on those before them.
+    """Fill `out` with an orthonormal basis of the space of the rows; a row that depends on earlier rows gives zeros.
 
     If the rows are not finite, `out` is filled with NaN. Two passes of Gram-Schmidt give orthogonality to round-off.
     """

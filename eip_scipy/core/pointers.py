@@ -130,7 +130,7 @@ class PointerFunction:
         raise self.unpicklable()
 
     def unpicklable(self) -> TypeError:
-        """Return the error for an attempt to pickle it."""
+        """Return the error for an attempt to pickle this function."""
         return TypeError(
             f"{self.name} is a C function by pointer, which cannot be pickled, because its address is not valid in "
             "another process. Use Python or Numba functions for ensembles on Dask or on processes."
@@ -138,7 +138,7 @@ class PointerFunction:
 
     def failure(self, t: float, status: int) -> RuntimeError:
         """Return the error for a negative status."""
-        return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; below 0 it ends the run.")
+        return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; a status below 0 ends the run.")
 
 
 def _as_params(rest: tuple[Any, ...]) -> np.ndarray | None:
@@ -168,7 +168,7 @@ def address_hint(fun: Any) -> str:
     """Return an additional hint for an integer given instead of a function."""
     if isinstance(fun, bool) or not isinstance(fun, (int, np.integer)):
         return ""
-    return "; an address says nothing of its signature: give a ctypes or cffi pointer, or a scipy.LowLevelCallable"
+    return "; an address does not contain the signature: give a ctypes or cffi pointer, or a scipy.LowLevelCallable"
 
 
 def _is_low_level(fun: Any) -> bool:

@@ -118,8 +118,8 @@ class Problem:
     G : float, optional
         Gravitational constant by which the masses of bodies are multiplied in `params`, if it is known.
     events : callable or sequence of callable, optional
-        Events of runs by `integrate`, `ensemble` and `solve_ivp` to which no others are given; ``events=()`` there
-        leaves them out.
+        Events that `integrate`, `ensemble` and `solve_ivp` use if their argument `events` is not given; with
+        ``events=()`` they use none.
     """
 
     name: str
@@ -193,7 +193,8 @@ class Problem:
         options |= given
         t_span, y0 = self.t_span if t_span is None else t_span, self.y0 if y0 is None else y0
         if t_span is None or y0 is None:
-            raise TypeError(f"{self.name}: the problem has no {'interval' if t_span is None else 'start'}; give one.")
+            missing = "t_span" if t_span is None else "y0"
+            raise TypeError(f"{self.name}: the problem has no {missing}; pass {missing} to solve_ivp.")
         brought: dict[str, Any] = {}
         if hasattr(method, "TABLEAU"):  # an EIP method; this module does not import the solvers
             brought = {name: value for name in BROUGHT if (value := getattr(self, name)) is not None}
@@ -230,7 +231,7 @@ class Problem:
         return tuple(item for item in self.invariants if not item.is_balance)
 
     def observed(self, t: Any, y: Any, params: Any = None) -> dict[str, Any]:
-        """Return further quantities at states of a run, by the names of the fields of a result: here none.
+        """Return further fields of the result of a run, by name, computed from its states; none for this class.
 
         Parameters
         ----------
@@ -243,7 +244,7 @@ class Problem:
 
     @property
     def has_second_order(self) -> bool:
-        """True if the problem has a method ``second_order()`` that returns it in (q, v)."""
+        """True if the problem has a method ``second_order()``, which returns the same problem with the state (q, v)."""
         return False
 
     def plain(self, **given: Any) -> dict[str, Any]:
@@ -287,7 +288,10 @@ class Problem:
         return out
 
     def _named_parameters(self, given: Mapping[str, Any]) -> np.ndarray:
-        """Return the values (p,), or (members, p) for columns, in the order of the problem; defaults are its own."""
+        """Return the values (p,) of all parameters in the order of the problem, or (members, p) if arrays are given.
+
+        Parameters that are not given have the values of the problem.
+        """
         known = self.parameters
         if not known:
             raise TypeError(
@@ -354,12 +358,12 @@ class Problem:
 
 
 def component_names(names: Any, n: int | None) -> tuple[str, ...]:
-    """Return the names of n components from a sequence or from text such as "x y"; any number if `n` is None.
+    """Return the names of n components from a sequence or from text such as "x y"; any number of names if `n` is None.
 
     Raises
     ------
     TypeError, ValueError
-        If the names are not strings, have another number, or two are equal.
+        If the names are not strings, if their number is not `n`, or if two names are equal.
     """
     if isinstance(names, str):
         names = names.replace(",", " ").split()
@@ -398,8 +402,8 @@ def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
 def library_variational(function: str, names: tuple[str, ...], parameters: tuple[int, ...]) -> Callable[..., None]:
     """Return the function of `library` of that name for a state with columns of derivatives, see `Problem`.
 
-    `names` has at most one parameter, the first of `params`; the function of a last column by it is called
-    ``{function}_by_parameter``.
+    `names` contains the name of the first parameter if the library has derivatives with respect to it, else nothing.
+    The function for a state whose last column is this derivative is called ``{function}_by_parameter``.
     """
     if not parameters:
         return library[function]

@@ -79,7 +79,7 @@ def project(
 
     Notes
     -----
-    The correction is y - y_hat = sigma * x (made neutral to the frame), where x has the smallest 2-norm with
+    The correction is y - y_hat = sigma * x (with a frame, shifted along S), where x has the smallest 2-norm with
     (G sigma) x = -(I(y_hat) - target), and G contains the gradients at y_hat. It is computed by column-pivoted QR, so
     that dependent gradients reduce the rank instead of failing. Errors within four rounding errors of the terms of an
     invariant are not corrected.
@@ -126,8 +126,9 @@ def project(
     left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
     for k in np.flatnonzero(left > LARGE_SHARE):
         warnings.warn(
-            f"the projection left an error of {work.defect[k]:.3g} in {known.names[k]!r}, {left[k]:.2g} of its terms: "
-            "the state was far from the target, or the gradient is wrong; increase iterations, or correct grad",
+            f"the projection left an error of {work.defect[k]:.3g} in {known.names[k]!r}, {left[k]:.2g} of the size of "
+            "its terms: the state was far from the target, or the gradient is wrong; increase iterations, or correct "
+            "grad",
             ProjectionWarning,
             stacklevel=2,
         )

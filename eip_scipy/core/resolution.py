@@ -38,9 +38,9 @@ def unresolved(
 ) -> str | None:
     """Return a sentence on the part of the state that steps of length h from (t, y) do not resolve, or None.
 
-    `method` is that of a run. Methods of one stage are not judged, because all that a first step of order 1 from rest
-    changes is an error of it; a user-defined method counts as one of them. Functions are not called at times behind the
-    end of the run.
+    `method` is `Run.method`, and `groups` are the blocks of the state. Methods of one stage, and user-defined methods,
+    are not judged: the error of a method of order 1 in a first step from rest is as large as the motion in this step.
+    `rhs` is not called at times after `end_of_run`.
     """
     steps = int(min(STEPS, (end_of_run - t) / h * (1 + ROUNDING)))
     if method.b.size == 1 or steps < 2:
@@ -66,7 +66,8 @@ def unresolved(
         return None
     return (
         f"steps of h={abs(h):g} do not resolve the motion of component{_components(groups, block)} of the state: at "
-        f"t={t:.6g} one step errs by {errors[block]:.2g} of what it changes there; take a shorter step"
+        f"t={t:.6g} the error of one step is {errors[block]:.2g} of the size of this part or of its change; take a "
+        "shorter step"
     )
 
 
@@ -90,7 +91,7 @@ def _nystrom_step(method: Method, rhs: Callable[[float, Array], Array], t: float
 
 
 def _norms(state: Array, groups: Grouping) -> Array:
-    """Return the length of each block of a state."""
+    """Return the 2-norm of each block of a state."""
     squares = np.ascontiguousarray(state).view(float)[groups.member] ** 2
     return np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
 

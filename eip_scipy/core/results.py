@@ -152,7 +152,7 @@ class Diagnostics:
 
     @property
     def slowness(self) -> np.ndarray:
-        """Mean rate of each balance in units of its terms, over the run or its end, (l,)."""
+        """Mean rate of each balance in units of its terms, (l,): the larger of those over the run and over its end."""
         places, sums = self._slow
         found = np.full(len(self.names), np.nan)
         found[places] = slowness(sums)
@@ -206,7 +206,7 @@ class Multipliers(NamedTuple):
     names : tuple of str
     values : ndarray, shape (m,) or (m, k)
         lambda of M u' + G^T lambda = F: the constraints exert the generalised forces -G^T lambda. The unit is that of
-        power over that of the constraint's derivative in time.
+        power divided by that of the constraint's time derivative.
     rank : int or ndarray of int, shape (k,)
         Rank of the constraints. Where it is below m, forces are distributed over dependent constraints such that the
         sum of the squares of ``lambda_i |G_i|`` is least.

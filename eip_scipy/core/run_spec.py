@@ -50,14 +50,15 @@ class RunSpec:
     extra : tuple
         Further arguments of the invariants' functions, ``(params,)`` or those of ``args``.
     fun, in_place : callable, bool
-        The user's function or None, and whether it fills its argument. The function may be an acceleration by mistake.
+        The user's function or None, and whether it fills an argument `out`. It is examined in case the user passed an
+        acceleration as `fun` by mistake.
     jacobian : callable
         ``jacobian()`` returns the Jacobian for a multistep method, see `SecondOrder`, or for an implicit method, see
         `Jacobian`, or None.
     frequencies : callable, optional
         ``frequencies(y0, length)`` for an interval of that length, see `Problem`.
     level : bool
-        Whether the states of multistep methods are those at the newest end of the history.
+        Whether a multistep method returns the state at the newest end of its history; otherwise that in the middle.
     hint : callable
         ``hint()`` returns the end of a message: advice for equations that are not of second order.
     called, left_out : str
@@ -122,14 +123,14 @@ class RunSpec:
             return steppers.checked(self.method, self.rhs, Start(t0, y0, f0, 0.0), self.name, self.hint), f0
 
     def attach_history(self, run: Run, start: Start) -> None:
-        """Make the history of a run with a multistep method, from a start."""
+        """Give a run with a multistep method its history, which begins at `start`."""
         span = self.stepping.span
         frequencies = None if self.frequencies is None else self.frequencies(start.y, span.t_bound - span.t0)
         seen = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
         attach_history(run, self.name, seen, self.stepping, level=self.level)
 
     def attach_solver(self, run: Run, start: Start) -> None:
-        """Make the solver of SciPy of a run with an implicit method, from a start."""
+        """Give a run with an implicit method its solver of SciPy, which begins at `start`."""
         run.method.begin(self.rhs, start, self.stepping, self.jacobian())
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
@@ -221,7 +222,7 @@ def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
 
 
 def _moved(before: Array, after: Array, floors: Array) -> str:
-    """Return a sentence on how far the projection moved the start; "" if by no more than TARGET_TOLERANCE."""
+    """Return a sentence on how far the projection moved the start; "" if none moved by more than TARGET_TOLERANCE."""
     share = np.abs(after - before) / np.maximum(np.abs(before), floors)
     count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0
     if not count:

@@ -26,7 +26,7 @@ __all__ = ["Counted", "Run", "Start"]
 
 
 class Start(NamedTuple):
-    """Start of a run: time, state, derivative, and the scale of time, which is the step or the first step."""
+    """Start of a run: time, state, derivative, and the scale of time, which is the fixed step or the first step."""
 
     t: float
     y: np.ndarray
@@ -57,7 +57,7 @@ class Run:
     called : str
         Name of the argument that gave the right-hand side.
     left_out : str
-        A possible cause of NaN in the value of the right-hand side.
+        A possible cause of NaN in the value of the right-hand side, for messages; "" if none is known.
     looked : int
         The step at which the invariants were checked last.
     warned_of_balances : bool
@@ -111,7 +111,7 @@ class Run:
         return engine
 
     def projected(self, rhs: Derivative, t: float, y: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return the projection of a state, and the engine's code; work.K[-1] must hold the derivative at the state.
+        """Return the projection of a state, and the engine's status code; work.K[-1] must hold the derivative there.
 
         `rhs` returns the derivative at the states of further Newton steps.
         """
@@ -178,8 +178,9 @@ class Run:
         self.warned_of_balances = True
         names, bound = [self.invariants.names[place] for place in carried.places[fast]], carried.most_slowness[fast[0]]
         warnings.warn(
-            f"balance {listed(names)} changes at {found[fast].max():.2g} of the terms of its rate. Above "
-            f"{bound:g} balances hardly help: compare with a run without it, or with other tolerances.",
+            f"balance {listed(names)} changes at {found[fast].max():.2g} of the terms of its rate (grad @ f), on "
+            f"average. Above {bound:g} a balance hardly improves the result: compare with a run without it, or with "
+            "other tolerances.",
             UserWarning,
             stacklevel=users_level(),
         )

@@ -574,7 +574,7 @@ def _revived(solver: type[EIPSolver], shared: dict[str, Any], copied: dict[str, 
 
 
 def _reduced_class(made: type) -> Any:
-    """Return how a class is pickled: by its name, or as a call of `eip_method` if that made it."""
+    """Return the name by which a class is pickled, or the call of `eip_method` that makes it again."""
     origin = vars(made).get("_ORIGIN")
     return made.__qualname__ if origin is None else (eip_method, (origin,))
 
@@ -747,7 +747,8 @@ class EIPRKN12(EIPSolver):
     """EIP method on the Runge-Kutta-Nystrom pair 12(10) of Dormand, El-Mikkawy and Prince, 17 stages.
 
     For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. `integrate`
-    also takes the acceleration alone, as ``acceleration=``. Options: see `EIPSolver`; at small steps ``every="auto"``.
+    also takes the acceleration alone, as ``acceleration=``. Options: see `EIPSolver`; use ``every="auto"`` with small
+    steps.
     Dense output is as accurate as the steps and takes 15 more evaluations in each step in which a state is asked for.
     """
 
@@ -781,7 +782,7 @@ class EIPGJ12(EIPSolver):
 class EIPGJ14(EIPSolver):
     """EIP method on the multistep method of Gauss and Jackson of order 14, its accelerations corrected by the Jacobian.
 
-    It is used as `EIPGJ12`, with longer steps: after each evaluation the accelerations are corrected by the Jacobian
+    It is used like `EIPGJ12`, with longer steps: after each evaluation the accelerations are corrected by the Jacobian
     times the change of the positions that a corrector step would make, for the bodies that need it. `nbody` and the
     problems made from it provide the Jacobian of the central body; for others pass
     ``jacobian=fun(t, q, dq, out[, params])`` to `integrate` or solve_ivp. Without a Jacobian only very short steps are

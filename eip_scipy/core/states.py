@@ -14,7 +14,7 @@ __all__ = ["as_derivative", "initial_state", "states"]
 
 
 def as_derivative(value: Any, n: int, dtype: np.dtype, t: float, name: str = "fun") -> np.ndarray:
-    """Return the value of a user's right-hand side at t as an array (n,), or an error; see `as_vector`."""
+    """Return the value of a user's right-hand side at t as an array (n,), or raise an error; see `as_vector`."""
     return as_vector(value, n, dtype, f"{name} returned", t)
 
 

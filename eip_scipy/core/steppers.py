@@ -150,7 +150,12 @@ def _(method: Tableau) -> Array:
 
 
 class Form(NamedTuple):
-    """Form of a run's interpolants: kind, number of states without the two ends, and how the states are computed."""
+    """Form of a run's interpolants, in the terms of the engine.
+
+    An interpolant consists of the states at both ends of its step and of `rows` further arrays of this size, which are
+    computed with the `weights`, and at further stages with the coefficients `A` and `c`. With `own_slopes` the
+    derivatives at both ends are evaluated, because the steps do not provide them.
+    """
 
     kind: int
     rows: int

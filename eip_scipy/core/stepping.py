@@ -147,8 +147,8 @@ class StepOptions:
         if h is None and method.fixed_steps_only:
             why = "takes fixed steps" if method.has_estimate else "has no error estimate"
             raise ValueError(
-                f"{name} {why} and needs the step h=...: without h, and also if rtol, atol, first_step or max_step are "
-                "given to a problem with a step, steps are adaptive."
+                f"{name} {why} and needs the step h=...; give it. The step of a problem is not used if rtol, atol, "
+                "first_step or max_step is given."
             )
         if h is not None and method.drives:
             raise ValueError(
@@ -235,7 +235,8 @@ def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool =
     TypeError
         If h has a unit.
     ValueError
-        If h is not a positive number, is longer than the interval, or is below ten spacings of t.
+        If h is not a positive number, is longer than the interval, or is below ten spacings of floating-point numbers
+        at the end of the interval that is farther from 0.
     """
     refuse_units(h=h)
     if not is_number(h) or not 0 < h < math.inf:
@@ -250,13 +251,14 @@ def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool =
     spacing = float(np.spacing(largest))
     if h < 10 * spacing:
         raise ValueError(
-            f"`h` is too small: h = {h:g} is below 10 spacings of t, which are {spacing:.3g} at t = {largest:g}."
+            f"`h` is too small: h = {h:g} is below 10 spacings of t; the spacing of floating-point numbers at t = "
+            f"{largest:g} is {spacing:.3g}. Give a larger h."
         )
     return h
 
 
 def _slack(h: float, t0: float, t_bound: float) -> float:
-    """Return the largest distance of T/h from an integer that still counts as rounding."""
+    """Return the largest difference between (t_bound - t0) / h and an integer that still counts as rounding."""
     if not math.isfinite(t_bound):
         return 0.0
     return max(1e-9, 8 * EPS * (abs(t_bound - t0) + abs(t0) + abs(t_bound)) / h)
@@ -265,8 +267,8 @@ def _slack(h: float, t0: float, t_bound: float) -> float:
 def fixed_steps(h: float, t0: float, t_bound: float) -> int:
     """Return the number of steps of length h from t0 to t_bound; UNBOUNDED for an infinite interval.
 
-    The number is T/h, rounded if it is an integer up to round-off, otherwise rounded up, so that the last step is
-    shorter. An interval that is not empty has at least one step, for any h.
+    It is the length of the interval divided by h, rounded if that is an integer up to round-off. Otherwise it is
+    rounded up, so that the last step is shorter. An interval that is not empty has at least one step, for any h.
     """
     ratio = abs(t_bound - t0) / h
     if not ratio < UNBOUNDED:

@@ -82,7 +82,8 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
     Raises
     ------
     TypeError
-        If a value has a unit but no units are known, or the unit is not one of astropy.
+        If a value has a unit but `known` is None, or if it has a unit of another package than
+        astropy.
     TypeError and ValueError
         astropy's UnitConversionError, if the dimensions do not fit.
     """
@@ -92,7 +93,7 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
 
     def convert(item: Any) -> Any:
         if is_time(item):
-            raise TypeError(f"{name}: {shown(item)} is a moment; expected {_expected(powers, known)}.")
+            raise TypeError(f"{name}: {shown(item)} is a date; expected {_expected(powers, known)}.")
         if powers != (0, 1) and not has_unit(item) and np.any(item):
             raise TypeError(f"{name}: {shown(item)} has no unit, but others have one; give it a unit too.")
         return _converted(name, item, powers, known)
@@ -101,12 +102,14 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
 
 
 def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch | None, whose: str) -> Any:
-    """Convert moments to numbers in the unit of time, counted from the epoch; durations and numbers count from 0.
+    """Convert dates, durations or plain numbers to numbers in the unit of time.
+
+    Dates are counted from `epoch`. `whose` names the owner of the epoch in messages.
 
     Raises
     ------
     TypeError, ValueError
-        As for `in_unit`; TypeError for a moment if there is no epoch.
+        As for `in_unit`; also TypeError for a date if `epoch` is None.
     """
     if known is None:
         refuse_units(**{name: value})

@@ -1,4 +1,4 @@
-"""Columns of derivatives that follow a state, called a wide state: the user's option, and functions of this state."""
+"""Wide states, which are states followed by columns of derivatives: the option `variations`, and their functions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ LEAST = 1e-3  # size for differences of a parameter that is 0
 class OfState(NamedTuple):
     """An invariant or event of a wide state as a function of the `n` components of the state, which the engine calls.
 
-    `by_parameters` returns the derivatives of an invariant by the `parameters` that follow the state, if there are any.
+    `parameters` is the number of parameters that follow the state in the wide state; if there are any, `by_parameters`
+    returns the derivatives of an invariant with respect to them.
     """
 
     n: int
@@ -58,7 +59,7 @@ class OfState(NamedTuple):
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of a run, at its start or where it is continued.
+    """The columns of derivatives of a run, at its start or where it is continued.
 
     Attributes
     ----------
@@ -115,7 +116,7 @@ class Columns:
         return self.order[0] if self.in_halves else slice(self.n)
 
     def wide(self, y: Array, params: Array) -> Array:
-        """Return the state with its columns."""
+        """Return the wide state of `y`: y, the values in `params` of the parameters, and the columns."""
         out = np.empty(self.order.size)
         out[self.order[0]] = np.concatenate([y, params[list(self.parameters)]])
         out[self.order[1:]] = self.values.T
@@ -150,7 +151,8 @@ def require_tableau(method: Any) -> None:
     """
     if method.TABLEAU.has_history or method.TABLEAU.in_python:
         raise ValueError(
-            f"variations: {method.__name__} carries no derivatives, because its steps are not stages of a tableau. Use "
+            f"variations: {method.__name__} carries no derivatives, because its steps do not consist of stages of a "
+            "tableau. Use "
             "EIPDOP853, EIPRKN12 or another Runge-Kutta or Nystrom method."
         )
 
@@ -161,7 +163,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in
     Raises
     ------
     TypeError, ValueError
-        If the option has a wrong value, the state is complex, or the run does not have a parameter.
+        If the option has a wrong value, the state is complex, or the option names a parameter that the run lacks.
     """
     if isinstance(asked, Columns):
         return replace(asked, in_halves=in_halves)
@@ -187,7 +189,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in
         values = values[:, None]
     if values.ndim != 2 or values.shape[0] != n or values.shape[1] == 0 or not np.isfinite(values).all():
         raise ValueError(
-            f'variations must be "state" for all {n} columns of the state-transition matrix, names or places of '
+            f'variations must be "state" for all {n} columns of the state-transition matrix, names or indices of '
             f"parameters, a list of these, or an array ({n}, k) of finite initial columns, got {shown(asked)}."
         )
     return Columns(values, (), False, False, in_halves)
@@ -221,7 +223,7 @@ def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invar
 def _parameter(item: Any, params: Array, names: Sequence[str]) -> int:
     if isinstance(item, str):
         if item not in names:
-            known = f"; it has {', '.join(names)}" if names else "; give their places in params instead"
+            known = f"; it has {', '.join(names)}" if names else "; give its index in params instead"
             raise ValueError(f"variations: the run has no parameter {item!r}{known}.")
         return list(names).index(item)
     if not 0 <= item < params.size:
@@ -258,7 +260,7 @@ def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tu
 
 
 class StateSolution(OdeSolution):
-    """Dense output of the state alone, from that of a wide state."""
+    """Dense output of the state alone, made from the dense output of a wide state."""
 
     def __init__(self, solution: OdeSolution, columns: Columns) -> None:
         super().__init__(solution.ts, solution.interpolants)
@@ -277,10 +279,11 @@ class Variations:
     ----------
     columns : Columns
     rhs : callable
-        In place: ``rhs(t, Y, out, *extra)``.
+        Right-hand side in place: ``rhs(t, Y, out, *extra)``.
     invariants : tuple of Invariant
+        The invariants as functions of the wide state.
     given : tuple of Invariant
-        The invariants as functions of the state.
+        The same invariants as functions of the state, as the user gave them.
     source : str
         Source of the products with the Jacobian: "problem", "jvp", "dual numbers" or "complex steps".
     """
@@ -303,9 +306,10 @@ class Variations:
         *,
         in_python: bool = False,
     ) -> Variations:
-        """Make the functions from the output of `right_hand_side`; `extra` has the further arguments of the invariants.
+        """Make the functions from `products`, the output of `right_hand_side`.
 
-        With `in_python` the functions are called from Python, and nothing is compiled.
+        `extra` contains the further arguments of the invariants. With `in_python` the functions are called from Python,
+        and nothing is compiled.
 
         Raises
         ------
@@ -329,7 +333,7 @@ class Variations:
         return out
 
     def with_targets(self, wide: tuple[Invariant, ...]) -> tuple[Invariant, ...]:
-        """Return the invariants as functions of the state, with the targets of those of the wide state."""
+        """Return the invariants as functions of the state, with the targets of `wide`, those of the wide state."""
         kept = []
         for item, known in zip(self.given, wide, strict=True):
             own = copy(item)
@@ -406,11 +410,14 @@ def _of_columns_in_order(
 def _require_products(
     columns: Columns, derivative: Callable[..., Array], jvp: Any, t0: float, y0: Array, extra: tuple
 ) -> None:
-    """Raise an error if `jvp` is not the product of the right-hand side's Jacobian and a vector.
+    """Check that `jvp` is the product of the Jacobian of the right-hand side, `derivative`, and a vector.
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError
+        If `jvp` is not callable or takes other arguments.
+    ValueError
+        If its value is wrong, or if columns are derivatives with respect to parameters.
     """
     if columns.parameters:
         raise ValueError("variations: a jvp gives no derivatives by parameters; ask for columns of the state alone.")
@@ -434,7 +441,7 @@ def _require_products(
 
 
 def _direction(y0: Array, parameters: int) -> tuple[Array, Array]:
-    """Return a direction for a check that moves all components, and none by much more than its size."""
+    """Return a direction (dy, dp) for a check, which changes all components, and none by much more than its size."""
     rng = np.random.default_rng(0)
     dy, dp = rng.standard_normal(y0.size), rng.standard_normal(parameters)
     sizes = np.abs(y0)
@@ -467,7 +474,7 @@ def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
 
 
 def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
-    """Return the derivative as a function f(t, y, extra) of real or complex states."""
+    """Return ``derivative(t, y, extra)``, which calls `fun` of this `form` with a real or complex state (n,)."""
     n = y0.size
     half = n // 2 if form.startswith("acceleration") else 0
 
@@ -546,8 +553,9 @@ def _difference(
 class _WideInvariant:
     """An invariant as a function of the wide state, with its gradient, for calls from Python.
 
-    `shape` is the shape of its value, `parameters` are the parameters of the columns on which it depends, and `slopes`
-    returns the derivatives by these, by default from differences.
+    `shape` is the shape of its value. `parameters` are the indices of the parameters that follow the state, if the
+    invariant depends on them. ``slopes(t, y, params)`` returns the derivatives with respect to these parameters; by
+    default they are computed by differences.
     """
 
     def __init__(
@@ -573,7 +581,7 @@ class _WideInvariant:
         self.own_gradient: Callable[..., Any] = gradient
 
     def value(self, t: float, Y: Array, *extra: Any) -> Any:
-        """Return the value, with the parameters that follow the state."""
+        """Return the value at the wide state Y, with the parameters that follow the state in Y."""
         return self.item.function(t, self.columns.own(Y), *self.item.args, *self._arguments(Y, extra))
 
     def gradient(self, t: float, Y: Array, *rest: Any) -> Array:

@@ -1,1 +1,1 @@
-"""The step and all it is made of, in C++."""
+"""The integration step and its parts, written in C++, and their interface to Python."""

@@ -19,7 +19,7 @@ BAND, BAND_COMPENSATED, BAND_MULTISTEP = 4.0, 1.0, 1 / 64
 
 
 def bare_schedule(span: Span, first: float) -> Schedule:
-    """Return a schedule that saves nothing; `first` is the length of the first step."""
+    """Return a schedule of the interval `span` that saves no states; `first` is the length of the first step."""
     none = np.zeros(0)
     clock = np.array([span.t0, span.t0, 0.0, first])
     return Schedule(span, 0, none, np.zeros(3, np.int64), clock, none, none, none, none, none)
@@ -35,7 +35,7 @@ _none = np.zeros(0)
 
 
 def no_columns(values: int) -> Columns:
-    """Return the record of a run with this number of invariants and without derivatives."""
+    """Return the record `Columns` of a run without columns of derivatives whose invariants have `values` values."""
     return Columns(kept=np.zeros((values, 0)), size=0, seen=0, half=0, symplectic=False)
 
 

@@ -56,11 +56,12 @@ class NumbaEntry(NamedTuple):
 class Call(NamedTuple):
     """A user's function in Python: ``fun(t, y[, f][, out], *args)``.
 
-    Its value is used directly if it is an array of the right shape (a float for ``()``) and type: that of the state, or
-    float if it is `real`. Otherwise ``convert(value, t)`` converts it to such an array, or raises an error.
+    `fun` receives the derivative f of the state if `takes_f`, and fills `out` if `in_place`. Otherwise its value is
+    used directly if it is an array of the shape `shape` (a float for ``()``) and of the dtype of the state (float if
+    `real`). ``convert(value, t)`` converts any other value to such an array, or raises an error.
 
-    `entry` is the machine code of a Numba function, which is called instead of the function: see `NumbaEntry`. The
-    function itself is called where the code raises an exception or returns another shape.
+    `entry` is the code that Numba compiled for the function, which is called instead of it. The function itself is
+    called if that code raises an exception or returns an array of another shape.
     """
 
     fun: Callable[..., Any]
@@ -74,7 +75,7 @@ class Call(NamedTuple):
 
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: Any) -> Call:
-    """Return a `Call` with the given further arguments."""
+    """Return a `Call` of ``fun(t, y, ..., *args)``; more `args` than the engine accepts are bound in Python."""
     if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
     return Call(fun, args, shape, convert, **kind)
@@ -86,12 +87,13 @@ class Rates(NamedTuple):
     Attributes
     ----------
     items : tuple of (int, int)
-        For each balance its index among the functions of the invariants, and the number of its values.
+        For each balance the index of its function among those of the invariants, and the number of its values.
     functions : tuple
-        For each balance its rate, as a `Call` or as an address. None: the rate follows from the gradient along the flow
-        and from the explicit dependence on time.
+        For each balance its rate, as a `Call` or as an address. If it is None, the rate is computed from the gradient
+        along the flow and from the explicit dependence on time.
     low, high, shift : float
-        Interval within which derivatives in time are computed, and the shift of the differences.
+        Start and end of the interval within which derivatives with respect to time are computed, and the shift of
+        their differences.
     """
 
     items: tuple[tuple[int, int], ...] = ()
@@ -102,7 +104,7 @@ class Rates(NamedTuple):
 
 
 class PythonFunctions(NamedTuple):
-    """The functions of a run in Python; `second_order`: `rhs` returns the accelerations of (q, v)."""
+    """The functions of a run in Python. If `second_order`, the state is (q, v) and `rhs` returns the accelerations."""
 
     rhs: Call
     inv: tuple[Call, ...]
@@ -117,11 +119,12 @@ class PythonFunctions(NamedTuple):
 class NativeFunctions(NamedTuple):
     """The addresses of the functions of a run, with the signatures in cpp/system.hpp; `owner` keeps them alive.
 
-    A function of the library is given as an object. For each invariant, gradient and event there is the address and the
-    number of floats that it fills. None for a gradient: it is computed by differences, with shifts in units of the size
-    of a component and of its floor, `floors` (n,). `python` contains the functions in Python if events are called from
-    Python; then no events are given as addresses. `by_parameters` are the derivatives of each invariant with respect to
-    the parameters behind the state, in runs with such columns of derivatives.
+    A function of the library is a `LibraryFunction` instead of an address. Each invariant, gradient and event is a
+    pair: the address, and the number of floats that the function fills. If the address of a gradient is None, the
+    gradient is computed by differences, with shifts in units of the size of a component and of its floor, `floors`
+    (n,). `python` contains the functions in Python if events are called from Python; then `event` is empty.
+    `by_parameters` are the derivatives of each invariant with respect to the parameters whose columns of derivatives
+    follow the state.
     """
 
     rhs: Any
@@ -140,7 +143,7 @@ class NativeFunctions(NamedTuple):
 
 
 class OctetFunctions(NamedTuple):
-    """The functions for eight members of an ensemble: each number in their arrays is replaced by eight."""
+    """Functions that compute eight members of an ensemble at once; their arrays hold eight numbers in place of one."""
 
     rhs: Any
     inv: tuple[tuple[Any, int], ...]
@@ -152,12 +155,13 @@ class OctetFunctions(NamedTuple):
 class Hooks(NamedTuple):
     """Parts of a step in Python, which replace those of the engine.
 
-    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. If it `drives`, it is
+    ``one_step(t, y, h)`` fills work.y_hat, and work.err if `estimates` is True. If `drives` is True, it is instead
     ``one_step(t, y, again)`` of a solver that controls its own error: it fills work.K too, and returns the end of its
-    step and the length of the next one, or None if no step is short enough; `again`: repeat the last step with a
-    shorter one. ``project(t_old, t, last, y_new)`` projects work.y_hat and returns the code of the engine. `joint` are
-    `JointInvariants`, which are used first. ``agree(here)`` returns True if the raw result is finite on all processes
-    that have a part of the state; `here` says whether it is on this process.
+    step and the length of the next one, or None if no step is short enough. If `again` is True, it repeats the last
+    step with a shorter length. ``project(t_old, t, last, y_new)`` projects work.y_hat and returns one of the engine's
+    codes. `joint` are the `JointInvariants`, which are tried before `project`. ``agree(here)`` returns True if the
+    result of the step before its projection is finite on all processes that hold a part of the state; `here` is True if
+    it is finite on this process.
     """
 
     one_step: Callable[..., Any] | None = None
@@ -181,7 +185,7 @@ def _build(name: str) -> Any:
 
 
 def _best() -> Any:
-    """Return the requested build, or the best one for the processor."""
+    """Return the build that the environment variable names, or the best one for the processor."""
     if name := os.environ.get(VARIABLE):
         return _build(name)
     plain = _build("_native")
@@ -193,11 +197,11 @@ def _require_current(build: Any) -> None:
     folder = Path(__file__).parent / "cpp"
     files = sorted(folder.rglob("*.?pp"))
     if files and hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest() != build.SOURCES:
-        raise ImportError(f"the sources in {folder} have changed since the engine was built. Build it: {AGAIN}")
+        raise ImportError(f"the sources in {folder} have changed since the engine was built. Build it again: {AGAIN}")
 
 
 def _is_worker() -> bool:
-    """Return True in a process of `multiprocessing`: there are usually as many of these as processors."""
+    """Return True in a process started by `multiprocessing`: there are usually as many of these as processors."""
     module = sys.modules.get("multiprocessing.process")
     return module is not None and module.parent_process() is not None
 
@@ -225,9 +229,9 @@ Engine = BUILD.Engine
 FailedCallError = BUILD.FailedCallError
 LibraryFunction = BUILD.LibraryFunction
 library: dict[str, LibraryFunction] = BUILD.LIBRARY
-"""The functions of the ready problems in C++, by name."""
+"""The functions in C++ of the problems in `eip_scipy.problems`, by name."""
 
 
 def library_function(name: str, own: Sequence[float] = ()) -> Any:
-    """Return the function of that name, with its `own` parameters if it has any; used by pickles."""
+    """Return the library's function `name`, with its `own` parameters if it has any; unpickling calls this function."""
     return library[name].bound(own) if own else library[name]

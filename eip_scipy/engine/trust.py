@@ -2,7 +2,8 @@
 
 The errors of the steps explain the corrections of a correct run. If corrections are much larger, the quantity is not an
 invariant of the system, its gradient is wrong, or the step is much too long; the projected run looks perfect
-nevertheless. The step records figures (`note` in cpp/trust.hpp), a row for each invariant; this module interprets them.
+nevertheless. The step records numbers about its projections, called figures, in a row for each invariant (`note` in
+cpp/trust.hpp); this module interprets them.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class ProjectionWarning(RuntimeWarning):
 
 
 class Trust:
-    """The figures of a run's projections and the doubts of its checks.
+    """The figures recorded in the projections of a run, and the findings of the checks of the run.
 
     Attributes
     ----------
@@ -116,7 +117,7 @@ class Trust:
         return np.where(self.figures[:, JUDGED] > 0, self.figures[:, NU], np.nan)
 
     def followed_by(self, other: Trust) -> Trust:
-        """Return the figures of a run together with those of the run that continued it."""
+        """Return the combined record of this run and of the run `other` that continued it."""
         one, two = self.figures, other.figures
         both = two.copy()  # START, TERMS, LEFT: of the last
         largest = [TERMS, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED]
@@ -134,7 +135,7 @@ class Trust:
 
     @property
     def reasons(self) -> list[str]:
-        """Return the reasons against the run: a sentence for each of the worst three invariants, and a count."""
+        """Return what makes the run unreliable: a sentence for each of the worst three invariants, and a count."""
         if not self.is_sick:
             return []
         found = np.flatnonzero(sick(self.figures))
@@ -148,13 +149,13 @@ class Trust:
 
     @property
     def message(self) -> str:
-        """Reason why the run is not to be trusted; "" if there is none."""
+        """Reasons why the run is not to be trusted, and possible causes; "" if there are none."""
         reasons = self.reasons + self.doubts
         if not reasons:
             return ""
         cause = "" if self.doubts else (
-            " No invariant of this system, a wrong gradient, a step far too long or a passage that it does not resolve "
-            "does that."
+            " Possible causes: the quantity is not an invariant of this system, its gradient is wrong, or the step is "
+            "too long for the motion, for example for a close encounter."
         )  # fmt: skip
         return f"not to be trusted: {'; '.join(reasons)}.{cause} See {PAGE}"
 
@@ -175,7 +176,7 @@ def are_calm(figures: np.ndarray) -> bool:
 def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:
     """Return a mask of the runs with a step that must be examined, from their figures (m, l, N_FIGURES).
 
-    `suspect`, (m, ...), holds what the engine has kept of these steps.
+    `suspect`, (m, ...), holds for each run the suspicious step that the engine has kept, and the reason for it.
     """
     reason = suspect[:, REASON]
     return (reason >= LARGE_ERROR) | ((reason == LARGE_CORRECTION) & _large_corrections(figures).any(axis=1))
@@ -196,7 +197,7 @@ def _extreme(figures: np.ndarray) -> np.ndarray:
 
 
 def _may_leak(figures: np.ndarray) -> np.ndarray:
-    """Return a mask of the rows whose quantities may change along the flow.
+    """Return a mask of the rows of figures whose quantities may change along the flow, and may not be invariants.
 
     If the rate of change is only rounding, large corrections come from error estimates that are too small, as in a step
     over a kink, or if the derivative depends on time only.
@@ -220,14 +221,15 @@ def _reason(name: str, row: np.ndarray) -> str:
             f"in {row[MANY]:.0f} of {row[JUDGED]:.0f} projections, first at t={row[FIRST]:.6g})"
         )
     elif _may_leak(row) and row[SUM] > TOGETHER * row[EXPECTED]:
-        parts.append(f"{name!r} was corrected by {row[SUM] / row[EXPECTED]:.2g} local errors a projection")
+        parts.append(f"{name!r} was corrected by {row[SUM] / row[EXPECTED]:.2g} local errors per projection on average")
     if row[RAW] > 0:
         parts.append(
-            f"steps missed {name!r} by up to {row[RAW]:.2g} of its own terms, at t={row[RAW_AT]:.6g} (by more than "
-            f"{row[FAR_FROM]:g} in {row[RAW_MANY]:.0f} of {row[NOTED]:.0f})"
+            f"before projections the error of {name!r} was up to {row[RAW]:.2g} times the size of its terms, at "
+            f"t={row[RAW_AT]:.6g} (more than {row[FAR_FROM]:g} times in {row[RAW_MANY]:.0f} of {row[NOTED]:.0f})"
         )
     if row[SHARE] > 0:
         parts.append(
-            f"the projection left an error of {row[SHARE]:.2g} of its terms in {name!r}, at t={row[SHARE_AT]:.6g}"
+            f"the projection left an error of {name!r} of {row[SHARE]:.2g} times the size of its terms, at "
+            f"t={row[SHARE_AT]:.6g}"
         )
     return ", and ".join(parts)

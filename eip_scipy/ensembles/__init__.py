@@ -1,1 +1,1 @@
-"""Many runs of one problem: tasks, chunks, stores, statistics, members in vectors."""
+"""Many runs of one problem: tasks, chunks, stores, statistics, vectorised members."""

@@ -21,8 +21,8 @@ from .tasks import Members, Plan, Task, run_members
 __all__ = ["Chunk", "FuturesPool", "Part", "Pool", "ThreadPool", "in_order", "run_chunk", "run_elsewhere"]
 
 KEPT = (
-    "The attribute partial of this exception contains the finished members; with out= or checkpoint=, the same call "
-    "with resume=True continues from there, on another executor."
+    "The attribute partial of this exception contains the finished members. With out= or checkpoint=, the same call "
+    "with resume=True and another executor continues from there."
 )
 KEPT_PLANS = 4
 AHEAD = 3
@@ -43,7 +43,7 @@ class Chunk(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Results of a chunk; `one_by_one` is that of the plan."""
+    """Results of a chunk; `one_by_one` is the reason why its members were not vectorised, "" if they were."""
 
     members: Members
     statistics: Statistics | None
@@ -51,7 +51,7 @@ class Part(NamedTuple):
 
 
 class Pool(Protocol):
-    """Interface of what runs chunks."""
+    """Interface of the classes that run chunks."""
 
     def capacity(self) -> int:
         """Return how many chunks can run at the same time."""
@@ -72,7 +72,7 @@ def run_chunk(plan: Plan, chunk: Chunk, *, stop: threading.Event | None = None) 
 
 
 def finished(task: Task, plan: Plan, members: Members) -> Part:
-    """Return the statistics of members, and the members without states that need not be kept."""
+    """Return the members, without saved states unless the task keeps them, and their statistics if requested."""
     statistics = None
     if task.reduce is not None:
         statistics = statistics_of(task.reduce, *plan.states(members))
@@ -98,7 +98,10 @@ def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
 
 
 class FuturesPool:
-    """Pool on an executor like those of `concurrent.futures`, which stays open; ``run(chunk)`` returns a `Part`."""
+    """Pool that calls ``run(chunk)``, which returns a `Part`, on an executor of `concurrent.futures`.
+
+    `close` cancels the chunks that have not started, and leaves the executor open.
+    """
 
     def __init__(self, executor: Executor, run: Callable[[Chunk], Part], workers: int) -> None:
         self._executor, self._run, self._workers = executor, run, workers

@@ -108,7 +108,8 @@ class EnsembleResult(WithColumns):
         True for members that ran vectorised, in a batch with others, which is several times faster; the page on
         ensembles in the documentation lists the conditions.
     one_by_one : str
-        Reason why members ran one after the other instead; "" if they did not, or if only exceptions did.
+        Reason why members ran one after the other instead of vectorised; "" if they were vectorised. Single members
+        that a batch could not finish may have run alone even then, see `side_by_side`.
     trusted : ndarray of bool, shape (members,)
         True for members that did not fail and are reliable, as in `IntegrationResult`; otherwise `message` says why.
     names : tuple of str
@@ -419,9 +420,9 @@ def ensemble(
 
     Notes
     -----
-    Members run in chunks, whose size depends only on the problem, and chunks are collected in order, so that statistics
-    also agree bit by bit for any number of workers. If the ensemble is interrupted (Ctrl-C, or an exception raised by
-    the callback), the attribute ``partial`` of the exception is the result up to that point.
+    Members run in chunks, whose size does not depend on the number of workers, and chunks are collected in order, so
+    that statistics also agree bit by bit for any number of workers. If the ensemble is interrupted (Ctrl-C, or an
+    exception raised by the callback), the attribute ``partial`` of the exception is the result up to that point.
 
     Examples
     --------
@@ -670,7 +671,7 @@ def _all_times(plan: Plan, own: OwnTimes) -> np.ndarray:
 
 
 def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
-    """Check the options of `integrate`; `reduced`: states go into statistics or a store."""
+    """Check the options of `integrate`; `reduced` is True if the states go into statistics or the store of `out`."""
     if reduced and options.get("variations") is not None:
         raise ValueError("ensemble: variations= cannot be combined with out= or reduce=; omit one of them.")
     known = set(Request._fields) - ALONE | set(ProjectionOptions.names())
@@ -681,13 +682,13 @@ def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
 
 
 def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
-    """Return the absolute places of `out` and `checkpoint`, so that the working directory may change."""
+    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change."""
     refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     flag("resume", resume)
     if out is not None and checkpoint is not None:
-        raise ValueError("give out= or checkpoint=, not both: out already stores finished members.")
+        raise ValueError("got both out= and checkpoint=; omit checkpoint, because out already stores finished members.")
     for name, path in (("out", out), ("checkpoint", checkpoint)):
         if path is not None and not isinstance(path, (str, os.PathLike)):
             raise TypeError(f"{name} must be a path, got {path!r}.")
@@ -715,14 +716,15 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
         raise ValueError(f"y0s must have the shape (members, n), got {starts.shape}.")
     if times and times.members != len(starts):
         raise ValueError(
-            f"{times.name} has {times.members} rows for {len(starts)} members; give one row for each, or one for all."
+            f"{times.name} has {times.members} rows for {len(starts)} members; give one row for each member, or one "
+            "for all."
         )
     if own is None:
         brought = None if problem is None or problem.rhs is None else problem.params
         own = np.zeros(0) if brought is None else np.asarray(brought, float).reshape(-1)
     elif own.ndim == 2 and len(own) != len(starts):
         raise ValueError(
-            f"params has {len(own)} rows for {len(starts)} members; give one row for each, or one for all."
+            f"params has {len(own)} rows for {len(starts)} members; give one row for each member, or one for all."
         )
     elif own.ndim > 2:
         raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
@@ -744,13 +746,13 @@ def _bare(fun: Any) -> Any:
 
 
 def _not_called(t: float, y: np.ndarray) -> np.ndarray:
-    raise NotImplementedError("the problem's compiled right-hand side is in use")
+    raise NotImplementedError("ensemble calls the compiled right-hand side of a problem, not this function")
 
 
 def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str]]:
-    """Return the plan, made from the first member with a valid start; raise the first error if none is found.
+    """Return the plan, made from the first of TRIED members with a valid start; raise the first error if none has one.
 
-    Also return the findings of the checks at the start, which apply to all members with the same parameters.
+    Also return the findings of the checks at the start, by member: they apply to all members with the same parameters.
     """
     first: Exception | None = None
     starts, params = everyone.y0s, everyone.params
@@ -778,7 +780,10 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
-    """Return the size of a chunk, which depends only on the problem: about one second of work, a multiple of LANES."""
+    """Return the size of a chunk: at most about one second of work, in a multiple of LANES.
+
+    The size depends on the problem and on the number of members, and not on the number of workers.
+    """
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
     native = is_compiled(rhs) or isinstance(rhs, PointerFunction)
     budget = CHUNK_STEPS if native and plan.task.request.compiled is not False else INTERPRETED_STEPS

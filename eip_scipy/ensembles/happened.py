@@ -1,4 +1,4 @@
-"""Events of members: when each happened in which state, and all of them as flat arrays for files."""
+"""Events of the members of an ensemble: their times and states, and their conversion to flat arrays for files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,11 @@ class Flat(NamedTuple):
 
 
 def happened(count: int, which: np.ndarray, t: np.ndarray, y: np.ndarray) -> Happened:
-    """Return the events of one member from their numbers, times and states in the order of their times."""
+    """Return the times and states of one member's events, grouped by event.
+
+    `count` is the number of event functions; `which`, `t` and `y` are the number of the event function, the time and
+    the state of each event, in the order of time.
+    """
     return [(t[which == k].copy(), y[which == k].copy()) for k in range(count)]
 
 

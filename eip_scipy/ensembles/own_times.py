@@ -20,9 +20,9 @@ class OwnTimes(NamedTuple):
     Attributes
     ----------
     spans : list of (float, float) or None
-        None if all members have the same interval.
+        Interval of each member; None if all members have the same interval.
     times : list of ndarray or None
-        None if all members have the same interval and times, or no times.
+        Times of saved states of each member; None if all members have the same interval and times, or no times.
     """
 
     spans: list[tuple[float, float]] | None = None
@@ -94,10 +94,15 @@ def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) 
     if spans is not None and times is None and t_eval is not None:
         times = [np.array(_plain(fun, "t_eval", t_eval), float)] * len(spans)
     if spans is not None and times is not None and len(spans) != len(times):
-        raise ValueError(f"t_span has {len(spans)} rows and t_eval has {len(times)}; give one of each for each member.")
+        raise ValueError(
+            f"t_span has {len(spans)} rows and t_eval has {len(times)}; give one row of each for each member."
+        )
     found = OwnTimes(spans, times)
     if found and save_every is not None:
-        raise ValueError("save_every needs the same t_span for all members; give t_eval, one row for each member.")
+        raise ValueError(
+            "save_every needs the same t_span for all members, and cannot be combined with a t_eval for each member; "
+            "omit it, and give t_eval with one row for each member."
+        )
     if found and reduce is not None:
         raise ValueError("reduce compares members at the same times; give one t_span and one t_eval for all members.")
     return found

@@ -27,7 +27,7 @@ def why_one_by_one(history: Multistep | None, options: Options, schedule: Schedu
         "the interval is infinite": schedule.span.n_steps >= UNBOUNDED,
         "the state is complex": np.dtype(dtype).kind == "c",
         "events may end members at different times": schedule.g.size > 0,
-        "there are fewer steps than the method's history has": history is not None and history.brief,
+        "the run has fewer steps than the history of the method": history is not None and history.brief,
         "compensated=True": history is None and options.compensated,
         "every='auto'": history is None and options.every == AUTO,
         "iterations > 1": options.iterations > 1,
@@ -42,7 +42,7 @@ def octet_functions(functions: NativeFunctions) -> OctetFunctions:
     Raises
     ------
     NotCompilableError
-        If a function has no such form; the message names it and the reason.
+        If a function has no version for eight members; the message names the reason.
     """
     owner = functions.owner
     found = {name: [_of_eight(native) for native in owner.get(name, [])] for name in NAMES}
@@ -65,7 +65,7 @@ def need_compiling(functions: NativeFunctions) -> bool:
 
 
 def _of_eight(native: Native) -> tuple[Any, int]:
-    """Return a function of eight members for the engine, and the number of floats that it fills for each."""
+    """Return the version of a function for eight members, and the number of floats that it fills for each member."""
     one = native.function
     if one is None:
         raise NotCompilableError("the gradient of an invariant is computed by differences")
@@ -75,7 +75,7 @@ def _of_eight(native: Native) -> tuple[Any, int]:
         return one, native.floats
     if isinstance(one, PointerFunction):
         if not one.octet_address:
-            raise NotCompilableError(f"{one.name} is a C function without a form for eight members (CFunctions)")
+            raise NotCompilableError(f"{one.name} is a C function without a version for eight members (see CFunctions)")
         return one.octet_address, native.floats
     from .octets.functions import compiled_for_octets  # loads Numba
 

@@ -94,13 +94,13 @@ def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics 
 
 
 def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there: np.ndarray) -> np.ndarray | None:
-    """Return the user's quantities (members, m, k), nan if there is no state."""
+    """Return the values (members, m, k) of the user's function `reduce`, nan where there is no state."""
     out: np.ndarray | None = None
     for i, j in zip(*np.nonzero(there), strict=True):
         value = np.atleast_1d(np.asarray(reduce(float(t[j]), states[i, j].copy())))
         if out is None:
             if value.ndim != 1 or value.dtype.kind not in "fiubc":
-                raise TypeError(f"reduce returned {value!r}, expected a number or one dimension (k,).")
+                raise TypeError(f"reduce returned {value!r}, expected a number or a 1-D array of numbers (k,).")
             dtype = complex if value.dtype.kind == "c" else float
             out = np.full((*there.shape, value.size), np.nan, dtype)
         out[i, j] = value
@@ -108,7 +108,7 @@ def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there
 
 
 def merge(first: Statistics | None, second: Statistics | None) -> Statistics | None:
-    """Return the statistics of two groups together (Chan, Golub & LeVeque 1983, eq. 2.1).
+    """Return the statistics of the union of two groups (Chan, Golub & LeVeque 1983, eq. 2.1).
 
     The order affects the last bits: merge chunks in order.
     """

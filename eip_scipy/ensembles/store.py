@@ -52,7 +52,7 @@ LEAST_RATIO = 19.0
 
 
 class _Store:
-    """Finished chunks on disk; base class of both kinds.
+    """Base class of the two stores of an ensemble's finished chunks on disk.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class _Store:
         checkpoint.require_same(self.path, there.get("settings"), here["settings"])
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
-            raise _other_functions(self.path, f"at the start ({one[:4]} there, {other[:4]} here)")
+            raise _other_functions(self.path, f"at the start (stored: {one[:4]}, now: {other[:4]})")
         if missing:
             raise CheckpointError(
                 f"{self.path!r} is not an ensemble of eip_scipy, or was written by an earlier version of eip_scipy: "
@@ -96,15 +96,15 @@ class _Store:
 
 
 def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
-    """Compare the values of functions at the end of a member of the last finished chunk.
+    """Compare the stored values of functions at the end of a member of the last finished chunk with the present ones.
 
     Raises
     ------
     CheckpointError
-        If they differ by more than rounding errors on another machine.
+        If the values differ by more than rounding errors on another machine.
     """
     if there.size and not (there.shape == here.shape and bool(np.all(np.abs(there - here) <= SAME * sizes))):
-        raise _other_functions(path, f"where a member from number {first} on ended")
+        raise _other_functions(path, f"at the end of a member from number {first} on")
 
 
 def _other_functions(path: str, where: str) -> CheckpointError:
@@ -118,8 +118,8 @@ class ZarrStore(_Store):
     """A group of arrays whose first axis is the member, with one Zarr chunk for each chunk of the ensemble.
 
     The status of the members of a chunk is written last: if it is present, the chunk is complete. (Zarr writes each
-    file under a temporary name and renames it.) A group in the local file system is locked, and is written to only
-    while it is the group that was opened.
+    file under a temporary name and renames it.) A group in the local file system is locked. Before each write a check
+    makes sure that it is still the group that was opened.
 
     Parameters
     ----------
@@ -140,8 +140,8 @@ class ZarrStore(_Store):
     ImportError
         If zarr is missing.
     CheckpointError
-        If `path` exists and `resume` is false, is not such a group, belongs to another ensemble, or is in use by
-        another ensemble.
+        If `path` exists and `resume` is false, is not a group written by an ensemble, belongs to another ensemble, or
+        is in use by another ensemble.
     """
 
     def __init__(
@@ -223,15 +223,15 @@ class ZarrStore(_Store):
         return found
 
     def _plain(self, name: str, there: Any, how: dict[str, Any]) -> Any:
-        """Return an array of the group, checked that reading it runs no foreign code; check its shape."""
+        """Return an array of the group after checks of its shape, and that reading it does not run foreign code."""
         metadata = there.metadata.to_dict()
         if metadata.get("node_type") != "array":
             raise ValueError(f"its {name!r} is not an array")
         codecs = {codec["name"] for codec in metadata.get("codecs", ())}
         if metadata["zarr_format"] != 3 or not codecs <= CODECS:
             raise ValueError(
-                f"its array {name!r} is stored by {', '.join(sorted(codecs - CODECS)) or 'another format'}; "
-                f"expected {', '.join(sorted(CODECS))}"
+                f"its array {name!r} is stored with {', '.join(sorted(codecs - CODECS)) or 'another format'}; "
+                f"expected codecs among {', '.join(sorted(CODECS))}"
             )
         shape, chunks = how["shape"], how.get("chunks", there.chunks)
         grows = name in ("event_t", "event_y")
@@ -264,7 +264,7 @@ class ZarrStore(_Store):
             )
 
     def _layout(self, times: np.ndarray) -> dict[str, dict[str, Any]]:
-        """Return the arguments with which the arrays of this ensemble are created."""
+        """Return by name the arguments with which the arrays of this ensemble are created."""
         layout: dict[str, dict[str, Any]] = {}
 
         def array(name: str, dtype: Any, axes: tuple[str, ...], shape: tuple[int, ...], rows: int, chunk: int) -> None:
@@ -303,7 +303,7 @@ class ZarrStore(_Store):
         return none._replace(**found, happened=unflattened(self._flat(first, last)))
 
     def _flat(self, first: int, last: int) -> Flat:
-        """Return the events of members `first` to `last`, which follow those of the members before."""
+        """Return the events of members `first` to `last`, which are stored after those of the preceding members."""
         if not self._events:
             return Flat(np.zeros((last - first, 0), np.int64), np.zeros(0), np.zeros((0, 1)))
         counts = self._arrays["event_count"][:last]
@@ -401,9 +401,10 @@ class CheckpointStore(_Store):
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
-        """Take the results of a chunk that starts at number `first`, the last part of `whole` so far.
+        """Record that the chunk that starts at number `first` is finished; write the file if it is time to do so.
 
-        `known_by` identifies its functions; `statistics` are those of `whole`.
+        `whole` holds the results of all members, and `statistics` are those of the finished members. `known_by`
+        identifies the functions of the chunk.
         """
         self._waiting = first + len(members.t), known_by, whole, statistics
         since = time.perf_counter() - self._written
@@ -437,7 +438,7 @@ Store = ZarrStore | CheckpointStore
 
 
 def _as_stored(value: Any) -> np.ndarray:
-    """Convert a field of Members to the axes of the group, or back."""
+    """Convert a field of Members to an array with the order of axes of the group, or back."""
     array = np.array(value, dtype=object) if isinstance(value, list) else value
     return array.swapaxes(1, 2) if array.ndim == 3 else array
 

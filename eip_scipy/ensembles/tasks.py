@@ -49,7 +49,7 @@ SHARED = OwnTimes()
 
 
 class StoppedError(Exception):
-    """The ensemble was stopped while members ran."""
+    """Exception that ends members that run while their ensemble is stopped."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Task:
     request : Request
         Arguments of `integrate` for one member with a valid start.
     reduce : callable, "state" or None
-        Quantity of which `Statistics` are computed.
+        Quantity of which `Statistics` are computed; None if there are none.
     keep : bool
         True if the saved states themselves are needed.
     members : int
@@ -379,7 +379,7 @@ def _alone(
     watch: _Watch,
     own: Mapping[str, Any] = NOTHING,
 ) -> None:
-    """Run one member as `integrate` does."""
+    """Run member `k` as `integrate` does, and store its results in `out`."""
     try:
         loop = plan.loop(y0, params, own)
     except Exception as error:
@@ -413,7 +413,7 @@ def _alone(
 
 
 def _cover(out: Members, those: slice, rows: np.ndarray, schedule: Schedule) -> None:
-    """Update the largest invariant errors with the values at rows (m, rows, l) and in the last states.
+    """Update the largest invariant errors of some members with the invariants at `rows` (m, rows, l) and at the end.
 
     The state at an event that ended a member is not included if `t_eval` was given, as in the result of a single run.
     """
@@ -439,7 +439,7 @@ def _values(driver: Driver, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -
 def _store(
     loop: Loop, k: int, status: int, message: str, out: Members, rows: np.ndarray, *, broken: bool = False
 ) -> None:
-    """Store the results of member k with the saved states `rows`; `broken`: a function raised an exception."""
+    """Store the results of member k, whose saved states are `rows`; `broken` is True if a function raised an error."""
     driver, work = loop.driver, loop.driver.run.work
     t, y = driver.now
     if status == 1:
@@ -464,7 +464,7 @@ def _reason(error: BaseException) -> str:
 
 
 class Sweeper:
-    """A native run with its buffers, on which the engine runs members.
+    """A compiled run with its buffers, which the engine uses for all members.
 
     Attributes
     ----------
@@ -576,7 +576,9 @@ class Sweeper:
     def _examine(self, each: data.Members, out: Members) -> None:
         """Examine the steps that the engine suspects, and check the invariants at the ends of members.
 
-        The invariants are checked at the end of the first member that arrived and, if one is not conserved, of all.
+            The invariants are checked at the ends of the members that arrived, in their order, up to the first member
+            at which
+        nothing is found.
         """
         run = self.loop.driver.run
         arrived = np.flatnonzero(out.status >= 0)
@@ -604,14 +606,14 @@ class Sweeper:
         out.message[k] = end if trust.trusted else f"{end}; {trust.message}"
 
     def _arrived(self, those: np.ndarray, each: data.Members, out: Members) -> None:
-        """Judge members that the engine has completed."""
+        """Store whether the members that the engine has completed are reliable, and their messages."""
         for k in those.tolist():
             out.trusted[k], out.message[k] = True, ENDS[out.status[k]]
         for k in those[sick(each.figures[those]).any(axis=1)].tolist():
             self._judge(k, each, out, [])
 
     def _side_by_side(self, each: data.Members, out: Members, watch: _Watch) -> None:
-        """Run all members in batches of eight, except those that must run individually."""
+        """Run all members in batches of eight, except those that must run individually, whose status stays NOT_RUN."""
         m, where = len(each.t), each.where
         while where[0] < m:
             watch.update()
@@ -652,7 +654,7 @@ class Sweeper:
             each.rows[k, driver.rows :] = np.nan
 
     def _first_steps(self, y0s: np.ndarray, params: np.ndarray) -> np.ndarray:
-        """Return the lengths of the first steps; NaN if none can be estimated."""
+        """Return the length of each member's first step; NaN if it cannot be estimated."""
         t0, stepping = self.loop.driver.schedule.span.t0, self.loop.driver.run.stepping
         if stepping.h is not None or stepping.first_step is not None:
             return np.full(len(y0s), stepping.h or stepping.first_step, float)
@@ -666,13 +668,13 @@ class Sweeper:
         return taus
 
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
-        """Return the derivative of a member with these parameters."""
+        """Set the parameters of the driver to those of a member, and return the right-hand side."""
         self.loop.driver.params[:] = params
         return self.loop.prepared.system.derivative
 
 
 def _part(each: data.Members, those: slice) -> data.Members:
-    """Return some of the members, none of which has started."""
+    """Return the inputs and buffers of some of the members, none of which has started."""
     own = {name: getattr(each, name)[those] for name in BY_MEMBER}
     rows = each.rows[those] if each.kept else each.rows
     return each._replace(**own, rows=rows, where=np.zeros(2, np.int64))

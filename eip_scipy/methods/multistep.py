@@ -30,13 +30,13 @@ Series = list[Fraction]
 class GaussJackson(Ordered):
     """Gauss-Jackson method of a given order in summed form, with one evaluation per step.
 
-    With the accelerations a_n at steps' ends, s_n = a_n + a_(n-1) + ... and S_n = s_n + s_(n-1) + ..., positions and
-    velocities are
+    With the accelerations a_n at the ends of the steps, s_n = a_n + a_(n-1) + ... and S_n = s_n + s_(n-1) + ...,
+    positions and velocities are
 
         q_(n+1) = h^2 (S_n + sum_j P_j a_(n-j)),    v_n = h (s_n + sum_j V_j a_(n-j)),    j < order,
 
     so that rounding errors are those of two sums, which are stored as pairs of floats. The position is predicted, the
-    acceleration is evaluated there, and added to both sums (PEC).
+    acceleration is evaluated there, and it is added to both sums (PEC).
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class GaussJackson(Ordered):
 
     @property
     def kappa(self) -> float:
-        """Exponent of the error metric: from the shape of a lower difference to that of the errors."""
+        """Exponent of the error metric: (order + 2) / (order of the estimate + 2)."""
         return (self.order + 2) / (min(ESTIMATE, self.order - 2) + 2)
 
     @property
@@ -109,7 +109,7 @@ class GaussJackson(Ordered):
 
 @cache
 def _inverse_powers(power: int, terms: int) -> Series:
-    """Return the series of L^-power."""
+    """Return the first `terms` coefficients of the series of L^-power in x."""
     L = [Fraction(1, k + 1) for k in range(terms)]
     inverse = [Fraction(1)]
     for k in range(1, terms):
@@ -125,7 +125,7 @@ def _product(a: Series, b: Series, terms: int) -> Series:
 
 
 def _shifted(series: Series, back: int) -> Series:
-    """Return the series times (1 - x)^back; back = -1 is one step ahead."""
+    """Return the series times (1 - x)^back, which shifts it back by `back` steps; back = -1 is one step ahead."""
     terms = len(series)
     if back < 0:
         return _product(series, [Fraction(1)] * terms, terms)
@@ -142,22 +142,22 @@ def _ordinates(series: Series) -> Series:
 
 
 def position_series(back: int, terms: int) -> Series:
-    """Return the series of the position `back` steps before the newest, after its leading terms 1 and -1 - back."""
+    """Return the series of the position `back` steps before the newest node, without its first terms 1, -1 - back."""
     return _shifted(_inverse_powers(2, terms + 2), back)[2:]
 
 
 def velocity_series(back: int, terms: int) -> Series:
-    """Return the series of the velocity after its leading term 1."""
+    """Return the series of the velocity `back` steps before the newest node, without its first term 1."""
     return _shifted(_inverse_powers(1, terms + 1), back)[1:]
 
 
 def position_weights(back: int, order: int) -> Series:
-    """Return the weights of a_n, a_(n-1), ... in the position."""
+    """Return the weights of a_n, a_(n-1), ... in the position `back` steps before the newest node n."""
     return _ordinates(position_series(back, order))
 
 
 def velocity_weights(back: int, order: int) -> Series:
-    """Return the weights of a_n, a_(n-1), ... in the velocity."""
+    """Return the weights of a_n, a_(n-1), ... in the velocity `back` steps before the newest node n."""
     return _ordinates(velocity_series(back, order))
 
 
@@ -171,9 +171,20 @@ def correction_weights(order: int) -> Series:
 class Weights(NamedTuple):
     """The weights of a method as floats, from the oldest node to the newest.
 
-    The weights of the predicted position and velocity are (order,), those of the state at each number of nodes before
-    the newest one (order, order), those of the corrector minus the predictor, of the differences with the shape of the
-    errors, and of the highest difference (order + 1,).
+    Attributes
+    ----------
+    predict_q, predict_v : ndarray, shape (order,)
+        Weights of the predicted position and velocity.
+    states_q, states_v : ndarray, shape (order, order)
+        Row k has the weights of the position or velocity k steps before the newest node.
+    correction : ndarray, shape (order + 1,)
+        Weights of the corrected minus the predicted position.
+    shape_q, shape_v : ndarray, shape (order + 1,)
+        Weights of the differences that have the shape of the errors of position and velocity.
+    size : ndarray, shape (order + 1,)
+        Weights of the highest difference.
+    error_constant : float
+        Size of the first omitted term of the series of the predicted position.
     """
 
     predict_q: np.ndarray
@@ -189,7 +200,7 @@ class Weights(NamedTuple):
 
 @cache
 def weights(order: int) -> Weights:
-    """Return the error weights of the method of this order; those of the velocity are differences of the others."""
+    """Return the weights of the method of this order; the velocity's errors have the shape of one difference more."""
     back = range(order)
     estimate = min(ESTIMATE, order - 2)
 
@@ -232,9 +243,10 @@ def _oldest_first(values: Series) -> np.ndarray:
 
 @cache
 def interpolation_weights(order: int) -> np.ndarray:
-    """Return the Lagrange polynomials [back, node, power] in theta, from the node `back` steps before the newest on.
+    """Return the coefficients [back, node, power] of the Lagrange polynomials in theta.
 
-    Node j is j steps before the newest one; theta = 1 is one step later than the node at theta = 0.
+    Node j is j steps before the newest one. theta counts steps from the node that is `back` steps before the newest
+    one.
     """
     out = np.zeros((order, order, order))
     for back in range(order):
@@ -255,7 +267,7 @@ def interpolation_weights(order: int) -> np.ndarray:
 def damping_limit(order: int) -> float:
     """Return the largest h c for which the method is stable for q'' = -c v (friction) and q'' = i c v (rotation).
 
-    Velocities are predicted as by the methods of Adams and Bashforth.
+    Velocities are predicted as in Adams-Bashforth methods.
     """
     P = np.array([float(c) for c in velocity_weights(-1, order)])
     # a_(n+1) = -c v^p_(n+1), whose first difference is that of h (s_n + sum_j P_j a_(n-j)).

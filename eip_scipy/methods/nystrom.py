@@ -31,7 +31,7 @@ MOMENTS = 7
 
 
 class NystromTree(NamedTuple):
-    """A special Nystrom tree below its root, which is an acceleration: velocities at its leaves, and further trees."""
+    """A special Nystrom tree with an acceleration as root: the number of leaves, which are velocities, and subtrees."""
 
     leaves: int
     subtrees: tuple[NystromTree, ...]
@@ -45,7 +45,10 @@ def nystrom_trees(order: int) -> tuple[NystromTree, ...]:
 
 
 def _forests(vertices: int, largest: int) -> Iterator[tuple[NystromTree, ...]]:
-    """Return multisets of trees, each on a vertex that joins it to the root, at most `vertices` vertices in total."""
+    """Yield the multisets of trees with at most `vertices` vertices in total and at most `largest` vertices per tree.
+
+    Each tree counts with one more vertex, which joins it to the root.
+    """
     if largest < 2:
         yield ()
         return
@@ -62,7 +65,7 @@ def _size(tree: NystromTree) -> int:
 
 @cache
 def _density(tree: NystromTree) -> int:
-    """Return the density: 1 / density is the weight of the tree in the velocity of the exact solution."""
+    """Return the density of a tree: 1 / density is the weight of the tree in the velocity of the exact solution."""
     product = _size(tree)
     for sub in tree.subtrees:
         product *= (1 + _size(sub)) * _density(sub)
@@ -79,7 +82,7 @@ def _fixed(values: np.ndarray) -> np.ndarray:
 
 
 class Weights(NamedTuple):
-    """A row of weights and its order; a position has an additional factor h from the velocity, and a vertex."""
+    """Weights of the position (if `position`) or of the velocity, their name, and the order that they must have."""
 
     label: str
     values: np.ndarray
@@ -90,8 +93,9 @@ class Weights(NamedTuple):
 def nystrom_residuals(A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> Iterator[tuple[Weights, int, float]]:
     """Yield the residuals of all conditions up to the order of each row, with the number of vertices of their trees.
 
-    sum_i b'_i phi_i(tree) - 1 / density(tree) up to `order` vertices for a velocity, and
-    sum_i b_i phi_i(tree) - 1 / ((vertices + 1) density(tree)) up to one vertex less for a position.
+    For a velocity the residuals are sum_i b'_i phi_i(tree) - 1 / density(tree), for trees of up to `order` vertices.
+    For a position they are sum_i b_i phi_i(tree) - 1 / ((vertices + 1) density(tree)), for trees of up to one vertex
+    less.
     """
     A, c = _fixed(A), _fixed(c)
     weights = [_fixed(row.values) for row in rows]
@@ -209,7 +213,9 @@ class NystromTableau(Ordered):
             _check_integer(name, "error_estimator_order", error_estimator_order)
             given |= {"b_hat": b_hat, "b_prime_hat": b_prime_hat}
         elif any(value is not None for value in (b_hat, b_prime_hat, error_estimator_order)):
-            raise ValueError(f"{name}: b_hat, b_prime_hat and error_estimator_order go together; give all or none.")
+            raise ValueError(
+                f"{name}: give all or none of b_hat, b_prime_hat and error_estimator_order; some are missing."
+            )
         s = len(b)
         exact = {"A": _stage_matrix(name, A, s), **{key: _row(name, key, row, s) for key, row in given.items()}}
         rows = [Weights("b", exact["b"], order, True), Weights("b_prime", exact["b_prime"], order, False)]
@@ -244,7 +250,7 @@ class NystromTableau(Ordered):
             if abs(residual) > tolerance:
                 raise ValueError(
                     f"{name}: {row.label} is not of order {row.order}: a condition of order {vertices + row.position} "
-                    f"misses by {residual:.3g}."
+                    f"is violated by {residual:.3g}."
                 )
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -262,7 +268,7 @@ def _check_integer(name: str, label: str, value: int) -> None:
 
 def _row(name: str, label: str, values: Sequence[Number], s: int) -> np.ndarray:
     if len(values) != s:
-        raise ValueError(f"{name}: {label} has {len(values)} entries and b {s}; they must agree.")
+        raise ValueError(f"{name}: {label} has {len(values)} entries and b has {s}; they must have the same number.")
     return _vector(name, values)
 
 
@@ -273,7 +279,7 @@ def _is_fsal(exact: Mapping[str, np.ndarray]) -> bool:
 
 
 def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:
-    """Return the weights minus those of the estimate, rounded once."""
+    """Return the weights `key` minus those of the estimate, rounded once; 0 without an estimate."""
     if f"{key}_hat" not in exact:
         return np.zeros(len(exact[key]))
     pairs = zip(exact[key], exact[f"{key}_hat"], strict=True)
@@ -286,7 +292,7 @@ def _velocity_moments(order: int) -> list[Fraction]:
 
 
 def _position_moments(order: int) -> list[Fraction]:
-    """Return the exact sums of b_i c_i^k for k = 0, 1, ...: one less, because the position gains an order."""
+    """Return the exact sums of b_i c_i^k for k = 0, 1, ..., one sum less than for b': positions gain an order."""
     return [Fraction(1, (k + 1) * (k + 2)) for k in range(min(order - 1, MOMENTS))]
 
 

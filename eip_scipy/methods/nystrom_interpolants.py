@@ -50,12 +50,12 @@ class Interpolant(NamedTuple):
 
 @cache
 def interpolant(tableau: NystromTableau) -> Interpolant:
-    """Return the interpolant of a tableau of order p, of at least `LEAST_ORDER`.
+    """Return the interpolant of a tableau whose order p is at least `LEAST_ORDER`.
 
     The velocity of a step is interpolated by the integral of the polynomial through accelerations at Gauss-Lobatto
-    nodes, the position by the integral of that. Where the error of the position at such a node is O(h^s), the
-    velocity in between has an error of O(h^(s + 1)); so a group of stages comes before, at equidistant nodes, until s
-    is at least p - 1 or no further group helps.
+    nodes, and the position by the integral of the velocity. If the error of the position at such a node is O(h^s), the
+    velocity between the nodes has an error of O(h^(s + 1)). Groups of stages at equidistant nodes are therefore
+    inserted before them, until s is at least p - 1 or no further group helps.
     """
     s = tableau.n_stages - tableau.fsal
     A, c = np.zeros((s + 1, s + 1)), np.ones(s + 1)
@@ -119,7 +119,7 @@ def _smallest(rows: Array, met: Array) -> Array:
 
 
 def _stage_factors(A: Array, c: Array, tree: NystromTree) -> Array:
-    """Return the elementary weights of a tree at all stages."""
+    """Return the factors phi_i(tree) of a tree at all stages i."""
     factors = c**tree.leaves
     for sub in tree.subtrees:
         factors = factors * (A.T * _stage_factors(A, c, sub)[:, None]).sum(axis=0)

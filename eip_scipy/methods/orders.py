@@ -9,7 +9,7 @@ __all__ = ["AT_REST", "AtRest", "Ordered", "named_constant"]
 
 
 def named_constant(value: Any, names: Mapping[str, Any]) -> str | None:
-    """Return the name of an object in its module, so that it is pickled by name."""
+    """Return the name of an object in `names`, the globals of its module, for pickling by name; None if it has none."""
     return next((name for name, own in names.items() if own is value), None)
 
 
@@ -35,19 +35,19 @@ class Ordered:
 
     @property
     def fixed_steps_only(self) -> bool:
-        """True if the step cannot be controlled, because there is no suitable error estimate."""
+        """True if the length of the step cannot be controlled, because there is no suitable error estimate."""
         return not self.has_estimate
 
     @property
     def kappa(self) -> float:
-        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
+        """Exponent of the error metric, (p + 1) / (p_hat + 1) with the orders of step and estimate; else 1."""
         if self.error_estimator_order is None:
             return 1.0
         return (self.order + 1) / (self.error_estimator_order + 1)
 
 
 class AtRest(Ordered):
-    """Stand-in for a method if a single state is projected."""
+    """Stand-in for a method, for the projection of a single state without steps."""
 
     name = "project"
     order = 0

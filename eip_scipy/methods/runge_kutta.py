@@ -34,7 +34,7 @@ def rooted_trees(order: int) -> tuple[Tree, ...]:
 
 
 def _forests(total: int, largest: int) -> Iterator[Tree]:
-    """Return multisets of trees with `total` vertices, each tree with at most `largest` vertices."""
+    """Yield the multisets of trees with `total` vertices in all and at most `largest` vertices per tree."""
     if total == 0:
         yield ()
         return
@@ -107,7 +107,7 @@ class Tableau(Ordered):
         Weights of a second, less accurate error e3 in addition to ``e = b - b_hat`` (e5): the estimate is then
         ``h e5 |e5| / hypot(e5, e3 / 10)``, as in DOP853, and `b_hat` is two orders below `error_estimator_order`.
     P : sequence of sequences, shape (s + 1, q), optional
-        Dense output: y(t + theta h) = y + h sum_j theta^(j + 1) (K^T P)_j, the last row for f at the new point.
+        Dense output: y(t + theta h) = y + h sum_j theta^(j + 1) (K^T P)_j; the last row is for f at the new point.
     reference : str
         Source of the coefficients, including the equation or table.
 
@@ -173,7 +173,7 @@ class Tableau(Ordered):
         self._check_order(name, "b", exact_A, exact_b, order)
         weights_hat = None
         if b_hat is None and error_estimator_order is not None:
-            raise ValueError(f"{name}: error_estimator_order was given without b_hat.")
+            raise ValueError(f"{name}: error_estimator_order was given without b_hat; give both or neither.")
         if b_hat is not None:
             # The combined estimate of a pair of orders 5 and 3 has the order 2 * 5 - 3 = 7.
             fewer = 0 if e_low is None else 2
@@ -205,7 +205,7 @@ class Tableau(Ordered):
     def _check_embedded(
         self, name: str, A: np.ndarray, b: np.ndarray, b_hat: Sequence[Number], order_hat: int | None, fewer: int
     ) -> np.ndarray:
-        """`b_hat` with s + 1 entries, its order checked on the stages and f at the new point (row b)."""
+        """Return `b_hat` with s + 1 entries after a check of its order, with f at the new point as a stage (row b)."""
         s = len(b)
         if len(b_hat) not in (s, s + 1):
             raise ValueError(
@@ -228,7 +228,7 @@ class Tableau(Ordered):
             if residual != 0 if exact else abs(float(residual)) > FLOAT_TOLERANCE:
                 raise ValueError(
                     f"{name}: {label} is not of order {order}: the condition of tree {tree} of order {_size(tree)} "
-                    f"misses by {float(residual):.3g}."
+                    f"is violated by {float(residual):.3g}."
                 )
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -252,7 +252,7 @@ def _vector(name: str, values: Sequence[Number]) -> np.ndarray:
 
 def _stage_matrix(name: str, A: Sequence[Sequence[Number]], s: int) -> np.ndarray:
     if len(A) != s:
-        raise ValueError(f"{name}: A has {len(A)} rows and b {s} entries; they must agree.")
+        raise ValueError(f"{name}: A has {len(A)} rows and b has {s} entries; they must have the same number.")
     full = np.full((s, s), Fraction(0), dtype=object)
     for i, row in enumerate(A):
         entries = [_exact(name, v) for v in row]
@@ -289,9 +289,9 @@ def _low_parts(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.
 
 
 def _least_corrections(nodes: Sequence[Fraction], missing: Sequence[Fraction]) -> list[Fraction]:
-    """Return the smallest x, in the Euclidean norm, with sum_i x_i c_i^k = missing[k], exactly.
+    """Return the smallest x, in the Euclidean norm, with sum_i x_i c_i^k = missing[k] for the nodes c, exactly.
 
-    It is a polynomial in the nodes, x_i = sum_k a_k c_i^k, whose coefficients solve V V^T a = missing with the
+    This x is a polynomial in the nodes, x_i = sum_k a_k c_i^k, whose coefficients solve V V^T a = missing with the
     Vandermonde matrix V. The system is solved in integers, with nodes in units of their last bit, by Bareiss's
     elimination.
     """

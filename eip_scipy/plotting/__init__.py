@@ -66,7 +66,7 @@ def typeset(text: str) -> str:
 
 
 def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") -> None:
-    """Make y, or x, a log axis of errors, with labels, few ticks and a range of at least two powers of ten."""
+    """Give the axis `along` a log scale with few ticks, widen a range below two powers of ten, and set both labels."""
     axis.set(**{f"{along}scale": "log"})
     low, high = axis.get_ylim() if along == "y" else axis.get_xlim()
     # A range below two powers of ten would have too few labelled ticks.

@@ -29,7 +29,7 @@ def stability_map(
     x, y : array_like, shape (k,) and (j,)
         Values of the quantities, in ascending order.
     megno : array_like, shape (j, k)
-        Mean MEGNO at each pair; values above `most` and inf have the same colour, nan has none.
+        Mean MEGNO at each pair (y, x). Values above `most`, and inf, have the colour of `most`; nan has no colour.
     xlabel, ylabel, title : str, optional
         Labels and title.
     most : float, optional
@@ -59,9 +59,11 @@ def draw_stability(axis: Axes, x: Any, y: Any, megno: Any, most: float) -> Any:
     """Draw the cells of a stability map, and return them for a colour bar."""
     x, y, values = (np.asarray(item, dtype=float) for item in (x, y, megno))
     if values.shape != (y.size, x.size):
-        raise ValueError(f"megno must have the shape {(y.size, x.size)} of (y, x), got {values.shape}.")
+        raise ValueError(
+            f"megno must have the shape {(y.size, x.size)}, a row for each y, a column for each x, got {values.shape}."
+        )
     if not most > REGULAR:
-        raise ValueError(f"most must be above {REGULAR:g}, MEGNO of a regular orbit, got {most!r}.")
+        raise ValueError(f"most must be above {REGULAR:g}, the MEGNO of a regular orbit, got {most!r}.")
     # The scale starts at 0, the value of a harmonic oscillator. Viridis suits colour-blind readers.
     return axis.pcolormesh(x, y, np.clip(values, 0.0, most), cmap="viridis", vmin=0.0, vmax=most, shading="nearest")
 

@@ -141,7 +141,7 @@ def _draw_last(axis: Axes, components: Mapping[str, Any]) -> None:
 
 
 def _draw_errors(axis: Axes, members: np.ndarray, errors: Mapping[str, Any], failed: np.ndarray) -> None:
-    """Draw the largest error of each invariant in each member, with a cross below those that failed."""
+    """Draw the largest error of each invariant in each member, and a cross at the bottom for each failed member."""
     styles = method_styles(errors)
     size = 4.0 if members.size <= 300 else 2.0
     for name, given in errors.items():

@@ -41,11 +41,12 @@ def run_figure(
     components : mapping of str to array_like, shape (m,)
         Values of each component; the magnitude of complex components is drawn.
     paths : mapping of str to (array_like, array_like)
-        x and y of each body, both (m,); if there are any, they are drawn instead of the components.
+        x and y of each body, both of shape (m,). If the mapping is not empty, paths are drawn instead of components.
     errors : mapping of str to array_like, shape (m,)
-        Errors of each invariant; without any there is no panel.
+        Errors of each invariant. If the mapping is empty, their panel is omitted.
     corrections : mapping of str to float
-        Largest correction for each invariant, in units of the local error; without any there is no panel.
+        Largest correction for each invariant, in units of the local error. If the mapping is empty, their panel is
+        omitted.
     title : str, optional
 
     Returns

@@ -1,4 +1,4 @@
-"""The harmonic oscillator of the paper's tables 1 and 2."""
+"""The harmonic oscillator of tables 1 and 2 of Cai, Gong & Wang."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["harmonic"]
 
 
 def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: float = 0.1) -> Problem:
-    """Harmonic oscillator y1' = omega y2, y2' = -omega y1 with ``H = omega |y|^2 / 2``.
+    """Return the harmonic oscillator y1' = omega y2, y2' = -omega y1 with the energy ``H = omega |y|^2 / 2``.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
         Angular frequency.
     y0 : array_like, shape (2,)
     t_end, h : float
-        End of the interval that starts at 0, and a step.
+        End of the interval that starts at 0, and the step.
 
     Returns
     -------

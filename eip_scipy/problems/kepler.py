@@ -1,4 +1,4 @@
-"""The Kepler problem with the relativistic perturbation of the paper's Experiment I."""
+"""The Kepler problem with the relativistic perturbation of Experiment I of Cai, Gong & Wang."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["kepler"]
 
 
 def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float = 200.0, h: float = 0.03) -> Problem:
-    """Kepler problem, ``H = |p|^2 / 2 - 1 / r - relativistic / (2 r^3)``, L = q1 p2 - q2 p1.
+    """Return the Kepler problem with ``H = |p|^2 / 2 - 1 / r - relativistic / (2 r^3)`` and L = q1 p2 - q2 p1.
 
     Parameters
     ----------
     eccentricity : float
         Eccentricity in [0, 1); the start is the pericentre of the orbit with semi-major axis 1.
     relativistic : float
-        Coefficient of the perturbation (the paper's 0.005); 0 for the plain Kepler problem.
+        Coefficient of the perturbation, by default that of Cai, Gong & Wang; 0 for the plain Kepler problem.
     t_end, h : float
-        End of the interval that starts at 0, and a step.
+        End of the interval that starts at 0, and the step.
 
     Returns
     -------
     Problem
-        Invariants "H" and "L"; for ``relativistic=0`` with the closed form as `reference`.
+        Its invariants are "H" and "L". For ``relativistic=0`` its `reference` is the closed form.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
 
 
 def _orbit(e: float, t: float) -> np.ndarray:
-    """Return the unperturbed orbit, by Kepler's equation E - e sin E = t."""
+    """Return the state on the unperturbed orbit at time t, by Kepler's equation E - e sin E = t."""
     mean = np.remainder(t + np.pi, 2 * np.pi) - np.pi
     E = brentq(lambda x: x - e * np.sin(x) - mean, mean - 1.0, mean + 1.0, xtol=1e-15, rtol=1e-15)
     b, r = sqrt(1 - e * e), 1 - e * np.cos(E)

@@ -1,4 +1,4 @@
-"""Invariants of equations on grids, made by their names, and the balances that they become by damping."""
+"""Invariants of equations on grids, created from their names, and the balances that replace them with damping."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def named_invariant(
     uses_f: bool = False,
     where: str = "",
 ) -> Invariant:
-    """Return the invariant of that name, from its value ``value(y)`` and its gradient in place.
+    """Return the invariant `name`; `made` has its value ``value(y)`` and a gradient that fills an array, by name.
 
     Raises
     ------
@@ -65,11 +65,13 @@ def damped_invariant(
     Parameters
     ----------
     item, rated : Invariant
-        The invariant, twice: one that remembers its last state is asked for rates at other states than for values.
+        Two separate objects for the same invariant, for its values and for its rates, because an invariant may store
+        results for its last state, and rates are computed at other states than values.
     parts : callable
-        ``parts(y, f) -> (kept, lost)``, two parts of the derivative f: that without damping, and what damping adds.
+        ``parts(y, f) -> (kept, lost)``, two parts of the derivative f: the derivative without damping, and the terms
+        that damping adds.
     total : callable, optional
-        Sums over the whole grid from those over the part that is here.
+        Function that returns the sum over the whole grid from the sum over the part of this process.
     """
     gradient = partial(_damped_gradient, item, parts)
     return Balance(
@@ -85,7 +87,7 @@ def _damped_gradient(item: Invariant, parts: Parts, t: float, y: np.ndarray, f: 
 def _loss(
     item: Invariant, parts: Parts, total: Callable[[float], float] | None, t: float, y: np.ndarray, f: np.ndarray
 ) -> float:
-    """Return the rate, Re <gradient, lost>."""
+    """Return the rate of the balance, Re <gradient, lost>."""
     kept, lost = parts(y, f)
     gradient = np.empty_like(y)
     assert item.gradient is not None

@@ -23,7 +23,7 @@ class Tips(NamedTuple):
     Attributes
     ----------
     t, R, z : ndarray, shape (k,)
-        Time, and the guiding centre's distance from the axis and height.
+        Times, and the distance of the guiding centre from the z axis and its height.
     """
 
     t: np.ndarray
@@ -33,21 +33,22 @@ class Tips(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ParticleOrbit:
-    """States of a charged particle along a run, and the observables that they hold.
+    """States of a charged particle along a run, and the quantities that are computed from them.
 
     Parameters
     ----------
     problem : ParticleProblem
-        Field, mass, charge and form of the states.
+        The problem, which defines the field, mass, charge and form of the states.
     t : ndarray, shape (m,)
     y : ndarray, shape (6, m)
-        As `integrate` returns them.
+        Times and states, as `integrate` returns them.
 
     Notes
     -----
     Lengths, times and velocities are in the problem's units. Guiding centre, gyroradius and magnetic moment are those
-    of lowest order, at each state by itself; they oscillate with the gyration by a part of the order of the gyroradius
-    over the field's length. `averaged` takes that out where states are saved several times a gyration.
+    of lowest order, computed from each state alone. They oscillate with the gyration, with a relative amplitude of
+    about the gyroradius divided by the length over which the field changes. `averaged` removes this oscillation if
+    states are saved several times per gyration.
 
     Examples
     --------
@@ -57,7 +58,7 @@ class ParticleOrbit:
     >>> problem = tokamak("banana", t_end=30_000)
     >>> run = integrate(problem, method=EIPRK4, save_every=1)
     >>> ParticleOrbit(problem, run.t, run.y).banana_tips().R.round(3).tolist()
-    [1.01]
+    [1.01, 1.01]
     """
 
     problem: ParticleProblem
@@ -88,7 +89,7 @@ class ParticleOrbit:
     def energy(self) -> np.ndarray:
         """H = m v^2 / 2 + q phi (m,); ValueError for a field whose potential is not known."""
         if self.problem.field.functions.phi is None:
-            raise ValueError("the energy needs the field's potential; give it to ParticleField.")
+            raise ValueError("the energy needs the potential of the field; pass potential= to ParticleField.")
         phi = self.problem.field.along("phi", self.x, self.t)
         return 0.5 * self.problem.mass * (self.v * self.v).sum(axis=0) + self.problem.charge * phi
 
@@ -96,7 +97,9 @@ class ParticleOrbit:
     def momentum(self) -> np.ndarray:
         """L = x p_y - y p_x with the canonical p = m v + q A (m,); ValueError for a field whose A is not known."""
         if self.problem.field.vector_potential is None:
-            raise ValueError("the canonical momentum needs the field's vector_potential; give it to ParticleField.")
+            raise ValueError(
+                "the canonical momentum needs the field's vector potential; pass vector_potential= to ParticleField."
+            )
         if self.problem.form == "canonical":
             p = self.y[3:]
         else:
@@ -151,7 +154,7 @@ class ParticleOrbit:
 
     @cached_property
     def gyrophase(self) -> np.ndarray:
-        """Angle of the gyration around B in rad, without jumps (m,); from the direction away from the z axis."""
+        """Angle of the gyration around B in rad, from the direction away from the z axis, without jumps (m,)."""
         b = self._magnetic / self._strength
         away = np.stack([self.y[0], self.y[1], np.zeros_like(self.t)]) / self.R
         first = away - (away * b).sum(axis=0) * b
@@ -161,32 +164,33 @@ class ParticleOrbit:
 
     @cached_property
     def _per_gyration(self) -> int:
-        """States in one gyration at the start."""
+        """Number of states in one gyration at the start; ValueError unless averages over a gyration are possible."""
         spacing = float(np.median(np.diff(self.t[: 2 * FEWEST_PER_GYRATION])))
         count = round(2 * np.pi / (self.gyrofrequency[0] * spacing))
         if count < FEWEST_PER_GYRATION or count >= self.t.size:
             raise ValueError(
-                f"a gyration has {count} of the {self.t.size} states; averages need at least {FEWEST_PER_GYRATION} in "
-                "one, and more than one: save more often (save_every), or integrate longer."
+                f"one gyration has {count} of the {self.t.size} states; averages need at least {FEWEST_PER_GYRATION} "
+                "states per gyration, and more than one gyration. Save more often (save_every), or integrate longer."
             )
         return count
 
     def averaged(self, values: Any) -> np.ndarray:
-        """Running means over one gyration of what is known at each state.
+        """Return the running means of a quantity over one gyration.
 
         Parameters
         ----------
         values : array_like, shape (..., m)
+            The quantity at all states, such as `magnetic_moment`.
 
         Returns
         -------
         ndarray, shape (..., k)
-            k = m + 1 less the states in a gyration; ``averaged(orbit.t)`` are the times.
+            k is m + 1 minus the number of states in a gyration; ``averaged(orbit.t)`` are the times of the means.
 
         Raises
         ------
         ValueError
-            If a gyration has fewer than four states, or more than there are.
+            If one gyration has fewer than four states, or if the run is not longer than one gyration.
         """
         n = self._per_gyration
         values = np.asarray(values, dtype=float)
@@ -196,7 +200,7 @@ class ParticleOrbit:
         return means + values[..., :1]
 
     def banana_tips(self) -> Tips:
-        """Places where the averaged velocity along B changes its sign.
+        """Return the places where the averaged velocity along B changes its sign.
 
         Returns
         -------
@@ -216,11 +220,11 @@ class ParticleOrbit:
         return Tips(*(values[k] + part * (values[k + 1] - values[k]) for values in found))
 
     def turns(self) -> np.ndarray:
-        """Revolutions of the guiding centre around the z axis since the first state (m,), positive either way."""
+        """Return the revolutions of the guiding centre around the z axis since the first state (m,), all positive."""
         return np.abs(self.guiding_angle - self.guiding_angle[0]) / (2 * np.pi)
 
     def poloidal_turns(self) -> Iterator[slice]:
-        """Parts of the run between two passages of the averaged guiding centre upward through z = 0.
+        """Yield the parts of the run between two passages of the averaged guiding centre upward through z = 0.
 
         Yields
         ------
@@ -238,18 +242,18 @@ class ParticleOrbit:
 
 
 def radial_range(orbit: ParticleOrbit, turn: float) -> float:
-    """Half of the range of R in one turn of the guiding centre around the z axis: the gyroradius that a picture shows.
+    """Return half of the range of R in one turn of the guiding centre around the z axis, the gyroradius in a picture.
 
     Parameters
     ----------
     orbit : ParticleOrbit
     turn : float
-        Its end in turns since the first state; 1 for the first turn.
+        The end of the turn, in turns since the first state; 1 for the first turn.
 
     Returns
     -------
     float
-        nan when the run does not reach the turn's end.
+        nan if the run does not reach the end of the turn.
     """
     turns = orbit.turns()
     if not turns[-1] >= turn:

@@ -1,4 +1,4 @@
-"""Fictitious time: with a fixed step in it the steps in time are short during fast motion.
+"""Fictitious time s: if the step in s is fixed, the steps in time t are short during fast motion.
 
 With dt = g(y) ds the state (y, t) as a function of s obeys another autonomous system, which has the invariants of the
 problem. In this way a method with a fixed step and its projection can be used for close encounters.
@@ -23,7 +23,7 @@ __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 
 @compilable
 def centre_time(y, params):
-    """Return the time scale r^(3/2) of motion around one centre with G M = 1: the choice of g for `kepler`."""
+    """Return the time scale r^(3/2) of motion around one centre with G M = 1, which is the function g for `kepler`."""
     r2 = 0.0
     for k in range(y.size // 2):
         r2 += y[k] * y[k]
@@ -55,8 +55,8 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         ``events=reaches(t)`` to `integrate`.
     g : callable, optional
         Compiled ``g(y, params) -> float``, positive: the time dt for a unit of s at y. Default: `pair_time`, for
-        problems such as `nbody`; `centre_time` is for `kepler`. With these functions a circular orbit of two bodies
-        takes 2 pi in s, and so does about half of a narrow ellipse with a passage of its pericentre.
+        problems such as `nbody`; `centre_time` is for `kepler`. With these functions 2 pi in s is one revolution of a
+        circular orbit of two bodies, or about half a revolution of a narrow ellipse that includes the pericentre.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     Raises
     ------
     ValueError
-        If the problem has no compiled right-hand side, or a part of its state would have the wrong size.
+        If the problem has no compiled right-hand side, or one of its invariants is a `Balance`.
 
     Notes
     -----
@@ -105,7 +105,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
 
 
 def reaches(t: float) -> Callable[..., float]:
-    """Return a terminal event for a run of a transformed problem, which ends the run at the time `t`."""
+    """Return a terminal event that ends a run of a transformed problem at the time `t` (not at s = t)."""
     refuse_units(t=t)
     t = float(t)
 
@@ -134,8 +134,8 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
 def _transformed_invariant(item: Invariant) -> Invariant:
     if item.is_balance:
         raise ValueError(
-            f"time_transformed: {item!r} is a Balance, whose rate is a derivative by time. Omit it, and give the new "
-            "problem a Balance with the rate in fictitious time: replace(problem, invariants=...)."
+            f"time_transformed: {item!r} is a Balance, whose rate is a derivative with respect to time. Omit it, and "
+            "give the new problem a Balance with the rate in fictitious time: replace(problem, invariants=...)."
         )
     fun, grad = _transformed_functions(item.function, item.gradient, item.uses_f)
     return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)

@@ -1,4 +1,4 @@
-"""One run's steps: the engine, its buffers, and what it saves."""
+"""The steps of one run: the engine, the buffers of the run, and the states that it saves."""
 
 from __future__ import annotations
 
@@ -90,7 +90,10 @@ class Driver:
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:
-        """Replace the engine's error by the exception of a compiled function, or by the meaning of its status."""
+        """Replace the engine's `FailedCallError` by the exception of the Numba function that failed.
+
+        For a C function, raise an error that names the function and its status.
+        """
         try:
             yield
         except FailedCallError as error:
@@ -129,7 +132,10 @@ class Driver:
         return float(self.schedule.clock[TIME_NEW if pending else TIME]), self.new if pending else self.state
 
     def parts(self) -> dict[str, np.ndarray]:
-        """Return the buffers that determine the remaining steps, and the counters; others are filled before use."""
+        """Return the buffers that determine the remaining steps, and the counters, by name.
+
+        All other buffers are filled before they are read.
+        """
         w, schedule = self.run.work, self.schedule
         history = self.run.method.multistep
         nodes = (
@@ -155,7 +161,10 @@ class Driver:
         }
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Return copies of the buffers of `parts` after the last accepted step, updated in the way of the loop."""
+        """Return copies of the buffers of `parts` after the last accepted step.
+
+        If a step is pending, the copies are updated as the loop would update the buffers.
+        """
         copies = {name: part.copy() for name, part in self.parts().items()}
         if self.schedule.place[PENDING] == 1:
             copies["place"][PENDING] = 0
@@ -222,7 +231,12 @@ class Driver:
 
     def _more_pieces(self, count: int) -> np.ndarray:
         floats = 0 if self._interpolants is None else self._interpolants.floats
-        require_memory((self._kept + count) * 8.0 * floats, "dense_output=True", self._max_bytes, "use t_eval")
+        require_memory(
+            (self._kept + count) * 8.0 * floats,
+            "dense_output=True",
+            self._max_bytes,
+            "use t_eval, or increase max_bytes",
+        )
         return np.empty((count, floats))
 
     @property
@@ -231,7 +245,7 @@ class Driver:
         return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
 
     def pending_events(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers and times of the events in the pending step, if the loop left them to the caller."""
+        """Return the indices and times of the events in the pending step, if the loop left them to the caller."""
         assert self._interpolants is not None  # the loop pauses for nothing else
         return self._interpolants.pending()
 
@@ -271,7 +285,7 @@ class Driver:
         return out
 
     def events_found(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the events that the loop has found since the last call, their times and states."""
+        """Return the indices, times and states of the events that the loop has found since the last call."""
         assert self._interpolants is not None  # a run with events has them
         return self._interpolants.roots()
 
@@ -282,7 +296,7 @@ def _first(size: int) -> int:
 
 
 def saved_rows(schedule: Schedule) -> int:
-    """Return how many states a run saves, including its start; 0 if that is not known in advance."""
+    """Return the number of states that a run saves, including its start; 0 if it is not known in advance."""
     if schedule.t_eval.size:
         return schedule.t_eval.size
     if schedule.save_every == 0:
@@ -291,20 +305,20 @@ def saved_rows(schedule: Schedule) -> int:
 
 
 def expected_steps(schedule: Schedule) -> int:
-    """Return the number of steps of a run; 0 if that is not known in advance."""
+    """Return the number of steps of a run; 0 if it is not known in advance."""
     return 0 if schedule.span.h == 0.0 or schedule.span.n_steps == UNBOUNDED else schedule.span.n_steps
 
 
 def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
     """Raise MemoryError if the saved rows would need too much memory."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
-    require_memory(needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "raise save_every")
+    require_memory(
+        needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "increase save_every or max_bytes"
+    )
 
 
 def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:
     """Raise MemoryError, with the number of bytes and advice, if `needed` exceeds the bound."""
     bound = most_bytes(needed, max_bytes)
     if needed > bound:
-        raise MemoryError(
-            f"{what} needs {needed / 1e9:.3g} GB, the bound is {bound / 1e9:.3g} GB; {advice} (or max_bytes)."
-        )
+        raise MemoryError(f"{what} needs {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB; {advice}.")

@@ -18,7 +18,7 @@ __all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
 
 
 def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[..., Any]]) -> tuple[Any, ...]:
-    """Return the functions `others` for the same events, with the counts of the events so far."""
+    """Return `others`, functions that replace those of `events` one by one, with the times of these so far."""
     return ContinuedEvents(others, events.happened) if isinstance(events, ContinuedEvents) else tuple(others)
 
 
@@ -28,7 +28,7 @@ class ContinuedEvents(tuple):
     happened: tuple[np.ndarray, ...]
 
     def __new__(cls, events: Any, happened: Any) -> ContinuedEvents:
-        """Take the events and the times of each."""
+        """Make the tuple from the events and, for each event, the times at which it has happened."""
         found = super().__new__(cls, events)
         found.happened = tuple(happened)
         return found
@@ -97,7 +97,7 @@ class Events:
         return [allowed - count for allowed, count in zip(self._allowed, self._counts, strict=True)]
 
     def take(self, which: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
-        """Record events that the loop has found, in the order in which they happened."""
+        """Record events that the loop has found, by their indices, times and states, in the order of their times."""
         for k, t, y in zip(which.tolist(), times.tolist(), states, strict=True):
             self._note(k, t, y.copy())
 
@@ -113,9 +113,9 @@ class Events:
             values[k] = self._value(k, t, y.copy())
 
     def leave(self, t: float, y: np.ndarray, f: np.ndarray, step: float, values: np.ndarray) -> None:
-        """Evaluate events that happened at the start of a continued run slightly later.
+        """Replace the values of events that happened at the start of a continued run by those slightly later.
 
-        Their value at the start is a rounding error, whose sign could make the event happen again.
+        The value of such an event at the start is a rounding error, whose sign could make the event happen again.
         """
         part = step / 4096
         for k, times in enumerate(self._happened):
@@ -200,7 +200,7 @@ def _adapted(event: Any, k: int) -> Any:
 
 
 def _direction(direction: Any) -> float:
-    """Return the sign that the change of an event must have, 0 for both."""
+    """Return the `direction` of an event after a check: the sign that its change must have, 0 for both signs."""
     if not (is_number(direction) or isinstance(direction, (bool, np.bool_))) or math.isnan(direction):
         raise ValueError(
             f"The `direction` attribute of each event must be a number: positive, negative or 0, got "
@@ -210,7 +210,7 @@ def _direction(direction: Any) -> float:
 
 
 def _allowed(terminal: Any) -> float:
-    """Return how many times an event may happen before it ends the run."""
+    """Return the number of times after which an event ends the run, from its `terminal`; infinity if it never does."""
     if terminal is None:
         return math.inf
     known = isinstance(terminal, (bool, np.bool_)) or (is_number(terminal) and float(terminal).is_integer())

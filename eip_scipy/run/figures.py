@@ -84,7 +84,7 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
 
 
 def planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    """Return the indices of x and y of each body."""
+    """Return the indices of the components x and y of each body, by the name of the body."""
     place = {name: k for k, name in enumerate(names)}
     bodies = [name[1:] for name in names if name[:1] == "x" and name[1:2] in ("", "_")]
     return {

@@ -242,7 +242,7 @@ class Loop:
             if run.tableau.drives:
                 raise ValueError(
                     f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
-                    "needs. Omit it, or save the state of a run and start another run from it."
+                    "needs. Omit checkpoint, or save the last state of a run and start another run from it."
                 )
             identity = prepared.identity(run.begin.y, system.parameters)
             keeper.identify(identity, run, system.derivative, *run.begin[:3])
@@ -295,7 +295,7 @@ class Loop:
     def steps(self, bar: Any) -> tuple[int, str]:
         """Run to the end of the interval, or until something ends the run earlier; return status and message.
 
-        Afterwards `told` is True if a run that has not failed is not reliable.
+        Afterwards `told` is True if the run has not failed but is not reliable.
         """
         self._doubtful = False
         status, message = self._steps(bar)
@@ -388,7 +388,11 @@ class Loop:
         return end is not None
 
     def _chunk(self, chunk: int) -> int:
-        """Return the number of steps of the next call: at most up to the next check or, with a callback, saved step."""
+        """Return the number of steps to make next: at most `chunk`, and none beyond the next check.
+
+        With a callback, none goes beyond the next state that is saved. At the end of a multistep run all remaining
+        steps are made, even if they are more than `chunk`.
+        """
         driver, schedule = self.driver, self.driver.schedule
         history, left = driver.run.method.multistep, schedule.span.n_steps - driver.step
         if history is not None and left - history.middle <= chunk:
@@ -497,7 +501,7 @@ class Loop:
 
 
 def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
-    """Return the states of rows without the derivatives that may follow them."""
+    """Return the states in `rows` without the columns of derivatives that follow them in a run with variations."""
     return rows if prepared.variations is None or rows.size == 0 else prepared.variations.columns.own(rows)
 
 

@@ -60,7 +60,7 @@ def _interpreted_in_place(
 def _second_order(
     interpreted: Callable[..., Callable[..., None]], fun: Callable[..., Any], extra: tuple, y0: np.ndarray
 ) -> Callable[..., None]:
-    """Return the in-place right-hand side of (q, v) from the acceleration `fun`."""
+    """Return the in-place right-hand side of y = (q, v) for the acceleration `fun`, checked by `interpreted`."""
     check_halves(y0.size)
     half = y0.size // 2
     acc = interpreted(fun, extra, y0[:half], "acceleration")

@@ -16,7 +16,7 @@ __all__ = ["TerminatedError", "ended_by_sigterm", "kept_ctrl_c", "look_for_signa
 
 
 class TerminatedError(KeyboardInterrupt):
-    """Exception raised by SIGTERM while a checkpoint must be written; it is handled as Ctrl-C is."""
+    """Exception raised by SIGTERM while a checkpoint must be written; it is handled like Ctrl-C."""
 
 
 # A Ctrl-C that Python would drop is repeated after this number of seconds.

@@ -159,7 +159,7 @@ class System:
 
     @property
     def left_out(self) -> str:
-        """Return a possible cause of NaN in the value of the function."""
+        """Return a possible cause of NaN in the value of the function, for messages; "" if none is known."""
         if isinstance(self.fun, PointerFunction):
             return "a C function leaves NaN in components that it does not fill, and if it returns a status above 0"
         return "with in_place=True it must fill all of out" if "in place" in self.form else ""
@@ -177,7 +177,7 @@ class System:
         return out
 
     def product(self) -> Callable[..., np.ndarray] | None:
-        """Return the Jacobian as a function that returns its product with a vector; it is compiled here."""
+        """Return ``product(t, q, dq)``, the Jacobian times dq, or None; a `Deferred` Jacobian is made here."""
         self.jacobian = made(self.jacobian)
         return None if self.jacobian is None else times(self.jacobian, *self.extra)
 
@@ -187,7 +187,10 @@ class System:
         return Jacobian((lambda t, y: jac(t, y, *self.extra)) if callable(jac) and self.extra else jac)
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
-        """Return the functions of the loop, and which of them are called from Python and why (None if none is)."""
+        """Return the functions that the loop calls, and a sentence on those called from Python and why, or None.
+
+        `wanted` is the option `compiled`: True raises NotCompilableError instead.
+        """
         numbers = scalars(self.extra)
         if wanted is False:
             return self._in_python(run), "interpreted: compiled=False"
@@ -402,7 +405,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
 
 
 def _variations(given: Any, request: Request, form: str) -> Variations | None:
-    """Return the derivatives that a request asks for, or None."""
+    """Return the `Variations` for the option of this name, or None if it was not given."""
     if request.variations is None:
         if request.jvp is not None or request.symplectic is not None:
             raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
@@ -469,7 +472,9 @@ def _second_order_hint(fun: Any) -> str:
     """Return advice on how to write the problem in (q, v), or how to pass an acceleration."""
     if not isinstance(fun, Problem):
         return f". If fun is the acceleration a(t, q), {BY_NAME}"
-    return "; this problem does it: problem.second_order(), with a start (q, v)" if fun.has_second_order else ""
+    return (
+        "; problem.second_order() returns this problem in that form, for a start (q, v)" if fun.has_second_order else ""
+    )
 
 
 def _method(method: Any) -> Any:
@@ -487,7 +492,7 @@ def _method(method: Any) -> Any:
 
 
 def _class_of(method: Any) -> str:
-    """Return a hint that names the class if its name was given, or the name of SciPy's method."""
+    """Return a hint that names the EIP class if `method` is its name or that of a method of SciPy, otherwise ""."""
     name = class_named(method)
     return "" if name is None else f". Give the class: from eip_scipy import {name}"
 
@@ -499,7 +504,7 @@ def _check_choices(request: Request) -> None:
     flag("progress", request.progress)
     flag("dense_output", request.dense_output)
     if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
-        raise ValueError(f"compiled must be True, False or None (where possible), got {shown(compiled)}.")
+        raise ValueError(f"compiled must be True, False or None (compile if possible), got {shown(compiled)}.")
     check_bytes(request.max_bytes)
 
 

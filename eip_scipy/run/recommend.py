@@ -67,7 +67,7 @@ def recommend(
         Wanted error of the state at the end: largest component of the difference to the exact one, relative to the
         largest component.
     invariants : Invariant or sequence of Invariant, optional
-        Invariants to keep; default: those of the problem, none for a function.
+        Invariants to keep; default: those of the problem; for a function, none.
     max_nfev : int, optional
         Approximate bound on the evaluations of one trial; default: 100 000, and 500 000 for compiled functions. A
         longer run is tried on the first part of its interval, and its error is extrapolated.

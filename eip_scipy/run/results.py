@@ -72,7 +72,7 @@ class WithColumns(Fields):
         Raises
         ------
         AttributeError
-            If the run did not integrate it.
+            If the run did not integrate the state-transition matrix.
         """
         if not self.get("columns", {}).get("state"):
             raise AttributeError(ABSENT["stm"])
@@ -85,7 +85,7 @@ class WithColumns(Fields):
         Raises
         ------
         AttributeError
-            If the run did not integrate any.
+            If the run did not integrate derivatives with respect to parameters.
         """
         count = self.get("columns", {}).get("parameters", 0)
         if not count:

@@ -99,7 +99,9 @@ def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[K
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
     if dense_output:
-        raise ValueError("a checkpoint does not store dense output; omit dense_output=True, use t_eval or save_every.")
+        raise ValueError(
+            "a checkpoint does not store dense output; omit dense_output=True and use t_eval or save_every."
+        )
     with closing(Lock(path)) as lock:
         found, origin = None, ""
         if os.path.lexists(lock.path):
@@ -273,8 +275,8 @@ class _FileKeeper(Keeper):
         self._require_fitting(arrays, parts)
         step, rows, pending = (int(k) for k in arrays["place"])
         if step < 0 or rows < 0 or pending != 0 or not is_number(header.get("wall_time")):
-            where = f"it is at step {step}, row {rows}"
-            raise CheckpointError(f"{self._name!r} is not a checkpoint of this run: {where}.")
+            stored = f"step {step}, {rows} rows, pending {pending}, wall_time {header.get('wall_time')!r}"
+            raise CheckpointError(f"{self._name!r} is not a checkpoint of this run: its values are wrong: {stored}.")
         n, dtype = driver.run.y0.size, driver.run.y0.dtype
         expected = {"saved_t": np.broadcast_to(0.0, rows), "saved_y": np.broadcast_to(dtype.type(0), (rows, n))}
         for k in range(len(events.functions)):

@@ -319,7 +319,8 @@ class Search:
         looser = self._trial(kind.settings(kind.near(LOOSER * chosen.options["rtol"])))
         if looser.nfev > FEWER * chosen.nfev:
             self.notes.append(
-                "Stability limits the steps, not accuracy: an implicit method or a splitting may cost much less."
+                "Stability limits the steps, and accuracy does not: an implicit method or a splitting may cost much "
+                "less."
             )
 
     def _why(self, chosen: Trial) -> str:

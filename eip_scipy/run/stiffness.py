@@ -22,7 +22,7 @@ LARGEST = 500
 
 
 class ImplicitRun(NamedTuple):
-    """Tolerances, error and evaluations of a run by EIPRadau; those for Jacobians are counted."""
+    """Tolerances, error and evaluations of a run by EIPRadau; evaluations for Jacobians are counted."""
 
     rtol: float
     atol: float

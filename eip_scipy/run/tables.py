@@ -171,7 +171,7 @@ def column_names(result: Any, components: Sequence[str]) -> list[str]:
 
 
 def component_names(result: Any, names: Any = None, n: int | None = None) -> tuple[str, ...]:
-    """Return `n` names: the given ones, else those of the result, else "y0", "y1" and so on; default: len(result.y)."""
+    """Return `names`, by default those of the result, else "y0", "y1" and so on; `n` is len(result.y) by default."""
     n = len(result.y) if n is None else n
     if names is None:
         names = getattr(result, "component_names", None)

@@ -85,7 +85,8 @@ def tune(
 ) -> list[Trial]:
     """Run trials of a kind, starting from a value of its number, until one has the wanted error.
 
-    The search ends early if nothing helps, or if the kind would cost much more than `bound` evaluations.
+    The search ends early if the first trials fail, if no other value is left to try, or if the kind would cost much
+    more than `bound` evaluations.
     """
     tried: dict[float, Trial] = {}
     fine: tuple[float, float] | None = None  # logarithms of number and error of an accurate enough trial
@@ -114,7 +115,10 @@ def tune(
 
 
 def _next(kind: Kind, fine: tuple[float, float] | None, coarse: tuple[float, float] | None, aim: float) -> float:
-    """Return the number at which the target error is expected, from known values on one side or on both."""
+    """Return the logarithm of the number at which the logarithm of the error is expected to be `aim`.
+
+    `fine` and `coarse` are those of `tune`; one of them may be None.
+    """
     farthest = FARTHEST[kind.fixed]
     if fine and coarse:
         width = coarse[0] - fine[0]

@@ -1,4 +1,4 @@
-"""Processes that work in parallel to a command: a single one, or one for each core."""
+"""Processes that work in parallel with a command: a single one, or several that share calls."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["Beside", "workers"]
 
 
 class Beside:
-    """A process that does one call after the other; leaving the context ends it at any time.
+    """Context of a second process that makes one call after the other.
 
-    It is started from scratch, not forked: a fork copies locks that other threads hold. It imports what the calls
-    need in about a second.
+    Leaving the context kills the process, even during a call. The process is spawned, not forked, because a fork copies
+    locks that other threads hold. It needs about a second for its imports.
     """
 
     def __enter__(self) -> Beside:
@@ -39,22 +39,25 @@ class Beside:
         self._pipe.close()
 
     def start(self, call: Callable[[], Any]) -> None:
-        """Start `call`, which must pickle like its result; the result of the previous call must have been read."""
+        """Start `call` in the process; `result` of the previous call must have been read.
+
+        The call and its result must pickle.
+        """
         with contextlib.suppress(BrokenPipeError):  # `result` reports it
             self._pipe.send(call)
 
     def result(self) -> Any:
-        """Wait for the value of the call, or raise its error.
+        """Wait for the call of `start`, and return its value or raise its error.
 
         Raises
         ------
         UsageError
-            If the process has ended.
+            If the process has died.
         """
         try:
             value, error = self._pipe.recv()
         except (EOFError, ConnectionError):
-            raise UsageError("a second process of this command has died: killed, or out of memory") from None
+            raise UsageError("the second process of this command has died: it was killed, or memory ran out") from None
         if error is not None:
             raise error
         return value
@@ -62,7 +65,7 @@ class Beside:
 
 @contextlib.contextmanager
 def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
-    """Start processes that share calls; leaving the context ends them at any time.
+    """Start processes that share calls; leaving the context kills them, even during calls.
 
     Parameters
     ----------
@@ -72,7 +75,7 @@ def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
     ------
     callable
         ``start(function, *args)`` queues a call and returns a function that waits for its value, or raises
-        UsageError if a process is no more. Function, arguments and value must pickle.
+        UsageError if a process has died. Function, arguments and value must pickle.
     """
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn"))
@@ -85,7 +88,7 @@ def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
             try:
                 return future.result()
             except BrokenProcessPool:
-                raise UsageError("a process of this command has died: killed, or out of memory") from None
+                raise UsageError("a process of this command has died: it was killed, or memory ran out") from None
 
         return value
 
@@ -99,7 +102,10 @@ def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
 
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
-    """Ignore Ctrl-C while a process starts: in a terminal it goes to all processes, and the command handles it."""
+    """Ignore Ctrl-C while a process starts, so that the new process ignores it, too.
+
+    In a terminal Ctrl-C goes to all processes, and the command alone reacts to it.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -64,7 +64,10 @@ def _longest_first() -> list[str]:
 
 
 def _no_command(words: list[str]) -> int:
-    """Raise an error for a first word that is an option, the first of a command's two words, or mistyped."""
+    """Report that the words name no command, and exit; ``--help`` and ``--version`` without a command are handled here.
+
+    The first word is then missing, an option, mistyped, or only the first of the two words of a command's name.
+    """
     groups = {name.split()[0] for name in COMMANDS if " " in name} - set(COMMANDS)
     group = words.pop(0) if words and words[0] in groups else ""
     known = [name for name in COMMANDS if name.startswith(group)]
@@ -75,7 +78,7 @@ def _no_command(words: list[str]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=_listed(known),
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and leave")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     _, rest = parser.parse_known_args(words)
     what = "TASK" if group else "COMMAND"
     last = list(dict.fromkeys(name.removeprefix(group).split()[0] for name in known))
@@ -132,9 +135,15 @@ def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
             settings["action"] = "store_true"
         parser.add_argument(flag, **settings)
     parser.add_argument(
-        "--out", type=Path, default=Path("eip_results"), metavar="DIR", help="folder of figures and CSV (./%(default)s)"
+        "--out",
+        type=Path,
+        default=Path("eip_results"),
+        metavar="DIR",
+        help="folder of figures and CSV files (default: ./%(default)s)",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="the numbers as JSON, with versions and machine")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write the numbers as JSON, with versions and machine"
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 
@@ -161,7 +170,7 @@ def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
             for message in untrusted:
                 warn(message)
             if unsaid:
-                warn(f"cannot print to standard output: {unsaid[0]}. The files of the command are not concerned.")
+                warn(f"cannot print to standard output: {unsaid[0]}. The files of the command are not affected.")
     if status == DONE and untrusted:
         return CHECK_FAILED
     return NOT_PRINTED if status == DONE and unsaid else status

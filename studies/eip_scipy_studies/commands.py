@@ -1,4 +1,7 @@
-"""The commands by name, with location and purpose, and exit statuses. The import is quick, for ``--help``."""
+"""Table of the commands, with their classes and purposes, and the exit statuses.
+
+It imports no command, so that ``--help`` is quick.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ DONE, CHECK_FAILED, WRONG_USAGE, NOT_PRINTED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 class Entry(NamedTuple):
-    """A command: "module:class" in `eip_scipy_studies`, and a line for ``--help``."""
+    """Entry of the table of commands: "module:class" in `eip_scipy_studies`, and the line for ``--help``."""
 
     where: str
     summary: str
@@ -19,7 +22,7 @@ class Entry(NamedTuple):
 
 COMMANDS = {
     "list": Entry("listing:Listing", "list commands, methods, problems and data sets"),
-    "doctor": Entry("doctor:Doctor", "what is installed, and a test of it in seconds"),
+    "doctor": Entry("doctor:Doctor", "list what is installed, and test in seconds whether it works"),
     "solar-system": Entry(
         "solar.solar_system:SolarSystem",
         "run the solar system and compare with other methods (the paper's Experiment II)",
@@ -27,7 +30,7 @@ COMMANDS = {
     "solar-system frontier": Entry(
         "solar.frontier:Frontier", "error against cost of long runs by methods of high order and by other packages"
     ),
-    "solar-system truth": Entry("solar.truth:Truth", "force models against the ephemeris DE440 itself"),
+    "solar-system truth": Entry("solar.truth:Truth", "compare force models with the ephemeris DE440 itself"),
     "charged-particle": Entry(
         "particles.charged_particle:ChargedParticle",
         "charged particles in two fields by several methods (the paper's Experiment III)",
@@ -42,27 +45,32 @@ COMMANDS = {
     "gpe ground-state": Entry(
         "condensates.states:GroundStates", "ground states of the rotating Gross-Pitaevskii equation (Experiment IV)"
     ),
-    "gpe ring": Entry("condensates.ring:Ring", "the paper's ring after its trap is tightened"),
-    "gpe vortex-lines": Entry("condensates.lines:VortexLines", "the paper's condensate in 3D, turned faster"),
+    "gpe ring": Entry("condensates.ring:Ring", "run the paper's ring of vortices after its trap is tightened"),
+    "gpe vortex-lines": Entry(
+        "condensates.lines:VortexLines", "run the paper's condensate in 3D after its rotation is made faster"
+    ),
     "mechanisms": Entry(
-        "mechanisms.study:Mechanisms", "error against cost of mechanisms with constraints, and IDA, LSODA and Radau"
+        "mechanisms.study:Mechanisms",
+        "error against cost on mechanisms with constraints, compared with IDA, LSODA and Radau",
     ),
     "work-precision": Entry(
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
-    "view": Entry("view:View", "a page that plays a saved run"),
+    "view": Entry("view:View", "write a page that plays a saved run"),
     "bench": Entry(
-        "bench.command:Bench", "this package compared with SciPy, REBOUND, heyoka and others, on this machine"
+        "bench.command:Bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
-    "study balances": Entry("measurements.balances:Balances", "what balances bring, and where they do not help"),
+    "study balances": Entry(
+        "measurements.balances:Balances", "final errors with and without balances, where they help and where not"
+    ),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
     ),
     "study control": Entry("measurements.control:Control", "step control by the error before and after the projection"),
     "study ensembles": Entry(
-        "measurements.ensembles:Ensembles", "cost of a member, threads, workers, memory, growth with the size"
+        "measurements.ensembles:Ensembles", "ensembles: cost of a member, gain from threads and workers, memory"
     ),
     "study exoplanets": Entry(
         "measurements.exoplanets:Exoplanets", "three systems of exoplanets compared with WHFast and IAS15"
@@ -78,14 +86,14 @@ COMMANDS = {
         "measurements.gradients:Gradients", "compiled gradients compared with gradients written by hand"
     ),
     "study growth": Entry("measurements.growth:Growth", "growth of the error of position over 10 000 years"),
-    "study import-time": Entry("measurements.import_time:ImportTime", "how long imports take"),
+    "study import-time": Entry("measurements.import_time:ImportTime", "duration of imports"),
     "study long-orbits": Entry(
-        "measurements.long_orbits:LongOrbits", "what projection and compensation bring over 1000 years"
+        "measurements.long_orbits:LongOrbits", "effect of projection and compensated sums over 1000 years"
     ),
     "study metric-memory": Entry(
-        "measurements.metric_memory:MetricMemory", "the metric on problems whose error estimates mislead it"
+        "measurements.metric_memory:MetricMemory", "the metric on problems with misleading error estimates"
     ),
-    "study metric-table": Entry("measurements.metric_table:MetricTable", "what the metric does to the solar system"),
+    "study metric-table": Entry("measurements.metric_table:MetricTable", "effect of the metric on the solar system"),
     "study multistep": Entry(
         "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
     ),
@@ -93,7 +101,7 @@ COMMANDS = {
         "measurements.nystrom_defaults:NystromDefaults", "two options of the Nyström methods that could be defaults"
     ),
     "study orbit-balances": Entry(
-        "measurements.orbit_balances:OrbitBalances", "what each quantity of the orbits costs and gains as a balance"
+        "measurements.orbit_balances:OrbitBalances", "cost and gain of each quantity of the orbits as a balance"
     ),
     "study overhead": Entry(
         "measurements.overhead:Overhead", "cost of a step in solve_ivp compared with SciPy's classes"
@@ -111,17 +119,20 @@ COMMANDS = {
         "measurements.solar_cloud:SolarCloud", "an ensemble of solar systems compared with REBOUND"
     ),
     "study solar-reference": Entry(
-        "measurements.solar_reference:SolarReference", "states of the solar system in 80 bits"
+        "measurements.solar_reference:SolarReference", "reference states of the solar system, computed in 80 bits"
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
     "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
     "study tangent-maps": Entry(
         "measurements.tangent_maps:TangentMaps",
-        "derivatives that runs carry along: errors, cost, chaos, a stability map",
+        "derivatives by start and parameters: errors, cost, chaos, a stability map",
     ),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
-    "study waves": Entry("measurements.waves:Waves", "errors against cost of waves compared with SciPy's DOP853"),
-    "study with-and-without": Entry("measurements.with_and_without:WithAndWithout", "the README's figure"),
+    "study waves": Entry("measurements.waves:Waves", "error against cost on waves, compared with SciPy's DOP853"),
+    "study with-and-without": Entry(
+        "measurements.with_and_without:WithAndWithout",
+        "the figures with and without invariants: a comet and a satellite",
+    ),
     "study written": Entry("measurements.written:Written", "cost of a problem written as an expression"),
 }
 # Former options by command, and the command that replaces each.
@@ -135,7 +146,7 @@ MOVED = {
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ``; did you mean ...?`` for the known name that is most like `name`, or nothing."""
+    """Return ``; did you mean ...?`` with the known name that is most like `name`, or "" if none is similar."""
     import difflib
 
     close = difflib.get_close_matches(name, list(known), n=1)

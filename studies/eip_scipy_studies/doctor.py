@@ -1,4 +1,4 @@
-"""``eip-scipy doctor``: a list of what is installed, and short trials of whether it computes correctly."""
+"""``eip-scipy doctor``: a list of what is installed, and short trials that show whether it computes correctly."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
 
 class Trial(NamedTuple):
-    """Subject of a trial, the number found and the largest acceptable one."""
+    """Result of a trial: its subject, the error that was found, the largest acceptable one, and the seconds it took."""
 
     name: str
     found: float
@@ -52,7 +52,7 @@ def _timed(name: str, bound: float, measure: Callable[[], float]) -> Trial:
 
 
 def _defects() -> float:
-    """Return the largest changes of energy and angular momentum, by their formulas."""
+    """Return the largest change of energy or angular momentum in a run, computed by their formulas."""
     problem = kepler(relativistic=0.0)
     run = solve_ivp(problem.fun, (0, 20), problem.y0, method=EIPRK4, h=0.02, invariants=problem.invariants)
     x, y, vx, vy = run.y
@@ -61,7 +61,7 @@ def _defects() -> float:
 
 
 def _bits() -> float:
-    """Return the largest difference of states by Python functions and by native ones, which must be 0."""
+    """Return the largest difference between final states by Python functions and by native ones, which must be 0."""
     problem = kepler()
     runs = problem.solve_ivp((0, 20), method=EIPRK4, h=0.02), integrate(problem, (0, 20), method=EIPRK4, h=0.02)
     return float(np.abs(runs[0].y[:, -1] - runs[1].y[:, -1]).max())
@@ -101,7 +101,7 @@ CHECKS = (
 
 
 class Examined(NamedTuple):
-    """Results of the command."""
+    """Results of the command: what is installed, and the trials."""
 
     installed: dict[str, Any]
     trials: list[Trial]
@@ -109,7 +109,7 @@ class Examined(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Study[Examined]):
-    """The command."""
+    """Command ``eip-scipy doctor``."""
 
     trials: tuple[tuple[str, float, Callable[[], float]], ...] = CHECKS
     writes_files = False
@@ -119,7 +119,9 @@ class Doctor(Study[Examined]):
         found = Examined(show_config("dicts") or {}, [_timed(*trial) for trial in self.trials])
         if failed := [trial.name for trial in found.trials if not trial.passed]:
             names = ", ".join(failed)
-            warn(f"failed: {names}. This installation computes something else than it must; install it anew.")
+            warn(
+                f"failed: {names}. This installation computes wrong results; reinstall eip_scipy and its dependencies."
+            )
         return found
 
     def text(self, found: Examined) -> str:

@@ -1,4 +1,4 @@
-"""Hard cases for integrators that project: 35 problems with exact final states.
+"""Hard cases for integrators with projection: 35 problems with exact final states.
 
 Kepler orbits to e = 0.999, SI units, circular orbits (parallel gradients), close encounters, tops, lattices, spins,
 weak invariants, complex states. The equations are here; parameters, starts and final states are data
@@ -30,14 +30,14 @@ class HardCase:
     ----------
     name, title : str
     problem : Problem
-        The problem; all its invariants are one `Invariant`, whose value is (l,). ``problem.source`` is the citation.
+        The problem. Its invariants are a single `Invariant` with values (l,), and ``problem.source`` is the citation.
     end : ndarray, shape (n,)
-        The exact state at the end of ``problem.t_span``, to the last bit or so.
+        The exact state at the end of ``problem.t_span``, up to about one rounding error.
     invariant_names : tuple of str, length l
     weak : tuple of str
-        Invariants that hold only on the manifold of the start.
+        Names of invariants that are constant only on the manifold on which the start lies.
     growth : float
-        Growth of a small relative perturbation of the start up to the end.
+        Factor by which a small relative perturbation of the start has grown at the end.
     note : str
         Why the case is hard.
     """
@@ -68,7 +68,10 @@ class HardCase:
 
 
 class CaseEquations(NamedTuple):
-    """``fun(t, y) -> (n,)``, ``values(t, y) -> (l,)`` and ``gradients(t, y) -> (l, n)``."""
+    """Equations of a case: right-hand side ``fun(t, y) -> (n,)``, and its invariants.
+
+    ``values(t, y) -> (l,)`` returns the invariants, and ``gradients(t, y) -> (l, n)`` their gradients.
+    """
 
     fun: Callable[..., np.ndarray]
     values: Callable[..., np.ndarray]
@@ -76,7 +79,7 @@ class CaseEquations(NamedTuple):
 
 
 class _Function:
-    """One of a case's functions, which pickles by its recipe."""
+    """One of the functions of a `CaseEquations`, which pickles by the names and parameters that make it."""
 
     def __init__(self, equations: str, params: dict[str, Any], which: str) -> None:
         self._made = equations, params, which
@@ -96,7 +99,7 @@ def stored_cases() -> dict[str, dict[str, Any]]:
 
 
 def hard_cases(names: Sequence[str] | None = None) -> tuple[HardCase, ...]:
-    """Hard cases for integrators that project.
+    """Return the hard cases.
 
     Parameters
     ----------

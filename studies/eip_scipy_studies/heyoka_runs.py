@@ -1,4 +1,4 @@
-"""heyoka as a reference: its Taylor integrator, in double precision, on our states.
+"""heyoka as a reference: its Taylor integrator in double precision, for states in the form of `nbody`.
 
 heyoka (F. Biscani, D. Izzo, MNRAS 504 (2021) 2614-2628) is free software under the MPL and not distributed with this
 package.
@@ -59,7 +59,7 @@ def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> He
         Initial state (q, v).
     t_end : float
     tolerance : float, optional
-        heyoka's; default: the spacing of numbers at 1.
+        Tolerance of heyoka; default: the spacing of floating-point numbers at 1.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> He
     outcome, *_, steps = integrator.propagate_until(float(t_end))[:4]
     wall_time = perf_counter() - start
     if outcome != heyoka.taylor_outcome.time_limit:
-        raise ValueError(f"heyoka stopped at t = {integrator.time:g}: {outcome}")
+        raise ValueError(f"heyoka stopped at t = {integrator.time:g}, before the end: {outcome}")
     y = integrator.state.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
     return HeyokaRun(heyoka.__version__, float(t_end), y, wall_time, int(steps))
 
@@ -95,7 +95,7 @@ def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_e
     Parameters
     ----------
     energy : callable
-        ``energy(heyoka, *y)``: the Hamiltonian of the components of the state (q, p), as an expression.
+        ``energy(heyoka, *y)`` returns the Hamiltonian as an expression of heyoka; `y` are the components of (q, p).
     y0, deviation : array_like, shape (n,)
         Initial state (q, p) and tangent vector.
     t_end, every : float
@@ -112,7 +112,10 @@ def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_e
     """
     y, d = np.array(y0, dtype=float), np.array(deviation, dtype=float)
     if y.ndim != 1 or y.size % 2 or d.shape != y.shape or not (t_end > 0 and every > 0):
-        raise ValueError(f"the state {y.shape} and the tangent vector {d.shape} must be (q, p), and the times positive")
+        raise ValueError(
+            f"y0 has shape {y.shape} and deviation {d.shape}; expected the same even number of components in both. "
+            f"t_end is {t_end!r} and every {every!r}; expected positive numbers"
+        )
     names = heyoka.make_vars(*(f"y{k}" for k in range(y.size)))
     H, half = energy(heyoka, *names), y.size // 2
     rates = [*(heyoka.diff(H, p) for p in names[half:]), *(-heyoka.diff(H, q) for q in names[:half])]

@@ -22,19 +22,19 @@ Found = dict[str, dict[str, str]]
 
 
 def fixed_step_methods() -> dict[str, type[EIPSolver]]:
-    """Find the solver classes with a tableau, which users name."""
+    """Return the solver classes of `eip_scipy` that have a tableau, by their names."""
     found = {name: getattr(eip_scipy, name) for name in eip_scipy.__all__ if name.startswith("EIP")}
     return {name: value for name, value in found.items() if hasattr(value, "TABLEAU")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Listing(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy list``."""
 
     writes_files = False
 
     def measure(self, session: Session) -> Found:
-        """Return names with the first lines of their docstrings, by their kind."""
+        """Return, for each kind, the names with the first lines of their docstrings."""
         sets = {name: solar_data.load(name) for name in solar_data.available()}
         others = {name: getattr(comparators, name) for name in comparators.__all__}
         functions = {name: make for name in problems.__all__ if _is_function(make := getattr(problems, name))}

@@ -1,4 +1,4 @@
-"""Commands that take minutes: their checkpoints, and the options of `integrate` for them."""
+"""Checkpoints of commands that take minutes, and the option of a positive number."""
 
 from __future__ import annotations
 
@@ -19,40 +19,41 @@ __all__ = ["Checkpoints", "named", "positive"]
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoints:
-    """Settings of a study whose runs keep checkpoints; a base class that comes before `Study`."""
+    """Options of a study whose runs keep checkpoints; among the base classes it must precede `Study`."""
 
     checkpoint: Path | None = option(
-        None, "keep checkpoints of the runs that this package does in DIR", type=Path, metavar="DIR"
+        None, "keep checkpoints of this package's own runs in the folder DIR", type=Path, metavar="DIR"
     )
-    resume: bool = option(False, "with --checkpoint: go on from those that are in DIR")
+    resume: bool = option(False, "continue from the checkpoints in the folder of --checkpoint")
 
     def check_settings(self) -> None:
-        """Check that the options go together and that the folder can be written to."""
+        """Check that ``--resume`` comes with ``--checkpoint``, and that the folder can be written to."""
         if self.resume and self.checkpoint is None:
             raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
         if self.checkpoint is not None:
             check_folder(self.checkpoint)
 
     def checkpoint_options(self, name: str) -> dict[str, Any]:
-        """Return the options of `integrate` for the checkpoints of the run of that name: one file each."""
+        """Return the options with which `integrate` keeps checkpoints of the run `name`, in a file of its own."""
         if self.checkpoint is None:
             return {}
         file = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
         return {"checkpoint": self.checkpoint / f"{file}.npz", "resume": self.resume}
 
     def when_interrupted(self) -> str:
-        """Print the command that continues the run, if there are checkpoints."""
+        """Return a line that says how to continue, or "" without checkpoints."""
         if self.checkpoint is None:
             return ""
         return f"the same command with --resume goes on from the checkpoints in {str(self.checkpoint)!r}"
 
 
 def positive(text: str) -> float:
-    """Read a finite number > 0.
+    """Return the finite positive number that `text` says.
 
     Raises
     ------
     ArgumentTypeError
+        If it is not such a number.
     """
     try:
         value = float(text)
@@ -64,5 +65,5 @@ def positive(text: str) -> float:
 
 
 def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
-    """Rename the method for its progress bar and for messages about the run."""
+    """Return a subclass of the method with this name, which progress bars and messages show."""
     return type(name, (method,), {"__doc__": method.__doc__})

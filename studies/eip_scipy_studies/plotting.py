@@ -1,4 +1,4 @@
-"""Figures of the studies: functions that take data and return a matplotlib Figure.
+"""Figures of the studies: functions that take data and return a `matplotlib.figure.Figure`.
 
 Needs ``pip install "eip_scipy[plot]"``. The figures belong to no window: save them with ``figure.savefig(path)``, or
 show them in a notebook.
@@ -101,7 +101,9 @@ Styles = Mapping[str, Mapping[str, Any]]
 def errors_figure(
     series: Mapping[str, ErrorSeries], *, time: str, trajectory: str, title: str = "", styles: Styles | None = None
 ) -> Figure:
-    """Draw invariant errors in time, and next to them the trajectory error, without which they prove nothing.
+    """Draw invariant errors in time, and next to them the error of the trajectory.
+
+    Small invariant errors alone do not show that the trajectory is right.
 
     Parameters
     ----------
@@ -361,7 +363,7 @@ def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figu
 
 
 def _share_limits(axes: Iterable[Axes], *, both: bool) -> None:
-    """Give all axes the same limits, in y or in x and y, which hold all of their data."""
+    """Give all axes the same limits, wide enough for the data of all: in x and y if `both`, otherwise in y."""
     for get, put in (("get_ylim", "set_ylim"), ("get_xlim", "set_xlim"))[: 1 + both]:
         limits = np.array([getattr(axis, get)() for axis in axes])
         for axis in axes:
@@ -436,7 +438,7 @@ class CostPanel(NamedTuple):
     curves : mapping of str to (array_like, array_like)
         Costs and errors by method; values that are not numbers above 0 are left out.
     slopes : mapping of str to float, optional
-        Slopes of some methods, each drawn as a line a little below the method's curve.
+        Slopes for some of the methods, each drawn as a dotted line a little below the method's curve.
     """
 
     title: str
@@ -524,7 +526,7 @@ class Linkage(NamedTuple):
     joints : array_like, shape (k, p, 2)
         Both ends of the chain of links, and the joints between them.
     pivots : array_like, shape (2, 2)
-        Points at rest, to which the ends belong.
+        Fixed points to which the two ends of the chain are attached.
     """
 
     t: Any
@@ -550,7 +552,8 @@ def linkage_figure(
     ----------
     drawings : mapping of str to Linkage
         Linkages by the titles of the panels; all have the same times.
-    panels : sequence of CostPanel, as many
+    panels : sequence of CostPanel
+        As many as `drawings`; they are drawn below them.
     unit, time, error : str
         Unit of length, labels of the time and of the error.
     title : str, optional
@@ -616,7 +619,7 @@ def _draw_linkages(figure: Figure, above: Any, drawings: Mapping[str, Linkage], 
 
 
 def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> None:
-    """Draw a dotted line below a method's curve, with its slope below the shortest step."""
+    """Draw a dotted line of the given slope a little below a method's curve, labelled with the slope."""
     ends = np.array([h.min(), h.max()])
     line = 0.25 * error[np.argmax(h)] * (ends / ends[1]) ** slope
     axis.plot(ends, line, color="0.4", lw=1.0, ls=":")
@@ -639,7 +642,7 @@ class FieldPanel(NamedTuple):
     vortices : array_like, shape (k, 2)
         Positions to mark.
     followed : int, optional
-        Number of the vortex that is marked differently, to be followed from panel to panel.
+        Index of a vortex that is marked differently, so that it can be followed from panel to panel.
     """
 
     density: Any
@@ -722,7 +725,7 @@ class SurfacePanel(NamedTuple):
     corners : array_like, shape (m, 3, 3)
         x, y and z of the three corners of each triangle.
     part : array_like of int, shape (m,)
-        Part to which each triangle belongs: 0 the outside, 1 the inside, 2 a part that is drawn differently.
+        Part of the surface to which each triangle belongs: 0 outer, 1 inner, 2 an inner part in another colour.
     """
 
     corners: Any
@@ -737,7 +740,7 @@ def surfaces_figure(
     columns: int = 3,
     view: tuple[float, float] = (28.0, -62.0),
 ) -> Figure:
-    """Draw surfaces in space, one panel for each: the outside transparent, the inside opaque.
+    """Draw surfaces in space, one panel for each: outer surfaces are transparent, inner ones opaque.
 
     Parameters
     ----------
@@ -808,8 +811,9 @@ def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) ->
 def blank_figure(width: float, height: float, title: str = "") -> Figure:
     """Return an empty figure in the layout of all figures.
 
-    Its size is this one, in inches, or narrower: a page shows all figures in its own width, and text of the same size
-    is too small to read in a wide one. The height shrinks by the root of what the width does, to leave room for text.
+    `width` and `height` are in inches. A wide figure is made narrower, because a page scales all figures to its own
+    width, and text in a wide one would be too small to read. The height is then reduced by the square root of the
+    factor of the width, to leave room for text.
     """
     scale = min(1.0, WIDEST / width)
     figure = Figure(figsize=(scale * width, scale**0.5 * height), dpi=DPI, layout="constrained")
@@ -819,7 +823,7 @@ def blank_figure(width: float, height: float, title: str = "") -> Figure:
 
 
 def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log: bool = False) -> None:
-    """Draw the largest magnitude in each of some hundred intervals of time; noise drawn in full would fill the area."""
+    """Draw the largest magnitude in each of some hundred time intervals, because full noise would fill the area."""
     t, magnitude = np.asarray(t, dtype=float), np.abs(np.asarray(values, dtype=float))
     n = min(t.size, magnitude.size)
     known = np.flatnonzero(np.isfinite(magnitude[:n]) & (t[:n] > 0))
@@ -835,7 +839,7 @@ def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log:
 
 
 def _marked(scale: np.ndarray, count: int = 6) -> list[int]:
-    """Return the numbers of `count` points at about equal distances, for markers."""
+    """Return the indices of `count` points that are about equally spaced on this scale, for markers."""
     wanted = np.linspace(scale[0], scale[-1], 2 * count + 1)[1::2]
     return sorted({int(np.argmin(np.abs(scale - at))) for at in wanted})
 
@@ -859,12 +863,12 @@ def log_x(axis: Axes) -> None:
 
 
 def _short(value: float, _: Any) -> str:
-    """Format a number on a log axis whose long labels would overlap."""
+    """Format a number in few characters, for labels of a log axis that would overlap otherwise."""
     return f"{value:g}" if value < 1e4 else f"{value:.0e}".replace("e+0", "e")
 
 
 def _plane(axis: Axes, title: str, unit: str) -> None:
-    """Set equal scales, and draw a cross for the central body."""
+    """Label a panel of orbits in a plane, set equal scales, and draw a cross for the central body."""
     axis.plot(0, 0, ls="", marker="+", color="black", ms=8)
     axis.set_title(title, fontsize="medium")
     axis.set_aspect("equal", adjustable="box")
@@ -906,11 +910,12 @@ def side_by_side_figure(
     Parameters
     ----------
     series : mapping of str to mapping
-        Arrays "seconds", "error" and "drift" by package, the last with nan if it is not known.
+        For each package, arrays "seconds", "error" (of the trajectory) and "drift" (of the invariants), which may be
+        nan.
     ours : collection of str
         Names of the series that are drawn with heavier lines.
     levels : collection of float
-        Errors of the trajectory at which the text compares, drawn as dotted lines.
+        Errors of the trajectory at which the report compares packages, drawn as dotted lines.
     time : str, optional
         Label of the time.
     title, footnote : str, optional
@@ -945,7 +950,7 @@ def side_by_side_figure(
 
 
 def _curve(axis: Axes, seconds: Any, errors: Any, style: Mapping[str, Any]) -> None:
-    """Draw a curve; errors below the spacing of numbers are drawn there, since a log axis has no zero."""
+    """Draw a curve on log axes; errors below the spacing of floating-point numbers at 1 are drawn at that value."""
     x, y = np.asarray(seconds, dtype=float), np.asarray(errors, dtype=float)
     good = np.isfinite(x) & np.isfinite(y)
     axis.plot(x[good], np.maximum(y[good], FLOOR), **style)

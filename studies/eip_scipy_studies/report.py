@@ -1,4 +1,4 @@
-"""Common functions of the commands: machine and versions, numbers and tables as text, complete files."""
+"""Common functions of the commands: machine and versions, numbers and tables as text, and writing of files."""
 
 from __future__ import annotations
 
@@ -89,7 +89,8 @@ def needed(module: str, install: str = "") -> Any:
     ----------
     module : str
     install : str, optional
-        Argument of ``pip install``. The integrations of the package have their own message.
+        Argument of ``pip install``. It may be omitted if the error of the import says what to install, as those of the
+        package's integrations do.
 
     Returns
     -------
@@ -122,9 +123,9 @@ def versions() -> dict[str, str | None]:
 
 
 def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
-    """Wrap a command's numbers for `write_json` with the options, the date, the versions and the machine.
+    """Return a command's numbers for `write_json`, with the options, the date, the versions and the machine.
 
-    It also says whether all runs since `listening` began are reliable.
+    The result also says whether all runs since `listening` began are reliable.
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict
 
 
 def compact(value: float | None, digits: int = 2) -> str:
-    """Write a number in at most ``digits + 6`` characters; "-" stands for None and for values that are not finite.
+    """Format a number in at most ``digits + 6`` characters; "-" stands for None and for values that are not finite.
 
     Examples
     --------
@@ -205,9 +206,10 @@ def _line(label: str, cells: Sequence[str], first: int, widths: Sequence[int]) -
 
 
 def say(text: str = "") -> None:
-    """Print on stdout; a terminal without Unicode or a closed stdout does not end the command.
+    """Print on stdout; neither a terminal without Unicode nor a closed stdout ends the command.
 
-    A reader that has closed the pipe, such as `head`, needs no more. Any other failure is noted for `printing`.
+    If a reader such as `head` has closed the pipe, nothing more is printed. Any other failure is recorded for
+    `printing`.
     """
     if sys.stdout is None or sys.stdout.closed:
         _unsaid.append("it is closed")
@@ -223,7 +225,7 @@ def say(text: str = "") -> None:
 
 
 def warn(message: str) -> None:
-    """Print one line for the user on the error stream, if there is a working one."""
+    """Print one line for the user on stderr, if stderr works."""
     if sys.stderr is not None:
         with suppress(OSError):
             print(f"eip-scipy: {message}", file=sys.stderr, flush=True)
@@ -231,7 +233,7 @@ def warn(message: str) -> None:
 
 @contextmanager
 def printing() -> Iterator[list[str]]:
-    """Collect the reasons why `say` could not print, instead of ending the command.
+    """Collect the reasons for which `say` could not print.
 
     Yields
     ------
@@ -244,17 +246,17 @@ def printing() -> Iterator[list[str]]:
 
 @contextmanager
 def listening(kind: type[Warning]) -> Iterator[list[str]]:
-    """Collect warnings that a run is not reliable, each text once, instead of showing them.
+    """Collect warnings of one class (`ProjectionWarning`), each text once, instead of showing them.
 
     Parameters
     ----------
     kind : type
-        Their class; other warnings are not affected.
+        The class; other warnings are not affected.
 
     Yields
     ------
     list of str
-        The warnings, added as runs end; `document` reads it, too.
+        The texts of the warnings, added as they come; `document` reads the list, too.
     """
     _untrusted.clear()
     with warnings.catch_warnings():
@@ -280,7 +282,7 @@ def listening(kind: type[Warning]) -> Iterator[list[str]]:
 
 @contextmanager
 def ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM end the block as Ctrl-C does, and afterwards the process, as the sender of the signal expects.
+    """Make SIGTERM end the block as Ctrl-C does; afterwards the process ends by SIGTERM, as its sender expects.
 
     A handler that the user has set is kept. A second SIGTERM does not disturb the reaction to the first one.
     """
@@ -313,7 +315,7 @@ def check_folder(folder: Path) -> None:
     Raises
     ------
     UsageError
-        If it cannot be made or written to.
+        If the folder cannot be made, or no file can be written there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -323,7 +325,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Check that a file can be written at `path`, in a folder that exists.
+    """Check that a file can be written at `path`; its folder must exist.
 
     Raises
     ------
@@ -399,13 +401,13 @@ def write_file(path: Path, write: Callable[[Path], Any]) -> Path:
 
 
 def write_json(path: Path, content: Any) -> Path:
-    """Write JSON; arrays become lists, and values that are not finite become null (JSON has no NaN)."""
+    """Write `content` as JSON; arrays become lists, and numbers that are not finite null, since JSON has no NaN."""
     text = json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
     return write_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write one line for each row under the names of the first row's entries; an empty cell is a missing number."""
+    """Write rows as CSV; the header has the names of the first row's entries. An empty cell is a missing number."""
 
     def write(temporary: Path) -> None:
         with open(temporary, "w", newline="", encoding="utf-8") as stream:
@@ -417,7 +419,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
 
 
 def _plain(value: Any) -> Any:
-    """Return `value` made of Python's own types, with None for numbers that are not finite."""
+    """Convert `value` to types that JSON has, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

@@ -1,4 +1,4 @@
-"""Definition of a command (settings, a measurement, and its output), and the one runner of all commands.
+"""Definition of a command (settings, a measurement, and its output), and the runner that all commands share.
 
 A new command is a file with a subclass of `Study`, and a line in `eip_scipy_studies.commands`.
 """
@@ -67,7 +67,7 @@ def option(default: Any, text: str, **settings: Any) -> Any:
     text : str
         Text of ``--help``.
     **settings
-        As for `argparse.ArgumentParser.add_argument`; ``positional=True`` makes it an argument without dashes.
+        As for `argparse.ArgumentParser.add_argument`; ``positional=True`` makes it a positional argument.
 
     Returns
     -------
@@ -77,12 +77,12 @@ def option(default: Any, text: str, **settings: Any) -> Any:
 
 
 def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
-    """Make a ``type`` of an option that takes one of these names, and suggests the nearest one for others.
+    """Make the ``type`` of an option that accepts one of these names, and suggests the most similar one for others.
 
     Parameters
     ----------
     what : str
-        Kind of the names.
+        Kind of the names, for messages.
     known : collection of str
 
     Returns
@@ -100,7 +100,7 @@ def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
 
 
 def some_of(what: str, known: Collection[str]) -> Any:
-    """Make a field of a command that takes some of these names, one option for each.
+    """Make a field of a command for an option that may be repeated, each time with one of these names.
 
     Parameters
     ----------
@@ -118,23 +118,23 @@ def some_of(what: str, known: Collection[str]) -> Any:
 
 
 class Verdict(Protocol):
-    """Interface of a check for the runner."""
+    """Interface that the runner needs of a check."""
 
     @property
     def passed(self) -> bool:
-        """Return whether it holds."""
+        """Return whether the check holds."""
         ...
 
 
 class Check(NamedTuple):
-    """A check of a command, in words."""
+    """Check of a command: its text, and whether it holds."""
 
     text: str
     passed: bool
 
     @property
     def line(self) -> str:
-        """One line of the text."""
+        """Return the check as a line of text."""
         return f"{'ok' if self.passed else 'FAILED':<6} {self.text}"
 
 
@@ -153,7 +153,7 @@ class Session:
     Attributes
     ----------
     name : str
-        The words of the command.
+        Name of the command, such as "gpe ring".
     out : Path
         Folder of figures and CSV files.
     json : Path or None
@@ -161,7 +161,7 @@ class Session:
     quiet : bool
         Print nothing but errors.
     absent : list of str
-        Packages that are not available for comparison, printed at the end.
+        Lines about packages that are not installed, printed at the end.
     written : set of Path
         Files that were made.
     unnamed : list of Path
@@ -191,7 +191,9 @@ class Session:
         return tqdm(total=total, desc=what, unit=unit, disable=not self.shown, **{"leave": False, **settings})
 
     def peer(self, name: str, methods: str) -> Any:
-        """Find an integration or one of `PEERS`; return None, and add a line at the end, if its package is missing.
+        """Import the adapter to another package, an integration or one of `PEERS`.
+
+        If the package is missing, return None, and print a line about it at the end of the command.
 
         Parameters
         ----------
@@ -212,18 +214,18 @@ class Session:
             return None
 
     def say(self, text: str = "") -> None:
-        """Print, unless quiet."""
+        """Print `text`, unless `quiet` is set."""
         if not self.quiet:
             say(text)
 
     def wrote(self, path: Path) -> None:
-        """Note that a file was written; `name_files` prints it, once."""
+        """Record that a file was written; `name_files` prints its name once."""
         if path not in self.written:
             self.unnamed.append(path)
         self.written.add(path)
 
     def name_files(self) -> None:
-        """Print the files that were made since the last time, with an empty line before the first of all."""
+        """Print the names of the files written since the last call, with an empty line before the first name of all."""
         first = len(self.unnamed) == len(self.written)
         for k, path in enumerate(self.unnamed):
             self.say(f"\nwrote {path}" if first and k == 0 else f"wrote {path}")
@@ -232,7 +234,10 @@ class Session:
 
 @dataclass(frozen=True, kw_only=True)
 class Command(ABC):
-    """Settings as fields: those made by `option` are the user's, the others are changed by tests and other commands."""
+    """Base class of commands, whose fields are the settings.
+
+    Fields made by `option` are options of the command line; the others are changed by tests and other commands only.
+    """
 
     @abstractmethod
     def run(self, session: Session) -> int:
@@ -244,17 +249,17 @@ class Command(ABC):
 
 
 class Study(Command, Generic[Found]):
-    """A command that measures something. The methods take the result of `measure`.
+    """Base class of commands that measure something.
 
-    The measurement and the text are required; everything else is optional. `writes_files` is False for a command
-    without CSV files and figures.
+    Subclasses must define `measure` and `text`, and may define the other methods. `found` is the result of `measure`.
+    `writes_files` is False for a command without CSV files and figures.
     """
 
     writes_files = True
 
     @abstractmethod
     def measure(self, session: Session) -> Found:
-        """Compute. After an interrupt by the user it may raise `PartlyDone` with the partial results."""
+        """Compute and return the results; after an interrupt by the user, perhaps raise `PartlyDone` with a part."""
 
     @abstractmethod
     def text(self, found: Found) -> str:
@@ -265,7 +270,7 @@ class Study(Command, Generic[Found]):
         return {}
 
     def tables(self, found: Found) -> Mapping[str, Rows]:
-        """Return CSV files, by their names."""
+        """Return the rows of CSV files, by the names of the files."""
         return {}
 
     def checks(self, found: Found) -> Sequence[Verdict]:
@@ -273,22 +278,22 @@ class Study(Command, Generic[Found]):
         return ()
 
     def figures(self, found: Found) -> Figures:
-        """Make figures one by one. An ImportError means that matplotlib is not installed, which is then printed."""
+        """Yield names and figures one by one. An ImportError means that matplotlib is missing; it is then printed."""
         return ()
 
     def refine(self, found: Found, session: Session) -> bool:
-        """Measure the long part after text and tables are written; return True if these must be written again."""
+        """Measure a long second part after text and tables are written; return True if these must be written again."""
         return False
 
     def when_interrupted(self) -> str:
-        """Print further information for the user: how to continue."""
+        """Return a text for the user on how to continue after an interrupt, or ""."""
         return ""
 
     def check_settings(self) -> None:
-        """Raise UsageError for settings that do not go together."""
+        """Raise a UsageError if settings are wrong or do not go together."""
 
     def run(self, session: Session) -> int:
-        """See `perform`; the settings and the files are checked first."""
+        """Check the settings and the files to write, and then do what `perform` does; return the exit status."""
         self.check_settings()
         if self.writes_files:
             check_folder(session.out)
@@ -298,7 +303,10 @@ class Study(Command, Generic[Found]):
 
 
 class Measurement(Study[Found]):
-    """A study of times: the result of `measure` is the content of the JSON, and the text begins with the machine."""
+    """Base class of studies of times.
+
+    The result of `measure` is the content of the JSON file. The text is the description of the machine and `table`.
+    """
 
     writes_files = False
 

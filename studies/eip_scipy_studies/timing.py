@@ -1,4 +1,4 @@
-"""Times of functions that are compared: all of them in turn, with the least time of each."""
+"""Timing of functions to be compared: all are called in turn, and the least time of each counts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FEWEST = 3
 
 
 def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> Action:
-    """Make a function that calls `call` once and returns the seconds that this took."""
+    """Make a function that calls `call` once and returns the seconds, on this clock, that the call took."""
 
     def run() -> float:
         begin = clock()
@@ -26,9 +26,9 @@ def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_coun
 
 
 def many_calls(call: Callable[[], Any]) -> Action:
-    """Make a function that returns the processor time of one of several calls, without the time of reading the clock.
+    """Make a function that returns the processor time of one call, as the mean of many.
 
-    `call` is called once before, to compile and plan.
+    The time of reading the clock is negligible in it. `call` is called once before, to compile and plan.
     """
     call()
     calls = max(1, int(2e-3 / max(clocked(call)(), 1e-6)))
@@ -50,11 +50,11 @@ def least(actions: Mapping[Name, Action], *, turns: int = 1, seconds: float = 0.
     Parameters
     ----------
     actions : mapping of hashable to callable
-        Functions that return their own times.
+        Functions that return the time that they took, in seconds.
     turns : int, optional
         Number of calls of each of them. All are called in turn, so that other load affects all equally.
     seconds : float, optional
-        If it is not 0: take turns until this number of seconds has passed, at least 3 turns.
+        If it is not 0: take at least 3 turns, and continue until this number of seconds has passed.
 
     Returns
     -------

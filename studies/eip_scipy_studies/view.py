@@ -17,24 +17,26 @@ __all__ = ["View"]
 
 
 class Movie(NamedTuple):
-    """A run, and the page that plays it."""
+    """A run, and the HTML text of the page that plays it."""
 
     run: Any
     page: str
 
     @property
     def trusted(self) -> bool:
-        """Return whether the run is reliable; a result of `solve_ivp` does not say."""
+        """Return whether the run is reliable; True for a result of `solve_ivp`, which does not say."""
         return bool(self.run.get("trusted", True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class View(Study[Movie]):
-    """The command."""
+    """Command ``eip-scipy view``."""
 
-    result: Path = option(None, "a file that run.save() has written", positional=True, type=Path, metavar="RESULT")
-    reference: Path | None = option(None, "another one, of the same times, that is right", type=Path, metavar="FILE")
-    names: str | None = option(None, 'names of the components, as "x y vx vy"', metavar="NAMES")
+    result: Path = option(None, "file that run.save() has written", positional=True, type=Path, metavar="RESULT")
+    reference: Path | None = option(
+        None, "file of a more accurate run with the same times, for errors of the trajectory", type=Path, metavar="FILE"
+    )
+    names: str | None = option(None, 'names of the components, such as "x y vx vy"', metavar="NAMES")
 
     def measure(self, session: Session) -> Movie:
         """Read the run, and write its page."""
@@ -59,7 +61,7 @@ class View(Study[Movie]):
         return {"of_a_trusted_run": found.trusted}
 
     def checks(self, found: Movie) -> list[Check]:
-        return [Check("the run is to be trusted", found.trusted)]
+        return [Check("the run is reliable", found.trusted)]
 
     def figures(self, found: Movie) -> Figures:
         yield f"{self.result.stem}.html", lambda path: path.write_text(found.page, encoding="utf-8")

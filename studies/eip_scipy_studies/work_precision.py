@@ -71,14 +71,14 @@ def work_precision(
     Parameters
     ----------
     methods : mapping of str to (callable, sequence of float)
-        ``run(step) -> (wall_time, y)`` for each method, the seconds without compilation, and the final
-        state; and the steps. The state of a run that failed is nan.
+        For each method the function ``run(step) -> (wall_time, y)``, and the steps. It returns the seconds without
+        compilation and the final state, which is nan if the run failed.
     error : callable
         ``error(y) -> float``, the error of a final state.
     repeats : int, optional
-        Runs of each point, the least time of which counts: disturbances make a timing longer, never shorter.
+        Number of runs of each point, of which the least time counts: disturbances make a timing longer, never shorter.
     enough_seconds : float, optional
-        A point that took longer is not run again.
+        A point (method and step) whose run took longer is not run again.
     in_all : float, optional
         A point whose runs took this number of seconds together is not run again.
     callback : callable, optional
@@ -123,7 +123,8 @@ def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
     Returns
     -------
     float
-        The cost; that of the cheapest run, an upper bound, if its error is smaller; nan if no run's error is.
+        The cost. If the cheapest run has a smaller error already, its cost, which is an upper bound. If no run has an
+        error of at most `level`, nan.
     """
     if errors[0] <= level:
         return float(costs[0])

@@ -480,7 +480,7 @@ def test_a_missing_constraint_is_named_as_the_cause(name):
     fun, y0, kept = MISSING[name]
     run, texts = said(lambda: integrate(fun, (0, 10), y0, method=EIPRK4, h=0.05, invariants=kept))
     assert "is kept only where its rate of change is 0" in run.message
-    assert "a constraint on which it depends is missing" in run.message
+    assert "depends is missing or not met" in run.message
     assert "not an invariant of this system" not in "".join((run.message, *texts))
 
 

@@ -382,7 +382,7 @@ def test_evaluations_of_multistep_members_do_not_depend_on_how_fast_the_machine_
 def test_multistep_members_without_a_history_run_one_by_one():
     run = check_bits(kepler(), (0, 0.2), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02)
     assert not run.side_by_side.any()
-    assert run.one_by_one == "there are fewer steps than the method's history has"
+    assert run.one_by_one == "the run has fewer steps than the history of the method"
 
 
 @njit

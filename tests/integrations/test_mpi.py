@@ -301,7 +301,7 @@ def test_an_error_on_a_single_rank():
 
 @pytest.mark.parametrize(("grid", "ranks"), [(Grid(8, 0, 1), 1), (Grid((8, 3), 0, 1), 4)])
 def test_grids_that_cannot_be_cut(grid, ranks):
-    with pytest.raises(ValueError, match=f"{ranks} ranks need as many points along x and along y"):
+    with pytest.raises(ValueError, match=f"{ranks} ranks need at least {ranks} points along x and along y"):
         SlabGrossPitaevskii(grid, comm=SimpleNamespace(rank=0, size=ranks))
 
 
@@ -311,7 +311,7 @@ def test_grids_that_cannot_be_cut(grid, ranks):
         ("EIPRK4", "must be an EIP class"),
         (EIPSolver, "must be an EIP class"),
         (eip_method(Splitting(small()[0])), "not a Runge-Kutta method"),
-        (ALONE, "is on ranks already"),
+        (ALONE, "is a class for ranks already"),
     ],
 )
 def test_methods_that_do_not_fit(method, match):

@@ -282,7 +282,7 @@ def test_problem_from_simulation_refuses(change, message):
 
 @pytest.mark.parametrize("given", ["archive.bin", None, np.zeros(12)])
 def test_problem_from_simulation_needs_a_simulation(given):
-    with pytest.raises(TypeError, match=r"got .*; one in an archive is rebound\.Simulation\(path\)"):
+    with pytest.raises(TypeError, match=r"got .*; read one from an archive by rebound\.Simulation\(path\)"):
         judge.problem_from_simulation(given)
 
 

@@ -242,7 +242,7 @@ def test_poloidal_turns_of_the_transit_orbit():
 def test_averages_need_enough_states():
     problem = tokamak(t_end=200.0)
     run = integrate(problem, method=EIPRK4, save_every=10)
-    with pytest.raises(ValueError, match="save more often"):
+    with pytest.raises(ValueError, match="Save more often"):
         ParticleOrbit(problem, run.t, run.y).averaged(run.t)
 
 

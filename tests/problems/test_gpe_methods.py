@@ -215,11 +215,11 @@ def test_wrong_options():
     gpe = GrossPitaevskii(grid, harmonic_trap(1, 1), Omega=0.5)
     with pytest.raises(ValueError, match=r"unknown scheme 'strangg', expected 'strang', .*Did you mean|strang"):
         Splitting(gpe, "strangg")
-    with pytest.raises(ValueError, match="equally far from the z axis"):
+    with pytest.raises(ValueError, match="at the same distance from the z axis"):
         at_rest(gpe.changed(potential=lambda x, y: x**4 + y**4).problem(np.ones((16, 16)), 1.0))
-    with pytest.raises(ValueError, match="no rotation: the problem has one dimension"):
+    with pytest.raises(ValueError, match="the problem has one dimension, without a z axis"):
         at_rest(soliton())
-    with pytest.raises(ValueError, match=r"turns by pi / 4 at most, got 1 "):
+    with pytest.raises(ValueError, match=r"is at most pi / 4, got 1;"):
         Splitting(gpe, "strang").one_step(0.0, noise(grid).ravel(), 2.0)
     with pytest.raises(ValueError, match="a rotation needs two or three"):
         rotated(GrossPitaevskii(Grid(8, -1, 1)), np.ones(8), 0.1)

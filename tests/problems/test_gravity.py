@@ -332,7 +332,7 @@ def test_a_pericentre_behind_the_end_of_a_run_does_not_bound_its_steps(method, e
 
 
 def test_a_pericentre_within_a_run_bounds_its_steps():
-    with pytest.raises(ValueError, match="is not stable for a motion as fast"):
+    with pytest.raises(ValueError, match="is not stable for the fastest motion"):
         integrate(falling((0, 1.0)), method=EIPGJ14, h=0.003)
 
 

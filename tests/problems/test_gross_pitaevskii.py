@@ -392,7 +392,7 @@ def test_bad_states_and_names():
         gpe.grid.field(np.zeros(63))
     with pytest.raises(ValueError, match="did you mean 'energy'"):
         gpe.invariants(["energie"])
-    with pytest.raises(ValueError, match="a rotation needs two dimensions"):
+    with pytest.raises(ValueError, match="a rotation needs at least two dimensions"):
         GrossPitaevskii(Grid(8, -1, 1), Omega=0.5)
     with pytest.raises(ValueError, match="angular momentum needs two or three"):
         line.angular_momentum(np.zeros(8))

@@ -117,7 +117,7 @@ def test_inputs_are_expressions_or_functions(pushed, given):
     outputs = {"acceleration": u.diff(), "again": x.diff(TIME, 2), "force": push, "spring": "k*x"}
     problem = mechanics(pushed, {m: 2, k: 3}, [0], [1], t_span=(0, 2), inputs={push: given}, outputs=outputs)
     jitted = numba.extending.is_jitted(given)
-    assert ("called as it is" in repr(problem)) is (given is late or jitted)
+    assert ("called as a function" in repr(problem)) is (given is late or jitted)
     assert numba.extending.is_jitted(problem.rhs) is (given is not late)
     assert problem.energy is None
     assert problem.momenta == ()

@@ -274,7 +274,7 @@ def test_wrong_input(arguments, message):
 
 
 def test_wrong_names_and_flags():
-    with pytest.raises(ValueError, match="bodies has 2 names, gm has 5 masses"):
+    with pytest.raises(ValueError, match="bodies has 2 names, but gm has 5 masses"):
         orbital_balances(GM, Y, bodies=["a", "b"])
     with pytest.raises(ValueError, match="newton must be True or False"):
         orbital_balances(GM, Y, newton=1)

@@ -78,7 +78,7 @@ def test_solve_ivp():
     adaptive = problem.solve_ivp((0, 3), method=EIPRK45, rtol=1e-9, t_eval=[1.0, 3.0])
     assert np.all(np.abs(adaptive.y[:, -1] - sol.y[:, -1]) < 1e-4)
     assert adaptive.t.tolist() == [1.0, 3.0]
-    with pytest.raises(TypeError, match="no start"):
+    with pytest.raises(TypeError, match="no y0"):
         replace(problem, y0=None).solve_ivp(method=EIPRK4)
 
 
@@ -89,5 +89,5 @@ def test_solve_ivp_by_a_method_of_scipy_gets_no_options_of_ours():
 
 def test_a_balance_is_not_written_in_another_time():
     balance = Balance(lambda t, y: y @ y, lambda t, y: 0.0, lambda t, y: 2 * y, name="B")
-    with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is a derivative by time"):
+    with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is a derivative with respect to time"):
         time_transformed(replace(kepler(), invariants=(balance,)), 1.0, centre_time)

@@ -119,7 +119,7 @@ def test_what_is_not_allowed_is_refused(text):
         ("x.real", "'x.real' is not allowed. Allowed are numbers, names, pi"),
         ("gamma(x)", "'gamma' is not a known function"),
         ("sin(x, y)", "because sin takes 1 argument"),
-        ("9**9**9", r"'9\*\*9' is an exponent beyond 1000"),
+        ("9**9**9", r"'9\*\*9' is an exponent above 1000"),
     ],
 )
 def test_errors_say_what_came_and_what_is_allowed(text, says):
@@ -351,7 +351,7 @@ def test_parameters_by_name_in_runs():
 def test_nystrom_methods_say_what_works():
     """The problem in (q, v) where there is one, and not where there is none."""
     options = {"method": EIPRKN12, "h": 0.1}
-    with pytest.raises(ValueError, match=r"Use a Runge-Kutta .*this problem does it: problem\.second_order\(\)"):
+    with pytest.raises(ValueError, match=r"Use a Runge-Kutta .*problem\.second_order\(\) returns this problem"):
         integrate(hamiltonian("px**2/4 + x**2/2"), (0, 1), [1.0, 2.0], **options)
     prey = equations({"x": "x*(1 - y)", "y": "y*(x - 1)"})
     for problem in (prey, hamiltonian("px**2*x + x**2")):
@@ -582,14 +582,14 @@ def test_how_invariants_are_known(H, invariants, params, how):
 @pytest.mark.parametrize(
     ("H", "invariants", "says"),
     [
-        ("(px**2 + py**2)/2 + x**2 + 2*y**2", L, "'L' is not an invariant of these equations: its rate is .*, at x="),
+        ("(px**2 + py**2)/2 + x**2 + 2*y**2", L, r"'L' is not an invariant of these equations: its rate is .*\. At x="),
         (HENON_HEILES, {"I": f"({HENON_HEILES})**13 + 1e-9*x"}, "'I' is not an invariant"),
         (HENON_HEILES, {"I": "z"}, "contains z, which is neither a component of the state nor a parameter"),
         (HENON_HEILES, {"I": "3"}, "does not depend on x, y, px, py"),
-        (HENON_HEILES, {"H": "x"}, "H is an invariant already"),
+        (HENON_HEILES, {"H": "x"}, "H is already the name of an invariant"),
         (HENON_HEILES, {"I": "sqrt(-2 - x**2)"}, "not finite and real at any point"),
         # Constant in one branch, which all points of moderate size are in.
-        ("(p**2 + q**2)/2", {"I": "max(q, 3)"}, r"its rate is p\*Heaviside\(q - 3\), at q="),
+        ("(p**2 + q**2)/2", {"I": "max(q, 3)"}, r"its rate is p\*Heaviside\(q - 3\)\. At q="),
         ("(p**2 + q**2)/2", {"I": "max(q**2, 1e8)"}, "'I' is not an invariant"),
         ("(p**2 + q**2)/2", {"I": "max(q, 3) - max(q, 3.001)"}, "'I' is not an invariant"),
         ("(p**2 + q**2)/2", {"I": "min(-7, q)*abs(p)"}, "'I' is not an invariant"),
@@ -608,7 +608,7 @@ def test_what_is_no_invariant_is_refused(H, invariants, says):
 @pytest.mark.parametrize(
     ("call", "kind", "says"),
     [
-        (lambda: hamiltonian("p**2", "q"), TypeError, "expected both q and p, or neither"),
+        (lambda: hamiltonian("p**2", "q"), TypeError, "give both q and p, or neither"),
         (lambda: hamiltonian("p**2", "q r", "p"), ValueError, "2 coordinates"),
         (lambda: hamiltonian("p**2", "q", "q"), ValueError, "occurs twice"),
         (lambda: hamiltonian("p**2*k", "q", "p"), ValueError, "contains k, which is neither"),

@@ -72,14 +72,14 @@ def test_constraints_may_depend_on_time():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"constraints": {"length": CONSTRAINTS["length"]}}, r"its rate is 2\*u\*x \+ 2\*v\*y.*add it to constraints"),
+        ({"constraints": {"length": CONSTRAINTS["length"]}}, r"its rate is 2\*u\*x \+ 2\*v\*y.*add that to"),
         ({"constraints": CONSTRAINTS | {"long": x**2 + y**2 - 4}}, "no state was found that meets 'length', 'rate'"),
         (
             {"constraints": CONSTRAINTS, "invariants": {"E": u**2 + g * y}},
             "'E' is not an invariant .* even where the con",
         ),
         ({"invariants": ENERGY}, "If it is conserved only if constraints hold, pass them as constraints="),
-        ({"constraints": CONSTRAINTS, "invariants": {"rate": x}}, "'rate' is a constraint and an invariant"),
+        ({"constraints": CONSTRAINTS, "invariants": {"rate": x}}, "'rate' is the name of a constraint and of"),
         ({"constraints": {"length": sympy.Integer(1)}}, "does not depend on x, y, u, v"),
     ],
 )

@@ -288,7 +288,7 @@ def test_charged_particle(name, form, compiled):
         y = problem.y0 + rng.uniform(-0.1, 0.1, 6)
         assert_variational(problem, y, rng, parameters, 3, 0.4, rtol)
         assert_variational(problem, y, rng, parameters, 0 if parameters else 1, 0.4, rtol)
-    with pytest.raises(ValueError, match=r"by its state, by parameter 0, the mass, .*; got parameters=\(2,\)"):
+    with pytest.raises(ValueError, match=r"its state, to parameter 0 \(the mass\) .*; got parameters=\(2,\)"):
         problem.variational((2,))
 
 

@@ -152,7 +152,7 @@ def test_a_zarr_group_at_a_url():
 
 # One run at a time.
 
-IN_USE = rf"in use by another run, of process {os.getpid()} on \S+, this one\. Wait until it ends"
+IN_USE = rf"in use by another run \(process {os.getpid()} on \S+, this one\)\. Wait until that run ends"
 
 
 @keeping
@@ -235,7 +235,7 @@ def test_another_process(keep, tmp_path, forker):
     process = forker.start(HOLDER, keep=keep.__name__, place=str(place))
     try:
         process.until("running")
-        with pytest.raises(CheckpointError, match=rf"in use by another run, of process {process.pid} on \S+\. Wait"):
+        with pytest.raises(CheckpointError, match=rf"in use by another run \(process {process.pid} on \S+\)\. Wait"):
             keep(place, resume=True)
     finally:
         os.kill(process.pid, signal.SIGKILL)
@@ -507,7 +507,7 @@ def test_members_of_functions_that_differ_later(keep, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         keep(place, callback=callback)
     for wrong in ({"fun": other}, {"invariants": Invariant(square, SQUARE.grad, name="S")}):
-        with pytest.raises(CheckpointError, match="had other values where a member from number 3 on ended"):
+        with pytest.raises(CheckpointError, match="had other values at the end of a member from number 3 on"):
             keep(place, resume=True, check=False, **wrong)
     same(members(), keep(place, resume=True))
     same(members(), keep(place, resume=True, fun=lambda t, y: oscillator(t, y) * (1 + 1e-14)))

@@ -407,7 +407,7 @@ def refused(c):
         (ffi.new("double *"), "'double *'"),
         (LowLevelCallable(c.kepler, ctypes.c_void_p(1)), "LowLevelCallable with user_data"),
         (VALUE(), "null pointer"),
-        (ctypes.cast(c.kepler, ctypes.c_void_p).value, "an address says nothing of its signature"),
+        (ctypes.cast(c.kepler, ctypes.c_void_p).value, "an address does not contain the signature"),
     ]
 
 
@@ -603,9 +603,9 @@ def test_what_has_no_function_of_eight_is_named(c):
     fun, kept = of_eight(c)
     options = {"params": MU, "method": EIPRK4, "h": 0.05}
     run = ensemble(c.kepler, (0, 1), [Y0, Y0], invariants=kept, **options)
-    assert run.one_by_one == "fun is a C function without a form for eight members (CFunctions)"
+    assert run.one_by_one == "fun is a C function without a version for eight members (see CFunctions)"
     run = ensemble(fun, (0, 1), [Y0, Y0], invariants=alone(c), **options)
-    assert run.one_by_one.startswith("invariant 'H L' is a C function without a form for eight members")
+    assert run.one_by_one.startswith("invariant 'H L' is a C function without a version for eight members")
     run = ensemble(fun, (0, 1), [Y0, Y0], invariants=kept, **options)
     assert run.side_by_side.all()
 

@@ -705,7 +705,7 @@ def test_fit_of_state_and_parameter(pendulum):
         (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, -1], method=EIPRK4, h=0.1), ValueError, "symmetric"),
         (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, 1], method=EIPRK4, h=0.1), ValueError, "sign -1"),
         (lambda p: TrajectoryFit(p, [0, 1], np.ones((3, 2)), y0=[0, 1], **FINE), ValueError, "data"),
-        (lambda p: TrajectoryFit(p, [1, 0, 2], np.ones((2, 3)), y0=[0, 1], **FINE), ValueError, "direction"),
+        (lambda p: TrajectoryFit(p, [1, 0, 2], np.ones((2, 3)), y0=[0, 1], **FINE), ValueError, "must be in order"),
         (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], sigma=0, **FINE), ValueError, "sigma"),
         (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], free=["x"], **FINE), ValueError, "parameter"),
         (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], observe="r", **FINE), ValueError, "observe"),

@@ -127,8 +127,8 @@ def test_angles_and_distances():
     [
         (["--forces", "1PN"], "'1PN', expected one of 1pn, eih, gr-potential, j2, moon-quadrupole, moon; did you mean"),
         (["--forces", "moonn"], "did you mean 'moon'?"),
-        (["--forces", "1pn", "eih"], "'1pn' and 'eih' are the same relativity twice"),
-        (["--forces", "moon", "moon-quadrupole"], "'moon-quadrupole' stands for the Moon"),
+        (["--forces", "1pn", "eih"], "'1pn' and 'eih' all describe relativity"),
+        (["--forces", "moon", "moon-quadrupole"], "'moon-quadrupole' replaces the Moon"),
         (["--years", "1000"], "is outside the kernel's span, JD 2287184.5 to 2688976.5 TDB (1549-12-31 to 2650-01-25)"),
         (["--years", "-1000"], "is outside the kernel's span"),
         (["--years", "0"], "expected a positive number"),

@@ -14,6 +14,7 @@ def compiled_for_octets(one: Compiled) -> Compiled:
     Raises
     ------
     NotCompilableError
-        If it branches on values, creates arrays, or does something else that vectors of members do not support.
+        If the function branches on values, creates arrays, or does something else that vectors of members do not
+        support.
     """
     return compiled(one.fun, one.kind, one.name, OCTET)

@@ -67,7 +67,7 @@ def _cast_number(context, builder, from_type, to_type, value):  # emits LLVM
 
 
 def _define(function: Any, arguments: int, emit: Callable[..., Any]) -> None:  # emits LLVM
-    """Type and emit a function of vectors, any argument of which may be a plain number."""
+    """Define the types and the LLVM code of a function of vectors, any argument of which may be a plain number."""
 
     @infer_global(function)
     class _Template(AbstractTemplate):

@@ -1,1 +1,1 @@
-"""Point masses: their equations and forces, the solar system, hard problems."""
+"""Point masses: their equations and forces, the solar system, and problems with close encounters."""

@@ -1,4 +1,4 @@
-"""Bodies with units and names: arguments of `nbody`, and the bodies of its problems and their runs."""
+"""Bodies with units and names: conversion of arguments of `nbody`, and the bodies of a problem or run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Bodies(NamedTuple):
     gm : ndarray, shape (N,)
         G times the masses.
     names : tuple of str
-        "0", "1" and so on for those without names.
+        Names of the bodies; "0", "1" and so on for bodies without names.
     """
 
     problem: Problem
@@ -52,20 +52,20 @@ class Bodies(NamedTuple):
 
 
 def bodies_of(run: Any) -> Bodies:
-    """Return the bodies of a problem that `nbody` made, or of a run of one.
+    """Return the bodies of a problem that was made by `nbody`, or of a run of such a problem.
 
     Raises
     ------
     TypeError
-        If it is another kind of problem or run, or a loaded result, which does not know its problem.
+        If `run` is another kind of problem or run, or a loaded result, which does not know its problem.
     """
     origin = None if isinstance(run, Problem) else getattr(run, "__dict__", {}).get("_origin")
     problem = run if origin is None else origin.request.fun
     if not (isinstance(problem, Problem) and problem.rhs in (library["gravity.rhs"], library["forces.rhs"])):
         raise TypeError(
-            f"expected a problem of bodies, such as nbody(...) or solar_system(), or a run of one by integrate; got "
-            f"{shown(type(run).__name__)}. A result that was loaded or comes from solve_ivp does not know its masses: "
-            "give them, or the problem."
+            f"expected a problem of bodies, such as nbody(...) or solar_system(), or a result of integrate for such a "
+            f"problem; got {shown(type(run).__name__)}. A result that was loaded or comes from solve_ivp does not "
+            "contain the masses: give them, or pass the problem."
         )
     given = None if origin is None else origin.request.params
     params = np.asarray(problem.params if given is None else given, dtype=float)
@@ -80,7 +80,7 @@ def body_names(names: Sequence[str], n: int) -> tuple[str, ...]:
     Raises
     ------
     TypeError, ValueError
-        If they are not strings, their number is not n, or two are equal.
+        If the names are not strings, their number is not n, or two names are equal.
     """
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise TypeError(f"bodies must be a sequence of names, got {shown(names)}.")
@@ -111,9 +111,10 @@ def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | N
     Raises
     ------
     TypeError
-        If one has a unit and another has none, or the units of the problem are not known.
+        If one argument has a unit and another has none, or an argument has a unit and the units of the problem are not
+        known.
     TypeError and ValueError
-        If dimensions do not fit.
+        If the dimension of a unit is wrong.
     """
     given = {"gm": gm, "position": position, "velocity": velocity}
     with_unit = [name for name, value in given.items() if has_unit(_first(value))]
@@ -123,7 +124,7 @@ def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | N
     for name in given:
         if name not in with_unit:
             raise TypeError(
-                f"{name} has no unit, and {' and '.join(with_unit)} has one: give units to all of gm, position and "
+                f"{name} has no unit, but {' and '.join(with_unit)} has: give units to all of gm, position and "
                 "velocity, or to none."
             )
     return (
@@ -134,7 +135,7 @@ def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | N
 
 
 def _gravitational(gm: Any, known: tuple[Unit, Unit]) -> Any:
-    """Return G m of values that are G m or masses."""
+    """Return G m as plain numbers, from values of G m or masses with units."""
     if isinstance(gm, tuple | list) or type(gm) is np.ndarray:
         return np.array([_gravitational(value, known) for value in gm])
     if not _is_mass(gm):  # a plain 0 among others is a test particle
@@ -148,7 +149,7 @@ def _is_mass(value: Any) -> bool:
 
 
 def _first(value: Any) -> Any:
-    """Return the first item of nested lists."""
+    """Return the first item of nested lists; a value that is not a list is returned unchanged."""
     while isinstance(value, tuple | list) and len(value):
         value = value[0]
     return value

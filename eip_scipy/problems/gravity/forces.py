@@ -31,7 +31,7 @@ FORCES = {
     "moon-quadrupole": "the Moon smeared out along a circle around the Earth",
     "drag": "drag in the first body's atmosphere, whose density falls exponentially",
 }
-"""Names of the forces with a line on each."""
+"""Names of the forces, with a description of each."""
 
 RELATIVITY = ("1pn", "eih", "gr-potential")
 VELOCITY_DEPENDENT = ("1pn", "eih", "drag")
@@ -44,27 +44,30 @@ KEPT = 1e-13
 
 @dataclass(frozen=True)
 class ForceConstants:
-    """Constants of nature that forces need, in the units of the state; only those of the forces in use.
+    """Constants that the forces of `nbody` need, in the units of the state.
+
+    Only the constants of the forces in use must be given.
 
     Attributes
     ----------
     c : float, optional
-        Speed of light: "1pn", "eih", "gr-potential".
+        Speed of light, for "1pn", "eih" and "gr-potential".
     j2 : float, optional
-        J2 times the square of the Sun's equatorial radius: "j2".
+        J2 times the square of the Sun's equatorial radius, for "j2".
     pole : sequence of 3 floats, optional
-        The Sun's axis of rotation, of any length: "j2", and "drag" with `spin`.
+        Vector of any length along the Sun's axis of rotation, for "j2", and for "drag" with `spin`.
     moon_body : int, optional
-        Index of the body that stands for Earth and Moon: "moon-quadrupole".
+        Index of the body that stands for Earth and Moon, for "moon-quadrupole".
     moon : float, optional
-        ``a^2 m_E m_M / (4 (m_E + m_M)^2)``, a the radius of the Moon's orbit: "moon-quadrupole".
+        ``a^2 m_E m_M / (4 (m_E + m_M)^2)`` with the radius a of the Moon's orbit, for "moon-quadrupole".
     drag : float, optional
-        Acceleration per squared speed relative to the air at the distance `drag_radius`, half the density times
-        c_D A / m of the bodies: "drag".
+        Acceleration divided by the squared speed relative to the air, at the distance `drag_radius`: half the density
+        of the air times c_D A / m of the bodies, for "drag".
     drag_radius, scale_height : float, optional
-        Distance from the first body at which `drag` holds, and over how much distance the density falls by e: "drag".
+        Distance from the first body at which `drag` holds, and the distance over which the density falls by a factor
+        of e, for "drag".
     spin : float, optional
-        Angular velocity of the atmosphere about the pole, 0 by default: "drag".
+        Angular velocity of the atmosphere about the pole, 0 by default, for "drag".
     """
 
     c: float | None = None
@@ -97,12 +100,14 @@ def check_forces(forces: Any) -> tuple[str, ...]:
     Raises
     ------
     ValueError
-        If a name is unknown, or there are two kinds of relativity.
+        If a name is unknown, or two of the names are kinds of relativity.
     TypeError
-        If it is neither a name nor a sequence.
+        If `forces` is neither a name nor a sequence.
     """
     if not isinstance(forces, Iterable):
-        raise TypeError(f"forces must be a name or a sequence of names, got {forces!r}; () is Newton alone.")
+        raise TypeError(
+            f"forces must be a name or a sequence of names, got {forces!r}; use () for Newton's gravitation alone."
+        )
     names = (forces,) if isinstance(forces, str) else tuple(forces)
     for name in names:
         if name not in FORCES:
@@ -110,7 +115,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
             raise ValueError(f"unknown force {name!r}; known: {', '.join(map(repr, FORCES))}{hint}")
     found = tuple(name for name in FORCES if name in names)
     if len(kinds := [name for name in found if name in RELATIVITY]) > 1:
-        raise ValueError(f"the forces {' and '.join(map(repr, kinds))} are the same relativity twice; give one of them")
+        raise ValueError(f"the forces {' and '.join(map(repr, kinds))} all describe relativity; give only one of them")
     return found
 
 
@@ -120,7 +125,7 @@ def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstant
     Raises
     ------
     ValueError
-        If a constant that a force needs is missing or senseless, or the first body has no mass.
+        If a constant that a force needs is missing or has a wrong value, or the first body has no mass.
     """
     known = ForceConstants() if constants is None else constants
     for force in forces:
@@ -131,7 +136,9 @@ def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstant
         if not isfinite(known.spin):
             raise ValueError(f"ForceConstants: spin must be a finite number; got {known.spin!r}.")
     if not gm[0] > 0:
-        raise ValueError(f"forces: the first body must be the Sun, with G m > 0; its G m is {gm[0]!r}.")
+        raise ValueError(
+            f"forces: the first body must be the one that exerts the forces, with G m > 0; its G m is {gm[0]!r}."
+        )
     entries = np.zeros(N_ENTRIES)
     entries[MOON_BODY] = -1.0
     for place, name in enumerate(RELATIVITY, 1):
@@ -193,7 +200,7 @@ def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> t
 
 
 def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
-    """Return True if v^2/c^2 times the relative size of the additional force is lost in round-off."""
+    """Return True if missing terms in 1/c^4, about v^2/c^2 times the relative size of "eih", are below round-off."""
     n = y0.size // 6
     newton = np.empty_like(y0)
     library["gravity.rhs"](0.0, y0, newton, params[:n])

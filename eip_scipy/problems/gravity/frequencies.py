@@ -1,4 +1,4 @@
-"""Frequencies of bodies, which limit the step of a multistep method."""
+"""Angular frequencies of orbits, which limit the step of a multistep method."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf)
     Returns
     -------
     bodies : ndarray, shape (N,)
-        0 for the heaviest body.
+        Frequency of the orbit of each body about the heaviest body; 0 for the heaviest body.
     others : float
-        Frequencies of pairs that bind each other more than the heaviest body does, such as a planet and its moon.
+        Largest frequency of pairs that bind each other more than the heaviest body does, such as a planet and its moon;
+        0 without such pairs.
 
     Notes
     -----
-    From the osculating orbit. Between the mean motion n and the frequency in the pericentre, n (1 - e)^(-3/2), a
-    multistep method's stability is that of their geometric mean: measured with Mercury, e = 0.2. If a bound pair does
-    not reach its pericentre within the run, its distance at the end takes the place of the pericentre. A pair has no
-    such orbit if the others change its motion more than its own attraction does, and no pericentre to come if it flies
-    apart for good: then the frequency is that at the present distance. So the frequency of a pair without angular
-    momentum is finite.
+    The frequency of a bound pair is computed from its osculating orbit. It is the geometric mean of the mean motion n
+    and the frequency in the pericentre, n (1 - e)^(-3/2), because this mean determines the stability of a multistep
+    method, as was measured with Mercury (e = 0.2). If a bound pair does not reach its pericentre within the run, its
+    distance at the end takes the place of the pericentre. If other bodies change the motion of a pair more than its own
+    attraction does, or if the pair flies apart for good, the frequency is that of its attraction at the present
+    distance. Therefore the frequency of a pair without angular momentum is finite.
     """
     bodies, others = BUILD.gravity.frequencies(gm, y, duration)
     return bodies, others

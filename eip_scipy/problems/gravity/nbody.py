@@ -121,7 +121,7 @@ def nbody(
 
     Notes
     -----
-    The invariants do not depend on test particles: their gradients are 0 there, and no correction moves these.
+    The invariants do not depend on test particles: their gradients are 0 there, and no correction moves test particles.
 
     The problem has those invariants that the equations conserve:
 
@@ -201,7 +201,7 @@ def _epoch(t_span: Any) -> Epoch | None:
 
 
 def _gravitational(masses: Any, G: Any) -> Any:
-    """Return G times the masses if G is given, else the first argument as it is."""
+    """Return G times the masses if G is given, otherwise the first argument unchanged."""
     if G is None:
         return masses
     refuse_units(G=G)
@@ -220,6 +220,7 @@ def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
 
 
 def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the three arguments as arrays; raise ValueError if shapes or values are wrong, and warn of wrong units."""
     masses, q, v = (np.array(x, dtype=float) for x in (gm, position, velocity))
     n = masses.size
     if masses.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
@@ -241,7 +242,7 @@ def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndar
 def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return each body's speed relative to the body that binds it most, in units of the escape speed.
 
-    Bodies at rest relative to that body are left out.
+    Bodies at rest relative to that body are left out. A ValueError is raised if two bodies are at the same place.
     """
     found = []
     for i in range(gm.size):  # one row of distances at a time, because N^2 distances may not fit in memory
@@ -273,7 +274,7 @@ def _check_speeds(ratio: np.ndarray) -> None:
 
 
 def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frame (C, S) of centre of mass and momentum, with shifts of bodies in proportion to their masses.
+    """Return the `frame` (C, S) of centre of mass and momentum, with shifts of bodies proportional to their masses.
 
     With these shifts the recoil from the correction of a planet goes to its star. `common_shift` would move the outer
     planets by the same distance as the star.
@@ -286,6 +287,6 @@ def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frame (C, S) of centre of mass and momentum, with a common shift of all bodies, which keeps orbits."""
+    """Return the `frame` (C, S) of centre of mass and momentum, with common shifts of all bodies, which keep orbits."""
     C, _ = recoil(gm)
     return C, np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), np.eye(3)))

@@ -24,14 +24,14 @@ TURN = 2 * np.pi
 
 @dataclass(frozen=True, eq=False)
 class OrbitalElements:
-    """Osculating elements of bodies; each array has the shape (bodies,) for a state, (bodies, m) for m of them.
+    """Osculating elements of bodies; each array has the shape (bodies,) for one state, or (bodies, m) for m states.
 
     Attributes
     ----------
     bodies : tuple of str
-        Names of the bodies that have an orbit here.
+        Names of the bodies whose orbits these are.
     t : ndarray, shape (m,), or None
-        Times, where the states have some.
+        Times of the states; None if the states have no times.
     a : ndarray
         Semi-major axis, negative for a hyperbola.
     e : ndarray
@@ -43,16 +43,16 @@ class OrbitalElements:
     omega : ndarray
         Argument of the pericentre.
     pomega : ndarray
-        Longitude of the pericentre, Omega + omega; Omega - omega of a retrograde orbit.
+        Longitude of the pericentre, Omega + omega; for a retrograde orbit Omega - omega.
     f : ndarray
         True anomaly.
     M : ndarray
-        Mean anomaly, n times the time since the pericentre; of a hyperbola any number, where REBOUND takes it modulo 2
-        pi. NaN of a parabola.
+        Mean anomaly, n times the time since the pericentre. For a hyperbola it is not reduced to the range from 0 to
+        2 pi, unlike in REBOUND. NaN for a parabola.
     theta : ndarray
-        True longitude, Omega + omega + f; Omega - omega - f of a retrograde orbit.
+        True longitude, Omega + omega + f; for a retrograde orbit Omega - omega - f.
     l : ndarray
-        Mean longitude, defined with M in the same way.
+        Mean longitude, Omega + omega + M; for a retrograde orbit Omega - omega - M.
     n : ndarray
         Mean motion; negative for a hyperbola, as in REBOUND.
     P : ndarray
@@ -75,9 +75,9 @@ class OrbitalElements:
     P: np.ndarray
 
     def __getitem__(self, body: str | int) -> OrbitalElements:
-        """Return the elements of one body, by its name or its place in `bodies`: arrays (m,), or numbers."""
+        """Return the elements of one body, by its name or its index in `bodies`, as arrays (m,) or numbers."""
         if isinstance(body, str) and body not in self.bodies:
-            raise KeyError(f"no orbit of {body!r}; there are those of {', '.join(self.bodies)}.")
+            raise KeyError(f"there is no orbit of {body!r}; the bodies with orbits are {', '.join(self.bodies)}.")
         k = self.bodies.index(body) if isinstance(body, str) else body
         names = [item.name for item in fields(self) if item.name not in ("bodies", "t")]
         return replace(self, bodies=(self.bodies[k],), **{name: getattr(self, name)[k] for name in names})
@@ -94,9 +94,9 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
     gm : array_like, shape (N,), optional
         G times the masses; default: those of the run's problem.
     primary : {"jacobi", "heliocentric", "barycentric"} or str or int
-        What the orbits go around:
+        The body or point that the orbits go around:
 
-        - "jacobi": for each body the centre of mass of all before it, with their mass; REBOUND's default;
+        - "jacobi": for each body the centre of mass of all bodies before it, with their mass; REBOUND's default;
         - "heliocentric": the first body;
         - "barycentric": the centre of mass of all, with the mass of all;
         - a body, by its name or number, for instance the Earth for the Moon.
@@ -104,10 +104,10 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
     Returns
     -------
     OrbitalElements
-        Of all bodies but the primary, in the conventions of REBOUND's ``Simulation.orbits()``, for hyperbolae and
-        undefined angles too: in a plane of reference the longitudes theta and pomega are measured from the x axis, and
-        on a circle omega is what is left of theta and f, which their sum does not see. ``elements["Earth"].a`` are
-        those of one body.
+        Elements of all bodies except the primary, in the conventions of REBOUND's ``Simulation.orbits()``. These
+        conventions include hyperbolae and undefined angles: in the plane of reference the longitudes theta and pomega
+        are measured from the x axis; on a circle only the sum of omega and f is meaningful. ``elements["Earth"].a``
+        belongs to one body.
 
     Raises
     ------
@@ -120,9 +120,10 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
     -----
     The gravitational parameter of an orbit is G times the sum of the masses of body and primary.
 
-    Near a circle, or an orbit in the plane of reference, single angles lose digits, as the angles themselves are all
-    but undefined: an error of 1e-16 of the state moves omega by 1e-16 / e. Their sums do not. Angles come from the arc
-    tangents of both of their components: those near 0 and pi do not lose half of their digits, as with an arc cosine.
+    Near a circle, or near an orbit in the plane of reference, single angles lose digits, because the angles themselves
+    are almost undefined: an error of 1e-16 of the state moves omega by 1e-16 / e. The sums of angles keep their digits.
+    Angles are computed by arc tangents of two components. Therefore angles near 0 and pi do not lose half of their
+    digits, as they would with an arc cosine.
 
     Examples
     --------
@@ -143,7 +144,7 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
 
 
 def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, tuple[str, ...]]:
-    """Return the states (2, N, 3, ...), times, G m and names."""
+    """Return the states (2, N, 3, ...), times, G m and names of the bodies, from arguments of `orbital_elements`."""
     t, names = None, None
     if hasattr(run, "y") and hasattr(run, "t"):
         y, t, names = run.y, np.asarray(run.t, dtype=float), getattr(run, "component_names", None)
@@ -159,8 +160,8 @@ def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray,
     n = masses.size
     if masses.ndim != 1 or n < 2 or y.ndim not in (1, 2) or y.shape[0] != 6 * n:
         raise ValueError(
-            f"orbital_elements: gm {masses.shape} and states {y.shape}; expected (N,) with N > 1, and (6 N,) or (6 N, "
-            "m)."
+            f"orbital_elements: gm has the shape {masses.shape} and the states {y.shape}; expected (N,) with N > 1, "
+            "and (6 N,) or (6 N, m)."
         )
     labels = tuple(map(str, range(n)))
     if names is not None and len(names) == 6 * n and names[0].startswith("x_"):
@@ -169,9 +170,11 @@ def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray,
 
 
 def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states relative to the centre of mass of all bodies before, and G times the mass up to each."""
+    """Return the states relative to the centre of mass of all bodies before each, and G times the mass of all these."""
     if not gm[0] > 0:
-        raise ValueError(f"orbital_elements: the first body needs a mass for Jacobi's orbits, its G m is {gm[0]!r}.")
+        raise ValueError(
+            f"orbital_elements: primary='jacobi' needs a first body with a mass, but its G m is {gm[0]!r}."
+        )
     total = np.cumsum(gm)
     weighted = gm.reshape(-1, 1, *[1] * (state.ndim - 3)) * state
     centres = np.cumsum(weighted, axis=1) / total.reshape(-1, 1, *[1] * (state.ndim - 3))
@@ -181,7 +184,7 @@ def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _around(
     state: np.ndarray, gm: np.ndarray, primary: str | int, names: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return the states relative to one primary, mu, and the indices of the bodies."""
+    """Return the states relative to one primary, the gravitational parameters, and the indices of the bodies."""
     every = list(range(gm.size))
     if primary == "barycentric":
         total = gm.sum()
@@ -194,8 +197,8 @@ def _around(
         k = int(primary)
     else:
         raise ValueError(
-            f"orbital_elements: no primary {shown(primary)}; expected one of {', '.join(map(repr, PRIMARIES))}, a "
-            f"number from 0 to {gm.size - 1}, or a name of {', '.join(names)}."
+            f"orbital_elements: unknown primary {shown(primary)}; expected one of {', '.join(map(repr, PRIMARIES))}, a "
+            f"number from 0 to {gm.size - 1}, or one of the names {', '.join(names)}."
         )
     others = [i for i in every if i != k]
     if gm[k] == 0:
@@ -204,7 +207,7 @@ def _around(
 
 
 def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the elements of relative states (2, bodies, 3, ...)."""
+    """Return the elements of relative states (2, bodies, 3, ...) with the gravitational parameters `mu` (bodies,)."""
     (x, y, z), (vx, vy, vz) = np.moveaxis(state, 2, 1)
     mu = mu.reshape(-1, *[1] * (x.ndim - 1))
     # Adding 0 leaves no -0, whose arc tangent is pi.
@@ -259,7 +262,7 @@ def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.nda
 
 
 def _mean_anomaly(e: np.ndarray, f: np.ndarray, a: np.ndarray, r: np.ndarray, rv: np.ndarray) -> np.ndarray:
-    """Return the mean anomaly from Kepler's equation, between 0 and 2 pi for an ellipse; `rv` is q . v with mu = 1."""
+    """Return the mean anomaly by Kepler's equation, between 0 and 2 pi for an ellipse; `rv` is q . v / sqrt(mu)."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         sine, cosine = rv / np.sqrt(np.abs(a)), 1 - r / a  # e times those of the eccentric anomaly
         nearly = 2 * np.arctan2(np.sqrt(np.abs(1 - e)) * np.sin(f / 2), np.sqrt(1 + e) * np.cos(f / 2))

@@ -21,7 +21,7 @@ ENERGY = 0
 
 
 class _Orbit(NamedTuple):
-    """Orbit of a body: its parameters for the engine, the components (6, k) that it moves, and their weights."""
+    """Orbit of a body: its parameters for the engine, the components (6, k) that corrections move, and weights."""
 
     body: int
     entries: Array
@@ -37,11 +37,11 @@ def orbital_balances(
     bodies: Sequence[str] | None = None,
     newton: bool = False,
 ) -> tuple[Balance, ...]:
-    """Return the quantities that Kepler's motion conserves as balances, for the orbit of each body but the heaviest.
+    """Return balances of the quantities that Kepler's motion conserves, for the orbit of each body except the heaviest.
 
     A planet moves about its star, and a moon about its planet. A planet with moons moves as their common barycentre.
-    The perturbing acceleration is that of the right-hand side less the pull of both sides on each other, so that the
-    rates hold for all forces.
+    The perturbing acceleration is that of the right-hand side minus the attraction between the two sides of the orbit,
+    so that the rates hold for all forces.
 
     Parameters
     ----------
@@ -55,13 +55,14 @@ def orbital_balances(
     bodies : sequence of str, optional
         Names of the bodies.
     newton : bool, optional
-        Whether no forces act except Newton's gravitation. The rates are then sums of the perturbing pulls instead of
-        differences of the accelerations. This reduces rounding about a hundredfold for orbits about the heaviest body.
+        True if no forces act except Newton's gravitation. The rates are then sums of the perturbing attractions instead
+        of differences of the accelerations, which reduces rounding errors about a hundredfold for orbits about the
+        heaviest body.
 
     Returns
     -------
     tuple of Balance
-        The energies are those less the energies at the start.
+        One balance for each quantity. The values of the energies are their differences from those at the start.
 
     Raises
     ------
@@ -91,8 +92,8 @@ def balances_beside_frame(
 ) -> tuple[Balance, ...]:
     """Return `orbital_balances` for runs whose frame keeps the centre of mass by a shift of all bodies.
 
-    The shift changes no orbit. So a body that moves about the heaviest one is all that its orbit's correction has to
-    move, where `orbital_balances` moves all other bodies in the opposite direction.
+    The shift changes no orbit. Therefore the correction of an orbit about the heaviest body moves only the body on this
+    orbit, while `orbital_balances` also moves all other bodies in the opposite direction.
     """
     return _balances(gm, y0, quantities, bodies, newton, neutral=False)
 
@@ -100,7 +101,7 @@ def balances_beside_frame(
 def _balances(
     gm: Any, y0: Any, quantities: Any, bodies: Sequence[str] | None, newton: bool, *, neutral: bool
 ) -> tuple[Balance, ...]:
-    """Return the balances, whose corrections keep the centre of mass by themselves where they are `neutral`."""
+    """Return the balances; if `neutral` is True, their corrections keep the centre of mass by themselves."""
     masses, state = real_array("gm", gm), real_array("y0", y0)
     newton = flag("newton", newton)
     if masses.ndim != 1 or masses.size < 2 or state.shape != (6 * masses.size,):
@@ -113,7 +114,9 @@ def _balances(
         raise ValueError(f"y0 must be finite, got {shown(y0)}.")
     names = tuple(map(str, range(masses.size))) if bodies is None else tuple(bodies)
     if len(names) != masses.size:
-        raise ValueError(f"bodies has {len(names)} names, gm has {masses.size} masses.")
+        raise ValueError(
+            f"bodies has {len(names)} names, but gm has {masses.size} masses; give one name for each mass."
+        )
     about = centres(masses, state)
     orbits = [_orbit(masses, state, about, body, neutral) for body in np.flatnonzero(about >= 0).tolist()]
     entries = np.concatenate([masses, *(orbit.entries for orbit in orbits)])
@@ -153,8 +156,8 @@ def chosen_quantities(given: Any) -> tuple[str, ...]:
 def centres(gm: Array, y0: Array) -> Array:
     """Return the number of the body that each body moves about at the start, -1 for the heaviest body.
 
-    Among the heavier bodies that a body is bound to and in whose Hill sphere it is, this is the one with the smallest
-    sphere; without any, it is the heaviest body.
+    Among the heavier bodies to which a body is bound and in whose Hill sphere it is, the one with the smallest sphere
+    is chosen. If there is none, the heaviest body is chosen.
     """
     q, v = y0.reshape(2, -1, 3)
     order = np.argsort(-gm, kind="stable").tolist()
@@ -173,7 +176,7 @@ def centres(gm: Array, y0: Array) -> Array:
 
 
 def _is_below(about: Array, body: int, top: int) -> bool:
-    """Return True if a body moves about another, directly or through a chain of centres."""
+    """Return True if `body` moves about `top`, directly or through a chain of centres."""
     while body >= 0:
         body = int(about[body])
         if body == top:

@@ -40,24 +40,24 @@ def satellite(
     """Return the problem of a satellite about an oblate planet, with drag in an exponential atmosphere.
 
     The acceleration is the gradient of ``mu / r (1 - j2 (radius / r)^2 (3 sin(latitude)^2 - 1) / 2)``, and
-    ``-drag exp((radius + height - r) / scale_height) |u| u``, u the velocity relative to the air.
+    ``-drag exp((radius + height - r) / scale_height) |u| u`` with the velocity u relative to the air.
 
     Parameters
     ----------
     position, velocity : array_like, shape (3,)
-        Relative to the planet's centre, at the start.
+        Position and velocity at the start, relative to the planet's centre.
     mu, radius : float
-        G m and the equatorial radius of the planet. All units are those of lengths and times of your choice.
+        G m and the equatorial radius of the planet. All arguments have the units of length and time of your choice.
     t_span : (float, float)
     h : float, optional
-        Step. Default: a sixteenth of the period of the start, if its energy is negative.
+        Step. Default: a sixteenth of the period of the Kepler orbit at the start, if that is bound.
     j2 : float, optional
         Oblateness.
     drag : float, optional
-        Half of the air's density at `height`, times c_D A / m of the satellite: one over a length.
+        Half of the air's density at `height`, times c_D A / m of the satellite. Its unit is one over a length.
     height, scale_height : float, optional
-        Height above the equator at which `drag` holds, and the height in which the density falls by e, which `drag`
-        needs.
+        Height above the equator at which `drag` holds, and the height over which the density falls by a factor of e,
+        which must be given with `drag`.
     spin : float, optional
         Angular velocity of the air about the pole.
     pole : sequence of 3 floats, optional
@@ -72,8 +72,8 @@ def satellite(
     Returns
     -------
     Problem
-        Of `nbody`, with the planet at rest in the origin and a satellite of mass 0: the state is (planet, satellite,
-        velocity of the planet, velocity of the satellite).
+        A problem of `nbody`, with the planet at rest in the origin and a satellite of mass 0. The state is (position of
+        the planet, position of the satellite, velocity of the planet, velocity of the satellite).
 
     Raises
     ------
@@ -102,7 +102,10 @@ def satellite(
             least = "> 0" if key in lengths else ">= 0"
             raise ValueError(f"satellite: {key} must be a finite number {least}, got {shown(value)}.")
     if drag and scale_height is None:
-        raise ValueError("satellite: drag needs scale_height, in which the density of the air falls by e; give it.")
+        raise ValueError(
+            "satellite: drag needs scale_height, the height over which the density of the air falls by a factor of e; "
+            "give it."
+        )
     forces = [force for force, size in (("j2", j2), ("drag", drag)) if size]
     constants = ForceConstants(
         j2=j2 * radius**2,
@@ -132,6 +135,6 @@ def satellite(
 
 
 def _sixteenth(x: np.ndarray, v: np.ndarray, mu: float) -> float | None:
-    """Return 1/16 of the period of the Kepler orbit, None for an unbound orbit."""
+    """Return 1/16 of the period of the Kepler orbit through a state; None for an unbound orbit."""
     inverse = 2 / float(np.linalg.norm(x)) - float(v @ v) / mu  # of the semi-major axis
     return None if inverse <= 0 else 2 * np.pi / STEPS / float(np.sqrt(mu * inverse**3))

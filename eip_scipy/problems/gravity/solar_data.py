@@ -1,9 +1,9 @@
 """Initial data and reference states of the solar system that are contained in the package.
 
-Four sets travel with the package: ``"de440"``, the Sun and the nine system barycentres of JPL's DE440 at
-2014-02-02 20:18:00 TDB, the epoch of Cai, Gong and Wang; ``"de440-j2000"``, the same at JD 2451545.0 TDB;
-``"de440-moon"``, the first with Earth and Moon in place of their barycentre; and ``"paper"``, the table of their
-Appendix A. Any other epoch: `eip_scipy.integrations.jpl.initial_data`.
+The package contains four sets: ``"de440"``, the Sun and the nine system barycentres of JPL's DE440 at
+2014-02-02 20:18:00 TDB, the epoch of Cai, Gong and Wang; ``"de440-j2000"``, the same bodies at JD 2451545.0 TDB;
+``"de440-moon"``, the first set with Earth and Moon in place of their barycentre; and ``"paper"``, the table in
+Appendix A of Cai, Gong and Wang. `eip_scipy.integrations.jpl.initial_data` returns data for any other epoch.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _REFERENCE_JSON = "solar_reference.json"
 
 @dataclass(frozen=True, eq=False)
 class SolarSystemData:
-    """Masses, positions and velocities of N bodies at one epoch; barycentre at rest at the origin.
+    """Masses, positions and velocities of N bodies at one epoch; their barycentre is at rest at the origin.
 
     Attributes
     ----------
@@ -53,15 +53,16 @@ class SolarSystemData:
     bodies : tuple of str
         Names of the N bodies, the Sun first.
     gm : ndarray, shape (N,)
-        Mass times constant of gravitation, AU^3/day^2.
+        Masses times the constant of gravitation, in AU^3/day^2.
     position : ndarray, shape (N, 3)
-        AU.
+        Positions in AU.
     velocity : ndarray, shape (N, 3)
-        AU/day.
+        Velocities in AU/day.
     epoch_jd_tdb : float
-        Julian date, TDB. One float64 resolves 40 microseconds; the states belong to the exact epoch.
+        Epoch as a Julian date in TDB. A float64 resolves 40 microseconds; the states belong to the exact epoch, which
+        is `epoch_jd_tdb` + `epoch_rest`.
     epoch : str
-        The same as a date of the (proleptic) Gregorian calendar.
+        The epoch as a date of the (proleptic) Gregorian calendar.
     axes : str
         "ICRF" or "ecliptic J2000".
     source : str
@@ -69,7 +70,7 @@ class SolarSystemData:
     units : str
         "AU, day".
     epoch_rest : float
-        Days that the rounding of `epoch_jd_tdb` lost.
+        Rounding error of `epoch_jd_tdb` in days.
     """
 
     name: str
@@ -105,24 +106,24 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
     ----------
     name : {"de440", "de440-j2000", "de440-moon", "paper"}
         ``"de440"``: Sun and nine system barycentres, ICRF axes, at 2014-02-02 20:18:00 TDB, the initial state of
-        `reference_states`. ``"de440-j2000"``: the same at JD 2451545.0 TDB. ``"de440-moon"``: as the first, with Earth
-        and Moon for their barycentre. ``"paper"``: the table of Cai, Gong and
-        Wang at the first of these epochs, ecliptic J2000 axes, with the Sun added. The table joins planet centres to
-        masses without satellites (Jupiter is 112 km from its system's barycentre, Earth lacks the Moon), hence is good
-        for reproducing the paper and not for predicting planets: Earth is 42 degrees off DE440 after 100 yr.
+        `reference_states`. ``"de440-j2000"``: the same bodies at JD 2451545.0 TDB. ``"de440-moon"``: the first set with
+        Earth and Moon in place of their barycentre. ``"paper"``: the table of Cai, Gong and Wang at the first of these
+        epochs, on ecliptic J2000 axes, with the Sun added. The table combines the centres of planets with masses
+        without satellites (Jupiter is 112 km from the barycentre of its system, Earth lacks the Moon). It is therefore
+        suitable for reproducing the paper, and not for predicting planets: Earth is 42 degrees off DE440 after 100 yr.
     as_printed : bool, optional
-        Only with ``"paper"``: keep Mars's v_z = -3.71e-02 m/s as printed, a misprint for -3.71e+02 m/s that takes Mars
-        6.4 degrees off after 100 yr.
+        Only with ``"paper"``: keep Mars's v_z = -3.71e-02 m/s as printed. This is a misprint for -3.71e+02 m/s, which
+        puts Mars 6.4 degrees off after 100 yr.
 
     Returns
     -------
     SolarSystemData
-        Fresh arrays, AU and day, barycentre at rest at the origin.
+        New arrays in AU and days, with the barycentre at rest at the origin.
 
     Raises
     ------
     ValueError
-        Unknown name, or `as_printed` with another set than ``"paper"``.
+        If the name is unknown, or `as_printed` is True for a set other than ``"paper"``.
 
     Notes
     -----
@@ -133,7 +134,7 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
     if name not in sets:
         raise ValueError(_unknown(name, tuple(sets)))
     if as_printed and name != "paper":
-        raise ValueError(f"as_printed=True is an option of the set 'paper', got name={name!r}")
+        raise ValueError(f"as_printed=True is an option of the set 'paper' only, got name={name!r}; omit it")
     entry = sets[name]
     gm, position, velocity = _with_sun(entry, as_printed) if name == "paper" else _arrays(entry)
     epoch, rest = exact_sum(*entry["epoch_jd_tdb"])
@@ -157,13 +158,13 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
     Parameters
     ----------
     name : {"de440"}
-        The set the states start from.
+        Name of the data set from which the states start.
 
     Returns
     -------
     dict of float to ndarray, shape (60,)
-        Time since the epoch in Julian years (1, 2, 5, 10 and so on to 10 000) to the state (q of all bodies, v of all
-        bodies) in AU and AU/day, on the axes of ``load("de440")``.
+        The states (q of all bodies, v of all bodies) in AU and AU/day, on the axes of ``load("de440")``, by the time
+        since the epoch in Julian years (1, 2, 5, 10 and so on to 10 000).
 
     Raises
     ------
@@ -172,10 +173,10 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
 
     Notes
     -----
-    Integrated in 80-bit arithmetic by a summed multistep method of order 14, from the state of
-    ``solar_system("de440")`` in AU and Julian years (`eip-scipy study solar-reference`). After 10 000 years Mercury is
-    6e-12 AU and the others are 2e-13 AU from where another step has them. A start in other units is rounded in another
-    way, which puts Mercury 2e-11 AU off by then.
+    The states were integrated in 80-bit arithmetic by a summed multistep method of order 14, from the state of
+    ``solar_system("de440")`` in AU and Julian years (`eip-scipy study solar-reference`). After 10 000 years a run with
+    another step differs by 6e-12 AU for Mercury and by 2e-13 AU for the other bodies. A start in other units is rounded
+    differently, which changes the position of Mercury by 2e-11 AU after this time.
     """
     if name != "de440":
         known = available()
@@ -189,7 +190,7 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
 
 
 def gm_from_km3_s2(gm: Any) -> np.ndarray:
-    """Convert GM from km^3/s^2 to AU^3/day^2; any shape."""
+    """Convert GM from km^3/s^2 to AU^3/day^2, in an array of any shape."""
     return np.asarray(gm, dtype=float) * DAY_S**2 / AU_KM**3
 
 
@@ -229,7 +230,7 @@ def _arrays(entry: dict[str, Any]) -> _Arrays:
 
 
 def _with_sun(entry: dict[str, Any], as_printed: bool) -> _Arrays:
-    """Add the Sun, which the paper leaves out, to its table; AU and day, relative to the barycentre."""
+    """Return the paper's table with the Sun, which it leaves out, in AU and days, relative to the barycentre."""
     gm, position, velocity = _arrays(entry)
     if not as_printed:
         misprint = entry["misprint"]

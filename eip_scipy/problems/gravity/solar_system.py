@@ -1,4 +1,4 @@
-"""The solar system: Sun, eight planets (or their systems' barycentres) and Pluto, on request with the Moon."""
+"""The solar system: Sun, eight planets (or the barycentres of their systems) and Pluto, optionally with the Moon."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def solar_system(
     forces: str | Sequence[str] = (),
     balances: str | Sequence[str] | None = None,
 ) -> Problem:
-    """Return the solar system from JPL initial data; by default under Newton's gravitation (the paper's Experiment II).
+    """Return the solar system from JPL initial data, by default under Newton's gravitation.
 
     Parameters
     ----------
     data : str or SolarSystemData
-        "de440" (system barycentres at the paper's epoch), "de440-j2000", "de440-moon" (with Earth and Moon for their
-        barycentre), "paper" (the paper's own table), or data for another epoch from
-        `eip_scipy.integrations.jpl.initial_data`.
+        One of the sets of `solar_data.load`: "de440" (barycentres of the planets' systems at the epoch of Experiment II
+        of Cai, Gong & Wang), "de440-j2000", "de440-moon" (with Earth and Moon instead of their barycentre) or "paper"
+        (the table of Cai, Gong & Wang); or data for another epoch from `eip_scipy.integrations.jpl.initial_data`.
     years : float
         Length of the run in Julian years; negative to go back in time.
     h : float
@@ -50,23 +50,23 @@ def solar_system(
     units : {"AU, yr", "SI"}
         Units of the state, of time and of G m: AU and Julian years, or metres and seconds.
     forces : str or sequence of str, optional
-        "1pn", "eih" or "gr-potential", "j2", "moon-quadrupole": see `nbody`, and for what each is worth the page
-        "Forces" of the documentation.
+        "1pn", "eih" or "gr-potential", "j2", "moon-quadrupole": see `nbody`. The page "Forces" of the documentation
+        shows what each of them contributes.
     balances : str or sequence of str, optional
-        "kepler" keeps each planet's energy about the Sun in place of the totals, see `nbody`: the most accurate way
-        over thousands of years, by `EIPGJ14` or `EIPDOP853`.
+        "kepler" keeps each planet's energy about the Sun instead of the total energy and angular momentum, see `nbody`.
+        With `EIPGJ14` or `EIPDOP853` this is the most accurate choice over thousands of years.
 
     Returns
     -------
     Problem
-        Of 60 components (66 with the Moon), see `nbody`, named x_Sun, y_Sun and so on, with the data's epoch as its
-        `epoch`. With "de440", or the same data from a kernel, and no further forces its `reference` gives stored states
-        at 1, 2, 5, 10 and so on to 10 000 years (in extended precision, see `reference_states`).
+        A problem of `nbody` with 60 components (66 with the Moon), named x_Sun, y_Sun and so on. Its `epoch` is that of
+        the data. For "de440", or the same data from a kernel, without further forces, its `reference` returns stored
+        states at 1, 2, 5, 10 and so on to 10 000 years (computed in extended precision, see `reference_states`).
 
     Raises
     ------
     ValueError
-        If data, units or forces are unknown, or "moon-quadrupole" is given for data without EMB.
+        If data, units or forces are unknown, or "moon-quadrupole" is given for data without the Earth-Moon barycentre.
     """
     refuse_units(years=years, h=h)
     known = load(data) if isinstance(data, str) else data
@@ -103,18 +103,18 @@ def _reference(references: dict[float, np.ndarray], length: float, time: float, 
 
 
 def _starts_as_references(data: SolarSystemData) -> bool:
-    """Return True if these are the masses and states of the stored states; a name does not determine the epoch."""
+    """Return True if the data are those from which the stored states start; a name does not determine the epoch."""
     start = load("de440")
     return np.array_equal(data.gm, start.gm) and np.array_equal(data.y0, start.y0)
 
 
 def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, time: float) -> ForceConstants:
-    """Return the constants in units of `length` to the AU and `time` to the day."""
+    """Return the constants in units in which the AU is `length` and the day is `time`."""
     km = length / AU_KM
     if "moon-quadrupole" in forces and "EMB" not in data.bodies:
         raise ValueError(
-            f"the force 'moon-quadrupole' stands for the Moon in data with the body EMB; {data.name!r} has none. Leave "
-            "it out, or take 'de440'."
+            f"the force 'moon-quadrupole' replaces the Moon in data that contain the Earth-Moon barycentre EMB; "
+            f"{data.name!r} does not. Omit this force, or use 'de440'."
         )
     return ForceConstants(
         c=C_KM_S * DAY_S * km / time,

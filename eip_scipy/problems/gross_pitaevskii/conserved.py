@@ -1,4 +1,4 @@
-"""Mass and energy of the Gross-Pitaevskii equation inside a step, computed from f = -i H psi without transforms."""
+"""Mass and energy of the Gross-Pitaevskii equation within a step, computed from f = -i H psi without transforms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ JOINT = ("mass", "energy")
 
 
 class _Known:
-    """A state with known f: its energy, and that of states at a distance of about 1e-12, by an expansion."""
+    """Energy of a state at which f is known, and by an expansion of states at a distance of about 1e-12 from it."""
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
         self._gpe, self._norm = gpe, gpe.largest_frequency()
@@ -33,7 +33,7 @@ class _Known:
         return found
 
     def beside(self, square: float, slope: float) -> float | None:
-        """Return the energy of a state at the difference d, from the sums of ``|d|^2`` and Re(conj(H psi) d).
+        """Return the energy of psi + d, from the sums of ``|d|^2`` and Re(conj(H psi) d), for the noted state psi.
 
         The result is None if the terms of second order and higher are not far below the rounding of the energy.
         """
@@ -44,10 +44,10 @@ class _Known:
 
 
 class Energy:
-    """The energy as an invariant: value, and gradient 2 w i f.
+    """The energy as an invariant: its value, and its gradient 2 w i f with the size w of a cell.
 
-    A step needs the gradient and the energy at its unprojected result, and the energy of the projected state. Neither
-    needs a transform.
+    A step needs the gradient and the energy at its unprojected result, and the energy of the projected state. None of
+    these needs a transform.
 
     Parameters
     ----------
@@ -79,10 +79,10 @@ class Energy:
 
 
 class Joint:
-    """Mass and energy, or one of them, with the functions of `JointInvariants`: two passes over the field.
+    """Functions of `JointInvariants` for mass and energy, or one of them; a projection takes two passes over the field.
 
-    The gradients 2 w psi and 2 w H psi = 2 w i f are never formed: their products are sums over psi and f, and so is
-    the energy.
+    The gradients 2 w psi and 2 w H psi = 2 w i f are never stored: their products and the energy are computed as sums
+    over psi and f.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Joint:
     def moments(
         self, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray, gram: np.ndarray, terms: np.ndarray
     ) -> None:
-        """Fill the values, products of gradients and terms at a state that a projection needs.
+        """Fill the arrays that a projection needs at a state: values, products of gradients, and sizes of terms.
 
         Parameters
         ----------
@@ -106,11 +106,11 @@ class Joint:
         y, f : ndarray, shape (n,)
             The state and the right-hand side there.
         values : ndarray, shape (l,)
-            Takes the invariants.
+            Filled with the values of the invariants.
         gram : ndarray, shape (l, l)
-            Takes the gradients' inner products.
+            Filled with the inner products of the gradients.
         terms : ndarray, shape (l,)
-            Takes the sums of ``|G_k y_k|`` over the real components, for the dead bands.
+            Filled with the sums of ``|G_k y_k|`` over the real components, for the dead bands.
         """
         found, w = self._known.note(y, f), self._gpe.grid.cell
         m, e = self._mass, self._energy
@@ -132,11 +132,11 @@ class Joint:
         y, f : ndarray, shape (n,)
             As given to `moments`.
         mu : ndarray, shape (l,)
-            Multiples of the gradients.
+            Factors of the gradients.
         out : ndarray, shape (n,)
-            Takes ``y + sum_i mu_i G_i(y)``.
+            Filled with ``y + sum_i mu_i G_i(y)``.
         values : ndarray, shape (l,)
-            Takes the invariants of `out`; the energy by a transform only where the move is a large one.
+            Filled with the invariants of `out`. The energy is computed with a transform only if the shift is large.
         """
         gpe, w = self._gpe, self._gpe.grid.cell
         a, b = (0.0 if k is None else 2 * w * mu[k] for k in (self._mass, self._energy))

@@ -17,7 +17,7 @@ __all__ = ["DampedGrossPitaevskii"]
 
 
 class DampedGrossPitaevskii(GrossPitaevskii):
-    """The equation ``psi_t = -(i + damping) (H(psi) - mu) psi - loss / 2 psi``, H as in `GrossPitaevskii`.
+    """The equation ``psi_t = -(i + damping) (H(psi) - mu) psi - loss / 2 psi``, with H of `GrossPitaevskii`.
 
     Parameters
     ----------
@@ -26,23 +26,24 @@ class DampedGrossPitaevskii(GrossPitaevskii):
     damping : float, optional
         Pitaevskii's phenomenological damping, the strength of the exchange with a thermal cloud.
     chemical_potential : float, optional
-        mu, that of the thermal cloud: the frequency of the rotating phase, about which `damping` relaxes.
+        mu, the chemical potential of the thermal cloud. `damping` relaxes the field to a state of this chemical
+        potential, which is at rest in these equations.
     loss : float, callable or array_like, optional
-        Rate at which ``|psi|^2`` decays at each point, given as a potential is.
+        Rate at which ``|psi|^2`` decays at each point, in one of the forms of `potential`.
     **options
         As for `GrossPitaevskii`: Omega, beta, nyquist, fft, threads.
 
     Raises
     ------
     ValueError
-        As for `GrossPitaevskii`, and if a damping is negative or not finite.
+        As for `GrossPitaevskii`, and if `damping` is negative or not finite.
 
     Notes
     -----
-    Mass, energy and momenta change at the rate Re <G, d>, G the gradient and d what damping and losses add to psi_t.
-    The derivative at a stage gives H psi, so that the rates of mass and energy take no transform. `invariants` and
-    `problem` have these quantities as balances, for the Runge-Kutta methods that carry them. `Splitting` is that of
-    the equation without damping.
+    Mass, energy and momenta change at the rate Re <G, d>, with the gradient G and the terms d that damping and losses
+    add to psi_t. The derivative at a stage contains H psi, so that the rates of mass and energy need no transform.
+    `invariants` returns these quantities as balances, and `problem` keeps them, with the Runge-Kutta methods that
+    support balances. `Splitting` solves the equation without damping and losses.
 
     Examples
     --------
@@ -83,25 +84,25 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         return None
 
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with psi_t; both flat and contiguous, and not the same array."""
+        """Fill `out` with psi_t; `y` and `out` are flat, contiguous, and different arrays."""
         super().rhs(t, y, out)
         out *= 1 - 1j * self.damping
         out += (self._growth + 1j * self.mu) * y
 
     def energy(self, psi: Any) -> float:
-        """Return the energy of `GrossPitaevskii`."""
+        """Return the energy of a state, defined as in `GrossPitaevskii`, without damping and losses."""
         psi = self.as_field(psi)
         f = np.empty(psi.size, complex)
         super().rhs(0.0, psi.reshape(-1), f)
         return self.grid.cell * self.moments(psi, f).energy(self.beta)
 
     def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``-i H psi``, and the terms of damping and losses without the rotation of the phase."""
+        """Return ``-i H psi``, and the terms of damping and losses without i mu psi, from the derivative f of y."""
         turning = (f - (self._growth + 1j * self.mu) * y) / (1 - 1j * self.damping)
         return turning, self._growth * y - 1j * self.damping * turning
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Balance, ...]:
-        """Make balances of the invariants of `GrossPitaevskii`.
+        """Return the invariants of `GrossPitaevskii` as balances.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The rotating Gross-Pitaevskii equation on a periodic grid: right-hand side, invariants, and the problem they make."""
+"""The rotating Gross-Pitaevskii equation on a periodic grid: right-hand side, invariants, and initial value problem."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class FieldProblem(Problem):
     Attributes
     ----------
     equation : GrossPitaevskii
-        With the `grid`, and ``equation.grid.field(y)`` for states as fields. The other attributes are those of
-        `Problem`.
+        The equation. ``equation.grid`` is the grid, and ``equation.grid.field(y)`` returns states as fields. The other
+        attributes are those of `Problem`.
     """
 
     equation: GrossPitaevskii | None = None
@@ -45,9 +45,9 @@ class FieldProblem(Problem):
 class GrossPitaevskii:
     """The equation ``i psi_t = H(psi) psi`` with ``H = -Laplace / 2 + V - Omega Lz + beta |psi|^2``.
 
-    Here ``Lz = -i (x d_y - y d_x)``. Fourier pseudospectral in space: each term of the linear part is a real multiplier
-    of the modes along its axes, of those along x ``k^2 / 2 + Omega y k``, of those along y ``q^2 / 2 - Omega x q``. One
-    pair of transforms along each axis does everything, the rotation included.
+    Here ``Lz = -i (x d_y - y d_x)``. The discretisation in space is Fourier pseudospectral. The linear part is a sum of
+    real factors of Fourier modes: ``k^2 / 2 + Omega y k`` for the modes along x, and ``q^2 / 2 - Omega x q`` for those
+    along y. One pair of transforms along each axis is enough for the linear part, including the rotation.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ class GrossPitaevskii:
     beta : float, optional
         Strength of the interaction: > 0 repulsive, < 0 attractive.
     nyquist : {"true", "zero"}, optional
-        The second derivative's factor of the Nyquist mode: its own, or 0 as where the second derivative is the first
-        one applied twice (the paper's tables).
+        Factor of the Nyquist mode in the second derivative: that of its own wavenumber, or 0, as if the first
+        derivative was applied twice (as in the tables of Cai, Gong & Wang).
     fft : {"auto", "ducc0", "scipy"}, optional
         See `make_transforms`.
     threads : int, optional
@@ -79,11 +79,11 @@ class GrossPitaevskii:
     Raises
     ------
     ValueError
-        If a value is wrong, the potential is complex, not finite or of another shape, or there is rotation in 1D.
+        If a value is wrong, the potential is complex, not finite or of a wrong shape, or `Omega` is not 0 in 1D.
 
     Notes
     -----
-    An object holds buffers: use one for each thread.
+    Each object has its own buffers; use a separate object in each thread.
 
     Examples
     --------
@@ -118,7 +118,9 @@ class GrossPitaevskii:
             if not isinstance(value, (int, float, np.integer, np.floating)) or not np.isfinite(value):
                 raise ValueError(f"{name} must be a finite number, got {value!r}.")
         if Omega != 0 and grid.dim == 1:
-            raise ValueError(f"a rotation needs two dimensions: Omega = {Omega!r} on {grid!r}.")
+            raise ValueError(
+                f"a rotation needs at least two dimensions, got Omega = {Omega!r} on {grid!r}; use Omega=0."
+            )
         self.grid, self.Omega, self.beta, self.nyquist = grid, float(Omega), float(beta), nyquist
         self.V = on_grid(potential, grid)
         self.transforms = make_transforms(fft, threads)
@@ -141,7 +143,7 @@ class GrossPitaevskii:
         return 0.5 * k * k
 
     def rotation_factors(self) -> list[np.ndarray]:
-        """Return the factors of Lz = x q - y k: of the modes along x and of those along y.
+        """Return the factors of Lz = x q - y k: -y k of the modes along x, and x q of the modes along y.
 
         Raises
         ------
@@ -163,7 +165,7 @@ class GrossPitaevskii:
 
     @cached_property
     def _moving(self) -> tuple[SpectralSum, ...]:
-        """Return -i times the first derivative along each axis."""
+        """Return the operators -i times the first derivative, one for each axis."""
         factors = [self.grid.wavenumbers(axis, odd=True) for axis in range(self.grid.dim)]
         terms = [self._multiplier((axis,), factor) for axis, factor in enumerate(factors)]
         return tuple(SpectralSum(self.grid, self.transforms, [term]) for term in terms)
@@ -171,11 +173,11 @@ class GrossPitaevskii:
     # These four a field on several ranks does in another way (`eip_scipy.integrations.mpi_fields`).
 
     def _method(self) -> Splitting | None:
-        """Return the method that suits the equation."""
+        """Return the method that problems of the equation use by default; None for the default of runs."""
         return Splitting(self)
 
     def _total(self, sums: Any) -> Any:
-        """Return the sums over the whole grid, from those over this process's part."""
+        """Return the sums over the whole grid, from the sums over the part of this process (here the whole grid)."""
         return sums
 
     def _multiplier(self, axes: Axes, factor: Any) -> Multiplier:
@@ -187,7 +189,8 @@ class GrossPitaevskii:
     def linear_terms(self) -> list[tuple[Axes, Any]]:
         """Return the linear part, kinetic energy and rotation, as axes and the real factors of the modes along them.
 
-        The number of transforms is smallest in this way: all axes together without rotation, otherwise x, then y and z.
+        The terms are chosen so that the number of transforms is smallest: without rotation one term of all axes,
+        otherwise one term of x and one of y and z.
         """
         kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
         if self.Omega == 0:
@@ -202,7 +205,7 @@ class GrossPitaevskii:
         Raises
         ------
         ValueError
-            If its shape is neither.
+            If `psi` has another shape.
         """
         psi = np.ascontiguousarray(psi, dtype=complex)
         if psi.shape not in (self.grid.shape, (self.grid.size,)):
@@ -210,7 +213,7 @@ class GrossPitaevskii:
         return psi.reshape(self.grid.shape)
 
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
+        """Fill `out` with -i H(psi) psi; `y` and `out` are flat, contiguous, and different arrays."""
         linear, psi, image = self._linear, y.reshape(self.grid.shape), out.reshape(self.grid.shape)
         for begin, rest in linear.parts(psi, image):
             part = slice(begin, begin + len(rest))
@@ -219,18 +222,18 @@ class GrossPitaevskii:
             derivative_at_once(psi, self.V, self.beta, image)
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return -i H(psi) psi as a flat array, for `solve_ivp`."""
+        """Return -i H(psi) psi as a new flat array, as `solve_ivp` needs it."""
         y = np.ascontiguousarray(y, dtype=complex)
         out = np.empty_like(y)
         self.rhs(t, y, out)
         return out
 
     def linear(self, psi: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both fields."""
+        """Fill `out` with (-Laplace / 2 - Omega Lz) psi; `psi` and `out` are fields."""
         self._linear.apply(psi, out)
 
     def angular(self, psi: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with Lz psi, both fields.
+        """Fill `out` with Lz psi; `psi` and `out` are fields.
 
         Raises
         ------
@@ -240,7 +243,7 @@ class GrossPitaevskii:
         self._turning.apply(psi, out)
 
     def hamiltonian(self, psi: Any) -> np.ndarray:
-        """Return H(psi) psi, a field."""
+        """Return H(psi) psi as a field."""
         psi = self.as_field(psi)
         out = np.empty_like(psi)
         self.linear(psi, out)
@@ -248,7 +251,7 @@ class GrossPitaevskii:
         return out
 
     def mass(self, psi: Any) -> float:
-        """Return the sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
+        """Return the sum of ``|psi|^2`` over the grid, times the size of a cell; it is 1 for a normalised state."""
         return float(self.grid.cell * self._total(total_mass(self.as_field(psi))))
 
     def energy(self, psi: Any) -> float:
@@ -257,11 +260,11 @@ class GrossPitaevskii:
         return self.grid.cell * self.moments(psi, self.fun(0.0, psi.reshape(-1))).energy(self.beta)
 
     def moments(self, psi: np.ndarray, f: np.ndarray) -> Moments:
-        """Return the sums over the grid from which mass, energy and products of gradients follow; f = fun(t, psi)."""
+        """Return the sums over the grid that give mass, energy and products of their gradients; f is fun(t, psi)."""
         return Moments(*map(float, self._total(moments(psi, f))))
 
     def angular_momentum(self, psi: Any) -> float:
-        """Return the mean of Lz times the mass.
+        """Return the angular momentum, the mean of Lz times the mass.
 
         Raises
         ------
@@ -271,12 +274,12 @@ class GrossPitaevskii:
         return float(self.grid.cell * self._total(self._turning.expectation(self.as_field(psi))))
 
     def momentum(self, psi: Any) -> np.ndarray:
-        """Return the means of -i times the derivatives along the axes of the grid, times the mass."""
+        """Return the momenta along the axes of the grid, the means of -i times the derivatives, times the mass."""
         psi = self.as_field(psi)
         return self.grid.cell * np.array([self._total(along.expectation(psi)) for along in self._moving])
 
     def chemical_potential(self, psi: Any) -> float:
-        """Return the mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
+        """Return the chemical potential, the mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
         psi = self.as_field(psi)
         above, below = self._total((np.vdot(psi, self.hamiltonian(psi)).real, np.vdot(psi, psi).real))
         return float(above / below)
@@ -296,23 +299,24 @@ class GrossPitaevskii:
         out *= 2 * self.grid.cell
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Invariant, ...]:
-        """Make the invariants of the equation.
+        """Return the invariants of the equation.
 
         Parameters
         ----------
         names : sequence of {"mass", "energy", "momentum_x", "momentum_y", "momentum_z", "angular_momentum"}, optional
-            Mass and energy are invariants of the equations on the grid, whatever the field. The others are so to
-            spectral accuracy only, as far as the grid resolves the field: a momentum where the potential does not
-            change along its axis and nothing rotates, the angular momentum where the potential is symmetric about the
-            z axis and the field vanishes at the ends of the box.
+            Mass and energy are invariants of the equations on the grid for every field. The others are conserved to
+            spectral accuracy only, as far as the grid resolves the field: a momentum if the potential does not change
+            along its axis and `Omega` is 0; the angular momentum if the potential is symmetric about the z axis and the
+            field vanishes at the ends of the box.
 
         Returns
         -------
         tuple of Invariant
-            Their gradients are 2 w psi, 2 w H psi, -2 i w d psi and 2 w Lz psi, w the cell. That of the energy is a
-            multiple of the right-hand side, which the step evaluates once for it and for the next step's first stage
-            (`reuse_f`). Mass and energy are `JointInvariants`: handed on as they are, their projection takes two passes
-            over the field.
+            The gradients of mass, energy, momentum and angular momentum are 2 w psi, 2 w H psi, -2 i w d psi and 2 w Lz
+            psi with the size w of a cell. The gradient of the energy is a multiple of the right-hand side, which the
+            step evaluates only once for this gradient and for the first stage of the next step (`reuse_f`). Mass and
+            energy are returned as `JointInvariants`. If this object is passed on unchanged, a projection takes two
+            passes over the field.
 
         Raises
         ------
@@ -336,7 +340,7 @@ class GrossPitaevskii:
         for axis, along in enumerate(MOMENTA[: self.grid.dim]):
             made[along] = partial(self._momentum_along, axis), partial(self._momentum_gradient, axis)
         if name in MOMENTA and name not in made:
-            raise ValueError(f"{name!r} is an invariant of more dimensions than {self.grid!r} has.")
+            raise ValueError(f"{name!r} needs an axis that {self.grid!r} does not have; omit this invariant.")
         return named_invariant(name, made, INVARIANTS, uses_f=name == "energy")
 
     def problem(
@@ -350,7 +354,7 @@ class GrossPitaevskii:
         reference: Callable[[float], np.ndarray | None] | None = None,
         source: str = SOURCE,
     ) -> FieldProblem:
-        """Make the initial value problem.
+        """Return the initial value problem.
 
         Parameters
         ----------
@@ -364,7 +368,7 @@ class GrossPitaevskii:
         invariants : sequence of str, optional
             See `invariants`.
         reference : callable, optional
-            ``reference(t) -> y``, the exact solution as a flat array.
+            ``reference(t) -> y``, the exact solution as a flat array, or None where it is not known.
         source : str, optional
 
         Returns
@@ -390,7 +394,7 @@ class GrossPitaevskii:
         )
 
     def largest_frequency(self) -> float:
-        """Return a bound for the norm of the linear part: the sum of the largest values of its terms."""
+        """Return an upper bound of the norm of the linear part and the potential: the sum of the terms' bounds."""
         kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
         turning = sum(self._largest(f) for f in self.rotation_factors()) if self.Omega else 0.0
         return kinetic + abs(self.Omega) * turning + self._largest(self.V)
@@ -403,12 +407,13 @@ class GrossPitaevskii:
         psi : array_like
             A typical field.
         limit : float, optional
-            The method's bound on h times the largest frequency; default: that of RK4, 2 sqrt(2).
+            Largest stable value of h times the largest frequency for the method; default: that of RK4, 2 sqrt(2).
 
         Returns
         -------
         float
-            From a bound of the largest frequency that counts the terms of H one by one; larger steps may do.
+            The step for an upper bound of the largest frequency, which is the sum of bounds of the terms of H. Somewhat
+            longer steps may be stable too.
         """
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
         local = 2 * abs(self.beta) * self._largest(self.as_field(psi)) ** 2

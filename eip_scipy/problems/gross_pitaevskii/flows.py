@@ -1,4 +1,4 @@
-"""Exact flows of the linear part: free motion and rotation together, by multipliers along one axis after another."""
+"""Exact flows of the linear part, free motion with rotation, by factors of the modes along one axis after another."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LARGEST_TURN = pi / 4
 
 
 class LinearFlow:
-    """exp(-i (time T - angle Lz)), T = -Laplace / 2, exact in time: a rotation by `angle` and free motion for `time`.
+    """The flow exp(-i (time T - angle Lz)) with T = -Laplace / 2: a rotation by `angle` and free motion for `time`.
 
     Parameters
     ----------
@@ -26,28 +26,30 @@ class LinearFlow:
     time : float
         Time of the free motion.
     angle : float, optional
-        Default: ``gpe.Omega * time``, the flow of the equation's linear part.
+        Angle of the rotation. Default: ``gpe.Omega * time``, which gives the flow of the equation's linear part.
 
     Raises
     ------
     ValueError
-        If the angle is above pi / 4 or the equation has one dimension and the angle is not 0.
+        If the absolute value of the angle is above pi / 4, or the equation has one dimension and the angle is not 0.
 
     Notes
     -----
-    Without rotation this is one multiplier of all modes. With it, three factors along x, y and x again, each of which
-    multiplies the modes along its axis: ``exp(-i (a k^2 / 2 + c y k))``, ``exp(-i (b q^2 / 2 - d x q))`` and the first
+    The flow is exact in time. Without rotation it is one factor of all modes. With rotation there are three factors, of
+    the modes along x, y and x again: ``exp(-i (a k^2 / 2 + c y k))``, ``exp(-i (b q^2 / 2 - d x q))`` and the first
     once more, with c = tan(angle / 2), d = sin(angle), a = time / (1 + cos(angle)), b = time cos(angle). For time = 0
-    that is the rotation of images by three shears (Unser, Thevenaz & Yaroslavsky 1995); with the free motion see
-    Bernier, Crouseilles & Li, J. Comput. Phys. 443 (2021) 110518, for such splittings of quadratic operators. The
-    values given here follow from the classical motion, which determines the flow of a quadratic Hamiltonian.
-    On the grid the flow is unitary to round-off, and exact as far as the field and its spectrum vanish at the ends.
+    this is the rotation of images by three shears (Unser, Thevenaz & Yaroslavsky 1995); for splittings with the free
+    motion see Bernier, Crouseilles & Li, J. Comput. Phys. 443 (2021) 110518. The values given here follow from the
+    classical motion, which determines the flow of a quadratic Hamiltonian. On the grid the flow is unitary to
+    round-off, and exact as far as the field and its spectrum vanish at the ends.
     """
 
     def __init__(self, gpe: GrossPitaevskii, time: float, angle: float | None = None) -> None:
         angle = gpe.Omega * time if angle is None else angle
         if abs(angle) > LARGEST_TURN * (1 + 1e-9):
-            raise ValueError(f"a flow turns by pi / 4 at most, got {angle:.3g} (Omega h); take shorter steps.")
+            raise ValueError(
+                f"the angle of a flow, Omega times its time, is at most pi / 4, got {angle:.3g}; use shorter steps."
+            )
         self._fft = gpe.transforms
         kinetic = [gpe.kinetic_factor(axis) for axis in range(gpe.grid.dim)]
         if angle == 0:
@@ -62,13 +64,13 @@ class LinearFlow:
 
     @staticmethod
     def _factor(gpe: GrossPitaevskii, axes: Axes, phases: list[Any]) -> tuple[Axes, list[np.ndarray]]:
-        """Return the factors exp(-i phase), which broadcast, the first divided by the number of points."""
+        """Return `axes`, and factors exp(-i phase) of the modes; the first is divided by the number of points."""
         points = int(np.prod([gpe.grid.shape[axis] for axis in axes]))
         first, *rest = (np.exp(-1j * phase) for phase in phases)
         return axes, [first / points, *rest]
 
     def apply(self, psi: np.ndarray, work: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the field's image, in one of the two arrays, and the other one; both are overwritten."""
+        """Return the image of `psi`, in one of the two arrays, and the other array; both arrays are overwritten."""
         for axes, factors in self._factors:
             self._fft.forward(psi, axes, work)
             for factor in factors:

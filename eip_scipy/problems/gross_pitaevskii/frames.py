@@ -1,4 +1,4 @@
-"""The frame at rest instead of the rotating one, for potentials that are symmetric about the z axis."""
+"""Problems in the frame at rest instead of the rotating frame, for potentials that are symmetric about the z axis."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ ALIKE = 1e-9  # radii and values of a potential that count as equal
 def at_rest(problem: FieldProblem) -> FieldProblem:
     """Return the problem in the frame at rest, in which the equation has no rotation and needs fewer transforms.
 
-    Where the potential is round about the z axis, ``rotated(gpe, y, gpe.Omega * t)`` is the solution in the rotating
-    frame if y is that at rest. The invariants are the mass and the energy at rest; the energy in the rotating frame is
-    that minus Omega times the angular momentum, which the grid keeps as far as it resolves the field.
+    The potential must be symmetric about the z axis. If y is the solution at time t in the frame at rest,
+    ``rotated(gpe, y, gpe.Omega * t)`` is the solution in the rotating frame. The invariants are the mass and the energy
+    in the frame at rest. The energy in the rotating frame is this energy minus Omega times the angular momentum, which
+    is conserved as far as the grid resolves the field.
 
     Parameters
     ----------
     problem : FieldProblem
-        As `GrossPitaevskii.problem` makes it.
+        A problem made by `GrossPitaevskii.problem`.
 
     Returns
     -------
     FieldProblem
-        With Omega = 0 and the same start, interval, step and names of invariants, without `reference`.
+        A problem with Omega = 0 and the same start, interval, step and names of invariants, without `reference`.
 
     Raises
     ------
     ValueError
-        If the potential is not round, or in one dimension.
+        If the potential is not symmetric about the z axis, or the problem has one dimension.
     """
     gpe = problem.equation
     assert gpe is not None
@@ -58,8 +59,8 @@ def at_rest(problem: FieldProblem) -> FieldProblem:
 def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
     """Return exp(i angle Lz) psi, the field at points turned anticlockwise by `angle` about the z axis.
 
-    A solution of the equation with Omega = 0 and a potential that is round about z becomes that of Omega when it is
-    rotated by ``Omega t``: the rotating frame, from the frame at rest.
+    For a potential that is symmetric about z, this function converts a solution from the frame at rest (Omega = 0) to
+    the frame that rotates with Omega, if the angle is ``Omega t``.
 
     Parameters
     ----------
@@ -68,17 +69,18 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
     psi : array_like
         A field or flat state that vanishes towards the ends of the box.
     angle : float
-        Any; done in parts of pi / 32 at most, whose shears hardly stretch the field.
+        Any angle. The rotation is made in parts of at most pi / 32, because the shears of larger parts could stretch
+        the field beyond the box.
 
     Returns
     -------
     ndarray
-        A field.
+        The rotated field.
 
     Raises
     ------
     ValueError
-        If the grid has one dimension, or the field has another shape.
+        If the grid has one dimension, or `psi` has the wrong shape.
     """
     psi = gpe.as_field(psi).copy()
     angle = remainder(angle, 2 * pi)
@@ -90,15 +92,15 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
 
 
 def check_radial(gpe: GrossPitaevskii) -> None:
-    """Return True if the potential is equal at all grid points with the same distance from the z axis.
+    """Require that the potential is equal at all grid points with the same distance from the z axis.
 
     Raises
     ------
     ValueError
-        If it has not, or in one dimension.
+        If the potential differs between such points, or the problem has one dimension.
     """
     if gpe.grid.dim == 1:
-        raise ValueError("without a z axis there is no rotation: the problem has one dimension.")
+        raise ValueError("at_rest: the problem has one dimension, without a z axis; expected two or three dimensions.")
     x, y, *_ = gpe.grid.mesh()
     square = (x * x + y * y).ravel()
     order = np.argsort(square)
@@ -106,5 +108,6 @@ def check_radial(gpe: GrossPitaevskii) -> None:
     alike = np.diff(square[order]) <= ALIKE * square.max()
     if np.any(np.abs(np.diff(values, axis=0))[alike] > ALIKE * np.abs(gpe.V).max()):
         raise ValueError(
-            "at_rest: the potential differs between points equally far from the z axis; at rest it would turn."
+            "at_rest: the potential differs between points at the same distance from the z axis, so that it would "
+            "rotate in the frame at rest. Use the problem in the rotating frame."
         )

@@ -1,4 +1,4 @@
-"""Periodic grids, and real multipliers of the Fourier modes along some of their axes."""
+"""Periodic grids, and real factors of the Fourier modes along some of their axes."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ SLAB = 2**19  # bytes of a field that stay in a processor's cache together with 
 
 
 class Grid:
-    """A uniform periodic grid in one, two or three dimensions; the upper ends are the lower ones again.
+    """A uniform periodic grid in one, two or three dimensions; points at the upper ends are those at the lower ends.
 
     Parameters
     ----------
     shape : int or sequence of int
-        Points along x, y, z: at least two each.
+        Numbers of points along x, y and z, at least two each.
     lower, upper : float or sequence of float
-        Ends of the box; a single number serves every axis.
+        Ends of the box; a single number applies to all axes.
 
     Attributes
     ----------
     shape : tuple of int
     lower, upper, spacing : ndarray, shape (d,)
     cell : float
-        Length, area or volume that belongs to a point, the paper's h_x h_y.
+        Length, area or volume of a cell, which belongs to one point; h_x h_y in two dimensions.
 
     Raises
     ------
@@ -80,17 +80,18 @@ class Grid:
         return int(np.prod(self.shape))
 
     def points(self, axis: int) -> np.ndarray:
-        """Return the coordinates along one axis, lower + j h."""
+        """Return the coordinates of the points along one axis, lower + j spacing."""
         return self.lower[axis] + self.spacing[axis] * np.arange(self.shape[axis])
 
     def mesh(self) -> tuple[np.ndarray, ...]:
-        """Return the coordinates that broadcast to fields: for two axes of shapes (J, 1) and (1, K)."""
+        """Return the coordinates as arrays that broadcast to fields, for two axes of the shapes (J, 1) and (1, K)."""
         return tuple(self._along(axis, self.points(axis)) for axis in range(self.dim))
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """Return the wavenumbers along one axis, of shapes as `mesh`; with `odd` that of the Nyquist mode is 0.
+        """Return the wavenumbers along one axis, with the shape as in `mesh`; if `odd`, that of the Nyquist mode is 0.
 
-        The mode of an even number of points has no sign: an odd derivative is 0 there, an even one is not.
+        The Nyquist mode, the highest mode of an even number of points, has no sign: odd derivatives of it are 0 at the
+        points, even derivatives are not.
         """
         n = self.shape[axis]
         k = 2 * np.pi / (self.upper[axis] - self.lower[axis]) * np.fft.fftfreq(n, 1 / n)
@@ -102,7 +103,7 @@ class Grid:
         return values.reshape([-1 if k == axis else 1 for k in range(self.dim)])
 
     def field(self, y: Any) -> np.ndarray:
-        """Return the states as fields, a view where `y` is contiguous.
+        """Return states as fields; the result is a view if `y` is contiguous.
 
         Parameters
         ----------
@@ -133,7 +134,7 @@ class Multiplier:
     axes : tuple of int
         The axes that are transformed.
     factor : array_like
-        Broadcasts to fields; along the other axes it may vary with the position.
+        Array that broadcasts to fields. Along the axes that are not transformed it may vary with the position.
     """
 
     def __init__(self, grid: Grid, axes: Axes, factor: Any) -> None:
@@ -149,9 +150,10 @@ class Multiplier:
             self._strips = _in_strips(self._factor)
 
     def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
-        """Fill `out` with the multiplied field; `psi` stays.
+        """Fill `out` with the field whose modes are those of `psi` times the factor; `psi` is not changed.
 
-        Both may be a slab of the field from index `first` of x on, if x is not among the axes transformed.
+        If x is not among the transformed axes, `psi` and `out` may be a slab of the field that begins at index `first`
+        along x.
         """
         if self._strips and fft.gains_by_strips:
             for columns, factor, work in self._strips:
@@ -166,13 +168,13 @@ class Multiplier:
         fft.backward(out, self.axes)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
-        """Return the sum over the grid of conj(psi) times the multiplied field, with one transform (Parseval)."""
+        """Return the sum over the grid of conj(psi) times the field of `apply`, with one transform (Parseval)."""
         fft.forward(psi, self.axes, work)
         return float(weighted_square(work, self._factor))
 
 
 def _in_strips(factor: np.ndarray) -> list[tuple[slice, np.ndarray, np.ndarray]]:
-    """Some columns at a time: which, their factor, and room for the field there, one for all strips of a width."""
+    """Return for each strip of columns its slice, its factor, and a buffer, which strips of the same width share."""
     strips = [slice(begin, begin + STRIP) for begin in range(0, factor.shape[1], STRIP)]
     factors = [np.ascontiguousarray(factor[:, columns]) for columns in strips]
     rooms = {part.shape: np.empty(part.shape, complex) for part in factors}
@@ -187,12 +189,12 @@ class SpectralSum:
     grid : Grid
     fft : Transforms
     terms : sequence of Multiplier
-        One at least.
+        At least one multiplier.
 
     Attributes
     ----------
     single : bool
-        Whether there is but one term.
+        True if there is only one term.
     """
 
     def __init__(self, grid: Grid, fft: Transforms, terms: Sequence[Multiplier]) -> None:
@@ -203,7 +205,7 @@ class SpectralSum:
         self._slab = grid.shape[0] if whole else max(1, SLAB // max(1, 16 * int(np.prod(grid.shape[1:]))))
 
     def parts(self, psi: np.ndarray, out: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Fill `out` with all terms but the last of several, and yield that slab by slab, as long as it is in cache.
+        """Fill `out` with all terms except the last of several; yield the last one by slabs, while these are in cache.
 
         Yields
         ------
@@ -222,10 +224,10 @@ class SpectralSum:
             yield begin, rest
 
     def apply(self, psi: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with the operator's image of `psi`."""
+        """Fill `out` with the operator applied to `psi`."""
         for begin, rest in self.parts(psi, out):
             out[begin : begin + rest.shape[0]] += rest
 
     def expectation(self, psi: np.ndarray) -> float:
-        """Return the sum over the grid of conj(psi) times the image."""
+        """Return the sum over the grid of conj(psi) times the operator applied to `psi`."""
         return sum(term.expectation(self._fft, psi, self._work) for term in self._terms)

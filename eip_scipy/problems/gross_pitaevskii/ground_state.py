@@ -1,4 +1,4 @@
-"""Ground states: the energy's minimum among fields of mass 1, by preconditioned nonlinear conjugate gradients.
+"""Ground states: minima of the energy among fields of mass 1, by preconditioned nonlinear conjugate gradients.
 
 X. Antoine, A. Levitt, Q. Tang, "Efficient spectral computation of the stationary states of rotating Bose-Einstein
 condensates by preconditioned nonlinear conjugate gradient methods", J. Comput. Phys. 343 (2017) 92-109.
@@ -34,10 +34,11 @@ class GroundState:
     energy, mu : float
         Energy and chemical potential.
     residual : float
-        Norm of H psi - mu psi, with the cell's weight.
+        Norm of H psi - mu psi, the root of the sum of squares times the size of a cell.
     iterations : int
+        Number of iterations.
     converged : bool
-        Whether the residual is below the tolerance.
+        True if the residual is at most `tol`.
     message : str
         Why the iteration ended.
     """
@@ -69,17 +70,18 @@ def ground_state(
     ----------
     gpe : GrossPitaevskii
     start : array_like
-        A field, normalised or not. See `trap_states` for starts.
+        A field, normalised or not, see `vortex_starts` and `imprint`.
     tol : float, optional
         Bound for the norm of H psi - mu psi.
     max_iterations : int, optional
+        Largest number of iterations.
     progress : callable, optional
-        ``progress(iteration, energy, residual)`` in each iteration; what is true ends the search.
+        ``progress(iteration, energy, residual)``, called in each iteration; a true return value ends the search.
 
     Returns
     -------
     GroundState
-        Its `converged` is False where the search ended early, its `message` says why.
+        If the search ended early, `converged` is False, and `message` has the reason.
 
     Raises
     ------
@@ -88,10 +90,10 @@ def ground_state(
 
     Notes
     -----
-    The combined preconditioner and the coefficient of Polak and Ribiere of the paper above, with an exact line search:
-    the energy of cos(a) psi + sin(a) p is a polynomial of degree 4 in cosine and sine, whose coefficients need no
-    further transform. One iteration costs the linear part of one field, and one pair of transforms of the
-    preconditioner.
+    The method uses the combined preconditioner and the coefficient of Polak and Ribiere of the paper by Antoine, Levitt
+    and Tang (2017), with an exact line search: the energy of cos(a) psi + sin(a) p is a polynomial of degree 4 in
+    cosine and sine, whose coefficients need no further transform. One iteration costs the linear part of one field, and
+    one pair of transforms for the preconditioner.
     """
     if not tol > 0 or isinstance(max_iterations, bool) or not isinstance(max_iterations, int) or max_iterations < 1:
         raise ValueError(f"tol must be > 0 and max_iterations an integer >= 1, got {tol!r} and {max_iterations!r}.")
@@ -103,7 +105,7 @@ def ground_state(
 
 
 class _Descent:
-    """The search: psi, the direction p, and the images of both under the linear part with the potential."""
+    """State of the search: psi, the direction p, and the linear part with the potential applied to both."""
 
     def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray) -> None:
         self.gpe, self.psi = gpe, psi
@@ -113,15 +115,16 @@ class _Descent:
         self.preconditioner = _Preconditioner(gpe)
 
     def inner(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Re <a, b>."""
+        """Return Re <a, b>, with the size of a cell as weight."""
         return self.gpe.grid.cell * float(inner(a, b))
 
     def apply(self, field: np.ndarray, out: np.ndarray) -> None:
-        """Linear part and potential."""
+        """Fill `out` with the linear part and the potential applied to `field`."""
         self.gpe.linear(field, out)
         add_potential(field, self.gpe.V, 0.0, out)
 
     def run(self, tol: float, max_iterations: int, progress: Progress | None) -> GroundState:
+        """Search until the residual is at most `tol`, or until another end, and return the result."""
         message, iteration = "", 0
         while not message:
             if iteration % REFRESH == 0:
@@ -140,18 +143,18 @@ class _Descent:
         return GroundState(self.psi, self.gpe.energy(self.psi), mu, norm, iteration, norm <= tol, message)
 
     def energy(self, mu: float) -> float:
-        """Return the energy from the last sums over the field: mu minus half of the interaction energy."""
+        """Return the energy, which is mu minus beta / 2 times the integral of ``|psi|^4``."""
         density = np.abs(self.psi) ** 2
         return mu - 0.5 * self.gpe.beta * self.gpe.grid.cell * float(np.vdot(density, density))
 
     def refresh(self) -> None:
-        """Remove accumulated rounding errors, and adapt the preconditioner."""
+        """Normalise psi, recompute its image to remove accumulated rounding errors, and adapt the preconditioner."""
         self.psi /= sqrt(self.inner(self.psi, self.psi))
         self.apply(self.psi, self.image)
         self.preconditioner.fit(self.psi)
 
     def gradient(self) -> tuple[float, float]:
-        """Fill the residual H psi - mu psi; returns mu and its norm."""
+        """Compute the residual H psi - mu psi; return mu and the norm of the residual."""
         r = self.residual
         np.copyto(r, self.image)
         add_potential(self.psi, self.preconditioner.zero, self.gpe.beta, r)
@@ -192,9 +195,10 @@ class _Descent:
 
 
 def _least_energy(e: tuple[float, float, float, float, float]) -> float:
-    """Return the t = tan(a) of least sum_k e_k cos(a)^(4 - k) sin(a)^k.
+    """Return t = tan(a) for the angle a at which sum_k e_k cos(a)^(4 - k) sin(a)^k is smallest.
 
-    Its derivative in a is a polynomial of degree 4 in t, over cos(a)^-4; the curve is not flat, for e_1 < 0.
+    The derivative of the sum with respect to a is a polynomial of degree 4 in t times cos(a)^4. It does not vanish
+    everywhere, because e_1 < 0.
     """
     e0, e1, e2, e3, e4 = e
     roots = np.roots([-e3, 4 * e4 - 2 * e2, 3 * (e3 - e1), 2 * e2 - 4 * e0, e1])
@@ -204,7 +208,7 @@ def _least_energy(e: tuple[float, float, float, float, float]) -> float:
 
 
 class _Preconditioner:
-    """D (a - Laplace / 2)^(-1) D with D = (a + V + beta |psi|^2)^(-1/2), a the field's typical energy."""
+    """Operator D (a - Laplace / 2)^(-1) D with D = (a + V + beta |psi|^2)^(-1/2), for a typical energy a."""
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
         self._gpe = gpe
@@ -216,7 +220,7 @@ class _Preconditioner:
         self.zero = np.zeros(gpe.grid.size)
 
     def fit(self, psi: np.ndarray) -> None:
-        """Compute the constants from a field: its kinetic, potential and interaction energy."""
+        """Compute the constant a from a field: the sum of its kinetic, potential and interaction energy."""
         gpe = self._gpe
         density = np.abs(psi) ** 2
         local = float(np.vdot(density, self._V + abs(gpe.beta) * density))
@@ -224,7 +228,7 @@ class _Preconditioner:
         self._inverse = Multiplier(gpe.grid, self._axes, 1 / (self._a + self._kinetic))
 
     def __call__(self, r: np.ndarray, psi: np.ndarray) -> np.ndarray:
-        """Return the preconditioned residual, in a buffer."""
+        """Return the preconditioned residual `r` in a buffer, which the next call overwrites."""
         local = (psi, self._V, abs(self._gpe.beta), self._a)
         divide_by_root(r, *local, self._scaled)
         self._inverse.apply(self._gpe.transforms, self._scaled, self._out)

@@ -42,14 +42,14 @@ class Moments(NamedTuple):
 
 
 def moments(psi: np.ndarray, f: np.ndarray) -> Moments:
-    """Return the moments of a field `psi` and its derivative f."""
+    """Return the sums over the grid for a field `psi` and its time derivative f = -i H psi."""
     return Moments(*_native.moments(psi, f))
 
 
 total_mass = _native.total_mass
-"""``total_mass(psi)``: the sum of ``|psi|^2`` alone."""
+"""``total_mass(psi)``: return the sum of ``|psi|^2``."""
 expansion = _native.expansion
-"""``expansion(psi, near, f)``: the sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near."""
+"""``expansion(psi, near, f)``: return the sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near."""
 shifted = _native.shifted
 """``shifted(psi, f, a, b, out)``: fill out = psi + a psi + b i f.
 

@@ -1,9 +1,9 @@
-"""The equation point by point, and sums over fields: the engine's functions, by the names that they have here.
+"""Functions of the engine that evaluate the equation point by point, and sums over fields.
 
-Fields are contiguous complex arrays with any number of axes, or float views of them (Re, Im, Re, Im ...); what is
-written is the argument `out`, else the first one. Sums are those of blocks of a few hundred points: the same bits on
-every machine, and the error of a sum over this number of terms, not of one over all. Other threads run meanwhile if a
-field is large.
+Fields are contiguous complex arrays with any number of axes, or float views of them (Re, Im, Re, Im ...). A function
+writes to its argument `out` or, if it has none, to its first argument. Sums are computed in blocks of a few hundred
+points. Therefore they have the same bits on every machine, and their rounding error is that of a sum over one block.
+Other Python threads run meanwhile if a field is large.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Problems for the Gross-Pitaevskii equation: closed forms of the NLS equation, and the paper's experiment IV."""
+"""Problems for the Gross-Pitaevskii equation: closed forms of the NLS equation, and condensates of "the paper".
+
+The paper is Cai, Gong & Wang; the condensates are those of its Experiment IV.
+"""
 
 from __future__ import annotations
 
@@ -76,8 +79,8 @@ def breather(
 ) -> FieldProblem:
     """Return the problem of two solitons of the focusing NLS equation in 1D at one place, with the closed form.
 
-    ``psi = 2 a / sqrt(-beta) sech(a x) exp(i v x)`` at t = 0, the wave of Satsuma and Yajima: its modulus comes back
-    after pi / (2 a^2), on a ring of the given length.
+    At t = 0 it is ``psi = 2 a / sqrt(-beta) sech(a x) exp(i v x)``, the wave of Satsuma and Yajima, on a ring of the
+    given length. Its modulus is periodic in time with the period pi / (2 a^2).
 
     Parameters
     ----------
@@ -90,7 +93,8 @@ def breather(
         Length of the ring; exp(-a length / 2) is the error of the closed form there.
     t_end : float
     h : float, optional
-        Default: 0.005 / a^2, for `Splitting`; `GrossPitaevskii.largest_step` bounds that of other methods.
+        Default: 0.005 / a^2, a step for `Splitting`. The step of other methods must be below
+        `GrossPitaevskii.largest_step`.
     **options
         Options of `GrossPitaevskii`.
 
@@ -174,7 +178,7 @@ def rotating_packet(
 ) -> FieldProblem:
     """Return the rotating wave packet of the paper's table 5, psi0 = 2 / sqrt(pi) (x + i y) exp(-8 (x^2 + y^2)).
 
-    On [-2, 2]^2 with V = (x^2 + y^2) / 2 and beta = 1.
+    The box is [-2, 2]^2, V = (x^2 + y^2) / 2 and beta = 1.
 
     Parameters
     ----------
@@ -204,7 +208,7 @@ def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> Gr
     Parameters
     ----------
     kappa : float
-        The paper's ground state is that of 0.3; its dynamics starts when that becomes 0.7.
+        The paper computes the ground state for 0.3, and starts the dynamics by a change of kappa to 0.7.
     points : int
         Number of points along each axis; with the paper's 256 the phase turns by Omega r h = 1.8 between two points.
     **options
@@ -221,7 +225,7 @@ def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> Gr
 def line_condensate(Omega: float = 0.7, points: int = 64, **options: Any) -> GrossPitaevskii:
     """Return the paper's condensate with vortex lines: V = (x^2 + y^2 + z^2 / 4) / 2, beta = 400.
 
-    On [-10, 10]^2 x [-15, 15].
+    The box is [-10, 10]^2 x [-15, 15].
 
     Parameters
     ----------
@@ -256,7 +260,7 @@ def _breather(x: np.ndarray, length: float, amplitude: float, velocity: float, b
 
 
 def _moving(x: np.ndarray, length: float, velocity: float, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shortest periodic distance from a moving centre, and the phase that belongs to the motion."""
+    """Return the distances of points from a centre that moves around the ring, and the phase factor of the motion."""
     # The phase follows the distance, so that nothing jumps where it turns.
     s = np.remainder(x - velocity * t + length / 2, length) - length / 2
     return s, np.exp(1j * (velocity * (s + velocity * t) - 0.5 * velocity**2 * t))

@@ -1,4 +1,4 @@
-"""Search for the lowest stationary state from several starts, and over windings for a condensate with a hole."""
+"""Searches for the lowest stationary state: from several starts, and over windings for a condensate with a hole."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ def lowest_ring(
     progress: Progress | None = None,
     report: Callable[[int, int, float], Any] | None = None,
 ) -> GroundState:
-    """Search for the lowest state with one row of vortices in a ring, over their number and the winding inside.
+    """Search for the lowest state with one row of vortices in a ring, over their number and the winding number inside.
 
     Parameters
     ----------
     gpe : GrossPitaevskii
         An equation whose Thomas-Fermi density has a hole.
     tol, max_iterations, progress
-        For the last search, see `ground_state`.
+        Arguments of the last search, see `ground_state`.
     seed : int, optional
-        Seed of the noise that breaks the symmetry of the state that the search has found.
+        Seed of the noise that breaks the symmetry of the best state before the last search.
     report : callable, optional
         ``report(count, winding, energy)`` for each pair tried.
 
@@ -75,12 +75,13 @@ def lowest_ring(
     Raises
     ------
     ValueError
-        If there is no hole.
+        If the condensate has no hole.
 
     Notes
     -----
-    States with different windings lie apart: no descent leads from one to another. So the walk descends from pairs
-    (count, winding), goes to the lowest neighbour as long as there is a lower one, and descends from there with noise.
+    No descent leads from a state to one with another winding. Therefore short searches are made from starts with pairs
+    (count, winding): from each pair the search goes on to its neighbour of lowest energy, until no neighbour is lower.
+    The last search starts from the best state with noise.
     """
     density = thomas_fermi(gpe)
     x, y, *_ = gpe.grid.mesh()

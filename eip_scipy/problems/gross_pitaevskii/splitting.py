@@ -24,9 +24,9 @@ class Scheme(NamedTuple):
     name : str
     order : int
     local : tuple of float, length s + 1
-        Parts of the step of ``V + beta |psi|^2``, whose flow is a phase at each point.
+        Fractions of the step for the flows of ``V + beta |psi|^2``, which multiply the field by a phase at each point.
     linear : tuple of float, length s
-        Parts of the step of -Laplace / 2 - Omega Lz, between the others.
+        Fractions of the step for the flows of -Laplace / 2 - Omega Lz, each between two local flows.
     reference : str
     """
 
@@ -38,7 +38,7 @@ class Scheme(NamedTuple):
 
 
 def _palindrome(half: tuple[float, ...], *, odd: bool, total: float = 1.0) -> tuple[float, ...]:
-    """Return symmetric coefficients from the first ones; the middle coefficient follows from the sum `total`."""
+    """Return symmetric coefficients from the first ones; the coefficients in the middle follow from the sum `total`."""
     rest = total - 2 * sum(half)
     return (*half, rest, *half[::-1]) if odd else (*half, rest / 2, rest / 2, *half[::-1])
 
@@ -62,7 +62,7 @@ SCHEMES = {scheme.name: scheme for scheme in (STRANG, S6, RKN6)}
 
 
 class Splitting:
-    """A splitting into the linear part, with the rotation, and the local one, each solved exactly: a one-step method.
+    """One-step method that solves the linear part, with the rotation, and the local part alternately, both exactly.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Splitting:
     gpe, scheme
     order : int
     evaluations : int
-        Linear flows in a step, each of a pair of transforms, as an evaluation of the right-hand side.
+        Number of linear flows in a step. Each takes about as many transforms as an evaluation of the right-hand side.
     name : str
 
     Raises
@@ -87,8 +87,9 @@ class Splitting:
 
     Notes
     -----
-    ``|psi|^2`` is constant in the local flow, which is thereby a phase. Every flow is unitary and reversible, and so
-    are the steps: the mass is kept to round-off, and a step back undoes a step. The energy is not kept: project.
+    ``|psi|^2`` is constant in the local flow, which therefore only changes the phase. Every flow is unitary and
+    reversible, and so are the steps: the mass is conserved to round-off, and a step back undoes a step. The energy is
+    not conserved without a projection.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Start fields for the search for a ground state: Thomas-Fermi densities with vortices."""
+"""Start fields for the search of a ground state: Thomas-Fermi densities with vortices."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
 
 
 def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
-    """Return the density (mu - V + Omega^2 r^2 / 2) / beta where that is positive, of mass 1.
+    """Return the Thomas-Fermi density of mass 1, (mu - V + Omega^2 r^2 / 2) / beta where this is positive, and else 0.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     Raises
     ------
     ValueError
-        If there is no repulsion, or the density reaches the ends of the box.
+        If beta is not positive, or the density reaches the ends of the box.
     """
     if not gpe.beta > 0:
         raise ValueError(f"a Thomas-Fermi density needs beta > 0, got {gpe.beta:g}; give a start of your own.")
@@ -46,7 +46,7 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     mu = brentq(excess, low, float(well.max()) + gpe.beta / volume, xtol=1e-12)
     density = np.maximum(mu - well, 0.0) / gpe.beta
     if any(np.any(np.take(density, 0, axis=axis)) for axis in range(gpe.grid.dim)):
-        raise ValueError("the condensate does not fit the box: enlarge it, or lower Omega.")
+        raise ValueError("the condensate does not fit into the box of the grid: enlarge the box, or lower Omega.")
     return density
 
 
@@ -82,7 +82,7 @@ def polygon(count: int, radius: float) -> np.ndarray:
 
 
 def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
-    """Return a ring with `count` vortices at equal distances in its middle, and a phase with `winding` inside.
+    """Return a ring with `count` vortices at equal distances in its middle and the winding number `winding` inside.
 
     Parameters
     ----------

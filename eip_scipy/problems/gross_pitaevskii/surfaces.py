@@ -1,4 +1,4 @@
-"""Surfaces of equal density in three dimensions, and which parts of them are the tubes around vortex lines."""
+"""Surfaces of equal density in three dimensions, with the parts that are tubes around vortex lines marked."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Surface(NamedTuple):
     corners : ndarray, shape (m, 3, 3)
         x, y and z of the three corners of each triangle.
     inside : ndarray of bool, shape (m,)
-        Whether the triangle lies within the condensate: around the core of a vortex, which is all that is empty there.
+        True if the triangle lies inside the condensate. It is then part of a tube around a vortex line.
     """
 
     corners: np.ndarray
@@ -32,16 +32,16 @@ class Surface(NamedTuple):
 
 
 def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
-    """The surface on which ``|psi|^2`` has a given value, by marching cubes (Lewiner et al. 2003, in scikit-image).
+    """Return the surface on which ``|psi|^2`` has a given value, by marching cubes (Lewiner et al. 2003, scikit-image).
 
     Parameters
     ----------
     gpe : GrossPitaevskii
         An equation in three dimensions.
     psi : array_like
-        A field or flat state, 0 at the ends of the box. It is evaluated on twice as many points along each axis.
+        A field or flat state that is 0 at the ends of the box. It is interpolated to twice as many points on each axis.
     level : float
-        Between 0 and the largest density.
+        The value of the density on the surface, between 0 and the largest density.
 
     Returns
     -------

@@ -15,7 +15,7 @@ Axes = tuple[int, ...]
 
 
 class Transforms:
-    """Transforms of contiguous complex fields along some of their axes, without a factor either way.
+    """Transforms of contiguous complex fields along some of their axes, without normalisation in both directions.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ class Transforms:
     """
 
     name = ""
-    # Return True if transforms along x are faster for some copied columns at a time than for a whole field.
+    # True if transforms along x are faster for some copied columns at a time than for a whole field.
     gains_by_strips = False
 
     def __init__(self, threads: int) -> None:
@@ -74,13 +74,13 @@ LIBRARIES: dict[str, type[Transforms]] = {kind.name: kind for kind in (_Ducc, _S
 
 
 def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
-    """Choose a library and make its transforms.
+    """Choose a library and return its transforms.
 
     Parameters
     ----------
     fft : {"auto", "ducc0", "scipy"}, optional
-        "auto": ducc0 where it is installed, about twice as fast, else scipy. ducc0, under the GPL, comes with
-        ``pip install "eip_scipy[fft]"``.
+        "auto" chooses ducc0 if it is installed, which is about twice as fast, otherwise scipy. ducc0, which has the GPL
+        licence, is installed by ``pip install "eip_scipy[fft]"``.
     threads : int, optional
         Threads of each transform. No other part of the right-hand side has threads, so that no two pools compete.
 
@@ -93,7 +93,7 @@ def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
     ValueError
         If the name is unknown, or the number of threads is below 1.
     ImportError
-        If the library asked for is not installed.
+        If the requested library is not installed.
     """
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
         raise ValueError(f"threads must be an integer >= 1, got {threads!r}.")
@@ -102,5 +102,5 @@ def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
     if fft not in LIBRARIES:
         raise ValueError(f"fft must be 'auto' or one of {', '.join(map(repr, LIBRARIES))}, got {fft!r}.")
     if find_spec(fft) is None:
-        raise ImportError(f"fft={fft!r} needs {fft}: pip install \"eip_scipy[fft]\", or fft='scipy'.", name=fft)
+        raise ImportError(f"fft={fft!r} needs {fft}: pip install \"eip_scipy[fft]\", or use fft='scipy'.", name=fft)
     return LIBRARIES[fft](int(threads))

@@ -1,4 +1,4 @@
-"""Vortices of a field: plaquettes of the grid inside the condensate around which the phase winds."""
+"""Vortices of a field: cells of the grid inside the condensate around which the phase winds."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ class Vortices(NamedTuple):
     Attributes
     ----------
     positions : ndarray, shape (k, 2)
+        x and y of each vortex.
     charges : ndarray of int, shape (k,)
-        Turns of the phase around each, positive anticlockwise.
+        Turns of the phase around each vortex, positive if anticlockwise.
     """
 
     positions: np.ndarray
@@ -38,7 +39,7 @@ def vortices(
     plane: int | None = None,
     Omega: float | None = None,
 ) -> Vortices:
-    """Find the vortices of a field where its density, their cores filled in, exceeds a part of its maximum.
+    """Return the vortices of a field inside the condensate.
 
     Parameters
     ----------
@@ -47,10 +48,11 @@ def vortices(
     psi : array_like
         A field or flat state.
     threshold : float, optional
-        Part of the largest density below which phases mean nothing.
+        Fraction of the largest density. Where the density with filled vortex cores is below this value, phases are not
+        meaningful, and no vortices are counted.
     core : float, optional
-        Width of the dips that are filled in (a grey closing). Default: four healing lengths at the largest density,
-        three points at least.
+        Width of the minima of the density that are filled (by a grey closing). Default: four healing lengths at the
+        largest density. The width is at least three points.
     plane : int, optional
         Index of z in three dimensions; default: the middle.
     Omega : float, optional
@@ -68,16 +70,17 @@ def vortices(
 
     Notes
     -----
-    The phase differences along the four edges are taken after subtraction of that of the rigid rotation and brought to
-    (-pi, pi]; their sum and the circulation 2 Omega dx dy of what was subtracted are 2 pi times the charge.
+    From the phase differences along the four edges of a cell those of the rigid rotation are subtracted, and the
+    results are reduced to (-pi, pi]. The sum of these, plus the circulation 2 Omega dx dy of the rotation, is 2 pi
+    times the charge.
     """
     if gpe.grid.dim == 1:
-        raise ValueError("vortices need two dimensions.")
+        raise ValueError("vortices need two or three dimensions, but the grid has one.")
     psi = gpe.as_field(psi)
     turning = gpe.Omega if Omega is None else Omega
     top = float((np.abs(psi) ** 2).max())
     if not top > 0:
-        raise ValueError("the field is zero.")
+        raise ValueError("psi is zero or not finite; vortices need a field.")
     if gpe.grid.dim == 3:
         psi = psi[:, :, gpe.grid.shape[2] // 2 if plane is None else plane]
     x, y = (gpe.grid.points(axis) for axis in (0, 1))
@@ -90,13 +93,13 @@ def vortices(
 
 
 def core_size(gpe: GrossPitaevskii, top: float, core: float | None = None) -> list[int]:
-    """Return the odd numbers of points (at least 3) of a vortex core along x and y, from the largest density."""
+    """Return the numbers of points across a vortex core along x and y, odd and at least 3, from the largest density."""
     width = core if core is not None else CORE / sqrt(2 * gpe.beta * top) if gpe.beta > 0 else 0.0
     return [max(3, ceil(width / d) | 1) for d in gpe.grid.spacing[:2]]
 
 
 def _charges(psi: np.ndarray, Omega: float, x: np.ndarray, y: np.ndarray, dx: float, dy: float) -> np.ndarray:
-    """Return the winding numbers (J - 1, K - 1) of the plaquettes, except those across the ends of the box."""
+    """Return the winding numbers (J - 1, K - 1) around the cells of the grid, without those across the box's ends."""
     psi = np.where(psi == 0, 1.0, psi)  # a vortex on a point of the grid: any phase will do, as long as it has one
     along_x = np.angle(psi[1:] * np.conj(psi[:-1]) * np.exp(1j * Omega * dx * y))
     along_y = np.angle(psi[:, 1:] * np.conj(psi[:, :-1]) * np.exp(-1j * Omega * dy * x[:, None]))
@@ -110,7 +113,7 @@ def _least_of_corners(a: np.ndarray) -> np.ndarray:
 
 
 def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: float) -> tuple[float, float]:
-    """Return the zero of the plane through the values at the four corners, in the frame of the plaquette's centre."""
+    """Return x and y of the zero of the linear function that fits the field best at the four corners of a cell."""
     u = np.array([[-0.5], [0.5]])
     middle = x + 0.5 * dx, y + 0.5 * dy
     c = corners * np.exp(-1j * Omega * (middle[0] * dy * u.T - middle[1] * dx * u))

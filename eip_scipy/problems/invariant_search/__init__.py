@@ -1,4 +1,4 @@
-"""Search for invariants in a vector field: combinations of monomials and given functions whose rate is zero."""
+"""Search for invariants of a vector field: combinations of monomials and given functions whose rate is zero."""
 
 from __future__ import annotations
 
@@ -34,36 +34,39 @@ def find_invariants(
 ) -> list[Invariant]:
     """Find invariants of y' = f(t, y) among combinations of polynomials of the state and given functions.
 
-    The rate of a sum of monomials is linear in its coefficients: those of an invariant are a null vector of the rates
-    at random points. What is found is tried at fresh points and times, and along a trajectory.
+    The rate of a sum of monomials is linear in its coefficients. Therefore the coefficients of an invariant are a null
+    vector of the matrix of rates at random points. Each combination that is found is tested at new points and times,
+    and along a trajectory.
 
     Parameters
     ----------
     fun : callable or Problem
         ``fun(t, y) -> (n,)``, for real states.
     y0 : array_like, shape (n,)
-        A state; points are drawn around it, about as far as its components are large. Where `fun` or a term raises an
-        error or is not finite, the points come closer.
+        A state. Random points are drawn around it, at distances of about the sizes of its components. If `fun` or a
+        term raises an error or is not finite at too many points, points nearer to the state are drawn.
     degree : int, optional
         Largest degree of the polynomials.
     terms : sequence or mapping, optional
-        Further functions of the state that may take part: pairs ``(g, grad)`` with ``g(y) -> float`` and ``grad(y) ->
-        (n,)``, or both of (t, y), but not changing with t; their names are those of the functions. Or a mapping of
-        names to pairs.
+        Further functions of the state that an invariant may contain: pairs ``(g, grad)`` with ``g(y) -> float`` and
+        ``grad(y) -> (n,)``, or both functions of (t, y) that do not depend on t. Their names are those of the
+        functions, or the keys of a mapping of names to pairs.
     t : float, optional
-        First time at which `fun` may be called; a trajectory goes on from there.
+        First time at which `fun` may be called. The trajectory starts at this time.
     rtol : float, optional
-        Largest rate of what is returned, in units of the sum of its terms, at each fresh point; a thousandth of it in
-        units of the sum of all products in it, which is what rounding leaves of zero.
+        Largest rate of a returned invariant at each new point, relative to the sum of the absolute values of the terms
+        ``dI/dy_i dy_i/dt``. In addition the rate must be below 0.001 `rtol` relative to the sum of the absolute values
+        of all products in these terms, because rounding errors are proportional to that sum.
     seed : int, optional
         Seed of the random points.
 
     Returns
     -------
     list of Invariant
-        Functionally independent ones, the simplest first, with readable names (``"y0*y3 - y1*y2"``), gradients, and
-        coefficients that are small fractions where those are kept too; jitted where `fun` is. Empty where there are
-        none. Polynomials and other functions of them are left out.
+        Functionally independent invariants, the simplest first, with readable names (``"y0*y3 - y1*y2"``) and
+        gradients. Coefficients are replaced by small fractions if these are conserved too. The functions are jitted if
+        `fun` is jitted. Polynomials and other functions of the returned invariants are left out. The list is empty if
+        no invariant is found.
 
     Raises
     ------
@@ -72,8 +75,9 @@ def find_invariants(
 
     Notes
     -----
-    Invariants that hold on a manifold only (of unit quaternions, say) are none at random points, and not found. A
-    quantity whose rate is below 1e-12 of its terms cannot be distinguished from an invariant.
+    Quantities that are conserved on a manifold only (for example of unit quaternions) are not conserved at random
+    points, and are not found. A quantity whose rate is below 1e-12 of its terms cannot be distinguished from an
+    invariant.
 
     Examples
     --------
@@ -92,12 +96,13 @@ def find_invariants(
         raise ValueError(f"find_invariants: y0 must be a real, finite state (n,), got {shown(y0)}.")
     for name, value in (("t", t), ("rtol", rtol)):
         if not (is_number(value) and math.isfinite(value)) or (name == "rtol" and not 0 < value < 1):
-            raise ValueError(f"find_invariants: {name} has the wrong value {shown(value)}.")
+            expected = "a finite number" if name == "t" else "a number between 0 and 1"
+            raise ValueError(f"find_invariants: {name} must be {expected}, got {shown(value)}.")
     size = math.comb(start.size + degree, degree) - 1 + len(terms)
     if size > LARGEST_BASIS:
         raise ValueError(
             f"find_invariants: {start.size} components make {size} monomials up to degree {degree}; at most "
-            f"{LARGEST_BASIS} are tried. Take a smaller degree, or give what may take part as terms."
+            f"{LARGEST_BASIS} can be tried. Use a smaller degree, and give functions that may occur as terms."
         )
     given = terms.items() if isinstance(terms, Mapping) else [(None, item) for item in terms]
     further = [_term(item, k, name) for k, (name, item) in enumerate(given)]
@@ -124,7 +129,7 @@ def _term(item: Any, k: int, name: str | None) -> Term:
 
 
 def _of_state(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of y from a function of (t, y) or of y."""
+    """Return a function of y from a function of (t, y) that does not depend on t, or from a function of y."""
     if isinstance(fun, np.ufunc) or len(inspect.signature(fun).parameters) != 2:
         return fun
     return compiled_like(lambda y: fun(0.0, y), fun)

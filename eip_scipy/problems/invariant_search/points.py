@@ -1,4 +1,4 @@
-"""A vector field at random points around a state, and the rates of monomials and further functions at these."""
+"""A vector field at random points around a state, and the rates of monomials and further functions there."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ STEPS = 200
 
 
 class Sample(NamedTuple):
-    """Points z = y / scale, dz/dt there made of size 1, and by columns rates of functions, with their products' sizes.
+    """Values at random points, one row for each point.
 
-    The size of a rate's products is the sum of ``|dI/dz_i dz_i/dt|``, for a monomial with each of its factors in turn.
+    `points` are z = y / scale, `slopes` dz/dt divided by the sum of its absolute values, `rates` the rates of the
+    functions, one column for each function. `sizes` are the sums of the absolute values of the products in the rates,
+    ``dI/dz_i dz_i/dt``, where the derivative of a monomial is written as one product for each of its factors.
     """
 
     points: Array
@@ -31,10 +33,10 @@ class Sample(NamedTuple):
 
 
 class Surroundings:
-    """Region and points for the search of invariants.
+    """The region around a state in which invariants are searched, and random points in it.
 
-    `scale` are the sizes of the components, `tau` a time in which the state moves by its own size, `trajectory` states
-    that follow y0.
+    `scale` holds the sizes of the components, `tau` is a time in which the state moves by its own size, and
+    `trajectory` holds states on the trajectory that starts at y0.
     """
 
     def __init__(self, fun: Callable[..., Any], y0: Array, terms: Sequence[Term], t: float, seed: int) -> None:
@@ -45,7 +47,7 @@ class Surroundings:
         self.trajectory = self._follow()
 
     def _slope(self, t: float, y: Array) -> Array:
-        """Return f, or NaN if it cannot be computed."""
+        """Return the derivative f(t, y), or NaN if it cannot be computed."""
         try:
             found = np.asarray(self.fun(t, y.copy()), dtype=float)
         except (ArithmeticError, ValueError) as error:
@@ -56,7 +58,7 @@ class Surroundings:
         return found
 
     def term_gradients(self, y: Array) -> Array:
-        """Return the gradients with a row for each term; NaN if one cannot be computed."""
+        """Return the gradients of the terms, one row for each term; all NaN if one of them cannot be computed."""
         try:
             return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
         except (ArithmeticError, ValueError) as error:
@@ -64,14 +66,14 @@ class Surroundings:
             return np.full((len(self.terms), y.size), np.nan)
 
     def term_values(self, y: Array) -> Array:
-        """Return the value of each term; NaN if it cannot be computed."""
+        """Return the values of the terms; all NaN if one of them cannot be computed."""
         try:
             return np.array([item.fun(y.copy()) for item in self.terms], dtype=float)
         except (ArithmeticError, ValueError):
             return np.full(len(self.terms), np.nan)
 
     def _look_around(self) -> None:
-        """Return the sizes of the components, and a time in which the state moves by its own size."""
+        """Set `scale`, the sizes of the components, and `tau`, a time in which the state moves by its own size."""
         here, self.scale, self.tau = self.y0, np.abs(self.y0), 0.0
         for _ in range(3):  # a component may start to move only where others have moved
             f = np.abs(self._slope(self.t, here))
@@ -84,7 +86,7 @@ class Surroundings:
         self.scale[self.scale == 0.0] = np.max(self.scale) or 1.0
 
     def sample(self, wanted: int, basis: Sequence[Monomial]) -> Sample:
-        """Return the rates of the monomials of a basis and of the terms at random points.
+        """Return `wanted` random points, and the rates of the monomials of a basis and of the terms there.
 
         Raises
         ------
@@ -105,8 +107,8 @@ class Surroundings:
                 if len(points) == wanted:
                     return _rates(np.array(points), np.array(slopes), np.array(gradients), basis)
         raise ValueError(
-            f"find_invariants: fun or a term is finite at fewer than 25 % of the points around y0, even within "
-            f"{SPREADS[-1]} of its components' sizes."
+            f"find_invariants: fun or a term is finite at fewer than 25 % of the random points around y0, even at "
+            f"distances of {SPREADS[-1]} times the sizes of the components. Choose another y0 or t."
         ) from self.failure
 
     def _follow(self) -> Array:

@@ -1,4 +1,4 @@
-"""Sums of monomials, and of further functions: products, names, and functions for runs."""
+"""Sums of monomials and of further functions: their products, their names, and their values and gradients."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LONGEST_NAME = 200
 
 
 class Term(NamedTuple):
-    """A function of the state that is not a monomial."""
+    """A given function of the state, with its gradient and its name, in addition to the monomials."""
 
     fun: Callable[..., float]
     grad: Callable[..., np.ndarray]
@@ -28,7 +28,7 @@ class Term(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Value and gradient as functions of (t, y)."""
+    """Value and gradient of a quantity, as functions of (t, y)."""
 
     value: Callable[..., float]
     gradient: Callable[..., np.ndarray]
@@ -47,7 +47,7 @@ def product_of(a: Polynomial, b: Polynomial) -> Polynomial:
 def functions(
     polynomial: Polynomial, terms: Sequence[tuple[Term, float]], n: int, like: Callable[..., object]
 ) -> Functions:
-    """Return a polynomial of n variables plus multiples of terms; it is jitted if `like` and the terms are."""
+    """Return a polynomial of n variables plus multiples of terms, jitted if `like` and the terms are jitted."""
     found = _of_polynomial(polynomial, n)
     compiled = [like]
     for term, coefficient in terms:
@@ -98,7 +98,7 @@ def _with_term(others: Functions, term: Term, coefficient: float) -> Functions:
 
 
 def written(polynomial: Polynomial, terms: Sequence[tuple[Term, float]], names: Sequence[str]) -> str:
-    """Return a polynomial as text such as "y0*y3 - y1*y2"."""
+    """Return a polynomial plus multiples of terms as text such as "y0*y3 - y1*y2"."""
     factors = [(_product(item, names), c) for item, c in polynomial.items()] + [(term.name, c) for term, c in terms]
     text = ""
     for name, coefficient in factors:

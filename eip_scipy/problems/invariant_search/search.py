@@ -29,9 +29,10 @@ APART = 1e3  # the least singular value that is not 0, in units of rounding
 
 
 class Search:
-    """One search.
+    """A search for invariants, which is made when the object is created; `found` has the result.
 
-    A function is a row of coefficients: of monomials of z = y / scale, then of the terms.
+    A function is represented by a row of coefficients: first those of the monomials of z = y / scale, then those of the
+    terms.
     """
 
     def __init__(self, around: Surroundings, degree: int, rtol: float) -> None:
@@ -52,7 +53,7 @@ class Search:
 
     @property
     def found(self) -> list[tuple[Polynomial, list[tuple[Term, float]]]]:
-        """Return the invariants as polynomials of y and multiples of terms."""
+        """Return the invariants as pairs of a polynomial of y and a list of terms with their coefficients."""
         rows = [row * self.units for row in self.accepted]
         of_terms = [zip(self.terms, row[len(self.basis) :].tolist(), strict=True) for row in rows]
         return [
@@ -61,7 +62,7 @@ class Search:
         ]
 
     def _search(self, columns: list[int]) -> None:
-        """Accept conserved combinations of some columns that are independent of those accepted before."""
+        """Accept conserved combinations of the functions in `columns` that are independent of those accepted before."""
         null, numerical = self._null_space(columns), self._numerical_null_space(columns)
         # The larger space first: a row alone of a smaller one is any combination of what spans the larger.
         if len(numerical) > len(null):
@@ -69,7 +70,7 @@ class Search:
         self._take(null, columns)
 
     def _take(self, null: Array, columns: list[int]) -> None:
-        """Accept the rows of a null space that are conserved."""
+        """Accept those rows of a null space that are conserved and independent of the rows accepted before."""
         known = np.array([self._row(item) for item in self._products(columns)]).reshape(-1, self._width)
         rows = self._reduced(known, null)
         for row in sorted(rows, key=self._simplicity):
@@ -93,10 +94,11 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _numerical_null_space(self, columns: Any) -> Array:
-        """Return the rows whose singular values are 0 up to rounding, if there is a gap to the others, without a test.
+        """Return the rows whose singular values are 0 up to rounding, if there is a gap to the others.
 
-        Rounding leaves such a row with a little of all columns. Near the points at which all terms of the invariant
-        vanish, of y1**2 + y0**4/2 where y0 does, that little is more than the terms, and the row is not kept there.
+        These rows are not tested. Because of rounding such a row contains small multiples of all columns. Near points
+        at which all terms of the invariant vanish, these multiples exceed the terms, so that the row would fail the
+        test of `_is_kept` there. An example is y1**2 + y0**4/2 near y0 = 0.
         """
         still, values, rows = self._singular(columns)
         if not values.size:
@@ -109,7 +111,7 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _singular(self, columns: Any) -> tuple[Array, Array, Array]:
-        """Return the constant columns, and the singular values of the others, largest first, with their rows."""
+        """Return the columns of constant functions, the singular values of the others, largest first, and vectors."""
         A, columns = self.sample.rates[:, columns], np.asarray(columns)
         weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
         still, moving = columns[weights == 0], columns[weights > 0]
@@ -119,7 +121,7 @@ class Search:
         return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
-        """Return True if the rate of a candidate vanishes at new points, relative to the sizes of its terms."""
+        """Return True if the rate of a candidate vanishes at new points, relative to the terms of the rate."""
         rate = np.abs(self.fresh.rates @ row)
         if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
             return False
@@ -127,7 +129,7 @@ class Search:
         return bool(np.all(rate <= self.rtol * np.abs(gradients * self.fresh.slopes).sum(axis=1)))
 
     def _gradients(self, row: Array, points: Array, part: Callable[[Array], Array] = np.positive) -> Array:
-        """Return dI/dz at points z (m, n); with ``part=np.abs`` the sum of the sizes of its terms."""
+        """Return dI/dz at points z (m, n); with ``part=np.abs`` the sums of the absolute values of its terms."""
         out = np.zeros_like(points)
         for k in np.flatnonzero(row[: len(self.basis)]):
             item = self.basis[k]
@@ -186,7 +188,7 @@ class Search:
         return [row / np.max(np.abs(row)) for row, _ in reduced[count_known:]]
 
     def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
-        """Return the key by which rows are sorted: number of terms, minus that of differences, mixed terms, places.
+        """Return the key for sorting rows: numbers of terms, of differences (negated) and of mixed terms, and columns.
 
         Angular momenta contain differences; a mixed term is a product of different variables.
         """
@@ -201,7 +203,7 @@ class Search:
         return -len(set(self.basis[k])), -len(self.basis[k]), k
 
     def _nice(self, row: Array) -> Array | None:
-        """Return a version with few terms and simple coefficients if it is conserved; None if nothing is conserved."""
+        """Return a conserved version of a row with few terms and, if possible, simple coefficients, or None."""
         for bound in NEGLIGIBLE:
             null = self._null_space(np.flatnonzero(np.abs(row) > bound * np.max(np.abs(row))))
             if not len(null):
@@ -218,7 +220,7 @@ class Search:
         return row
 
     def _rational(self, row: Array) -> Array:
-        """Replace the coefficients of y, in units of one of them, by small fractions if all are close to such."""
+        """Return a scaled row whose coefficients for y are small fractions, if all are close to such fractions."""
         raw = row * self.units
         raw = raw / raw[np.argmax(np.abs(row))]
         for unit in (1.0, np.min(np.abs(raw[raw != 0]))):
@@ -231,7 +233,7 @@ class Search:
         return raw * np.sign(raw[np.flatnonzero(raw)[0]]) / self.units
 
     def _is_new(self, row: Array) -> bool:
-        """Return True if its gradient is independent of the gradients of the others at some point."""
+        """Return True if a candidate's gradient is independent of those of the accepted invariants at some point."""
         points = self.fresh.points[:10]
         own, sizes = self._gradients(row, points), self._gradients(row, points, np.abs)
         others = [self._gradients(item, points) for item in self.accepted]

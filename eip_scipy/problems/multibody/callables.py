@@ -1,4 +1,4 @@
-"""Problems of mechanical systems from functions of arrays."""
+"""Problems of mechanical systems with constraints, made from functions of arrays."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ def mechanism(
     kinematics : callable, optional
         ``kinematics(t, q, u)``, the derivatives q', linear in u. Default: q' = u.
     jacobian, gamma : callable, optional
-        ``jacobian(t, q)``, the derivatives (m, n) of `constraints` by q, and ``gamma(t, q, u)``, (m + k,), the second
-        time derivatives of `constraints` and the first ones of `velocity_constraints` for u' = 0. By default both are
-        computed. Given ones are compared with computed ones at the start.
+        ``jacobian(t, q)``, the derivatives (m, n) of `constraints` with respect to q, and ``gamma(t, q, u)``, (m + k,),
+        the second time derivatives of `constraints` and the first ones of `velocity_constraints` for u' = 0. By default
+        both are computed. If they are given, they are compared with computed derivatives at the start.
     energy : callable, optional
         ``energy(t, q, u)``, the total energy.
     potential : callable, optional
@@ -125,7 +125,7 @@ def mechanism(
     >>> pendulum = mechanism([1, 1], [0, -9.81], lambda t, q: [q[0] ** 2 + q[1] ** 2 - 1], q0=[1, 0], u0=[0, 0],
     ...                      potential=lambda t, q: 9.81 * q[1])
     >>> run = integrate(pendulum, (0, 10), method=EIPDOP853, rtol=1e-8, atol=1e-8)
-    >>> bool(abs(run.y[:, 0] ** 2 + run.y[:, 1] ** 2 - 1).max() < 1e-14)
+    >>> bool(abs(run.y[0] ** 2 + run.y[1] ** 2 - 1).max() < 1e-14)
     True
     """
     given = Given(
@@ -185,10 +185,10 @@ def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
 
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
-    """Return the given numbers as an array, for the first calls of the functions; numbers that are missing are 0."""
+    """Return the argument `what` as an array, for the first calls of the functions; numbers that are missing are 0."""
     if isinstance(given, dict):
         if names is None:
-            raise TypeError(f"{what}: a mapping needs names; give coordinates= and speeds=.")
+            raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")
         return np.array([float(given.get(name, 0.0)) for name in component_names(names, None)])
     return np.atleast_1d(real_array(what, given)).astype(float)
 
@@ -265,7 +265,7 @@ def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
 
 
 def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
-    """Return the parts made from expressions if the given functions can be traced, otherwise from the functions."""
+    """Return the parts, made from expressions if all functions can be converted to them, otherwise from functions."""
     if find_spec("sympy") is None:
         return numerical_parts(given, names, t, q, u, "SymPy is not installed")
     from ..symbolic.traced import NotTraceableError

@@ -65,8 +65,8 @@ def norms_of(
 ) -> tuple[Invariant, ...]:
     """Return the sums of squares of coordinates that are constant because of the kinematics.
 
-    These are sets of coordinates whose sum of q q' is 0 for all speeds, such as the components of a quaternion. Sums
-    that depend on the invariants in `kept` are left out.
+    For such a set of coordinates the sum of q q' is 0 for all speeds; an example are the components of a quaternion.
+    Sums of squares that depend on the invariants in `kept` are left out.
     """
     t, y = states[-1]
     if _speeds_are_rates(parts, names, t, y, params):
@@ -107,7 +107,7 @@ def _is_independent(gradient: np.ndarray, rows: np.ndarray) -> bool:
 
 
 def _rates(parts: Parts, names: Names, t: float, y: np.ndarray, params: np.ndarray | None) -> np.ndarray:
-    """Return q'."""
+    """Return q', the derivatives of the coordinates at a state."""
     sizes = Sizes(len(names.coordinates), len(names.speeds), len(names.velocities))
     out = np.empty(sizes.matrices + sizes.coordinates)
     plain(parts.fill)(t, y, out, *(() if params is None else (params,)))

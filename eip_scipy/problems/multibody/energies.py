@@ -1,4 +1,4 @@
-"""Search for an energy that a mechanical system conserves, at states that meet its constraints."""
+"""Search for an energy that a mechanical system conserves, by its rates at states that meet the constraints."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def energy_of(
     states: Sequence[tuple],
     params: np.ndarray | None,
 ) -> tuple[Invariant | None, str]:
-    """Return the energy as an invariant, as a balance, or None, and a description.
+    """Return the energy as an invariant or a balance, or None if it is not kept, and a description for the repr.
 
     The energy is the first candidate that is constant, otherwise the candidate that changes most slowly, if its rate is
     small enough for a balance.
@@ -111,7 +111,7 @@ def states_near(
     coordinates: int,
     t_end: float | None = None,
 ) -> list[tuple[float, np.ndarray]]:
-    """Return the start and states near it that meet the constraints, at typical speeds and at other times.
+    """Return times and states that meet the constraints: the start, and states near it at typical speeds.
 
     The times lie between t and `t_end`, and within the time in which the coordinates change by half their size.
     """
@@ -147,7 +147,7 @@ def _nearest(y: np.ndarray, constraints: Sequence[Invariant], t: float, sizes: n
 
 
 def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> float:
-    """Return the largest speed, or the speed reached from rest over a distance of the coordinates' size if larger."""
+    """Return the larger of the largest speed and the speed reached from rest over a distance of the size of q."""
     size = np.abs(q).max(initial=0.0) or 1.0
     return float(max(np.abs(u).max(initial=0.0), np.sqrt(size * np.abs(accelerations).max(initial=0.0))))
 

@@ -55,13 +55,13 @@ class Motion(NamedTuple):
 
 
 def plain(function: Any) -> Callable[..., Any]:
-    """Return the Python function of a jitted one, because compilation does not pay for a few calls before a run."""
+    """Return the Python function of a jitted function, for a few calls before a run that are not worth compilation."""
     return function.py_func if is_jitted(function) else function
 
 
 @lru_cache(maxsize=64)
 def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
-    """Return the functions of the motion M u' + G^T lambda = F, G u' = -gamma.
+    """Return the functions of the motion that satisfies M u' + G^T lambda = F and G u' = -gamma.
 
     Parameters
     ----------

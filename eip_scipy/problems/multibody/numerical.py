@@ -53,7 +53,7 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
         values,
         gradient,
         tuple(energies),
-        f"functions are called as they are, derivatives are numerical where none is given: {why}",
+        f"functions are not converted to expressions, and derivatives that are not given are numerical: {why}",
         outputs=outputs_as_given(given, nq, u.size),
     )
 
@@ -96,7 +96,7 @@ class _Constraints:
             )
 
     def rates(self, t: float, q: Array, u: Array) -> Array:
-        """Return q'."""
+        """Return q', the derivatives of the coordinates."""
         return u if self.given.kinematics is None else np.asarray(self.given.kinematics(t, q, u))
 
     def positions(self, t: float, q: Array) -> Array:
@@ -104,7 +104,7 @@ class _Constraints:
         return np.zeros(0) if self.given.constraints is None else np.asarray(self.given.constraints(t, q), float)
 
     def jacobian(self, t: float, q: Array) -> tuple[Array, Array]:
-        """Return the derivatives of the constraints on positions by q and by t."""
+        """Return the derivatives of the constraints on positions with respect to q and to t."""
         if self._slopes is None:
             return np.zeros((0, q.size)), np.zeros(0)
         slopes = self._slopes(0.0, np.append(q, t))
@@ -123,7 +123,7 @@ class _Constraints:
         return np.concatenate([self.positions(t, q), self.velocities(t, q, u)])
 
     def speed_gradient(self, t: float, q: Array, u: Array) -> Array:
-        """Return G, the derivatives of the constraints on velocities by the speeds."""
+        """Return G, the derivatives of the constraints on velocities with respect to the speeds."""
         n, others = u.size, self.given.velocity_constraints
         J, _ = self.jacobian(t, q)
         speeds = np.eye(n)
@@ -136,7 +136,7 @@ class _Constraints:
         return G if others is None else np.concatenate([G, linear(others)])
 
     def gamma(self, t: float, q: Array, u: Array) -> Array:
-        """Return the time derivatives of the constraints on velocities for u' = 0."""
+        """Return gamma, the time derivatives of the constraints on velocities for u' = 0."""
         if self.given.gamma is not None:
             return np.asarray(self.given.gamma(t, q, u), float)
         if self._rows == 0:
@@ -149,7 +149,7 @@ class _Constraints:
         )[:, 0]
 
     def gradient(self, t: float, q: Array, u: Array, out: Array) -> None:
-        """Fill `out` with the derivatives of all constraints by the state."""
+        """Fill `out` with the derivatives of all constraints with respect to the state."""
         out[:] = 0.0
         m, nq = self._positions, q.size
         out[:m, :nq] = self.jacobian(t, q)[0]

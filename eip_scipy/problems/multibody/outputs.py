@@ -20,7 +20,7 @@ class Outputs(NamedTuple):
 
 
 def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times as an array and the states as columns.
+    """Return the times as an array and the states as columns; `what` names the caller in messages.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarra
 
 
 def required_outputs(what: str, outputs: Any, taken: Any) -> dict[str, Any]:
-    """Return the outputs by name.
+    """Return the argument `outputs` as a dictionary after checks; `taken` are the names of components of the state.
 
     Raises
     ------

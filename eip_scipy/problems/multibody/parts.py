@@ -12,7 +12,7 @@ __all__ = ["Given", "Parts"]
 
 
 class Given(NamedTuple):
-    """The functions of a mechanism as the user gave them, or None."""
+    """The functions of a mechanism, see `mechanism`; None for those that the user did not give."""
 
     mass: Any
     forces: Any
@@ -31,7 +31,7 @@ class Parts(NamedTuple):
     """The functions of which a problem is made, see `motion` and `Energy`.
 
     ``values(t, y, out, *params)`` fills `out` with the constraints on positions and velocities, and ``gradient`` fills
-    it with their derivatives (m, n) by the state.
+    it with their derivatives (m, n) with respect to the state.
     """
 
     fill: Callable[..., None]

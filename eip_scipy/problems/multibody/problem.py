@@ -48,6 +48,7 @@ class MechanicsProblem(Problem):
     momenta : tuple of Invariant
         Momenta of coordinates that neither the energy nor forces depend on.
     energy : Invariant, Balance or None
+        The energy, if a run can keep it.
     energy_kept : str
         How a run keeps the energy, or why it does not.
     motion : Motion
@@ -55,9 +56,11 @@ class MechanicsProblem(Problem):
     notes : tuple of str
         Descriptions of changes to the equations and to the start.
     parameter_names : tuple of str
+        Names of the parameters, in the order of `params`.
     observer : Outputs, optional
         The functions of `outputs`.
     rank_tolerance : float
+        Distance within which gradients of constraints, each scaled to length 1, count as dependent.
     origin : optional
         The expressions from which the functions were made; None if they cannot be made again.
     """
@@ -149,7 +152,7 @@ class MechanicsProblem(Problem):
         return found
 
     def _extra(self, params: Any) -> tuple[np.ndarray, ...]:
-        """Return a tuple of the parameters, the last argument of functions; empty if there are none."""
+        """Return a tuple with the parameters, the last argument of functions; it is empty if there are none."""
         if params is None:
             params = self.params
         elif isinstance(params, Mapping):
@@ -166,7 +169,7 @@ class MechanicsProblem(Problem):
         return out
 
     def _solved(self, t: float, y: np.ndarray, extra: tuple[np.ndarray, ...]) -> tuple[int, np.ndarray, np.ndarray]:
-        """Return the rank of the constraints, u' and the multipliers."""
+        """Return the rank of the constraints, u' and the multipliers at a state."""
         n, m = len(self.names.speeds), len(self.names.velocities)
         rates, accelerations, multipliers = np.empty(len(self.names.coordinates)), np.empty(n), np.empty(m)
         rank = self.motion.solved(float(t), np.ascontiguousarray(y), rates, accelerations, multipliers, *extra)
@@ -281,7 +284,7 @@ def mechanics_problem(
     notes: tuple[str, ...] = (),
     **others: Any,
 ) -> MechanicsProblem:
-    """Return the problem with the functions `parts` and the coordinates and speeds `start`."""
+    """Return the problem with the functions `parts`, started at the coordinates and speeds `start` at time `t`."""
     sizes = Sizes(len(names.coordinates), len(names.speeds), len(names.velocities))
     functions = motion(parts.fill, sizes, tolerance)
     once = motion(plain(parts.fill), sizes, tolerance)
@@ -370,7 +373,7 @@ def _at_speed(
     sizes: Sizes,
     args: tuple[Any, ...],
 ) -> Any:
-    """Return the sizes of the terms of constraints or of a momentum at a typical speed, because they vanish at rest."""
+    """Return the sizes of the terms of constraints or of a momentum at a typical speed; at rest the terms vanish."""
     nq = sizes.coordinates
     speed = typical_speed(y[:nq], y[nq:], derivative(t, y)[nq:])
     slopes = np.empty((size or 1, y.size))

@@ -105,12 +105,12 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
         by_name = {name_of(name): value for name, value in given.items()}
         for name in by_name:
             if name not in names:
-                raise ValueError(f"{what}: there is no {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
+                raise ValueError(f"{what}: unknown name {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
         missing = [name for name in names if name in held and name not in by_name]
         if missing:
             raise ValueError(
-                f"{what}: {missing[0]} is missing; give its value, or name in independent= "
-                "the components that are set, so that the others are computed."
+                f"{what}: {missing[0]} is missing; give its value, or list in independent= the components whose values "
+                "are kept, so that the others are computed."
             )
         given = [by_name.get(name, 0.0) for name in names]
     values = np.atleast_1d(real_array(what, given)).astype(float)
@@ -152,7 +152,7 @@ def _gradient(item: Invariant, t: float, y: np.ndarray) -> np.ndarray:
 
 
 def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, float]:
-    """Return the index of the constraint that is violated most, its value, and its value relative to its terms."""
+    """Return the index of the constraint that is violated most, its value, and the value relative to its terms."""
     values = np.asarray(item.fun(t, y), float)
     gradient = np.abs(_gradient(item, t, y))
     # The size of a constraint is that of its terms, or its change while a component changes by 1.
@@ -180,7 +180,7 @@ def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.
 
 
 def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
-    """Return why a constraint is not met; `gradient` has the derivatives by the components that are computed."""
+    """Return the reason why a constraint is not met; `gradient` holds the derivatives by the components to compute."""
     sizes = np.linalg.norm(gradient, axis=1)
     if sizes[worst] <= DEPENDENT * sizes.max():
         return "It does not depend on any component that is computed; list fewer components in independent=."

@@ -1,1 +1,1 @@
-"""Charged particles in fields."""
+"""Charged particles in electromagnetic fields."""

@@ -23,15 +23,16 @@ def variational(
     start: tuple[float, ...],
     parameters: tuple[int, ...],
 ) -> Callable[..., None]:
-    """Return the right-hand side of a state with columns of derivatives behind it, see `Problem`.
+    """Return the right-hand side of a state followed by columns of derivatives, see `Problem`.
 
-    Jitted functions of the field are differentiated by dual numbers, others by complex steps where these are right, and
-    else by differences of order 6, with shifts in units of their distance from 0 and of `length`.
+    Jitted functions of the field are differentiated by dual numbers. Others are differentiated by complex steps if
+    these give correct derivatives at `start`, otherwise by differences of order 6, whose shifts are proportional to the
+    distances of the coordinates from 0 and to `length`.
 
     Parameters
     ----------
     rhs : callable
-        That of the state alone.
+        The right-hand side of the state without columns.
     functions : FieldFunctions
     form : {"canonical", "velocity"}
     length : float
@@ -39,17 +40,17 @@ def variational(
     start : tuple of float
         (t, x, y, z), where complex steps are tried.
     parameters : tuple of int
-        Places in [mass, charge] that the last columns belong to.
+        Indices in [mass, charge] of the parameters to which the last columns belong.
 
     Raises
     ------
     ValueError
-        If there are other parameters.
+        If another parameter is requested.
     """
     if not set(parameters) <= {MASS, CHARGE}:
         raise ValueError(
-            f"variational: a charged particle has derivatives by its state, by parameter {MASS}, the mass, and by "
-            f"parameter {CHARGE}, the charge; got parameters={tuple(parameters)}."
+            f"variational: a charged particle has derivatives with respect to its state, to parameter {MASS} (the "
+            f"mass) and to parameter {CHARGE} (the charge); got parameters={tuple(parameters)}."
         )
     by_mass = np.array([place == MASS for place in parameters], bool)
 
@@ -66,7 +67,7 @@ def variational(
 
 @jitable
 def combined(scale, u, v, w, first, second, third, fourth):
-    """Return scale (u first + v second + w third + fourth), for vectors of three numbers."""
+    """Return the vector scale (u first + v second + w third + fourth), from vectors of three numbers."""
     return (
         scale * (u * first[0] + v * second[0] + w * third[0] + fourth[0]),
         scale * (u * first[1] + v * second[1] + w * third[1] + fourth[1]),
@@ -141,9 +142,9 @@ def _velocity(rhs, B, E, slopes, slopes_of_E, by_mass):
 
 @lru_cache(maxsize=64)
 def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[float, ...]) -> Callable[..., Any]:
-    """Return ``slopes(t, y, y)``: the derivatives of a field's function by the first three of y.
+    """Return ``slopes(t, y, y)``, the derivatives of a field's function with respect to the position y[:3].
 
-    `ndim`: 1 for a vector, 2 for three rows.
+    `ndim` is 1 if the function returns a vector, and 2 if it returns three rows.
     """
     if is_jitted(fun) and not jit_is_off():
         try:
@@ -162,7 +163,7 @@ def _by_duals(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
     Raises
     ------
     NotCompilableError
-        If the function does something that dual numbers cannot.
+        If the function does something that dual numbers do not support.
     """
     from ...core.dual_arrays import for_duals, inside
     from ...core.dual_numbers import Dual, seed, slope

@@ -1,9 +1,10 @@
 """Equations of motion and invariants of a charged particle, from functions of its field.
 
-Each function here takes the field's functions first, and is plain Python when they are; `compose` binds them. Called
-from compiled code all is inlined, and what two of the field's functions have in common is computed once: the loop is as
-fast as one written out for the field. Components are written out, because Numba takes only constant indices of a tuple
-such as (-y, x, 0), whose types differ.
+The first arguments of the functions here are functions of the field; `compose` binds them. The functions are compiled
+if those of the field are jitted, otherwise they are plain Python. In compiled code they are inlined, and subexpressions
+that two functions of the field have in common are computed once, so that a loop is as fast as one written for the
+field. Components are written out, because Numba accepts only constant indices of a tuple such as (-y, x, 0), whose
+types differ.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ MASS, CHARGE = 0, 1  # places in the parameters
 
 
 class FieldFunctions(NamedTuple):
-    """Functions of (t, x, y, z); A with its jacobian, and phi, only where they are known."""
+    """Functions of a field, with arguments (t, x, y, z); A and its jacobian, or phi, are None if they are not known."""
 
     A: Callable[..., Any] | None
     jacobian: Callable[..., Any] | None
@@ -31,7 +32,7 @@ class FieldFunctions(NamedTuple):
 
 
 class ParticleEquations(NamedTuple):
-    """Functions of a problem; the invariants are None if the field does not have them."""
+    """Functions of the problem of a particle; those of an invariant are None if the field does not have it."""
 
     rhs: Callable[..., None]
     energy: Callable[..., float] | None
@@ -44,7 +45,7 @@ class ParticleEquations(NamedTuple):
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
-    """Return `fun`, compiled together with functions of this module that it calls if all of the others are compiled."""
+    """Return `fun`, compiled with the functions of this module that it calls if all of `others` are compiled."""
     if all(is_compiled(other) for other in others if other is not None):
         _register()
     return compiled_like(fun, *(other for other in others if other is not None))
@@ -54,14 +55,14 @@ _inlined: list[Callable[..., Any]] = []
 
 
 def jitable(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Mark a function that compiled ones call."""
+    """Mark a function of this package that compiled functions call, so that Numba inlines it; return it unchanged."""
     _inlined.append(fun)
     return fun
 
 
 @cache
 def _register() -> None:
-    """Make Numba compile these functions into their callers."""
+    """Make Numba inline the marked functions into the compiled functions that call them."""
     from numba.extending import register_jitable
 
     for fun in _inlined:
@@ -69,22 +70,23 @@ def _register() -> None:
 
 
 def no_potential(t, x, y, z):
-    """Return a potential that is 0 everywhere."""
+    """Return 0, the potential of a field without one."""
     return 0.0
 
 
 def no_force(t, x, y, z):
-    """Return an electric field that is 0 everywhere."""
+    """Return (0, 0, 0), the electric field of a field without one."""
     return 0.0, 0.0, 0.0
 
 
 def compose(field: FieldFunctions, form: str) -> ParticleEquations:
-    """Equations of motion and invariants in one form.
+    """Return the equations of motion and the invariants of a particle in one of the two forms.
 
     Parameters
     ----------
     field : FieldFunctions
-        The canonical form needs A, jacobian and E, the other one B and E; the rest is for the invariants.
+        The equations need A, jacobian and E in the canonical form, and B and E in the form (x, v). The other functions
+        are needed for invariants only.
     form : {"canonical", "velocity"}
 
     Returns
@@ -118,7 +120,7 @@ def _canonical(field: FieldFunctions) -> ParticleEquations:
 
 @jitable
 def canonical_rhs(A, jacobian, E, t, y, out, m, q):
-    """Canonical: x' = v = (p - q A) / m, p_j' = q (sum_i v_i dA_i/dx_j + E_j)."""
+    """Fill `out` with the canonical equations, x' = v = (p - q A) / m and p_j' = q (sum_i v_i dA_i/dx_j + E_j)."""
     a = A(t, y[0], y[1], y[2])
     d = jacobian(t, y[0], y[1], y[2])
     e = E(t, y[0], y[1], y[2])
@@ -136,7 +138,7 @@ def canonical_rhs(A, jacobian, E, t, y, out, m, q):
 
 @jitable
 def canonical_energy(A, phi, t, y, m, q):
-    """H = |p - q A|^2 / (2 m) + q phi (the paper's eq. 3.7)."""
+    """Return H = |p - q A|^2 / (2 m) + q phi (Cai, Gong & Wang, eq. 3.7)."""
     a = A(t, y[0], y[1], y[2])
     u = y[3] - q * a[0]
     v = y[4] - q * a[1]
@@ -145,7 +147,7 @@ def canonical_energy(A, phi, t, y, m, q):
 
 
 def canonical_energy_gradient(t, y, f, out, params):
-    """The equations are canonical: dH/dx = -p', dH/dp = x'."""
+    """Fill `out` with the gradient of H, which the canonical equations give: dH/dx = -p', dH/dp = x'."""
     out[0] = -f[3]
     out[1] = -f[4]
     out[2] = -f[5]
@@ -155,12 +157,12 @@ def canonical_energy_gradient(t, y, f, out, params):
 
 
 def canonical_momentum(t, y, params):
-    """L = x p_y - y p_x (the paper's eq. 3.9, its misprint corrected)."""
+    """Return L = x p_y - y p_x (Cai, Gong & Wang, eq. 3.9, with its misprint corrected)."""
     return y[0] * y[4] - y[1] * y[3]
 
 
 def canonical_momentum_gradient(t, y, out, params):
-    """Gradient of L."""
+    """Fill `out` with the gradient of L."""
     out[0] = y[4]
     out[1] = -y[3]
     out[2] = 0.0
@@ -209,7 +211,7 @@ def _velocity(field: FieldFunctions) -> ParticleEquations:
 
 @jitable
 def velocity_rhs(E, B, t, y, out, ratio):
-    """Newton's: x' = v, v' = (q / m) (E + v x B) (the paper's eq. 3.8)."""
+    """Fill `out` with Newton's equations, x' = v and v' = (q / m) (E + v x B) (Cai, Gong & Wang, eq. 3.8)."""
     e = E(t, y[0], y[1], y[2])
     b = B(t, y[0], y[1], y[2])
     u, v, w = y[3], y[4], y[5]
@@ -223,7 +225,7 @@ def velocity_rhs(E, B, t, y, out, ratio):
 
 @jitable
 def velocity_energy(phi, t, y, m, q):
-    """H = m |v|^2 / 2 + q phi."""
+    """Return H = m |v|^2 / 2 + q phi."""
     return 0.5 * m * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5]) + q * phi(t, y[0], y[1], y[2])
 
 
@@ -233,7 +235,7 @@ def kinetic_energy(t, y, params):
 
 
 def kinetic_energy_gradient(t, y, out, params):
-    """Gradient of the kinetic energy, (0, m v)."""
+    """Fill `out` with the gradient of the kinetic energy, (0, m v)."""
     out[:3] = 0.0
     out[3] = params[MASS] * y[3]
     out[4] = params[MASS] * y[4]
@@ -242,7 +244,7 @@ def kinetic_energy_gradient(t, y, out, params):
 
 @jitable
 def velocity_energy_gradient(E, t, y, out, m, q):
-    """Gradient of H: (-q E, m v)."""
+    """Fill `out` with the gradient of H, (-q E, m v)."""
     e = E(t, y[0], y[1], y[2])
     out[0] = -q * e[0]
     out[1] = -q * e[1]
@@ -254,14 +256,14 @@ def velocity_energy_gradient(E, t, y, out, m, q):
 
 @jitable
 def velocity_momentum(A, t, y, m, q):
-    """L = x p_y - y p_x with p = m v + q A."""
+    """Return L = x p_y - y p_x with p = m v + q A."""
     a = A(t, y[0], y[1], y[2])
     return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
 
 
 @jitable
 def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
-    """Gradient of L."""
+    """Fill `out` with the gradient of L."""
     a = A(t, y[0], y[1], y[2])
     d = jacobian(t, y[0], y[1], y[2])
     out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
@@ -276,7 +278,7 @@ def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
 
 
 def at_any_time(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of (t, x, y, z) that is `fun` of (x, y, z)."""
+    """Return a function of (t, x, y, z) with the values of `fun`, a function of (x, y, z)."""
 
     def timeless(t, x, y, z):
         return fun(x, y, z)
@@ -290,7 +292,7 @@ def at_any_time(fun: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
-    """B = curl A from the rows of dA_i/dx_j."""
+    """Return the function B = curl A, from the function of the rows dA_i/dx_j."""
 
     def magnetic(t, x, y, z):
         d = jacobian(t, x, y, z)
@@ -300,7 +302,7 @@ def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def difference_jacobian(A: Callable[..., Any], step: float) -> Callable[..., Any]:
-    """Return the rows of dA_i/dx_j by central differences of order 6."""
+    """Return a function of the rows dA_i/dx_j, computed by central differences of order 6 with the shift `step`."""
 
     def along(t, x, y, z, dx, dy, dz):
         d0 = d1 = d2 = 0.0
@@ -324,7 +326,7 @@ def difference_jacobian(A: Callable[..., Any], step: float) -> Callable[..., Any
 
 
 def difference_force(phi: Callable[..., Any], step: float) -> Callable[..., Any]:
-    """E = -grad phi by central differences of order 6."""
+    """Return the function E = -grad phi, computed by central differences of order 6 with the shift `step`."""
 
     def force(t, x, y, z):
         e0 = e1 = e2 = 0.0

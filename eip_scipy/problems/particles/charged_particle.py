@@ -1,4 +1,7 @@
-"""Charged particles in electromagnetic fields: the paper's Experiment III, and user-defined fields."""
+"""Charged particles in electromagnetic fields: Experiment III of "the paper", and user-defined fields.
+
+The paper is Cai, Gong & Wang.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ BALANCES = ("energy", "kinetic")
 STEP = pi / 10  # a twentieth of the gyro-period
 UNIFORM_STEPS, TOKAMAK_STEPS = 270_000, 500_000
 ORBITS = {"banana": 1.0, "transit": 2.0}
-"""The tokamak's orbits, with the factor of the initial v_y."""
+"""Names of the orbits of `tokamak`, with the factor of the initial v_y."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,7 +42,7 @@ class ParticleProblem(Problem):
     ----------
     field : ParticleField
     form : {"canonical", "velocity"}
-        Whether the state is (x, p) or (x, v).
+        "canonical" if the state is (x, p), "velocity" if it is (x, v).
     mass, charge : float
     """
 
@@ -103,35 +106,35 @@ def charged_particle(
     field : ParticleField
         `UNIFORM`, `TOKAMAK`, or one of your own.
     position, velocity : array_like, shape (3,)
-        At the start; x' also where the state is (x, p).
+        x and x' at the start. The velocity x' must also be given if the state is (x, p).
     t_span : (float, float)
     h : float, optional
-        A step; a twentieth of the gyro-period 2 pi m / (q B) is a sensible one.
+        Step, for example a twentieth of the gyro-period 2 pi m / (q B).
     mass, charge : float, optional
     form : {"canonical", "velocity"}, optional
-        The state: (x, p) with p = m x' + q A(x), or (x, x'). A field that varies needs "velocity".
+        The state: (x, p) with p = m x' + q A(x), or (x, x'). A field that varies in time needs "velocity".
     name, units, source : str, optional
     reference : callable, optional
     balances : {"energy", "kinetic"}, optional
-        Keep an energy as a `Balance` in place of the invariant "H", in the form "velocity": "kinetic" the kinetic
-        energy "T", at the rate q v . E; "energy" the total energy "H" of a field that varies and has a potential, at
-        the rate q (dphi/dt - v . dA/dt), and else "T".
+        Keep an energy as a `Balance` instead of the invariant "H"; this needs the form "velocity". "kinetic" keeps the
+        kinetic energy "T", which changes at the rate q v . E. "energy" keeps the total energy "H", which changes at the
+        rate q (dphi/dt - v . dA/dt), if the field varies and has a potential; otherwise it keeps "T".
 
     Returns
     -------
     ParticleProblem
-        Invariants "H", the energy, where the field is static and has a potential or no electric field; and "L",
-        the angular momentum x p_y - y p_x, where the field is said to be axisymmetric and A is known. Blocks of 3: the
-        error metric does not depend on the orientation of the axes.
+        The invariants are the energy "H", if the field is static and has a potential or no electric field, and the
+        angular momentum "L", x p_y - y p_x, if the field has ``axisymmetric=True`` and A is known. The blocks have 3
+        components, so that the error metric does not depend on the orientation of the axes.
 
     Raises
     ------
     TypeError
         If `field` is not a ParticleField.
     ValueError
-        If the form is unknown, or canonical without A; if the start or a function of the field is not finite; if the
-        mass is not positive or the charge is 0; if functions contradict each other at the start, or the magnetic field
-        has a divergence there.
+        If the form is unknown, or canonical for a field without A; if the start or a function of the field is not
+        finite; if the mass is not positive or the charge is 0; if functions of the field contradict each other at the
+        start, or the magnetic field has a divergence there.
 
     Notes
     -----
@@ -140,7 +143,7 @@ def charged_particle(
 
     Examples
     --------
-    A magnetic mirror, B_z = 1 + z^2 on the axis, by its vector potential alone:
+    A magnetic mirror with B_z = 1 + z^2 on the axis, defined by its vector potential alone:
 
     >>> import numpy as np
     >>> from eip_scipy import EIPRK4, integrate
@@ -159,11 +162,11 @@ def charged_particle(
         raise ValueError(f"charged_particle: form must be one of {', '.join(FORMS)}, got {form!r}{hint}")
     if form == "canonical" and field.vector_potential is None:
         raise ValueError(
-            "charged_particle: the canonical form needs the field's vector_potential; give it, or take form='velocity'."
+            "charged_particle: the canonical form needs the field's vector_potential; give it, or use form='velocity'."
         )
     if form == "canonical" and (field.varies or balances is not None):
         what = "balances need" if balances is not None else "a field that varies needs"
-        raise ValueError(f"charged_particle: {what} form='velocity', got the form 'canonical'.")
+        raise ValueError(f"charged_particle: {what} form='velocity', got form='canonical'.")
     if balances is not None and balances not in BALANCES:
         hint = nearest(str(balances), BALANCES)
         raise ValueError(f"charged_particle: balances must be 'energy', 'kinetic' or None, got {balances!r}{hint}")
@@ -247,7 +250,7 @@ def _vector(name: str, value: Any) -> np.ndarray:
 
 
 def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STEP, h: float = STEP) -> ParticleProblem:
-    """Return a charged particle in B = e_z and the potential 1e-2 / R, which gyrates and drifts around the origin.
+    """Return a particle that gyrates and drifts around the z axis, in B = e_z and the electric potential 1e-2 / R.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Fields for charged particles: those of the paper's Experiment III, and the record for user-defined fields."""
+"""Fields for charged particles: those of Experiment III of Cai, Gong & Wang, and the class for user-defined fields."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ class ParticleField:
     vector_potential : callable, optional
         ``A(x, y, z) -> (A_x, A_y, A_z)``. Needed for the canonical form, and for L in the form (x, v).
     jacobian : callable, optional
-        ``(x, y, z) -> 3 rows``, row i holding dA_i/dx, dA_i/dy, dA_i/dz. Default: differences of A.
+        ``(x, y, z) -> 3 rows``, whose row i is (dA_i/dx, dA_i/dy, dA_i/dz). Default: differences of A.
     potential : callable, optional
         ``phi(x, y, z) -> float``. Default: 0, if there is no electric field either.
     electric : callable, optional
-        ``E(x, y, z) -> (E_x, E_y, E_z)``, -grad phi. Default: differences of phi.
+        ``E(x, y, z) -> (E_x, E_y, E_z)``, which is -grad phi. Default: differences of phi.
     magnetic : callable, optional
-        ``B(x, y, z) -> (B_x, B_y, B_z)``, curl A. Default: from the jacobian.
+        ``B(x, y, z) -> (B_x, B_y, B_z)``, which is curl A. Default: computed from the jacobian.
     axisymmetric : bool
         Whether A and phi do not change under rotations about the z axis; then L = x p_y - y p_x is an invariant.
     varies : bool
@@ -77,7 +77,7 @@ class ParticleField:
     Notes
     -----
     Differences are central and of order 6, with step length / 128: relative errors of about 1e-12, and 18 evaluations
-    of A in each evaluation of the equations. If you give `jacobian` and `electric`, they are not needed.
+    of A in each evaluation of the equations. If you give `jacobian` and `electric`, no differences are needed.
     """
 
     vector_potential: Callable[..., Any] | None = None
@@ -190,14 +190,14 @@ class ParticleField:
             return
         said = (
             f"ParticleField: the divergence of magnetic is {divergence:.3g} at {np.array(point)}, where its largest "
-            f"derivative is {largest:.3g}; a magnetic field has none."
+            f"derivative is {largest:.3g}; a magnetic field has no divergence."
         )
         if share > NO_FIELD:
             raise ValueError(f"{said} Correct it (or `length`, if the field changes over shorter distances).")
         warnings.warn(said, stacklevel=4)
 
     def _divergence(self, point: np.ndarray, t: float) -> tuple[float, float, float]:
-        """Return the divergence of B: its share in the largest derivative, itself, and that derivative.
+        """Return the divergence of B relative to the largest derivative of B, the divergence, and that derivative.
 
         Several steps of the differences are tried, and the result with the smallest share is returned, because errors
         of differences only increase it.
@@ -337,7 +337,7 @@ UNIFORM = ParticleField(
     axisymmetric=True,
     name="uniform",
 )
-"""Uniform magnetic field e_z and the potential 1e-2 / R (paper, section 3.3); invariant under rotations about z."""
+"""Uniform magnetic field e_z and potential 1e-2 / R (Cai, Gong & Wang, section 3.3); axisymmetric about z."""
 
 TOKAMAK = ParticleField(
     vector_potential=_tokamak_vector_potential,
@@ -346,4 +346,4 @@ TOKAMAK = ParticleField(
     axisymmetric=True,
     name="tokamak",
 )
-"""Axisymmetric tokamak of major radius 1 without inductive electric field (paper, section 3.3)."""
+"""Axisymmetric tokamak of major radius 1 without inductive electric field (Cai, Gong & Wang, section 3.3)."""

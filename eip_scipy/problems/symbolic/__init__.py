@@ -1,4 +1,4 @@
-"""Problems written as expressions: `hamiltonian` from H alone, `equations` from y' = f(t, y).
+"""Problems written as expressions: `hamiltonian` from H, `equations` from y' = f(t, y), `mechanics` from SymPy models.
 
 SymPy is imported when one of these functions is called, and nowhere else in the package.
 """

@@ -22,7 +22,7 @@ SIMPLIFIED_OPERATIONS = 120
 
 
 class NotKeptError(ValueError):
-    """A quantity is not an invariant."""
+    """Error for a quantity that is not an invariant."""
 
 
 class Rate(NamedTuple):
@@ -47,7 +47,7 @@ class Rate(NamedTuple):
 def how_kept(
     name: str, quantity: Any, variables: Sequence[Any], rates: Sequence[Any], parameters: Mapping[Any, float]
 ) -> str:
-    """Return how it was shown that a quantity is conserved: "symbolically" or "numerically, at 8 points".
+    """Return how a quantity was shown to be conserved, such as "symbolically" or "numerically, at 8 points".
 
     Parameters
     ----------
@@ -94,8 +94,8 @@ def _require_kept(name: str, rate: Rate, points: Sequence[Any]) -> None:
         if abs(total) > ROUND_OFF * size:
             place = ", ".join(f"{key}={float(value):.3g}" for key, value in point.items())
             raise NotKeptError(
-                f"{name!r} is not an invariant of these equations: its rate is {shortened(rate.total)}, at {place} "
-                f"{float(total):.3g} where its terms sum to {float(size):.3g}."
+                f"{name!r} is not an invariant of these equations: its rate is {shortened(rate.total)}. At {place} the "
+                f"rate is {float(total):.3g}, and the absolute values of its terms sum to {float(size):.3g}."
             )
 
 
@@ -137,7 +137,10 @@ def _simplifies_to_zero(expression: Any) -> bool:
 
 
 def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]) -> Iterator[tuple[Any, Any]]:
-    """Yield random points at which the rate is finite and real; only positive ones if roots or logarithms need that."""
+    """Yield random points at which the rate is finite and real, with its value there.
+
+    If there are too few such points, for example because of roots or logarithms, points with positive values are drawn.
+    """
     draw = random.Random(20220)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}
     found = 0
@@ -154,7 +157,7 @@ def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float
 def _beside_switches(
     expressions: Sequence[Any], variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield points on both sides of the places at which max, min, abs and similar functions change their branches."""
+    """Yield points on both sides of each place at which max, min, abs or a similar function changes its branch."""
     switches = Switches(expressions, variables)
     draw = random.Random(20221)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}

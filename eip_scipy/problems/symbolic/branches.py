@@ -36,7 +36,7 @@ class Switches:
             self._differences |= {item: atom for item in found if item.free_symbols & set(variables)}
 
     def points(self, draw: Callable[[], dict[Any, Any]], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
-        """Return points next to all changes of a branch, on both sides of them.
+        """Return points on both sides of all places at which a function changes its branch.
 
         Parameters
         ----------
@@ -51,7 +51,7 @@ class Switches:
             If there are too many branches, or one of them is not found; the message names the function.
         """
         if len(self._differences) > MOST:
-            raise ValueError(f"it has {len(self._differences)} changes of a branch, more than {MOST}")
+            raise ValueError(f"its functions change branches at {len(self._differences)} places, more than {MOST}")
         found = []
         for difference, atom in self._differences.items():
             sides = [side for _ in range(LINES) for side in self._sides(difference, draw(), at)]

@@ -1,4 +1,4 @@
-"""Mechanical systems with constraints, as expressions, and their functions."""
+"""Mechanical systems with constraints as expressions, and the functions that are compiled from them."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ class Constrained(NamedTuple):
         return sympy.Add(sympy.diff(expression, symbol("t")), *terms)
 
     def with_velocities(self) -> Constrained:
-        """Return the system with the derivatives of all positions' constraints in front of those on velocities."""
+        """Return the system with the derivatives of `positions` in front of the other constraints on velocities."""
         return self._replace(velocities=(*map(self.rate, self.positions), *self.velocities))
 
 
 def own_speed(system: Constrained, k: int) -> list[Any]:
-    """Return the derivatives of all speeds by q_k'; [] unless one speed belongs to this coordinate alone."""
+    """Return the derivatives of all speeds by q_k', the rate of coordinate k; [] unless it has a speed of its own."""
     speeds = [symbol(name) for name in system.speeds]
     own = [u for u in speeds if u in system.rates[k].free_symbols]
     if len(own) != 1 or sum(own[0] in rate.free_symbols for rate in system.rates) != 1:
@@ -247,6 +247,6 @@ def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Call
 
 
 def _gradient(item: Any, system: Constrained) -> dict[int, Any]:
-    """Return the nonzero derivatives of an expression by components of the state, keyed by the components' indices."""
+    """Return the nonzero derivatives of an expression with respect to the state, by the indices of the components."""
     slopes = ((k, sympy.diff(item, x)) for k, x in enumerate(system.variables) if item.has(x))
     return {k: slope for k, slope in slopes if slope != 0}

@@ -24,7 +24,7 @@ AGREES = 1e-9
 
 
 class Inputs(NamedTuple):
-    """Inputs that are expressions, by their functions of time, and inputs that are called, ``f(t, y)``, by name."""
+    """Inputs as expressions, by their functions of time; inputs as functions ``f(t, y)``, by name; and notes."""
 
     expressions: dict[Any, Any]
     called: tuple[tuple[str, Callable[..., float]], ...]
@@ -69,7 +69,7 @@ def read_inputs(
                 expressions |= found
         else:
             expressions |= _as_expressions(keys, value)
-    notes = tuple(f"the input {name} is a function that is called as it is" for name, _ in called)
+    notes = tuple(f"the input {name} is called as a function, not converted to an expression" for name, _ in called)
     return Inputs(expressions, tuple(called), notes)
 
 

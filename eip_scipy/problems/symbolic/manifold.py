@@ -1,4 +1,4 @@
-"""Test whether a quantity is conserved if constraints hold, and possibly only then."""
+"""Test whether a quantity is conserved at states that meet constraints, though possibly not at others."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Manifold:
             )
 
     def how_kept(self, name: str, quantity: Any) -> str:
-        """Return how it was shown that the quantity is conserved if the constraints hold.
+        """Return how a quantity was shown to be conserved if the constraints hold; `name` is its name in messages.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class Manifold:
             if abs(values.sum()) > CONSTANT * np.abs(values).sum():
                 raise self._not_kept(name, Rate(terms).total, t, y, values)
         if count == 0:
-            raise ValueError(f"{name!r}: its rate is not finite at any point that was tried and meets the constraints.")
+            raise ValueError(f"{name!r}: its rate is not finite at any of the points that meet the constraints.")
         return f"numerically, at {count} points that meet the constraints"
 
     def _not_kept(self, name: str, rate: Any, t: float, y: np.ndarray, values: np.ndarray) -> ValueError:
@@ -91,12 +91,13 @@ class Manifold:
         place = ", ".join(f"{key}={value:.3g}" for key, value in zip((*self._components, "t"), (*y, t), strict=True))
         return ValueError(
             f"{name!r} is not an invariant of these equations, even where the constraints {constraints} hold: its "
-            f"rate is {shortened(rate)}, at {place} {values.sum():.3g} where its terms sum to "
-            f"{np.abs(values).sum():.3g}. Where that rate is 0, as a constraint on velocities, add it to constraints."
+            f"rate is {shortened(rate)}. At {place} the rate is {values.sum():.3g}, and the absolute values of its "
+            f"terms sum to {np.abs(values).sum():.3g}. If the rate is 0 at your states, because of a constraint on "
+            "velocities, add that to constraints."
         )
 
     def _function(self, what: str, items: Sequence[Any]) -> Callable[[float, np.ndarray], np.ndarray | None]:
-        """Return a function of time and state, which returns None if its values are not finite."""
+        """Return a function of (t, y) with the values of `items`, which returns None if they are not finite."""
         places = {k: item for k, item in enumerate(items) if item != 0}
         fill = plain(function(what, list(places.values()), self._arguments, in_place=True, places=list(places)))
 

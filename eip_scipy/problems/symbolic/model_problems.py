@@ -36,7 +36,7 @@ def mechanics_of_model(
     name: str,
     others: Mapping[str, Any],
 ) -> MechanicsProblem:
-    """See `mechanics`."""
+    """Return the problem of a model; see `mechanics`."""
     # PyDy refuses constants that are in the constraints on positions alone: they are given here.
     constants = {**(getattr(model, "constants", None) or {}), **(params or {})}
     if q0 is None and u0 is None:
@@ -93,7 +93,7 @@ def _swapped(function: Any) -> Any:
 
 
 def _by_name(given: Any, names: tuple[str, ...]) -> Any:
-    """Return a mapping with names in place of symbols, and only with the entries of `names` if there are any."""
+    """Return a mapping with names as keys, restricted to `names` if it has any of them; return an array unchanged."""
     if not isinstance(given, Mapping):
         return given
     found = {name_of(key): value for key, value in given.items()}

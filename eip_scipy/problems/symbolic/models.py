@@ -1,4 +1,4 @@
-"""The equations of models of sympy.physics.mechanics, in the package's symbols."""
+"""The equations of models of sympy.physics.mechanics, converted to real symbols."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ class Start(NamedTuple):
 
 
 class _Conversion:
-    """Converter of expressions from a model's symbols to the package's symbols."""
+    """Converter of expressions from a model's functions of time and symbols to the real symbols of this package."""
 
     def __init__(self, found: _Equations, inputs: Any, start: Start) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
@@ -276,7 +276,7 @@ def _momenta(found: _Equations, system: Constrained, converted: _Conversion) -> 
 
 
 def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
-    """Return the derivatives of the speeds of a KanesMethod by the rate of the k-th coordinate; [] without any."""
+    """Return the derivatives of a KanesMethod's speeds by the rate of the k-th coordinate; [] if they are unknown."""
     by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
     if by_speeds.rows != by_speeds.cols:
         return []
@@ -421,7 +421,7 @@ def _require_distinct(names: Mapping[Any, str]) -> None:
     twice = next((name for k, name in enumerate(found) if name in found[:k] or name == "t"), None)
     if twice is not None:
         raise ValueError(
-            f"mechanics: {twice!r} is the name of two components of the state, or of one and the time; rename one."
+            f"mechanics: {twice!r} is the name of two components of the state, or of one and of the time; rename one."
         )
 
 

@@ -12,7 +12,7 @@ KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
 
 
 def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the coordinates and their momenta among names.
+    """Return the coordinates and their momenta, in the same order, among `names`.
 
     Pairs are x and px, q1 and p1, theta and p_theta or ptheta; p belongs to the one remaining coordinate.
 

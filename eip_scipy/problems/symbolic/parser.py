@@ -140,7 +140,7 @@ def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
 
 
 class Reader:
-    """Reader of one text."""
+    """Converter of one text to a SymPy expression; `what` describes the expression in messages."""
 
     def __init__(self, what: str, text: str, declared: Iterable[str] = ()) -> None:
         self.what, self.text = what, " ".join(text.split())  # the text may have several lines
@@ -186,7 +186,9 @@ class Reader:
 
     def _expression(self, node: ast.expr, depth: int) -> sympy.Expr:
         if depth > DEEPEST:
-            raise ValueError(f"{self.what}: {_cut(self.text)} nests more than {DEEPEST} deep.")
+            raise ValueError(
+                f"{self.what}: {_cut(self.text)} nests more than {DEEPEST} deep; give it as a SymPy expression."
+            )
         try:
             found = self._converted(node, depth)
             if found.is_number:
@@ -248,7 +250,7 @@ class Reader:
         if exponent.is_number:
             size = abs(float(exponent))
             if size > LARGEST_EXPONENT:
-                raise self._refuse(node.right, f"is an exponent beyond {LARGEST_EXPONENT}")
+                raise self._refuse(node.right, f"is an exponent above {LARGEST_EXPONENT} in size")
             if base.is_number and base != 0 and size * abs(math.log(abs(float(base)))) > math.log(LARGEST):
                 raise self._refuse(node, "is too large, or too small")
         require_power(base, exponent)

@@ -1,4 +1,4 @@
-"""Bounds for the work that SymPy does by itself when an expression is built; they are checked before.
+"""Checks, before an expression is built, that SymPy will not need too much work for it.
 
 SymPy adds, multiplies and raises rational numbers exactly, collects equal terms and factors, and expands some arguments
 of functions. Each of these can take hours, within one operation that no signal interrupts.
@@ -38,7 +38,7 @@ ZERO, ONE = sympy.Integer(0), sympy.Integer(1)
 
 
 class TooLargeError(ValueError):
-    """SymPy would need too much work to build an expression."""
+    """Error for an expression for which SymPy would need too much work."""
 
 
 def require_sum(items: Iterable[Any]) -> None:

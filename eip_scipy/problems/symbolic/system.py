@@ -34,7 +34,11 @@ LARGEST_JACOBIAN = 16  # number of coordinates; the Jacobian has its square of e
 
 
 class System(NamedTuple):
-    """Names, derivatives, invariants, balances and their rates as expressions. Equal systems share their functions."""
+    """Equations and their invariants and balances as expressions. Equal systems share their compiled functions.
+
+    `rates` are the time derivatives of `components`. An invariant is a name with an expression, a balance a name with
+    an expression and its rate.
+    """
 
     components: tuple[str, ...]
     parameters: tuple[str, ...]
@@ -60,7 +64,7 @@ class System(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Functions of a system: for each invariant the value and the gradient in place, for each balance also the rate."""
+    """Functions of a system: value and gradient (in place) of each invariant and balance; the rate of each balance."""
 
     rhs: Callable[..., None]
     acc: Callable[..., np.ndarray] | None
@@ -139,7 +143,7 @@ class SymbolicProblem(Problem):
         return self._kinetic() is not None
 
     def _kinetic(self) -> Any:
-        """Return the matrix W of q' = W p if it is constant and regular and p' does not depend on p; else None."""
+        """Return the matrix W of q' = W p if W is constant and regular and p' does not depend on p; otherwise None."""
         names, rates, half = self.system.components, self.system.rates, len(self.pairs)
         p = [symbol(item) for item in names[half:]]
         if half == 0 or len(names) != 2 * half or any(rate.has(*p) for rate in rates[half:]):
@@ -193,7 +197,7 @@ def hamiltonian_problem(
     extended: bool,
     perturbed: Perturbed,
 ) -> SymbolicProblem:
-    """See `hamiltonian`."""
+    """Return the problem of a Hamiltonian; see `hamiltonian`."""
     values = parameter_values(params)
     declared = {*values, *(name for given in (q, p) if given is not None for name in as_names("q and p", given))}
     energy = as_expression("H", H, declared)
@@ -235,7 +239,7 @@ class Further(NamedTuple):
 
 
 class Perturbed(NamedTuple):
-    """The arguments that `hamiltonian` adds to H: a second Hamiltonian, further derivatives, and the balances."""
+    """Arguments of `hamiltonian` for a perturbed system: a second Hamiltonian, dissipation, and balances."""
 
     perturbation: Any
     dissipation: Any
@@ -243,7 +247,7 @@ class Perturbed(NamedTuple):
 
     @property
     def given(self) -> bool:
-        """Return True if any of the arguments is given."""
+        """Return True if a perturbation or dissipation is given; raise TypeError if only balances are given."""
         if self.perturbation is None and self.dissipation is None:
             if self.balances is not None:
                 raise TypeError(
@@ -297,7 +301,7 @@ def _with_perturbation(
 def equations_problem(
     f: Any, y: Any, params: Any, invariants: Any, constraints: Any, name: str | None
 ) -> SymbolicProblem:
-    """See `equations`."""
+    """Return the problem y' = f(t, y); see `equations`."""
     timed = Timed(f, y)
     values = parameter_values(params)
     declared = {*timed.names, *values}
@@ -318,7 +322,7 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
     if q is None and p is None:
         q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
     elif q is None or p is None:
-        raise TypeError("hamiltonian: expected both q and p, or neither; with poisson= give the whole state as q.")
+        raise TypeError("hamiltonian: give both q and p, or neither; with poisson=, give the whole state as q.")
     q, p = as_names("q", q), as_names("p", p)
     if len(q) != len(p) or not q:
         raise ValueError(f"hamiltonian: {len(q)} coordinates ({', '.join(q)}) but {len(p)} momenta ({', '.join(p)}).")
@@ -332,7 +336,7 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
 
 
 def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
-    """Return the output of `_canonical` for y' = B(y) grad H, without pairs."""
+    """Return the names, a function of H that returns y' = B(y) grad H, and an empty tuple of pairs, as `_canonical`."""
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= give the names of the whole state as q, and omit p.")
     names = as_names("q", y)
@@ -364,7 +368,7 @@ def _checked(
     pairs: Any,
     slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
-    """Return the problem after a check of the names and of the further invariants."""
+    """Return the problem after checks of the names and of the given invariants and constraints."""
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
     for kind, items in given._asdict().items():
@@ -380,13 +384,13 @@ def _checked(
         _require_known(what, rate, known)
     for label in constraints:
         if label in further:
-            raise ValueError(f"{label!r} is a constraint and an invariant; give it as one of them.")
+            raise ValueError(f"{label!r} is the name of a constraint and of an invariant; rename or omit one of them.")
     quantities = {}
     for label, item in (*constraints.items(), *further.items()):
         if not isinstance(label, str):
             raise TypeError(f"invariants: names must be strings, got {shown(label)}.")
         if label in kept:
-            raise ValueError(f"invariants: {label} is an invariant already; choose another name or omit it.")
+            raise ValueError(f"invariants: {label} is already the name of an invariant; choose another or omit it.")
         kind = "constraint" if label in constraints else "invariant"
         quantities[label] = _quantity(f"{kind} {label!r}", item, names, known)
     zero = {label: quantities[label] for label in constraints}
@@ -413,7 +417,7 @@ def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> A
 def _how_kept(
     label: str, quantity: Any, names: Sequence[str], rates: Any, parameters: Any, manifold: Manifold | None, hint: str
 ) -> str:
-    """Return how it was shown that a quantity is conserved, if the constraints hold."""
+    """Return how a quantity was shown to be conserved, at all states or at those that meet the constraints."""
     try:
         return how_kept(label, quantity, [symbol(item) for item in names], rates, parameters)
     except NotKeptError as error:
@@ -495,7 +499,7 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
 
 
 def _deferred_jacobian(system: System) -> Deferred | None:
-    """Return the product of the accelerations' Jacobian and a vector, made on demand; None if there is none."""
+    """Return the product of the accelerations' Jacobian and a vector, made on demand; None if it is not available."""
     found = system.accelerations
     if found is None or len(found) > LARGEST_JACOBIAN:
         return None
@@ -516,7 +520,7 @@ def _jacobian(system: System) -> Callable[..., None]:
 
 
 def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
-    """Return the right-hand side with columns of derivatives, see `Problem`; it is made on demand."""
+    """Return the right-hand side of a state followed by columns of derivatives, see `Problem`."""
     for k in parameters:
         if not 0 <= k < len(system.parameters):
             raise ValueError(

@@ -27,7 +27,7 @@ FUNCTIONS: dict[str, Any] = {
 
 
 class NotTraceableError(TypeError):
-    """A function cannot be converted to an expression, because of a branch on a value for example."""
+    """Error for a function that cannot be converted to an expression, for example because it branches on a value."""
 
 
 class Number:
@@ -115,7 +115,7 @@ def _number(value: Any) -> Number:
 
 
 def traced(what: str, fun: Any, *groups: Any) -> np.ndarray:
-    """Return the value of a function as an array of expressions.
+    """Return the value of the function `fun` as an array of expressions; `what` describes it in messages.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Waves on periodic grids, by lines: the sine-Gordon and the Korteweg-de Vries equation."""
+"""Waves on periodic grids, by the method of lines: the sine-Gordon and the Korteweg-de Vries equation."""
 
 from .korteweg_de_vries import KortewegDeVries
 from .lawson import Lawson

@@ -1,4 +1,4 @@
-"""The Korteweg-de Vries equation on a ring: right-hand side, invariants, and the problem they make."""
+"""The Korteweg-de Vries equation on a ring: right-hand side, invariants, and initial value problem."""
 
 from __future__ import annotations
 
@@ -24,37 +24,39 @@ SOURCE = "Gardner, Greene, Kruskal & Miura, Phys. Rev. Lett. 19 (1967) 1095"
 class KortewegDeVries:
     """The equation ``u_t + 6 u u_x + u_xxx + damping u = 0`` on a ring, by Galerkin's method in Fourier modes.
 
-    The state is u at the grid's points. The square is taken on a finer grid, on which its modes are not mistaken for
-    others (the 3/2 rule), so that the equations for the modes are exact projections of the equation's.
+    The state is u at the grid's points. The square u^2 is computed on a finer grid, on which its modes are not aliased
+    (the 3/2 rule), so that the equations for the modes are exact projections of the partial differential equation.
 
     Parameters
     ----------
     grid : Grid
         Grid of one dimension.
     damping : float, optional
+        Damping rate, >= 0.
 
     Attributes
     ----------
     grid : Grid
     damping : float
     frequencies : ndarray
-        Of the linear part: modes of u_t = -u_xxx - damping u change as exp(-i frequency t); complex with damping.
+        Frequencies of the linear part: the modes of u_t = -u_xxx - damping u change as exp(-i frequency t). They are
+        complex with damping.
 
     Raises
     ------
     ValueError
-        If the grid has more dimensions than one, or for a damping that is negative or not finite.
+        If the grid has more than one dimension, or `damping` is negative or not finite.
 
     Notes
     -----
-    With the square so taken the mass ``w sum u``, the momentum ``w sum u^2`` and the energy ``int u_x^2 / 2 - u^3``, w
-    the cell, are all invariants of the equations on the grid, whatever the field: ``u_t = d_x grad H`` with a skew d_x,
-    and H does not change when u is moved along the ring. (At the grid's points alone the square is wrong in its
-    highest modes, and the momentum is not kept.) The highest of an even number of modes has no derivative and takes
-    no part: `problem` leaves it out of the start.
+    Because of the finer grid for u^2, the mass ``w sum u``, the momentum ``w sum u^2`` and the energy
+    ``int u_x^2 / 2 - u^3``, with the size w of a cell, are invariants of the equations on the grid for every field:
+    ``u_t = d_x grad H`` with a skew d_x, and H does not change when u is moved along the ring. (With the square at the
+    points of the grid alone, its highest modes would be wrong, and the momentum would not be conserved.) The highest of
+    an even number of modes has no derivative and is not used: `problem` removes it from the start.
 
-    Damping makes the mass fall by exp(-damping t), the momentum by exp(-2 damping t), exactly, also on the grid. Both
-    are invariants with these factors divided out, which depend on time. The energy has no such law.
+    With damping, the mass decays exactly as exp(-damping t) and the momentum as exp(-2 damping t), also on the grid.
+    Both, divided by these factors, are invariants that depend on time. The energy has no such law.
 
     Examples
     --------
@@ -70,7 +72,7 @@ class KortewegDeVries:
 
     def __init__(self, grid: Grid, damping: float = 0.0) -> None:
         if grid.dim != 1:
-            raise ValueError(f"the Korteweg-de Vries equation has one dimension, got {grid!r}.")
+            raise ValueError(f"the Korteweg-de Vries equation needs a grid of one dimension, got {grid!r}.")
         self.grid, self.damping = grid, checked_damping(damping)
         self._n = grid.size
         most = (self._n - 1) // 2  # the highest mode that has a sign
@@ -90,7 +92,7 @@ class KortewegDeVries:
         return scipy.fft.rfft(u, norm="forward")[: self._kept]
 
     def field(self, modes: np.ndarray) -> np.ndarray:
-        """Return the field with these modes."""
+        """Return the field on the grid with these modes."""
         return scipy.fft.irfft(modes, self._n, norm="forward")
 
     def nonlinear(self, modes: np.ndarray) -> np.ndarray:
@@ -148,13 +150,13 @@ class KortewegDeVries:
         np.multiply(self.field(found), self.grid.cell, out=out)
 
     def invariants(self, names: Sequence[str] | None = None) -> tuple[Invariant, ...]:
-        """Make the invariants of the equation.
+        """Return the invariants of the equation.
 
         Parameters
         ----------
         names : sequence of {"mass", "momentum", "energy"}, optional
-            Default: momentum and energy, with damping the momentum, whose factor is divided out. The mass is linear:
-            every method keeps it, and `problem` keeps the corrections out of it by its `frame`.
+            Default: momentum and energy; with damping the momentum, divided by its decay. The mass is linear: every
+            method keeps it, and the `frame` of `problem` prevents corrections from changing it.
 
         Returns
         -------
@@ -184,14 +186,14 @@ class KortewegDeVries:
         return Invariant(partial(_value, rate, item), partial(_gradient, rate, item), name=name, in_place=True)
 
     def largest_step(self, u: Any, limit: float = 2.8) -> float:
-        """Return the step above which `Lawson` is unstable; only the nonlinear term limits it, the linear one is exact.
+        """Return the step above which `Lawson` is unstable; the nonlinear term limits it, as the linear one is exact.
 
         Parameters
         ----------
         u : array_like
             A typical field.
         limit : float, optional
-            The method's bound on h times the largest frequency; default: about that of RK4.
+            Largest stable value of h times the largest frequency for the method; default: about that of RK4.
 
         Returns
         -------
@@ -210,27 +212,27 @@ class KortewegDeVries:
         reference: Callable[[float], np.ndarray | None] | None = None,
         source: str = SOURCE,
     ) -> WaveProblem:
-        """Make the initial value problem.
+        """Return the initial value problem.
 
         Parameters
         ----------
         u0 : array_like
-            The field at t = 0, which loses the highest of an even number of modes.
+            The field at t = 0. The highest of an even number of modes is removed from it.
         t_end : float
             End of the interval that starts at 0.
         h : float, optional
-            A step; `largest_step` bounds it.
+            The step, which must be below `largest_step`.
         name : str, optional
         invariants : sequence of str, optional
             See `invariants`.
         reference : callable, optional
-            ``reference(t) -> u``: a closed form.
+            ``reference(t) -> u``, a closed form of the solution.
         source : str, optional
 
         Returns
         -------
         WaveProblem
-            Its method is `Lawson` on DOP853, its `frame` keeps the mass.
+            The problem. Its method is `Lawson` with the tableau DOP853, and its `frame` keeps the mass.
 
         Raises
         ------
@@ -259,7 +261,7 @@ class KortewegDeVries:
 
 
 def _value(rate: float, item: Invariant, t: float, u: np.ndarray) -> float:
-    """Return the invariant times the factor by which it has decayed."""
+    """Return the invariant divided by the factor exp(-rate t) of its decay."""
     return exp(rate * t) * item.fun(t, u)
 
 

@@ -1,4 +1,4 @@
-"""Lawson's method (integrating factors): the linear part is exact, the rest is integrated by a Runge-Kutta tableau."""
+"""Lawson's method (integrating factors): the linear part is exact; a Runge-Kutta tableau integrates the rest."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ __all__ = ["Lawson"]
 
 
 class Lawson:
-    """A Runge-Kutta step for the modes ``exp(i w t) u``, in which only the nonlinear term moves: a one-step method.
+    """One-step method: a Runge-Kutta step for the modes ``exp(i w t) u``, which only the nonlinear term changes.
 
     Parameters
     ----------
     equation : KortewegDeVries
-        Or another object with its `frequencies` w, `modes`, `field` and `nonlinear`.
+        The equation, or another object with the attribute `frequencies` (w) and the methods `modes`, `field` and
+        `nonlinear`.
     tableau : Tableau, optional
-        Default: that of `EIPDOP853`. Its error estimate, if it has one, is the step's.
+        Runge-Kutta method, by default that of `EIPDOP853`. If it has an error estimate, the step has this estimate.
 
     Attributes
     ----------
@@ -36,12 +37,12 @@ class Lawson:
     Raises
     ------
     TypeError
-        If the tableau is of another kind.
+        If `tableau` is not a `Tableau`.
 
     Notes
     -----
-    The linear part, the stiff one, turns each mode and sets no bound on the step; the nonlinear term does. For the
-    equation's frequencies the change of variables has no growing factors.
+    The linear part, which is stiff, only multiplies each mode by a factor and does not limit the step; the nonlinear
+    term limits it. For the frequencies of the equation the change of variables has no growing factors.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Fourier modes of real fields on periodic grids: half of them, because the others are their conjugates."""
+"""Fourier modes of real fields on periodic grids; only half of the modes are stored, the others are conjugates."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class RealModes:
         self.shape = (*grid.shape[:-1], grid.shape[-1] // 2 + 1)
 
     def forward(self, field: np.ndarray) -> np.ndarray:
-        """Return the modes of a field, given flat or as a field: sum_j field_j exp(-i k x_j)."""
+        """Return the modes sum_j field_j exp(-i k x_j) of a field, which may be flat."""
         return scipy.fft.rfftn(field.reshape(self.grid.shape))
 
     def backward(self, modes: np.ndarray) -> np.ndarray:
-        """Return the field with these modes, flat."""
+        """Return the field with these modes as a flat array; `modes` is overwritten."""
         return scipy.fft.irfftn(modes, s=self.grid.shape, overwrite_x=True).ravel()
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """Return the wavenumbers along one axis that broadcast to modes; with `odd` that of the Nyquist mode is 0."""
+        """Return the wavenumbers along one axis, which broadcast to modes; if `odd`, that of the Nyquist mode is 0."""
         k = self.grid.wavenumbers(axis, odd=odd)
         return np.abs(k[..., : self.shape[-1]]) if axis == self.grid.dim - 1 else k

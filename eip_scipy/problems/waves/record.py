@@ -1,4 +1,4 @@
-"""The record of a problem whose state is one real field, or several."""
+"""The class of problems whose state is one real field, or several."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class WaveProblem(Problem):
     Attributes
     ----------
     equation : SineGordon or KortewegDeVries
-        With the `grid`, and functions of the state such as ``equation.energy(y)``. The other attributes are those of
-        `Problem`.
+        The equation, with the attribute `grid` and functions of the state such as ``equation.energy(y)``. The other
+        attributes are those of `Problem`.
     """
 
     equation: SineGordon | KortewegDeVries | None = None

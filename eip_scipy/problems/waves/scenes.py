@@ -65,14 +65,14 @@ def sine_gordon_kinks(
 ) -> WaveProblem:
     """Return the problem of a kink and an antikink of the sine-Gordon equation that collide, with its closed form.
 
-    ``tan(q / 4) = sinh(v c s) / (v cosh(c x))``, c = 1 / sqrt(1 - v^2), s = t - t_end / 2: they meet in the middle of
-    the run, at the middle of the ring.
+    ``tan(q / 4) = sinh(v c s) / (v cosh(c x))``, with c = 1 / sqrt(1 - v^2) and s = t - t_end / 2. The kinks meet in
+    the middle of the run, at the middle of the ring.
 
     Parameters
     ----------
     points : int
     velocity : float
-        v of the kink, that of the antikink is -v; between 0 and 1.
+        v, the velocity of the kink, between 0 and 1; the antikink has the velocity -v.
     length : float
         Length of the ring; the error of the closed form there is exp(-c (length - v t_end) / 2).
     t_end : float
@@ -133,14 +133,15 @@ def korteweg_de_vries_solitons(
 ) -> WaveProblem:
     """Return the problem of Korteweg-de Vries solitons that overtake each other, with its closed form.
 
-    One soliton is ``u = c / 2 sech^2(sqrt(c) (x - c t - x0) / 2)``; of several the closed form is Hirota's.
+    One soliton is ``u = c / 2 sech^2(sqrt(c) (x - c t - x0) / 2)``; for several solitons the closed form is Hirota's.
 
     Parameters
     ----------
     speeds : float or sequence of float
-        c > 0, each another.
+        c of each soliton, positive and all different.
     places : float or sequence of float
-        Position x0 of each soliton. Only a soliton to the left of all others is there; the others are shifted.
+        x0 of each soliton. At the start only a soliton to the left of all others is at its x0; the interaction with the
+        others has shifted the rest.
     points : int
     length : float
         Length of the ring. The closed form is that of an infinite line: all solitons must stay well within half of the
@@ -173,7 +174,7 @@ def korteweg_de_vries_solitons(
 
 
 def _solitons(x: np.ndarray, length: float, k: np.ndarray, x0: np.ndarray, t: float) -> np.ndarray:
-    """2 (log F)_xx, F the sum over all sets of solitons of exp(sum of k (x - x0 - k^2 t) and of their shifts).
+    """Return 2 (log F)_xx with F = sum over all sets of solitons of exp(sum of k (x - x0 - k^2 t) and of their shifts).
 
     With the terms of F as weights this is twice the variance of the sets' sums of k.
     """
@@ -192,5 +193,5 @@ def _solitons(x: np.ndarray, length: float, k: np.ndarray, x0: np.ndarray, t: fl
 
 
 def _around(x: np.ndarray, length: float) -> np.ndarray:
-    """Return the shortest distances on the ring."""
+    """Return the shortest distances on the ring, with signs, from distances on the line."""
     return np.remainder(x + length / 2, length) - length / 2

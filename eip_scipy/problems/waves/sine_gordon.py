@@ -1,4 +1,4 @@
-"""The sine-Gordon equation on a periodic grid: right-hand side, invariants, and the problem they make."""
+"""The sine-Gordon equation on a periodic grid: right-hand side, invariants, and initial value problem."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ SOURCE = "Ablowitz & Segur, Solitons and the Inverse Scattering Transform (SIAM 
 class SineGordon:
     """The equation ``q_tt = Laplace q - sin q - damping q_t`` in one to three dimensions, pseudospectral in space.
 
-    The state is (q, p), both fields flat, with p = q_t: without damping a system of the second order, for Nystrom
+    The state is (q, p), two flat fields with p = q_t. Without damping this is a system of second order, for Nystrom
     methods.
 
     Parameters
     ----------
     grid : Grid
     damping : float, optional
-        With damping, energy and momenta are balances, and Nystrom methods cannot be used.
+        Damping rate, >= 0. With damping, energy and momenta are balances, and Nystrom methods cannot be used.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class SineGordon:
         np.multiply(self._slope(axis, y[:n]), -cell, out=out[n:])
 
     def invariants(self, names: Sequence[str] = ("energy",)) -> tuple[Invariant, ...]:
-        """Make the invariants of the equation.
+        """Return the invariants of the equation.
 
         Parameters
         ----------
@@ -138,7 +138,8 @@ class SineGordon:
         Returns
         -------
         tuple of Invariant
-            Balances, if there is damping. The energy's gradient takes the right-hand side, which the step has.
+            Invariants, or balances if there is damping. The gradient of the energy is computed from the right-hand
+            side, which the step has already evaluated.
 
         Raises
         ------
@@ -164,7 +165,8 @@ class SineGordon:
         Parameters
         ----------
         limit : float, optional
-            The method's bound on h times the largest frequency; default: for `EIPRKN12`. That of `EIPRKN8` is 3.3.
+            Largest stable value of h times the largest frequency for the method. Default: that of `EIPRKN12`; the value
+            of `EIPRKN8` is 3.3.
 
         Returns
         -------
@@ -184,7 +186,7 @@ class SineGordon:
         reference: Callable[[float], np.ndarray | None] | None = None,
         source: str = SOURCE,
     ) -> WaveProblem:
-        """Make the initial value problem.
+        """Return the initial value problem.
 
         Parameters
         ----------
@@ -193,18 +195,18 @@ class SineGordon:
         t_end : float
             End of the interval that starts at 0.
         h : float, optional
-            A step; `largest_step` bounds it.
+            The step, which must be below `largest_step`.
         name : str, optional
         invariants : sequence of str, optional
             See `invariants`.
         reference : callable, optional
-            ``reference(t) -> y``: a closed form.
+            ``reference(t) -> y``, a closed form of the solution.
         source : str, optional
 
         Returns
         -------
         WaveProblem
-            Its method is the Nystrom method of `EIPRKN12`, or with damping the Runge-Kutta method of `EIPDOP853`.
+            The problem. Its method is the Nystrom method of `EIPRKN12`, or with damping that of `EIPDOP853`.
 
         Raises
         ------

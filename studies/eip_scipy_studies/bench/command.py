@@ -25,18 +25,30 @@ __all__ = ["Bench", "Found"]
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Study[Found]):
-    """The command. The least time of `repeats` runs counts; a sweep ends after a run longer than `patience` seconds."""
+    """Command ``eip-scipy bench``.
+
+    Attributes
+    ----------
+    repeats : int
+        Largest number of runs at each setting; the least time counts.
+    enough : float
+        Seconds of runs at one setting after which it is not run again.
+    patience : float
+        Seconds: after a longer run, finer settings of the same method and problem are left out.
+    limit : float
+        Seconds after which the process of a method is stopped.
+    """
 
     suite: Sequence[str] = option(
         ("all",),
-        f"what to run: all, or some of {', '.join(SUITES)}",
+        f"what to run (default: all): all, or some of {', '.join(SUITES)}",
         nargs="+",
         metavar="SUITE",
         type=one_of("suite", ("all", *SUITES)),
     )
     peers: Sequence[str] | None = option(
         None,
-        "packages to compare with, by their names with pip, or beginnings of the names of methods",
+        "what to compare with: names of packages with pip, or beginnings of names of methods (default: all)",
         nargs="+",
         metavar="PEER",
     )
@@ -48,14 +60,14 @@ class Bench(Study[Found]):
     field_of_peers: Mapping[str, Peer] = field(default_factory=lambda: PEERS)
 
     def check_settings(self) -> None:
-        """Raise an error if a package is not known."""
+        """Raise an error if a name of `peers` is neither a package nor the beginning of a method."""
         for name in self.peers or ():
             if not any(_is(peer, name) for peer in PEERS.values()):
                 known = sorted({peer.distribution for peer in PEERS.values() if not peer.ours})
                 raise UsageError(f"the package {name!r} is not known; expected some of {', '.join(known)}")
 
     def measure(self, session: Session) -> Found:
-        """Run one package after the other."""
+        """Run all methods of all packages, one after the other."""
         found = Found(describe_machine(), datetime.now(UTC).strftime("%Y-%m-%d"))
         found.versions["eip_scipy"] = __version__
         asked = [
@@ -107,7 +119,7 @@ class Bench(Study[Found]):
         return text(found)
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """Return all points, and the comparison at equal error."""
+        """Return the runs at all settings, and the comparison at equal error."""
         compared = [
             {**each._asdict(), "ratio": each.ratio if math.isfinite(each.ratio) else None}
             for each in standings(found.rows)
@@ -115,7 +127,7 @@ class Bench(Study[Found]):
         return {"bench.csv": [row._asdict() for row in found.rows], "bench-equal-error.csv": compared}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """Return all rows, with the versions."""
+        """Return the runs at all settings, with the versions of the packages."""
         return {
             "rows": [row._asdict() for row in found.rows],
             "versions_of_peers": found.versions,

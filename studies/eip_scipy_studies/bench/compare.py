@@ -1,4 +1,4 @@
-"""Costs at equal error: our best method compared with each package, with the reason if a package is faster."""
+"""Times at equal error: our best method compared with each package, with the reason if a package is faster."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ class Row(NamedTuple):
     ----------
     suite, scene, takes, peer : str
         `takes`: the kind of function.
-    setting, seconds, error, drift : float or None
+    setting : float or None
+        Tolerance or number of steps.
+    seconds, error, drift : float or None
+        Time, error at the end, and largest relative change of an invariant.
     said : str
         The first line of an error, or another remark.
     """
@@ -38,7 +41,7 @@ class Row(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """Comparison of a package with our best method at one error.
+    """Comparison of another package's method with our best method at one error.
 
     Attributes
     ----------
@@ -46,11 +49,11 @@ class Standing(NamedTuple):
     level : float
         Error of the trajectory.
     seconds : float
-        nan if no run reached this error.
+        Time of the package; nan if no run of it reached this error.
     best : str
         Name of our method.
     ours : float
-        Its seconds; inf if none of our runs reached this error.
+        Time of our method; inf if none of our runs reached this error.
     tried : float
         Seconds of the package's longest run.
     bound : bool
@@ -89,7 +92,10 @@ def groups(rows: Iterable[Row]) -> dict[tuple[str, str, str], dict[str, list[Row
 
 
 def standings(rows: Iterable[Row], levels: Sequence[float] = LEVELS) -> list[Standing]:
-    """Compare each package of each group with our best method, or our compiled ones if there is none of the kind."""
+    """Compare each package in each group with our best method for the same kind of function.
+
+    If there is no method of ours for the kind, the best compiled one takes its place.
+    """
     known = groups(rows)
     found = []
     for (suite, scene, takes), peers in known.items():

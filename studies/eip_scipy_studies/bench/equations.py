@@ -1,7 +1,8 @@
 """The equations of the problems, written once for all packages: plain Python, Numba, heyoka's expressions and JAX.
 
-The small ones are functions of a square root that return the components as tuples. Systems of bodies have one form for
-each kind of function: sums over arrays, loops, and the package's own.
+The equations of small systems are made by functions that take the square root to use (NumPy's, heyoka's ...) and return
+the components as tuples. Systems of bodies have one form for each kind of function: sums over arrays for plain Python,
+loops for Numba, and the form that each package has for its own equations.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ __all__ = ["EQUATIONS", "Functions", "Scene", "scene_from"]
 
 
 class Functions(NamedTuple):
-    """Functions of users: ``fun(t, y)``, ``values(t, y)``, ``gradients(t, y)``, and ``acc(t, q)`` if q'' = acc."""
+    """Functions as a user writes them: ``fun(t, y)``, ``values(t, y)`` and ``gradients(t, y)`` of the invariants.
+
+    ``acc(t, q)`` is given if the equations are q'' = acc.
+    """
 
     fun: Callable[..., Any]
     values: Callable[..., Any]
@@ -27,7 +31,7 @@ class Functions(NamedTuple):
 
 
 def kepler(sqrt: Any) -> Functions:
-    """Kepler's problem; energy, angular momentum."""
+    """Return Kepler's problem, with energy and angular momentum."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         r2 = y[0] * y[0] + y[1] * y[1]
@@ -52,7 +56,7 @@ def kepler(sqrt: Any) -> Functions:
 
 
 def henon_heiles(sqrt: Any) -> Functions:
-    """Hénon and Heiles; energy."""
+    """Return the system of Hénon and Heiles, with its energy."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         return y[2], y[3], -y[0] - 2.0 * y[0] * y[1], -y[1] - y[0] * y[0] + y[1] * y[1]
@@ -71,7 +75,7 @@ def henon_heiles(sqrt: Any) -> Functions:
 
 
 def rigid_body(sqrt: Any) -> Functions:
-    """Return a free top with moments of inertia 2, 1, 2/3; Casimir, energy."""
+    """Return a free top with moments of inertia 2, 1, 2/3, with its Casimir invariant and energy."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         return 0.5 * y[1] * y[2], -y[2] * y[0], 0.5 * y[0] * y[1]
@@ -87,7 +91,7 @@ def rigid_body(sqrt: Any) -> Functions:
 
 
 def particle(sqrt: Any) -> Functions:
-    """Return a charge in B = r e_z and the potential 0.01 / r; energy, canonical angular momentum."""
+    """Return a charge in B = r e_z and the potential 0.01 / r, with energy and canonical angular momentum."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         r2 = y[0] * y[0] + y[1] * y[1]
@@ -155,7 +159,7 @@ class Scene:
         if self.equations == "bodies":
             return _jitted_bodies(np.array(self.params["gm"]), njit)
         if name not in EQUATIONS:
-            raise NotImplementedError("the bench has this problem as a plain Python function only")
+            raise NotImplementedError("the bench has this problem (a hard case) as plain Python functions only")
         fun, values, gradients, acc = EQUATIONS[name](math.sqrt)
         return Functions(
             _filling(njit(fun), njit),
@@ -165,11 +169,14 @@ class Scene:
         )
 
     def error(self, y: np.ndarray) -> float:
-        """Return the largest component of the difference from the exact end, relative to the largest component."""
+        """Return the largest error of a component of the final state `y`, relative to the largest component."""
         return float(np.max(np.abs(np.asarray(y) - self.end)) / np.max(np.abs(self.end)))
 
     def drift(self, y: np.ndarray) -> float | None:
-        """Return the largest relative change of an invariant; for small ones relative to 0.001 of the largest."""
+        """Return the largest relative change of an invariant up to the final state `y`; None for "members".
+
+        Changes of small invariants are relative to 0.001 of the largest invariant.
+        """
         if self.equations == "members":
             return None
         values = self.plain().values
@@ -178,7 +185,7 @@ class Scene:
 
 
 def scene_from(record: Mapping[str, Any]) -> Scene:
-    """Return the problem that a request holds."""
+    """Return the problem that an entry of a worker's request describes."""
     y0, end = (np.array(record[name]) for name in ("y0", "end"))
     if record["complex"]:
         y0, end = y0.view(complex), end.view(complex)
@@ -206,7 +213,7 @@ def _jitted_array(function: Any, njit: Any) -> Any:
 
 
 def _bodies(gm: list[float]) -> Functions:
-    """N bodies by sums over arrays, G = 1; energy, momentum, angular momentum."""
+    """Return N bodies by sums over arrays, G = 1, with energy, momentum and angular momentum."""
     case = import_module("eip_scipy_studies.hard_cases").n_body(gm, 1.0, 3)
     m, n = np.array(gm), len(gm)
 
@@ -221,7 +228,7 @@ def _bodies(gm: list[float]) -> Functions:
 
 
 def _jitted_bodies(gm: np.ndarray, njit: Any) -> Functions:
-    """N bodies by loops over pairs; the invariants are those of `nbody`, which are compiled."""
+    """Return N bodies by loops over pairs, with the compiled invariants of `nbody`."""
 
     @njit
     def acc(t, q, out):  # type: ignore[no-untyped-def]
@@ -250,7 +257,7 @@ def _jitted_bodies(gm: np.ndarray, njit: Any) -> Functions:
 
 
 def _nls(points: int, length: float) -> Functions:
-    """i psi' = -psi'' / 2 - |psi|^2 psi on a ring, by FFT; mass, energy."""
+    """Return i psi' = -psi'' / 2 - |psi|^2 psi on a ring, by FFT, with mass and energy."""
     k2 = (2 * np.pi * np.fft.fftfreq(points, length / points)) ** 2
     dx = length / points
 

@@ -30,9 +30,9 @@ class Found:
     versions : dict
         Versions of the packages, including ours, by their names with pip.
     absent : dict
-        Reasons why packages did not run, by the same names.
+        Reasons why packages did not run, by their names with pip.
     took : dict
-        Seconds that each package took, by suite and package.
+        Seconds that each method took, by suite and name of the method.
     """
 
     machine: str
@@ -75,7 +75,7 @@ def _times(value: float) -> str:
 
 
 def _equal_error(found: Found, suite: str) -> list[Table]:
-    """Make one table for each problem and kind of function: seconds at each level, and the ratio to our best."""
+    """Make a table for each problem and kind of function: times at each level of error, and ratios to our best time."""
     known = [each for each in standings(found.rows) if each.suite == suite]
     tables = []
     for where in dict.fromkeys((each.suite, each.scene, each.takes) for each in known):
@@ -101,12 +101,12 @@ def _equal_error(found: Found, suite: str) -> list[Table]:
 
 
 def _factor(value: float) -> str:
-    """Format a ratio above 1, so that it does not read 1."""
+    """Format a ratio above 1 with enough digits not to read 1."""
     return f"{value:.3g}" if value < 1.1 else f"{value:.2g}"
 
 
 def _losses(group: list[Standing]) -> list[str]:
-    """Make a line for each reason: the packages that are faster for it, the place and the ratio."""
+    """Make a line for each reason: the packages that are faster for this reason, with ratio and level of error."""
     by_reason: dict[str, list[str]] = {}
     for each in group:
         if each.lost:

@@ -26,13 +26,13 @@ class Reply:
     Attributes
     ----------
     answers : list of dict
-        Answers until its end, or until it was stopped.
+        Answers that it gave until its end, or until it was stopped.
     version : str or None
         Version of the package.
     first : float or None
         Seconds from the start of the process to its first answer.
     failed : str
-        Why it did not finish; empty if it did.
+        Reason why the worker did not finish; empty if it did.
     """
 
     answers: list[dict[str, Any]]
@@ -47,10 +47,11 @@ def ask(request: Mapping[str, Any], limit: float, worker: str = WORKER) -> Reply
     Parameters
     ----------
     request : mapping
-        See `worker`.
+        The request, in the form that the module `worker` describes.
     limit : float
+        Seconds after which the process is stopped.
     worker : str, optional
-        The module that is run.
+        Name of the module that is run as the process.
 
     Returns
     -------

@@ -32,7 +32,8 @@ class Suite:
     task : str
         Task of the worker: "precision", "first", "asked" or "overhead".
     make : callable
-        ``make()(peer)``: records for a request, with settings; none if the method is not run.
+        ``make()(peer)`` returns the problems of a request to the worker, with the settings of this method; an empty
+        list if the method is not run.
     note : str
         Explanation for the reader.
     """
@@ -63,7 +64,7 @@ def _record(
 
 
 def _for(peer: Peer, records: list[dict[str, Any]], tolerances: tuple[float, ...] = TOLERANCES) -> list[dict[str, Any]]:
-    """Return the records for this method, with its settings."""
+    """Return those of the problems (records of a request) that this method runs, with its settings."""
     if " LSODA" in peer.name.upper():
         tolerances = tuple(max(tolerance, TIGHTEST) for tolerance in tolerances)
     found = []
@@ -97,7 +98,7 @@ RIGID_BODY = {
 
 
 def kepler() -> list[dict[str, Any]]:
-    """Three small systems; runs of compiled code are longer, because the checks of a call take milliseconds."""
+    """Return three small systems; runs of compiled code are longer, because the checks of a call take milliseconds."""
     orbit, regular, top = (case.problem for case in hard_cases(["kepler_e06", "henon_heiles_regular", "euler_top"]))
     compiled = COMPILED, OWN
 
@@ -124,7 +125,7 @@ def kepler() -> list[dict[str, Any]]:
 
 
 def solar() -> list[dict[str, Any]]:
-    """Outer and full solar system."""
+    """Return the outer and the full solar system."""
     (outer,) = hard_cases(["outer_solar_system"])
     stored = stored_cases()[outer.name]["params"]
     gm = [stored["G"] * m for m in stored["masses"]]
@@ -166,12 +167,12 @@ def field() -> list[dict[str, Any]]:
 
 
 def hard() -> list[dict[str, Any]]:
-    """Some of the hard cases, as plain functions."""
+    """Return some of the hard cases, as plain functions."""
     return [_case(name, name.replace("_", " "), "case", takes=(PYTHON,)) for name in HARD]
 
 
 def members() -> list[dict[str, Any]]:
-    """Kepler orbits of e = 0 ... 0.6, whole revolutions: the end is the start."""
+    """Return Kepler orbits of e = 0 ... 0.6 over whole revolutions, so that the end is the start."""
     e = np.linspace(0.0, 0.6, MEMBERS)
     starts = np.array([1 - e, 0 * e, 0 * e, np.sqrt((1 + e) / (1 - e))]).T
     steps = {"EIPRKN12": _geometric(200, 1000, 5)}
@@ -180,7 +181,7 @@ def members() -> list[dict[str, Any]]:
 
 
 def first_use() -> list[dict[str, Any]]:
-    """One short solution, each in its own process."""
+    """Return one short problem, which each method solves in a new process."""
     (orbit,) = hard_cases(["kepler_e03"])
     steps = {"EIPRKN12": [250], "EIPGJ12": [4000], "heyoka": [1e-9]}
     t_end = orbit.problem.t_span[1]
@@ -189,7 +190,7 @@ def first_use() -> list[dict[str, Any]]:
 
 
 def asking() -> list[dict[str, Any]]:
-    """Requests other than the solution of a real system, with the option for each."""
+    """Return problems that ask for more than the solution of a real system: a complex state, invariants, events."""
     (orbit,), (wave,) = hard_cases(["kepler_e03"]), hard_cases(["three_wave"])
     steps = {"EIPRKN12": [250], "EIPGJ12": [4000]}
     real = ("kepler", orbit.problem.y0, orbit.end, orbit.problem.t_span[1], steps, (PYTHON, COMPILED, OWN))
@@ -202,7 +203,10 @@ def asking() -> list[dict[str, Any]]:
 
 
 def _one_setting(records: list[dict[str, Any]]) -> Callable[[Peer], list[dict[str, Any]]]:
-    """One tolerance, only the first method of each package, with each kind of function."""
+    """Return a function that gives the records with one tolerance to a method, as a `make` of `Suite` returns it.
+
+    Only the first method of each package for each kind of function gets any.
+    """
     able = [peer for peer in PEERS.values() if _for(peer, records)]
     first = {(peer.distribution, peer.takes): peer.name for peer in reversed(able)}.values()
     return lambda peer: _for(peer, records, (1e-9,)) if peer.name in first else []
@@ -229,7 +233,7 @@ def _described() -> tuple[Suite, ...]:
 
 
 def cheap() -> list[dict[str, Any]]:
-    """Return a rigid body: three components, three products each."""
+    """Return a rigid body, whose right-hand side is cheap: three components of three products each."""
     return [record for record in kepler() if record["title"] == "rigid body, t = 1000"]
 
 

@@ -30,7 +30,7 @@ Answers = Iterator[dict[str, Any]]
 
 
 def precision(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Write time and errors of each problem at its settings, from the loosest on."""
+    """Yield time and errors of each problem at its settings, from the loosest on."""
     for record in request["scenes"]:
         try:
             scene = scene_from(record)
@@ -72,7 +72,10 @@ def _points(
 
 
 def _least(action: Callable[[], np.ndarray], enough: float, repeats: int) -> tuple[float, np.ndarray]:
-    """Return the least time of at most `repeats` calls and at least one; stop after `enough` seconds in all."""
+    """Return the least time of a call, and its result.
+
+    There are at most `repeats` calls, and none after `enough` seconds in all.
+    """
     least, spent, y = np.inf, 0.0, np.empty(0)
     for _ in range(repeats):
         begin = perf_counter()
@@ -85,14 +88,14 @@ def _least(action: Callable[[], np.ndarray], enough: float, repeats: int) -> tup
 
 
 def first(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Compute one solution, which the other side times together with the start of this process."""
+    """Yield the error of one solution; the parent process times it together with the start of this process."""
     (record,) = request["scenes"]
     scene = scene_from(record)
     yield {"scene": record["title"], "error": scene.error(peer.prepare(scene)(record["settings"][0]))}
 
 
 def asked(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Record the response to a request: the first line of the error or warning, or the accuracy."""
+    """Yield the response of the package to each request: the first line of its error or warning, or the accuracy."""
     for record in request["scenes"]:
         scene, extra = scene_from(record), dict(record["extra"])
         functions = scene.plain()
@@ -118,7 +121,7 @@ def _crossing(t: float, y: np.ndarray) -> float:
 
 
 def overhead(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Measure the time of one evaluation of the user's function in a run, and of the function alone."""
+    """Yield the time that a package adds to each evaluation of the user's function in a run."""
     (record,) = request["scenes"]
     scene = scene_from(record)
     setting = record["settings"][0]
@@ -148,7 +151,7 @@ class _Counting(Scene):
     calls = 0
 
     def plain(self) -> Functions:
-        """Return the functions of the problem, counted."""
+        """Return the functions of the problem, wrapped to count their calls."""
         functions = super().plain()
 
         def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
@@ -168,13 +171,13 @@ TASKS: dict[str, Callable[[Peer, Mapping[str, Any]], Answers]] = {
 
 
 def first_line(error: BaseException) -> str:
-    """Return the kind of an error and the first line of its message."""
+    """Return the class of an error and the first line of its message, as text."""
     said = str(error).strip().split("\n")[0]
     return f"{type(error).__name__}: {said}" if said else type(error).__name__
 
 
 def main() -> None:
-    """Answer one request."""
+    """Read one request, and write the answers and then the version of the package."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # output of a package is not an answer
 

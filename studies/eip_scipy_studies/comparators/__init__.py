@@ -1,7 +1,7 @@
-"""Methods that the projection is compared with; each is independent and uses no solver of this package.
+"""Methods with which EIP methods are compared; none of them uses a solver of `eip_scipy`.
 
 `stormer_verlet` is the symplectic leapfrog of order 2 for q'' = a(t, q), in both of its forms; `boris` the pusher for
-charged particles; `implicit_midpoint` the symplectic method of order 2 for any Hamiltonian. `crank_nicolson`,
+charged particles; `implicit_midpoint` a symplectic method of order 2 for any Hamiltonian. `crank_nicolson`,
 `linearly_implicit` and `sav_crank_nicolson` are the implicit schemes of the paper's test of efficiency, for the
 Gross-Pitaevskii equation (the last one without rotation).
 """

@@ -1,4 +1,4 @@
-"""Common part of the implicit schemes for the Gross-Pitaevskii equation: their loop, their record and their solver.
+"""Common part of the implicit schemes for the Gross-Pitaevskii equation: their loop, result and iterative solver.
 
 With the linear part ``K = -Laplace / 2`` diagonal in the modes, ``1 + i c K`` is inverted by one pair of transforms.
 """
@@ -31,11 +31,11 @@ class FieldResult:
     t : ndarray, shape (m,)
         Saved times, including the first and the last of the interval.
     y : ndarray, shape (n, m)
-        States at `t`, flat and complex; ``gpe.grid.field(y)`` for fields. nan from where a scheme failed.
+        States at `t`, flat and complex; ``gpe.grid.field(y)`` has the shape of the grid. After a failure they are nan.
     nfev : int
-        Number of evaluations of the nonlinear term, each with a pair of transforms: linear solves, in other words.
+        Number of evaluations of the nonlinear term, each with one linear solve, which is a pair of transforms.
     wall_time : float
-        Seconds spent in the integration, without plans of transforms.
+        Seconds spent in the integration, without planning the transforms.
     message : str
         "completed", or why and where the scheme failed.
     """
@@ -48,7 +48,7 @@ class FieldResult:
 
 
 class FieldScheme:
-    """A scheme during a run; its subclasses implement `restart` and `step`.
+    """Base class of a scheme and its state during a run; subclasses implement `restart` and `step`.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class FieldScheme:
     psi : ndarray
         The state, flat.
     nfev : int
-        Pairs of transforms so far.
+        Number of pairs of transforms so far.
     """
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
@@ -72,21 +72,21 @@ class FieldScheme:
         self._rotation = np.empty(gpe.grid.size if gpe.Omega else 0, complex)
 
     def start(self, psi: np.ndarray) -> None:
-        """Return to t0, with a copy of `psi`."""
+        """Set the state to a copy of `psi`, the number of transforms to 0, and discard earlier states."""
         self.psi = psi.copy()
         self.nfev = 0
         self.restart()
 
     def restart(self) -> None:
-        """Discard everything that was computed from former states."""
+        """Discard everything that was computed from earlier states."""
         raise NotImplementedError
 
     def step(self, h: float) -> str:
-        """Advance `psi` by h, signed; return the reason for a failure, or nothing."""
+        """Advance `psi` by the signed step `h`; return the reason for a failure, or ""."""
         raise NotImplementedError
 
     def rotation(self, field: np.ndarray) -> np.ndarray:
-        """Return -Omega Lz field, flat and in a buffer; (0,) without rotation."""
+        """Return -Omega Lz `field`, flat and in a buffer that is used again; an empty array if Omega is 0."""
         if self.gpe.Omega:
             shape = self.gpe.grid.shape
             self.gpe.angular(field.reshape(shape), self._rotation.reshape(shape))
@@ -94,12 +94,12 @@ class FieldScheme:
         return self._rotation
 
     def forward(self, field: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with the modes of `field`; both flat."""
+        """Fill `out` with the Fourier modes of `field`; both are flat."""
         shape = self.gpe.grid.shape
         self.gpe.transforms.forward(field.reshape(shape), self.axes, out.reshape(shape))
 
     def backward(self, field: np.ndarray) -> None:
-        """Replace modes by their field times the number of points."""
+        """Replace the modes in `field` by the field that they describe, times the number of points."""
         self.gpe.transforms.backward(field.reshape(self.gpe.grid.shape), self.axes)
 
 
@@ -114,9 +114,9 @@ class FixedPoint:
     ----------
     scheme : FieldScheme
     tol : float
-        Bound of the residual's norm relative to that of the state.
+        Bound on the norm of the residual relative to that of the state.
     c, w : float
-        The best w is the middle of the range of W.
+        Constants of the equation; the iteration converges fastest if w is the middle of the range of W.
     """
 
     def __init__(self, scheme: FieldScheme, tol: float, c: float, w: float) -> None:
@@ -126,19 +126,20 @@ class FixedPoint:
         self._means: list[np.ndarray] = []
 
     def solve(self, rhs: Callable[[np.ndarray, np.ndarray], float], guess: np.ndarray) -> tuple[np.ndarray, str]:
-        """Find m, in an array that remains unchanged for the next three solutions only.
+        """Find m. It is returned in an array that is used again after three further calls.
 
         Parameters
         ----------
         rhs : callable
-            ``rhs(m, values)`` replaces `values` and returns the norm of their change.
+            ``rhs(m, values)`` replaces `values` by the right-hand side at m, and returns the norm of their change.
         guess : ndarray, shape (n,)
-            Used until three solutions are known, from which a parabola is then extrapolated.
+            First iterate, used until three solutions are known; then a parabola through these is extrapolated.
 
         Returns
         -------
         m : ndarray, shape (n,)
         failure : str
+            Reason why the iteration failed; empty if it converged.
         """
         scheme, values = self.scheme, self._rhs
         if len(self._means) < 3:
@@ -164,9 +165,10 @@ class FixedPoint:
 
 
 class Implicit(FieldScheme):
-    """A scheme whose step goes from a state to another, 2 c later, through their mean, which `FixedPoint` finds.
+    """Base class of schemes whose step solves, by `FixedPoint`, for the mean of two states that are 2 c apart in time.
 
-    The mean fulfils ``mean = start - i c (K + W - Omega Lz) mean``, W pointwise.
+    The mean fulfils ``mean = start - i c (K + W - Omega Lz) mean`` with a pointwise potential W, which subclasses
+    compute.
 
     Parameters
     ----------
@@ -189,18 +191,18 @@ class Implicit(FieldScheme):
         self._solver = None
 
     def solver(self, c: float) -> tuple[FixedPoint, bool]:
-        """Return the solver for c, and whether it is a new one, without solutions before."""
+        """Return the solver for `c`, and whether it has just been made, so that it has no earlier solutions."""
         new = self._solver is None or self._solver.c != c
         if self._solver is None or new:
             self._solver = FixedPoint(self, self._tol, c, self._w)
         return self._solver, new
 
     def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with W."""
+        """Fill `out` with the potential W for a step from `start` with this mean."""
         raise NotImplementedError
 
     def cross(self, solver: FixedPoint, start: np.ndarray) -> str:
-        """Replace `start` by the state at the other end; return the reason for a failure, or nothing."""
+        """Replace `start` by the state at the other end of the step; return the reason for a failure, or ""."""
 
         def rhs(mean: np.ndarray, values: np.ndarray) -> float:
             self.potential(start, mean, self._W)
@@ -225,7 +227,7 @@ def check_tol(tol: Any) -> float:
 
 
 def check_equation(gpe: Any) -> GrossPitaevskii:
-    """Return `gpe` if it is an equation.
+    """Return `gpe` if it is a `GrossPitaevskii`, and raise an error otherwise.
 
     Raises
     ------
@@ -246,7 +248,7 @@ def march(
     save_every: int | None,
     observe: Callable[[Any], float] = lambda scheme: math.nan,
 ) -> tuple[FieldResult, np.ndarray]:
-    """Take all steps; also return the values of `observe(scheme)` at the saved states."""
+    """Run a scheme over `t_span`; return its result, and the values of `observe(scheme)` at the saved states."""
     steps = FixedSteps.of(t_span, h, save_every)
     psi = check_equation(gpe).as_field(y0).reshape(-1)
     if not np.isfinite(psi).all():

@@ -25,9 +25,10 @@ def boris(
 ) -> FixedStepResult:
     """Integrate m x'' = q (E + x' x B) by the Boris pusher with a fixed step.
 
-    Half a step along the velocity, half of the electric kick, a rotation around B, the other half of the kick, half a
-    step along the velocity: one evaluation of the fields per step. The method is reversible, of order 2 and keeps
-    phase-space volume, but is not symplectic; the rotation alone keeps the kinetic energy exactly if E is 0.
+    A step consists of half a step along the velocity, half of the electric kick, a rotation around B, the other half of
+    the kick, and half a step along the velocity, with one evaluation of the fields. The method is reversible, of order
+    2 and keeps phase-space volume, but is not symplectic; the rotation alone keeps the kinetic energy exactly if E is
+    0.
 
     Parameters
     ----------
@@ -49,8 +50,8 @@ def boris(
     Returns
     -------
     FixedStepResult
-        A record with t (m,), y (6, m), nfev, wall_time [s] and message. Positions and velocities belong to the same
-        time.
+        A record with t (m,), y (6, m), nfev, wall_time [s] and message. Positions and velocities are those at the same
+        times.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def crank_nicolson(
     """Integrate the Gross-Pitaevskii equation by the energy-preserving Crank-Nicolson scheme.
 
     ``i (psi' - psi) / h = (K + V - Omega Lz + beta / 2 (|psi'|^2 + |psi|^2)) (psi' + psi) / 2``, K = -Laplace / 2.
-    Order 2; keeps mass and energy up to the residual of the solver.
+    psi' is the state at the end of the step. The scheme has order 2, and keeps mass and energy up to the residual.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def crank_nicolson(
     h : float
         Length of a step, positive in both directions; the last one is shortened if `h` does not divide the interval.
     tol : float, optional
-        Bound of the norm of each step's residual, relative to that of the state.
+        Bound on the norm of each step's residual, relative to the norm of the state.
     save_every : int, optional
         Save every `save_every`-th state in addition to the first and the last; default: only these two.
 
@@ -56,11 +56,11 @@ def crank_nicolson(
 
     Notes
     -----
-    Each step is solved for the mean of its two states by a fixed point that is preconditioned in the modes and starts
-    from a parabola through the three means before; an iteration takes a pair of transforms. It contracts if
-    h / 2 times half the range of ``V + beta |psi|^2`` is well below 1. A rotation, which is not diagonal in the modes,
-    takes two more pairs along one axis and needs h below about 2 / (Omega r)^2, with r the largest distance from the
-    axis.
+    Each step solves for the mean of its two states by a fixed-point iteration, which is preconditioned in Fourier space
+    and starts from the parabola through the three previous means. An iteration takes a pair of transforms. It converges
+    if h / 2 times half the range of ``V + beta |psi|^2`` is well below 1. A rotation, which is not diagonal in Fourier
+    space, takes two more pairs of transforms along one axis and needs h below about 2 / (Omega r)^2, where r is the
+    largest distance from the axis.
 
     References
     ----------

@@ -21,9 +21,9 @@ def implicit_midpoint(
 ) -> FixedStepResult:
     """Integrate y' = f(t, y) by the implicit midpoint rule with a fixed step.
 
-    y_new = y + h k, k = f(t + h / 2, y + h k / 2). Symplectic for canonical equations; it keeps quadratic
-    invariants, such as x p_y - y p_x, and no others. The equation for k is solved by fixed-point iteration until
-    round-off, from an extrapolation of the last two steps.
+    y_new = y + h k, k = f(t + h / 2, y + h k / 2). The rule is symplectic for canonical equations. It keeps linear and
+    quadratic invariants, such as x p_y - y p_x, but in general no others. The equation for k is solved to round-off by
+    fixed-point iteration, which starts from an extrapolation of the last two steps.
 
     Parameters
     ----------
@@ -44,8 +44,9 @@ def implicit_midpoint(
     Returns
     -------
     FixedStepResult
-        A record with t (m,), y (n, m), nfev, wall_time [s] and message. If the iteration does not converge, with h
-        times the largest derivative of f above about 2, the run ends, and the states from there on are nan.
+        A record with t (m,), y (n, m), nfev, wall_time [s] and message. The iteration
+        converges if h times the norm of the Jacobian of f is below about 2; otherwise the run ends, and the states from
+        there on are nan.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The linearly implicit central difference scheme for the Gross-Pitaevskii equation: two steps, keeps the mass."""
+"""The linearly implicit central difference scheme for the Gross-Pitaevskii equation: a two-step scheme, keeps mass."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ def linearly_implicit(
 ) -> FieldResult:
     """Integrate the Gross-Pitaevskii equation by the linearly implicit central difference scheme.
 
-    ``i (psi'' - psi) / (2 h) = (K + V - Omega Lz + beta |psi'|^2) (psi'' + psi) / 2`` with K = -Laplace / 2: one linear
-    system per step, with coefficients that vary in space. Order 2; keeps the mass, and a form of two neighbours
-    in place of the energy.
+    ``i (psi'' - psi) / (2 h) = (K + V - Omega Lz + beta |psi'|^2) (psi'' + psi) / 2`` with K = -Laplace / 2, where psi,
+    psi', psi'' are three successive states: one linear system per step, with coefficients that vary in space. The
+    scheme has order 2, and keeps the mass and, in place of the energy, an expression in two successive states (see
+    Notes).
 
     Parameters
     ----------
@@ -48,8 +49,8 @@ def linearly_implicit(
     Notes
     -----
     The first step, and a shorter last one, are steps of `crank_nicolson`, which has the same order and keeps
-    the mass. The linear systems are solved as there, by a fixed point preconditioned in the modes; the bounds of h for
-    its convergence are half of those there.
+    the mass. The linear systems are solved by the same preconditioned fixed-point iteration; the bounds on h for its
+    convergence are half of those of `crank_nicolson`.
 
     The scheme keeps ``(<psi'', L psi''> + <psi', L psi'>) / 2 + beta / 2 <|psi'|^2, |psi''|^2>``, L = K + V - Omega Lz.
 

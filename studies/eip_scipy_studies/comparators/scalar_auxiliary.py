@@ -24,7 +24,8 @@ class SAVResult(FieldResult):
     Attributes
     ----------
     modified_energy : ndarray, shape (m,)
-        ``<psi, K psi> + r^2 - C`` at `t`, which the scheme keeps; the energy is ``gpe.energy``.
+        ``<psi, K psi> + r^2 - C`` at `t`, which the scheme keeps, with r and C as in `sav_crank_nicolson`. The true
+        energy is ``gpe.energy``.
     """
 
     modified_energy: np.ndarray
@@ -46,9 +47,9 @@ def sav_crank_nicolson(
     - ``i (psi' - psi) / h = K (psi' + psi) / 2 + (r' + r) / 2 b*``,
     - ``r' - r = Re <b*, psi' - psi>``,
 
-    where b* belongs to the state half a step ahead as extrapolated from the last two. The scheme is linear with
-    constant coefficients: one pair of transforms per step. Order 2; keeps a modified energy, but mass and energy to
-    order 2 only.
+    where primes denote the end of the step, and b* is b at the middle of the step, from an extrapolation of the last
+    two states. The scheme is linear with constant coefficients: one pair of transforms per step. It has order 2 and
+    keeps a modified energy, but mass and energy to order 2 only.
 
     Parameters
     ----------
@@ -57,7 +58,8 @@ def sav_crank_nicolson(
     t_span, y0, h, save_every
         As for `crank_nicolson`.
     shift : float, optional
-        C, such that E1 + C remains positive. Default: 1, plus ten times the magnitude of a negative E1 at the start.
+        The constant C, which must keep E1 + C positive. Default: 1, plus ten times the magnitude of a negative E1 at
+        the start.
 
     Returns
     -------
@@ -92,7 +94,7 @@ def sav_crank_nicolson(
         if gpe.Omega:
             raise ValueError(
                 f"SAV/CN needs Omega = 0, where the linear part is diagonal in the modes; got Omega = {gpe.Omega:g}. "
-                "Use EIPRK4 or crank_nicolson, or for a round trap the frame at rest"
+                "Use EIPRK4 or crank_nicolson, or, if the trap is round, the equation in the frame at rest (Omega = 0)"
             )
         return _SAV(gpe, _shift(gpe, psi, shift))
 
@@ -102,7 +104,7 @@ def sav_crank_nicolson(
 
 
 def interaction(gpe: GrossPitaevskii, psi: np.ndarray) -> float:
-    """Return E1, the potential and the interaction energy."""
+    """Return E1, the sum of the potential energy and the interaction energy."""
     return gpe.grid.cell * float(interaction_energy(gpe.as_field(psi), gpe.V, gpe.beta))
 
 
@@ -118,7 +120,7 @@ def _shift(gpe: GrossPitaevskii, psi: np.ndarray, shift: Any) -> float:
 
 
 class _SAV(FieldScheme):
-    """The scheme of `sav_crank_nicolson`, with its variable `r`."""
+    """The scheme of `sav_crank_nicolson`, with its scalar variable `r`."""
 
     def __init__(self, gpe: GrossPitaevskii, shift: float) -> None:
         super().__init__(gpe)
@@ -148,7 +150,10 @@ class _SAV(FieldScheme):
         return failure
 
     def _new_state(self, other: np.ndarray, a: float) -> tuple[float, str]:
-        """Take the step with b* of psi + a (psi - other), into `_new` and `_new_modes`; return r' and a failure."""
+        """Take a step with b* at the state psi + a (psi - other), and write the result to `_new` and `_new_modes`.
+
+        Return r at the end of the step, and the reason for a failure, or "".
+        """
         gpe, force = self.gpe, self._force
         square = gpe.grid.cell * fields.nonlinear_force(self.psi, other, a, self.V, gpe.beta, force) + self.shift
         if not square > 0:

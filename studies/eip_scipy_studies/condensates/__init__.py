@@ -1,1 +1,1 @@
-"""``gpe``, and the condensates among the paper's figures."""
+"""The commands ``eip-scipy gpe ...`` and ``reproduce fig-efficiency``: Bose-Einstein condensates."""

@@ -2,9 +2,9 @@
 
 Two problems on 64 x 64 points of [0, 2 pi)^2, beta = 1, to t = 1. The paper's plane wave is a stationary state: the
 gradients of mass and energy are parallel, so that a projection onto both has rank 1 (counted in the table), |psi|^2 is
-constant, so that the linear systems of LIC need no iteration, and splittings are exact. The modulated wave has none of
-that. Explicit steps are limited by the grid, the others are not. Times are processor seconds, the least of
-several runs taken in turn, minus the least of a run of a single step, which removes the set-up of up to 20 ms.
+constant, so that the linear systems of LIC need no iteration, and splittings are exact. None of this holds for the
+modulated wave. Explicit steps are limited by the grid, the others are not. Times are processor seconds, the least of
+several runs taken in turn, minus the least time of a run of a single step, which removes the set-up of up to 20 ms.
 All methods use the same library of transforms.
 """
 
@@ -50,7 +50,8 @@ SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
 class Contender(NamedTuple):
     """A method of the test.
 
-    ``run(problem, h, t_end)`` returns the two ends, the pairs of transforms and a remark; ``steps(problem)`` the steps.
+    ``run(problem, h, t_end)`` returns the first and the last state (n, 2), the number of pairs of transforms, and a
+    remark for the table. ``steps(problem)`` returns the lengths of the steps at which the method is run.
     """
 
     run: Callable[[FieldProblem, float, float], tuple[np.ndarray, int, str]]
@@ -58,7 +59,7 @@ class Contender(NamedTuple):
 
 
 def stable_steps(problem: FieldProblem) -> list[float]:
-    """Return steps below RK4's limit that divide the interval."""
+    """Return lengths of steps below the stability limit of RK4, which divide the interval."""
     assert problem.equation is not None
     limit = problem.equation.largest_step(problem.y0)
     return [T_END / ceil(T_END / (share * limit)) for share in SHARES]
@@ -74,12 +75,12 @@ def _own(problem: FieldProblem, h: float, t_end: float, base: Any, names: Sequen
 
 
 def runge_kutta(*names: str) -> Contender:
-    """Return EIP on RK4."""
+    """Return EIP on RK4 with these invariants; plain RK4 without any."""
     return Contender(lambda problem, h, t_end: _own(problem, h, t_end, lambda gpe: EIPRK4, names), stable_steps)
 
 
 def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Contender:
-    """Return EIP on another one-step method, or without `names` that method alone."""
+    """Return EIP on the one-step method `base(gpe)` with the invariants `names`; without names the plain method."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> Any:
         return _own(problem, h, t_end, lambda gpe: eip_method(base(gpe)), names)
@@ -88,7 +89,7 @@ def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Cont
 
 
 def implicit(scheme: Callable[..., Any]) -> Contender:
-    """Return one of the paper's schemes."""
+    """Return one of the paper's implicit schemes."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> tuple[np.ndarray, int, str]:
         result = scheme(problem.equation, (0.0, t_end), problem.y0, h)
@@ -111,7 +112,7 @@ METHODS = {
 
 
 def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
-    """Return a plane wave with bumps, and its state at the end by SciPy's DOP853 at its tightest tolerance."""
+    """Return the problem of a modulated plane wave, and its final state by SciPy's DOP853 at its tightest tolerance."""
     gpe = plane_wave((points, points), fft=make_transforms().name).equation
     assert gpe is not None
     x, y = gpe.grid.mesh()
@@ -123,7 +124,7 @@ def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
 
 
 class Trial:
-    """One problem with its runs, and the numbers that they give in addition to error and time.
+    """A problem with the results of its runs.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ class Trial:
         self._single: dict[str, float] = {}  # seconds of a single step, including set-up
 
     def runner(self, name: str) -> Callable[[float], tuple[float, np.ndarray]]:
-        """Return ``run(h)`` of a method, for `work_precision`."""
+        """Return ``run(h) -> (seconds, final state)`` of a method, for `work_precision`."""
         method = METHODS[name]
 
         def run(h: float) -> tuple[float, np.ndarray]:
@@ -159,7 +160,7 @@ class Trial:
         return run
 
     def errors(self, y: np.ndarray) -> dict[str, float]:
-        """Return errors at the end, those of mass and energy relative."""
+        """Return the errors of the final state, and the relative errors of mass and energy there."""
         gpe, (start, end) = self.problem.equation, y.T
         assert gpe is not None
         difference = end - self.exact
@@ -171,11 +172,11 @@ class Trial:
         }
 
     def methods(self) -> dict[str, tuple[Callable[[float], tuple[float, np.ndarray]], Sequence[float]]]:
-        """Return all runners with their steps."""
+        """Return `runner` and the steps of each method."""
         return {name: (self.runner(name), method.steps(self.problem)) for name, method in METHODS.items()}
 
     def measure(self, repeats: int, callback: Callable[[], Any]) -> None:
-        """Fill `rows`; `callback()` after each run."""
+        """Run all methods at all steps and fill `rows`; call `callback()` after each run."""
 
         def error(end: np.ndarray) -> float:
             return float(np.abs(end - self.exact).max())
@@ -185,18 +186,22 @@ class Trial:
             self.rows[point.method, point.step]["seconds"] = point.wall_time - self._single[point.method]
 
     def column(self, name: str, key: str) -> np.ndarray:
-        """Return a quantity of a method, by its steps."""
+        """Return the values of a quantity (a key of `rows`) for all steps of a method."""
         return np.array([row[key] for (method, _), row in self.rows.items() if method == name])
 
     def slope(self, name: str) -> float:
-        """Return the fitted order; nan without two clean errors, for example for a splitting on the plane wave."""
+        """Return the fitted order of a method.
+
+        It is nan if fewer than two errors lie between round-off and the largest that is fitted, for example for a
+        splitting on the plane wave, which is exact.
+        """
         h, error = self.column(name, "h"), self.column(name, "error_max")
         clean = np.flatnonzero((error > FIT_BETWEEN[0]) & (error < FIT_BETWEEN[1]))[-FITTED:]
         return float(np.polyfit(np.log(h[clean]), np.log(error[clean]), 1)[0]) if clean.size > 1 else float("nan")
 
 
 class Slope(NamedTuple):
-    """Expected and measured value of a slope or an invariant error."""
+    """Check of a slope or an invariant error: expected (`known`) and measured (`ours`) value, allowed difference."""
 
     wave: str
     quantity: str
@@ -222,7 +227,7 @@ class Efficiency(Study[Found]):
     points : int
         Number of points along each axis.
     repeats : int
-        Runs of each point; the least time counts.
+        Number of runs of each method and step; the least time counts.
     orders : mapping of str to int
         Expected slopes.
     stem : str
@@ -288,7 +293,7 @@ class Efficiency(Study[Found]):
         }
 
     def figures(self, found: Found) -> Figures:
-        """Draw error against step and against time, a row for each wave."""
+        """Draw error against step and against time, with a row of panels for each wave."""
         from ..plotting import CostPanel, cost_figure
 
         rows = []
@@ -311,10 +316,10 @@ class Efficiency(Study[Found]):
 
 @dataclass(frozen=True, kw_only=True)
 class AllRuns(Efficiency):
-    """``eip-scipy study gpe-efficiency``: the test on a grid of any size, with a table of all runs."""
+    """Command ``eip-scipy study gpe-efficiency``: the test on a grid of any size, with a table of all runs."""
 
-    points: int = option(64, "points of the grid along each axis (%(default)s)", type=int)
-    repeats: int = option(5, "runs of each (%(default)s)", type=int)
+    points: int = option(64, "points of the grid along each axis (default: %(default)s)", type=int)
+    repeats: int = option(5, "runs of each method and step (default: %(default)s)", type=int)
     stem: str = "gpe-efficiency"
 
     def text(self, found: Found) -> str:
@@ -326,7 +331,7 @@ def _number(value: float, form: str) -> str:
 
 
 def runs_text(trials: Found) -> str:
-    """Lay out all runs."""
+    """Lay out a table of all runs."""
     parts = []
     for wave, trial in trials.items():
         body = []

@@ -1,4 +1,4 @@
-"""``eip-scipy gpe vortex-lines``: the paper's condensate in three dimensions, rotated faster; its lines in time."""
+"""``eip-scipy gpe vortex-lines``: the paper's condensate in three dimensions after its rotation is made faster."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ ROOM = ((-4.0, 4.0), (-4.0, 4.0), (-6.0, 6.0))
 
 @dataclass(frozen=True, kw_only=True)
 class VortexLines(QuenchStudy):
-    """The command.
+    """Command ``eip-scipy gpe vortex-lines``.
 
-    The trap is round: the stationary state of the slower frame continues to rotate with it, and lags behind the faster
-    frame.
+    The trap is round. The stationary state at the slower rotation therefore continues to rotate at this rate, and lags
+    behind the frame that rotates faster.
 
     Attributes
     ----------
@@ -49,9 +49,10 @@ class VortexLines(QuenchStudy):
     saved : float
         Time between two saved states.
     energies_known : float
-        Accuracy of the energies of the start and below it.
+        Allowed error of the known energies, of the start (a saddle) and of the lower state.
     turn_known : float
-        rad: at the lines 0.1 of the distance between two points of the grid.
+        Allowed error of the angle of the lines [rad], which is 0.1 of the distance between two points of the grid
+        there.
     """
 
     points: int = LINE_POINTS
@@ -98,7 +99,7 @@ class VortexLines(QuenchStudy):
         ]
 
     def _turn_check(self, moved: Motion) -> FieldCheck:
-        """Return the angle by which the lines turn: the difference of the rotations times t."""
+        """Check the angle by which the lines turn, which should be the difference of the rotations times t."""
         slower = OMEGA_BEFORE - OMEGA_AFTER
         off = float(np.abs(moved.angle - slower * moved.t).max())
         return FieldCheck(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
@@ -133,7 +134,10 @@ def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[
 
 
 def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
-    """Return how far the reference ends from the closed form: the start, turned and with the phase of mu t."""
+    """Return a line that gives the distance of the reference's final state from the closed form.
+
+    The closed form is the start, turned and multiplied by exp(-i mu t).
+    """
     assert made.reference is not None
     start = made.quench.problem.y0
     mu, turn = before.chemical_potential(start), OMEGA_AFTER - OMEGA_BEFORE
@@ -154,7 +158,7 @@ def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
 
 
 def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
-    """Return the surface, and the sector of it that contains the followed line."""
+    """Return the surface of equal density, with the sector marked that contains the followed line."""
     from ..plotting import SurfacePanel
 
     surface = density_surface(made.quench.equation, _field(made, k), LEVEL)

@@ -26,25 +26,28 @@ FRAMES_PER_SECOND = 8
 
 @dataclass(frozen=True, kw_only=True)
 class Ring(QuenchStudy):
-    """The command.
+    """Command ``eip-scipy gpe ring``.
 
     The tightened ring contracts, keeps its angular momentum, and so turns faster than the frame: `sense` is 1.
 
     Attributes
     ----------
     condensate : callable
-        ``condensate(kappa, points)``: the equation.
+        ``condensate(kappa, points)`` returns the equation.
     kappas : (float, float)
-        Values before and after the quench.
+        Values of kappa before and after the quench, the sudden change of the trap at t = 0.
     saved : float
         Time between two saved states.
     """
 
     start: Path | None = option(
-        None, "ring.npz of ground-state; default: the state is searched first", type=Path, metavar="FILE"
+        None,
+        "ring.npz that `gpe ground-state` has written; default: the ground state is searched first",
+        type=Path,
+        metavar="FILE",
     )
     t_end: float = option(
-        1.0, "end of the run (%(default)s); 10 in the paper's figure of the errors", type=positive, metavar="T"
+        1.0, "end of the run (default: %(default)s); 10 in the paper's figure of the errors", type=positive, metavar="T"
     )
     movie: bool = option(False, "write ring.gif, too")
     condensate: Callable[[float, int], GrossPitaevskii] = ring_condensate
@@ -57,7 +60,7 @@ class Ring(QuenchStudy):
     sense: int = 1
 
     def check_settings(self) -> None:
-        """Raise an error if there is no step to take."""
+        """Raise an error if the run is shorter than a step of the reference."""
         if self.t_end < self.reference_step:
             least = f"{self.reference_step:g}, the reference's step"
             raise UsageError(f"--t-end: expected at least {least}, got {self.t_end:g}")
@@ -67,7 +70,10 @@ class Ring(QuenchStudy):
         return {"h": self.step, "t_end": self.t_end}
 
     def measure(self, session: Session) -> QuenchRuns:
-        """Do all runs, from the ground state: from a file, from the folder of the checkpoints, or computed."""
+        """Do all runs from the ground state.
+
+        It is read from the file `start` or from the folder of the checkpoints, or computed.
+        """
         before, after = (self.condensate(kappa, self.points) for kappa in self.kappas)
         if self.start is not None:
             start = load_state(self.start, before)
@@ -86,7 +92,7 @@ class Ring(QuenchStudy):
         return self.do_runs(quench, session)
 
     def pictures(self, found: QuenchRuns) -> Figures:
-        """Draw density and vortices at some times, and as a film."""
+        """Draw density and vortices at some times, and if asked for as a movie."""
         from ..plotting import fields_figure, fields_movie
 
         quench, fields, moved = found.quench, found.fields, found.moved
@@ -108,7 +114,7 @@ class Ring(QuenchStudy):
 
 
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
-    """Return one panel for each saved state, all of the size of the first one, which is the largest."""
+    """Return one panel for each saved state, all cropped as the first one, whose condensate is the largest."""
     from ..plotting import FieldPanel
 
     fields = np.abs(gpe.grid.field(y)) ** 2

@@ -1,4 +1,4 @@
-"""Condensates after a quench, for `gpe ring` and `gpe vortex-lines`: runs, errors, vortices in time, checks, files."""
+"""Condensates after a quench, a sudden change of their equation, for ``gpe ring`` and ``gpe vortex-lines``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SENSES = {1: "anticlockwise", -1: "clockwise"}
 
 
 class FieldCheck(NamedTuple):
-    """A condition, its value, and whether it holds."""
+    """A check: its condition in words, the measured value, and whether it holds."""
 
     what: str
     value: Any
@@ -49,12 +49,13 @@ class Quench:
         Name in its files.
     title : str
     problem : FieldProblem
-        Problem with the step of RK4, from the stationary state of the equation before the quench.
+        Problem after the quench, with the step of RK4. It starts from the stationary state before the quench.
     reference_step : float
-        Step of EIPDOP853, with which the others are compared.
+        Step of the reference, a run by EIPDOP853 with which the other runs are compared.
     interval : float
         Time between two saved states, short enough to follow the vortices.
     snapshots : tuple of float
+        Times at which fields are drawn and vortices are counted.
     sense : int
         Direction in which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
     energy_kept : float
@@ -84,11 +85,11 @@ class Quench:
 
     @property
     def t_end(self) -> float:
-        """Return the end of the run."""
+        """Return the time at which the run ends."""
         return self.problem.t_span[1]
 
     def shown(self, t: np.ndarray) -> list[int]:
-        """Return the indices of the saved times of the snapshots, as far as the run goes."""
+        """Return the indices in the saved times `t` of those snapshots that the run has reached."""
         return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
 
 
@@ -125,9 +126,9 @@ class QuenchRuns:
     quench : Quench
     lines : dict of str to FieldRun
     reference, fields : ndarray, shape (n, m), or None
-        States of the reference and of `SHOWN`.
+        States of the reference, and of the method `SHOWN`, whose fields are drawn.
     moved : Motion or None
-        The vortices of `SHOWN`.
+        The vortices in the run of `SHOWN`.
     more : list of FieldCheck
         Checks in addition to those of all quenches.
     notes : list of str
@@ -145,12 +146,13 @@ class QuenchRuns:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The vortices in time; in three dimensions those of the middle plane.
+    """The vortices in time; in three dimensions their positions in the middle plane.
 
     Attributes
     ----------
     t : ndarray, shape (m,)
     vortices : list of Vortices
+        One entry for each time.
     angle : ndarray, shape (m,)
         Mean angle by which they have turned about the centre, positive anticlockwise [rad].
     """
@@ -160,7 +162,7 @@ class Motion:
     angle: np.ndarray
 
     def off(self, k: int, x: Any, y: Any) -> Any:
-        """Return the polar angles of points (x, y) relative to a reference vortex in the k-th state, in (-pi, pi].
+        """Return polar angles of points (x, y) relative to that of a reference vortex in the k-th state, in (-pi, pi].
 
         The reference is the vortex with the largest x at the start, turned by the mean angle of all vortices.
         """
@@ -207,7 +209,10 @@ def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
 
 
 def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
-    """Follow the vortices: each is extrapolated, then matched with the nearest one in the next state; medians count.
+    """Find the vortices in all states, and the angle by which they have turned.
+
+    From one state to the next, each vortex is extrapolated and matched with the nearest one; the median of the turns
+    counts.
 
     Parameters
     ----------
@@ -229,7 +234,10 @@ def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
 
 
 def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
-    """Return the median of the turns from each old angle, `guess` added, to the nearest new one."""
+    """Return the median turn of vortices from angles `old` to `new`.
+
+    Each old angle plus `guess` is matched with the nearest new one.
+    """
     if not (old.size and new.size):
         return guess
     difference = np.angle(np.exp(1j * (new[None, :] - old[:, None] - guess)))
@@ -293,7 +301,7 @@ def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
 
 
 def _value(value: Any) -> str:
-    """Format a check's number: an error shortly, other numbers with the digits in which they are compared."""
+    """Format the value of a check: errors with few digits, other numbers with those in which they are compared."""
     if isinstance(value, float):
         return compact(value, 3) if abs(value) < SMALL else f"{value:.6g}"
     return str(value)
@@ -310,9 +318,9 @@ def _radius(found: Vortices) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class QuenchStudy(Checkpoints, Study[QuenchRuns]):
-    """Common part of the commands on quenches."""
+    """Base class of the commands on quenches."""
 
-    seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
+    seed: int = option(0, "seed of the random starts (default: %(default)s)", type=int, metavar="N")
 
     def do_runs(self, quench: Quench, session: Session) -> QuenchRuns:
         """Run the reference and each of `METHODS`; an interrupt by the user keeps the completed runs.

@@ -64,15 +64,16 @@ Ends = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A stationary state and its origin.
+    """A stationary state, and the start from which it was found.
 
     Attributes
     ----------
     label : str
-        Distinguishing property of its start.
+        Property that distinguishes its start, for the table.
     equation : GrossPitaevskii
     state : GroundState
     published : float or None
+        Published energy.
     """
 
     label: str
@@ -82,12 +83,12 @@ class Found:
 
     @property
     def count(self) -> int:
-        """Return the number of vortices, in three dimensions in the middle plane."""
+        """Return the number of vortices; in three dimensions of those in the middle plane."""
         return len(vortices(self.equation, self.state.psi).charges)
 
 
 def trap(settings: GroundStates, update: Update) -> list[Found]:
-    """Return the lowest of several states for each rotation."""
+    """Return, for each angular velocity in a harmonic trap, the state of lowest energy from several starts."""
     grid = Grid((settings.trap_points, settings.trap_points), -10.0, 10.0)
     found = []
     for Omega, published in settings.published.items():
@@ -102,7 +103,7 @@ def trap(settings: GroundStates, update: Update) -> list[Found]:
 
 
 def ring(settings: GroundStates, update: Update) -> list[Found]:
-    """Return the paper's ring."""
+    """Return the ground state of the paper's ring, as a list of one."""
     return [search_ring(settings.seed, update)]
 
 
@@ -134,7 +135,10 @@ def lines(settings: GroundStates, update: Update) -> list[Found]:
 
 
 def search_saddle(points: int, update: Update) -> Found:
-    """Return the paper's state with four lines, a saddle: the descent keeps the square symmetry of the start."""
+    """Return the paper's state with four lines.
+
+    It is a saddle of the energy, which the descent reaches because it keeps the square symmetry of the start.
+    """
     update(f"lines, {SADDLE_LINES} imprinted without noise")
     gpe = line_condensate(points=points)
     start = imprint(gpe, polygon(SADDLE_LINES, LINES_RADIUS))
@@ -142,7 +146,7 @@ def search_saddle(points: int, update: Update) -> Found:
 
 
 def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
-    """Continue the descent from a state with a little noise: from a saddle it leads to a lower state."""
+    """Add a little noise to a saddle and continue the descent, which then leads to a lower state."""
     update("lines, down from the saddle")
     start = with_noise(saddle, np.random.default_rng(seed))
     state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
@@ -160,7 +164,7 @@ Results = dict[str, list[Found]]
 
 
 class KnownState(NamedTuple):
-    """Known value of a number of a state, and ours."""
+    """Check of a number of a state: its known value, and the one that was found (`ours`)."""
 
     quantity: str
     known: float
@@ -170,13 +174,13 @@ class KnownState(NamedTuple):
 
     @property
     def record(self) -> dict[str, Any]:
-        """Return the entry of the JSON."""
+        """Return the entry for the JSON file."""
         known = {"quantity": self.quantity, "known": self.known, "ours": self.ours}
         return {**known, "matched": self.passed, "note": self.note}
 
     @property
     def line(self) -> str:
-        """Return one line of the text."""
+        """Return the check as a line of text."""
         note = f" ({self.note})" if self.note else ""
         verdict = "ok" if self.passed else "FAILED"
         return f"{verdict:<6} {self.quantity} {self.known:.10g}, ours {self.ours:.10g}{note}"
@@ -194,11 +198,13 @@ def _count(text: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class GroundStates(Study[Results]):
-    """The command."""
+    """Command ``eip-scipy gpe ground-state``."""
 
     scene: Sequence[str] | None = some_of("scene", SCENES)
-    starts: int = option(4, "starts for each rotation in the trap (%(default)s)", type=_count, metavar="N")
-    seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
+    starts: int = option(
+        4, "starts for each angular velocity in the trap (default: %(default)s)", type=_count, metavar="N"
+    )
+    seed: int = option(0, "seed of the random starts (default: %(default)s)", type=int, metavar="N")
     scenes: Mapping[str, Scene] = field(default_factory=lambda: SCENES)
     published: Mapping[float, float] = field(default_factory=lambda: PUBLISHED)
     trap_points: int = 128
@@ -293,7 +299,10 @@ def _rows(results: Results) -> Rows:
 
 
 def panels(name: str, found: list[Found]) -> dict[str, Any]:
-    """Return densities to draw: one panel for each state; lines in the plane z = 0, the lowest also in x = 0."""
+    """Return the densities to draw, one panel for each state.
+
+    States with vortex lines are shown in the plane z = 0, the lowest one also in x = 0.
+    """
     from ..plotting import FieldPanel
 
     out = {}
@@ -322,7 +331,10 @@ def _counted(count: int, kind: str) -> str:
 def cropped(
     density: np.ndarray, grid: Grid, axes: tuple[int, int], half: float | None = None
 ) -> tuple[np.ndarray, Ends]:
-    """Return the middle of a plane, by default with little of the empty space around the condensate, and its ends."""
+    """Cut the middle out of a density in a plane; return it with its ends along both axes.
+
+    It reaches to `half` on all sides; by default it contains the condensate and a margin.
+    """
     if half is None:
         seen = (np.any(density > VISIBLE * density.max(), axis=1 - k) for k in (0, 1))
         half = MARGIN * max(float(np.abs(grid.points(a)[there]).max()) for a, there in zip(axes, seen, strict=True))
@@ -358,7 +370,7 @@ def _save(item: Found, path: Path) -> None:
 
 @contextmanager
 def searching(session: Session) -> Iterator[Update]:
-    """Show the subject and the time of a search; yield the function that takes these words."""
+    """Show the subject of a search and the elapsed time; yield the function that sets the subject."""
     with session.bar(None, "", bar_format="{desc} [{elapsed}]") as bar:
         yield bar.set_description_str
 
@@ -366,7 +378,7 @@ def searching(session: Session) -> Iterator[Update]:
 def kept_state(
     settings: Checkpoints, session: Session, gpe: GrossPitaevskii, search: Callable[[Update], Found]
 ) -> np.ndarray:
-    """Return the initial field: with ``--resume`` the one next to the checkpoints, else the one that `search` finds.
+    """Return the initial field: with ``--resume`` the one in the folder of the checkpoints, else that of `search`.
 
     Parameters
     ----------
@@ -374,7 +386,7 @@ def kept_state(
     session : Session
     gpe : GrossPitaevskii
     search : callable
-        ``search(update)``.
+        ``search(update)`` returns the state; `update` takes the words to be shown.
 
     Returns
     -------
@@ -391,7 +403,7 @@ def kept_state(
 
 
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
-    """Read the field of a state of `save_state`, which must belong to `gpe`.
+    """Read the field of a state that `save_state` has written, which must belong to `gpe`.
 
     Raises
     ------
@@ -412,7 +424,9 @@ def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
     }
     for name, value in expected.items():
         if np.shape(value) != content[name].shape or not np.allclose(value, content[name], rtol=1e-12):
-            raise UsageError(f"{str(path)!r} holds a state of another equation: its {name} differs from {gpe!r}")
+            raise UsageError(
+                f"{str(path)!r} holds a state of another equation: its {name} differs from that of {gpe!r}"
+            )
     psi = content["psi"]
     if psi.shape != gpe.grid.shape or psi.dtype.kind != "c" or not np.isfinite(psi).all():
         raise UsageError(f"{str(path)!r}: psi must be a finite complex field of shape {gpe.grid.shape}")

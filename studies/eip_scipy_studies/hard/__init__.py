@@ -1,1 +1,1 @@
-"""``hard-cases`` and ``hard-scenes``."""
+"""The commands ``eip-scipy hard-cases`` and ``eip-scipy hard-scenes``."""

@@ -60,12 +60,12 @@ class CaseOutcome:
     Attributes
     ----------
     error : float
-        Relative error of the final state; nan for a run that did not get there.
+        Relative error of the final state; nan for a run that did not reach the end.
     drift : float
         Largest relative change of an invariant.
     steps, nfev : int
     failure : str
-        Why it did not reach its end; empty if it did.
+        Reason why the run did not reach its end; empty if it did.
     rank_reduced, rejected_projections : int
         Steps with parallel gradients, and projections that failed.
     """
@@ -139,7 +139,7 @@ def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | No
     Returns
     -------
     CaseOutcome
-        Also for a run that raised an error, which is its failure.
+        A run that raises an error is returned as well, with the error as its `failure`.
     """
     problem, record = case.problem, Diagnostics()
     options: dict[str, Any] = {} if metric is None else {"invariants": problem.invariants, "metric": metric}
@@ -179,7 +179,9 @@ def compare(
     metric: str,
     callback: Callable[[], Any] = lambda: None,
 ) -> list[Comparison]:
-    """Run cases with and without projection, and cases with a larger error also at neighbouring tolerances.
+    """Run cases with and without projection.
+
+    A case whose error the projection increases is also run at neighbouring tolerances and in the euclidean metric.
 
     Parameters
     ----------
@@ -213,7 +215,7 @@ def geometric_mean(values: Iterable[float]) -> float:
 
 
 def summary(results: Sequence[Comparison]) -> dict[str, Any]:
-    """Compute the numbers for which the bounds are set."""
+    """Compute the numbers that `bars` compares with bounds."""
     worst = min(results, key=lambda r: r.gain if r.gain == r.gain else -math.inf)
     drifts = [r.projected.drift for r in results]
     return {
@@ -264,14 +266,18 @@ def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -
     if method in WORST_GAIN:
         at_most = 1 / WORST_GAIN[method]
         found.append(
-            Check(f"no error more than {at_most:g} times the plain one: {_times(worst)}", worst >= WORST_GAIN[method])
+            Check(
+                f"no error more than {at_most:g} times that without projection: {_times(worst)}",
+                worst >= WORST_GAIN[method],
+            )
         )
     if method in LARGEST_ERROR:
         limit = LARGEST_ERROR[method]
         above = [r.case.name for r in results if r.plain.error < limit and not r.projected.error <= limit]
         found.append(
             Check(
-                f"no error above {compact(limit, 1)} where the plain one is below it: {', '.join(above) or 'none'}",
+                f"no error above {compact(limit, 1)} where that without projection is below it: "
+                f"{', '.join(above) or 'none'}",
                 not above,
             )
         )
@@ -279,7 +285,7 @@ def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -
 
 
 def _times(gain: float) -> str:
-    """Format a gain in words: "2.7 times worse", "310 times better"."""
+    """Format a gain (error without projection by error with it) as "2.7 times worse" or "310 times better"."""
     if not math.isfinite(gain):
         return "-"
     factor, word = (gain, "better") if gain >= 1 else (1 / gain, "worse")
@@ -369,13 +375,13 @@ def rows(results: Sequence[Comparison]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, kw_only=True)
 class HardCases(Study[list[Comparison]]):
-    """The command."""
+    """Command ``eip-scipy hard-cases``."""
 
-    method: str = option("EIPRK45", "the method (%(default)s)", choices=list(adaptive_methods()))
+    method: str = option("EIPRK45", "the adaptive method (default: %(default)s)", choices=list(adaptive_methods()))
     rtol: float | None = option(
-        None, "relative tolerance (1e-9 for EIPDOP853, else 1e-6); atol is a thousandth of it", type=_tolerance
+        None, "relative tolerance (default: 1e-9 for EIPDOP853, else 1e-6); atol is 0.001 of it", type=_tolerance
     )
-    metric: str = option("error", "metric of the projection (%(default)s)", choices=METRICS)
+    metric: str = option("error", "metric of the projection (default: %(default)s)", choices=METRICS)
     cases: Sequence[HardCase] = field(default_factory=hard_cases)
 
     @property

@@ -1,6 +1,7 @@
 """The hard problems run by several methods: errors against stored states or a closed form, evaluations, time.
 
-This module prints and writes nothing. REBOUND is passed as a module, or None, so that no extra is needed.
+This module prints and writes nothing. The integration of REBOUND is passed as a module, or None, so that the extra is
+optional.
 """
 
 from __future__ import annotations
@@ -50,8 +51,9 @@ class Spread:
     Attributes
     ----------
     tolerances : tuple of float
+        Relative tolerances of the adaptive methods.
     steps_per_turn : tuple of int
-        Steps per turn in fictitious time.
+        Steps per turn of the orbit in fictitious time (see `time_transformed`).
     epsilons : mapping of str to tuple of float
         Tolerances of IAS15, by its step criterion.
     repeats : int
@@ -74,7 +76,7 @@ class HardScene:
     name, title : str
     problem : Problem
     g : callable
-        Value of a unit of fictitious time, see `time_transformed`.
+        Time per unit of fictitious time, as a function of the state; see `time_transformed`.
     steps : tuple of int
         Numbers of fixed steps in the whole run, for EIPRKN12.
     level : float
@@ -98,7 +100,7 @@ class HardScene:
 
     @property
     def dimensions(self) -> int:
-        """Return the coordinates of a body."""
+        """Return the number of coordinates of a body, 2 or 3."""
         return int(self.problem.blocks)
 
     def error(self, y: np.ndarray) -> float:
@@ -119,7 +121,10 @@ class HardScene:
         return energy, momentum
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return G m and the state for REBOUND, which has no fixed centre: Kepler's bodies are two equal masses."""
+        """Return G m and the initial state for REBOUND.
+
+        REBOUND has no fixed centre, so that Kepler's problem becomes one of two equal masses.
+        """
         problem = self.problem
         if self.dimensions == 3:
             assert problem.params is not None
@@ -128,7 +133,7 @@ class HardScene:
         return np.array([0.5, 0.5]), np.stack([relative / 2, -relative / 2], axis=1).ravel()
 
     def from_bodies(self, y: np.ndarray) -> np.ndarray:
-        """Return states of those bodies, in columns, as states of the problem."""
+        """Return states of the bodies of `bodies`, in columns, as states of the problem."""
         if self.dimensions == 3:
             return y
         q1, q2, v1, v2 = y.reshape(4, 3, -1)
@@ -187,7 +192,7 @@ class Outcome(NamedTuple):
     nfev : int
     wall_time : float
     failure : str
-        Why it did not reach its end; empty if it did.
+        Reason why the run did not reach its end; empty if it did.
     """
 
     y: np.ndarray
@@ -202,11 +207,12 @@ class Contender(NamedTuple):
     Attributes
     ----------
     setting : str
-        Kind of the settings: "rtol", "h", "ds" or "epsilon".
+        Name of the setting: "rtol", "h", "ds" (a step of fictitious time) or "epsilon" (of IAS15).
     settings : tuple of float
-        From coarse to fine.
+        Values of the setting, from coarse to fine.
     run : callable
-        ``run(setting, look) -> Outcome``; with ``look`` the states of all steps are saved, and the time is meaningless.
+        ``run(setting, look) -> Outcome``; if `look` is true, the states of all steps are saved, and the time is
+        meaningless.
     """
 
     setting: str
@@ -226,7 +232,7 @@ class Point(NamedTuple):
     wall_time : float
         Seconds, the least of several runs.
     error : float
-        Largest distance of a body from its true position at the end; nan for a run that failed.
+        Largest distance of a body from its true position at the end; nan if the run failed.
     energy_error, momentum_error : float
         Largest error along the run, see `HardScene.invariant_errors`.
     failure : str
@@ -245,7 +251,7 @@ class Point(NamedTuple):
 
 
 def methods(of: HardScene, spread: Spread, rebound: Any = None) -> dict[str, Contender]:
-    """Set up the methods for a problem.
+    """Return the methods for a problem, by their names.
 
     Parameters
     ----------
@@ -287,7 +293,7 @@ def measure(
     spread : Spread
     rebound : module, optional
     callback : callable, optional
-        ``callback()`` after each of the repeats of each point, those left out included.
+        ``callback()`` after each of the ``repeats`` runs of each point, including those that are left out.
 
     Returns
     -------

@@ -19,7 +19,7 @@ Results = dict[str, tuple[HardScene, list[Point]]]
 
 
 class Found(NamedTuple):
-    """The points by their problems, and the machine."""
+    """Results (`Point`) of all methods by problem, and the description of the machine."""
 
     results: Results
     machine: str
@@ -39,7 +39,7 @@ def _failures(failures: list[str]) -> list[str]:
 
 
 def _costs(results: Results) -> list[str]:
-    """Return the cost of each method at each problem's error level, evaluations and time."""
+    """Lay out what each method costs, in evaluations and time, at the error level of each problem."""
     scenes = [of for of, _ in results.values()]
     names = list(dict.fromkeys(p.method for _, points in results.values() for p in points))
     lines = []
@@ -59,7 +59,7 @@ def _costs(results: Results) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class HardScenes(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy hard-scenes``."""
 
     scene: Sequence[str] | None = some_of("scene", SCENES)
     spread: Spread = field(default_factory=Spread)

@@ -1,1 +1,1 @@
-"""``work-precision``, and Kepler's problem among the paper's figures."""
+"""The commands ``eip-scipy work-precision`` and ``reproduce fig-kepler``: Kepler's problem."""

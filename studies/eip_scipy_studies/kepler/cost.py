@@ -56,7 +56,10 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class KeplerCost(Study[Found]):
-    """The command: several steps and tolerances, each timed `repeats` times; the least time counts."""
+    """Command ``eip-scipy work-precision``.
+
+    Each method is timed `repeats` times at each of its steps or tolerances; the least time counts.
+    """
 
     t_end: float = 200.0
     repeats: int = 5

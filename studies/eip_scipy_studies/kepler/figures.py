@@ -50,7 +50,7 @@ class KeplerRun:
     t : ndarray, shape (m,)
     y : ndarray, shape (4, m)
     energy_error, momentum_error, position_error : ndarray, shape (m,)
-        Absolute errors, the last against the reference.
+        Absolute errors; that of the position is the distance from the reference.
     """
 
     t: np.ndarray
@@ -61,7 +61,7 @@ class KeplerRun:
 
 
 class KnownValue(NamedTuple):
-    """Error that is known to two digits, and ours."""
+    """Check of an error: the value that is known to two digits, and the measured one (`ours`)."""
 
     method: str
     quantity: str
@@ -70,12 +70,12 @@ class KnownValue(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Return whether the digits agree."""
+        """Return whether the measured value agrees with the known one to two digits."""
         return compact(self.ours) == self.known
 
     @property
     def line(self) -> str:
-        """One line of the text."""
+        """Return the check as a line of text."""
         verdict = "ok" if self.passed else "FAILED"
         return f"{verdict:<6} {self.method}, {self.quantity}: {compact(self.ours)}, known {compact(float(self.known))}"
 
@@ -85,9 +85,10 @@ Found = dict[str, KeplerRun]
 
 @dataclass(frozen=True, kw_only=True)
 class KeplerFigures(Study[Found]):
-    """``reproduce fig-kepler``: the methods of both figures in the paper's setting, by the names in the figures.
+    """Command ``reproduce fig-kepler``: the methods of the paper's figures 1 and 2, in the paper's setting.
 
-    The reference is EIPDOP853 with 1/6 of the step, compensated; with 1/3 it differs by 1e-11 at t = 2000.
+    The reference is EIPDOP853 with 1/6 of the step and compensated sums; with 1/3 of the step it differs by 1e-11 at
+    t = 2000.
     """
 
     t_end: float = 2000.0

@@ -1,1 +1,1 @@
-"""Measurements behind the numbers of the documentation, a module for each."""
+"""Measurements of the numbers in the documentation; most modules are one command ``eip-scipy study NAME``."""

@@ -54,10 +54,11 @@ MOST_TIMES, MOST_UNWARNED, LEAST_GAIN = 1.5, 3.0, 100.0
 
 
 class Case(NamedTuple):
-    """A system in one rotation: a run of it, its sets of balances, and which floats of the state are compared.
+    """A system in one rotation of the axes: a function that runs it, its sets of balances, and its settings.
 
-    `steps` are h, or rtol and atol; `finer` is how many steps of the reference there are in one step (or rtol over
-    that of the reference). The error is the largest one of the vectors at `places`.
+    `steps` are the options h, or rtol and atol. `finer` is the number of steps of the reference in one step, or the
+    ratio of the tolerances. The error is the largest length of an error vector; `places` are the parts of the state
+    that are these vectors.
     """
 
     run: Callable[..., Any]
@@ -68,7 +69,13 @@ class Case(NamedTuple):
 
 
 class System(NamedTuple):
-    """A system: how to make a case, the unit of its error and which bars apply to it."""
+    """A system, and the conditions (bars) that its results must fulfil.
+
+    ``make(rotation, number)`` returns a `Case`, and `unit` is the unit of the error. `helps`: balances must not
+    increase the error more than `MOST_TIMES`; otherwise a run with more than `MOST_UNWARNED` times the error must come
+    with a warning. `gains`: the error must be `LEAST_GAIN` times smaller. `drawn` is the label of the error in the
+    figure, if it is drawn. `times` converts errors to `unit`.
+    """
 
     make: Callable[[np.ndarray, int], Case]
     unit: str
@@ -210,7 +217,7 @@ def bodies(
 
 
 def asteroid(turned: np.ndarray, turn: int) -> Case:
-    """Return an asteroid with a = 3.7 AU and e = 0.1 inside of Jupiter, for 2000 years (281 revolutions)."""
+    """Return an asteroid inside the orbit of Jupiter, a = 3.7 AU and e = 0.1, for 2000 years (281 revolutions)."""
     sun, gm = 4 * math.pi**2, np.array([4 * math.pi**2, 4 * math.pi**2 / 1047.35, 0.0])
     q = np.array([[0, 0, 0], [0, 5.2 * 0.95, 0], [3.7 * 0.9, 0, 0]])
     speeds = math.sqrt((sun + gm[1]) / 5.2 * 1.05 / 0.95), math.sqrt(sun / 3.7 * 1.1 / 0.9)
@@ -349,7 +356,7 @@ VARYING = ParticleField(
 
 
 def held(turned: np.ndarray, turn: int) -> Case:
-    """Some 400 gyrations, from several directions of the velocity."""
+    """Return a charged particle over some 400 gyrations, which starts in several directions of the velocity."""
     start = [0.5, 0, 0], [0.3 * math.sin(turn), 0.3 * math.cos(turn), 0]
     made = {
         name: charged_particle(VARYING, *start, t_span=(0, 2000), form="velocity", balances=name)
@@ -489,17 +496,17 @@ SYSTEMS = {
 
 
 def runner(**start: Any) -> Callable[..., Any]:
-    """Return ``run(**options)``, which integrates from a start."""
+    """Return ``run(**options)``, which calls `integrate` by EIPDOP853 with the arguments `start` and these options."""
     return lambda **options: integrate(method=EIPDOP853, **start, **options)
 
 
 def of(problem: Any, method: Any = EIPDOP853) -> Callable[..., Any]:
-    """Return ``run(**options)``, which integrates a problem."""
+    """Return ``run(**options)``, which calls `integrate` for a problem with these options."""
     return lambda **options: integrate(problem, method=method, **options)
 
 
 class Row(NamedTuple):
-    """Errors of one set of balances in one rotation, and the warnings of the run."""
+    """Errors without and with one set of balances (`kept`) in one rotation, and the warnings of the run."""
 
     system: str
     kept: str
@@ -515,14 +522,14 @@ class Row(NamedTuple):
 
 
 class Found(NamedTuple):
-    """All rows, and the curves of the figure: times, errors without and errors with balances, by system."""
+    """All rows, and for each system of the figure its times, errors without balances and errors with balances."""
 
     rows: list[Row]
     curves: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def finer_steps(case: Case, share: float = 1.0) -> dict[str, Any]:
-    """Return the options of a reference, or of a run with a multiple of its step."""
+    """Return the options of the reference, or of a run with `share` times the steps or tolerances of the reference."""
     exact = {"invariants": (), "compensated": True}
     if "h" in case.steps:
         return {**exact, "h": case.steps["h"] * share / case.finer}
@@ -530,12 +537,12 @@ def finer_steps(case: Case, share: float = 1.0) -> dict[str, Any]:
 
 
 def distance(case: Case, a: np.ndarray, b: np.ndarray) -> Any:
-    """Return the largest error of the vectors at `places`."""
+    """Return the largest distance between `a` and `b` among the vectors at `places` of the state."""
     return np.max([np.linalg.norm((a - b)[part], axis=0) for part in case.places], axis=0)
 
 
 def measured(name: str, system: System, turned: np.ndarray, turn: int) -> list[Row]:
-    """Return one row for each set of balances."""
+    """Run a system without and with balances, and return one row for each set of balances."""
     case = system.make(turned, turn)
     right = case.run(**finer_steps(case)).y[:, -1]
     of_reference = distance(case, case.run(**finer_steps(case, 2.0)).y[:, -1], right)
@@ -573,9 +580,11 @@ def curve(system: System, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 @dataclass(frozen=True, kw_only=True)
 class Balances(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy study balances``."""
 
-    rotations: int = option(6, "rotations of the axes, phases or starts (%(default)s)", type=int)
+    rotations: int = option(
+        6, "number of rotations of the axes, phases or starts of each system (default: %(default)s)", type=int
+    )
     system: Sequence[str] | None = some_of("system", SYSTEMS)
 
     def measure(self, session: Session) -> Found:
@@ -658,7 +667,7 @@ def summary(rows: list[Row]) -> dict[str, float]:
 
 
 def bars(groups: Mapping[tuple[str, str], list[Row]]) -> list[str]:
-    """Return the conditions that do not hold: too small a gain, a larger error, or one without a warning."""
+    """Return a line for each condition that does not hold: too small a gain, a larger error, or no warning about it."""
     lines = []
     for (name, kept), rows in groups.items():
         system, one = SYSTEMS[name], summary(rows)

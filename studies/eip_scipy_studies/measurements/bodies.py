@@ -41,7 +41,7 @@ Found = dict[int, dict[str, Any]]
 
 @dataclass(frozen=True)
 class Row:
-    """An integrator: steps in a period, milliseconds for a step and for a period, and its error."""
+    """Results of an integrator: steps per innermost period, milliseconds for a step and for a period, and its error."""
 
     steps: float
     step: float
@@ -64,11 +64,12 @@ def system(bodies: int, periods: float) -> Problem:
 
 @dataclass(frozen=True, kw_only=True)
 class Bodies(Measurement[Found]):
-    """The command."""
+    """Command ``eip-scipy study bodies``."""
 
     periods: int = option(
         5,
-        "length of the runs in innermost periods from 300 bodies on, 300 / N times as many with fewer (%(default)s)",
+        "length of the runs in innermost periods, for N >= 300 bodies; 300 / N times as many for fewer (default: "
+        "%(default)s)",
         type=int,
         metavar="N",
     )
@@ -115,7 +116,7 @@ def _compare(n: int, periods: int, rebound: Any) -> dict[str, Any]:
 
 
 def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict[str, Row], dict[str, float]]:
-    """Return the rows, and the shares of the projection."""
+    """Return the rows of this package, and the shares of the time that the projection takes."""
     coarse, h = f"EIPRKN12, {COARSE} steps", PERIOD / COARSE
     shared, alone = problem.y0.size >= 6 * SHARED, working_alone()
     actions = {"EIPRKN12": alone(partial(_seconds, problem))}
@@ -132,7 +133,10 @@ def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict
 
 
 def _shares(problem: Problem) -> dict[str, float]:
-    """Return the shares of the projection, from processor times: other programs do not change these."""
+    """Return the shares of the time that the projection takes.
+
+    They are computed from processor times, which other programs hardly change.
+    """
     cases: dict[str, dict[str, Any]] = {
         "every=10": {"every": 10},
         "every=1": {"every": 1},

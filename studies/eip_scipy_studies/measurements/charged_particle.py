@@ -1,8 +1,9 @@
 """``eip-scipy study charged-particle``: speed of the compiled step, and error against cost, for charged particles.
 
 1. Time of a step in the tokamak: plain RK4, EIP-HL with both metrics and with wider spacings, Boris, implicit midpoint;
-   and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp: 5000). Runs in turn,
-   the least time of each, without the time before the first step; the ratios are taken within one process.
+   and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp: 5000). Runs take
+   turns, and the least time of each counts, without the time before the first step. Ratios are those within one
+   process.
 2. Error against cost in the uniform field and on both orbits of the tokamak: error of position and of the guiding
    centre (averaged over a gyration) at the end of the paper's interval, EIP methods and the same without projection in
    the canonical form, Boris and heyoka (if installed) in the form (x, v).
@@ -43,7 +44,7 @@ ROUNDS = 5
 
 
 def speed(turns: int, share: float) -> dict[str, float]:
-    """Return microseconds per step of the banana orbit; `share`: of the steps."""
+    """Return microseconds per step on the banana orbit, from `share` of the steps, for each method."""
     problem, other = tokamak(), tokamak(form="velocity")
     h, rhs = problem.h, problem.rhs
     assert h is not None
@@ -104,7 +105,11 @@ class Point(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One method at one setting: seconds of a run without saving, and the states (t, y), with the last gyrations."""
+    """One method at one setting.
+
+    ``seconds()`` times a run that saves no states; ``states()`` returns saved times and states, which include the last
+    gyrations.
+    """
 
     method: str
     setting: float
@@ -114,7 +119,10 @@ class Case(NamedTuple):
 
 
 def cases(problem: ParticleProblem, other: ParticleProblem, with_heyoka: bool) -> Iterator[Case]:
-    """Return all methods and settings: steps in units of the paper's, or tolerances. `other` has the states (x, v)."""
+    """Yield all methods and settings, which are steps in units of the paper's step, or tolerances.
+
+    `other` is the same problem with states (x, v).
+    """
     fine, wide, wider = (1.0, 0.5, 0.25, 0.125), (2.0, 1.0, 0.5, 0.25), (4.0, 2.0, 1.0, 0.5)
     for name, method, factors in (("RK4", EIPRK4, fine), ("RK45", EIPRK45, wide), ("DOP853", EIPDOP853, wider)):
         for factor in factors:
@@ -191,7 +199,7 @@ def tail_times(problem: ParticleProblem) -> np.ndarray:
 
 
 def costs(name: str, repeats: int, share: float, with_heyoka: bool) -> list[Point]:
-    """Run all methods on a share of one problem's interval, in turn; the least time of several turns counts."""
+    """Run all methods in turn on a share of one problem's interval; the least time of `repeats` turns counts."""
     problem, other = (shortened(scene(name, form=form), share) for form in ("canonical", "velocity"))
     assert problem.h is not None
     # The reference has 1/4 of the paper's step, compensated: it is 1e-9 from the states stored with the problem.
@@ -207,7 +215,7 @@ def costs(name: str, repeats: int, share: float, with_heyoka: bool) -> list[Poin
 
 
 def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
-    """Return a share of the interval, a whole number of the longest steps."""
+    """Return the problem over a share of its interval, which is a whole number of the longest steps."""
     assert problem.h is not None
     if share == 1:
         return problem
@@ -236,10 +244,10 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ParticleCost(Measurement[Found]):
-    """The command."""
+    """Command ``eip-scipy study charged-particle``."""
 
     writes_files = True
-    repeats: int = option(3, "runs of each (%(default)s)", type=int)
+    repeats: int = option(3, "runs of each method at each setting (default: %(default)s)", type=int)
     quick: bool = option(False, "a hundredth of the steps, each run once")
 
     def measure(self, session: Session) -> Found:

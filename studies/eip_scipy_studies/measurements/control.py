@@ -51,12 +51,15 @@ CHANGED = [*CONTROLS][1:]
 
 
 def floats(a: np.ndarray) -> np.ndarray:
-    """Return numbers as floats, real and imaginary parts next to each other."""
+    """Return real or complex numbers as floats; real and imaginary parts become neighbours."""
     return np.ascontiguousarray(a).view(float)
 
 
 def correction(change: np.ndarray, G: np.ndarray, weights: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """Return the least move in the metric of the weights that changes the invariants by `change`."""
+    """Return the shortest correction, in the metric of the weights, that changes the invariants by `change`.
+
+    `G` are the gradients as rows of floats, and `like` is a state.
+    """
     sigma = np.repeat(weights / weights.max(), G.shape[1] // like.size)
     sizes = np.maximum(np.linalg.norm(G * sigma, axis=1), 1e-290)
     x = np.linalg.lstsq(G * sigma / sizes[:, None], change / sizes, rcond=np.sqrt(EPS))[0]
@@ -64,7 +67,10 @@ def correction(change: np.ndarray, G: np.ndarray, weights: np.ndarray, like: np.
 
 
 class Projected:
-    """The projected step of a method with another step control, as a `OneStepMethod` without invariants."""
+    """The projected step of a method with another step control, in the form of a `OneStepMethod`.
+
+    It projects by itself, so that runs with it have no invariants.
+    """
 
     def __init__(self, case: HardCase, method: type[EIPSolver], rtol: float, control: str) -> None:
         pair: Any = method.TABLEAU
@@ -98,7 +104,7 @@ class Projected:
         self.ends[y_new.tobytes()] = memory, K[-1]
 
         def norm(weights: Any) -> float:
-            """SciPy's norm of what a projection with these weights leaves of the estimate."""
+            """Return SciPy's norm of the estimate after a projection with these weights; None: without a projection."""
             left = [e if weights is None else e - correction(G @ floats(e), G, weights, y) for e in (err, low)]
             fine, coarse = (((abs(e) / scale) ** 2).sum() for e in left)
             return float(fine / np.sqrt((fine + 0.01 * coarse) * y.size or 1.0))
@@ -123,7 +129,7 @@ def run_one(case: HardCase, name: str, exponent: float, control: str) -> dict[st
 
 
 def relative_cost(found: Sequence[dict[str, Any]], control: str) -> float:
-    """Return the calls of a control relative to those of the package's at the same errors."""
+    """Return the calls of f of a control relative to those of the package's control, as a mean over equal errors."""
     runs = [[row for row in found if row["control"] == x and row["error"] < LARGEST] for x in ("before", control)]
     curves = [([row["nfev"] for row in rows], [row["error"] for row in rows]) for rows in runs]
     if not all(runs):
@@ -147,7 +153,7 @@ def lines(found: Sequence[dict[str, Any]], method: str) -> Iterator[tuple[str, l
 
 @dataclass(frozen=True, kw_only=True)
 class Control(Measurement[list[dict[str, Any]]]):
-    """The command."""
+    """Command ``eip-scipy study control``."""
 
     method: Sequence[str] | None = some_of("method", METHODS)
     case: Sequence[str] | None = some_of("case", NAMES)

@@ -1,7 +1,7 @@
 """``eip-scipy study ensembles``: cost of a member of an ensemble, and the gain from more cores and workers.
 
-Kepler's problem with H and L, EIPRK4, fixed step. Everything that is compared runs in turns, and the least times count.
-Next to the wall time is the processor time of the same work, which other load on the machine hardly affects.
+Kepler's problem with H and L, EIPRK4, fixed step. Runs that are compared take turns, and the least times count. Next to
+the wall time is the processor time of the same work, which other load on the machine hardly affects.
 
 1. One thread against the loop of single runs that are already set up (their `wall_time`), per step.
 2. Two threads against one; two Dask workers on the loopback interface against one.
@@ -61,7 +61,7 @@ def seconds(members: int, steps: int, executor: Any) -> float:
 
 
 def single(members: int, steps: int) -> float:
-    """Return the time of as many single runs, without the time before their steps."""
+    """Return the total time of `members` single runs, without the time before their steps."""
     problem, y0s = kepler(), starts(members)
     return sum(integrate(problem, (0.0, steps * H), y0, method=EIPRK4, h=H, check=False).wall_time for y0 in y0s)
 
@@ -69,7 +69,10 @@ def single(members: int, steps: int) -> float:
 def in_turns(
     actions: Mapping[str, tuple[Callable[[], float], Callable[[], float]]], repeats: int
 ) -> dict[str, dict[str, float]]:
-    """Return least wall and processor times; an action is a clock of its workers' processor time, and a timed call."""
+    """Return the least wall and processor times of each action.
+
+    An action is a pair: a clock of the processor time of its workers, and a function that returns the seconds it took.
+    """
     found = {name: {"wall": np.inf, "processor": np.inf} for name in actions}
     for _ in range(repeats):
         for name, (clock, action) in actions.items():
@@ -81,7 +84,7 @@ def in_turns(
 
 
 def threads(members: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Compare single runs, one thread and two."""
+    """Measure single runs, an ensemble on one thread, and one on two threads."""
     ways = {
         "single runs, loop only": lambda: single(members, steps),
         "one thread": lambda: seconds(members, steps, 1),
@@ -91,7 +94,7 @@ def threads(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
 
 
 def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Compare one worker of Dask and two."""
+    """Measure an ensemble on one worker of Dask, and on two."""
     local_client = needed("eip_scipy.integrations.dask").local_client
     clients = {"one Dask worker": local_client(1), "two Dask workers": local_client(2)}
     try:
@@ -109,7 +112,10 @@ def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
 
 
 def memory(members: int) -> dict[str, float]:
-    """Return megabytes of a process: of the states, its peak, and the peak without imports and starts."""
+    """Return the memory of a process that runs an ensemble: megabytes of all states, of its peak, and of the run alone.
+
+    The last number is the peak less the memory after the imports and the making of the starts.
+    """
     code = MEMORY.format(members=members, h=H)
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     base, peak = (int(text) * PEAK_UNIT / 2**20 for text in printed.split())
@@ -118,14 +124,16 @@ def memory(members: int) -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Ensembles(Measurement[dict[str, Any]]):
-    """The command."""
+    """Command ``eip-scipy study ensembles``."""
 
     writes_files = True
-    members: int = option(10_000, "members of the whole job (%(default)s)", type=int)
-    steps: int = option(10_000, "steps of each (%(default)s)", type=int)
-    repeats: int = option(5, "runs of what is compared (%(default)s)", type=int)
-    largest: int = option(1_000_000, "largest number of members (%(default)s)", type=int)
-    curve_steps: int = option(200, "steps of each member where their number grows (%(default)s)", type=int)
+    members: int = option(10_000, "members of the whole job on all cores (default: %(default)s)", type=int)
+    steps: int = option(10_000, "steps of each of these members (default: %(default)s)", type=int)
+    repeats: int = option(5, "number of times that each comparison is repeated (default: %(default)s)", type=int)
+    largest: int = option(
+        1_000_000, "largest number of members in the curve of time against members (default: %(default)s)", type=int
+    )
+    curve_steps: int = option(200, "steps of each member in this curve (default: %(default)s)", type=int)
 
     def measure(self, session: Session) -> dict[str, Any]:
         seconds(16, self.steps, None)  # compile before the measurement

@@ -2,9 +2,9 @@
 
 A resonant chain (seven planets with the periods, masses and transits of TRAPPIST-1's, on circles at the start), a
 planet of eccentricity 0.6 with one further out, and a hot Jupiter with two companions under the relativistic potential
-in 1/r^2, which is REBOUNDx's `gr_potential` there. Errors of position [AU], of the innermost planet and the
-largest of another one's, against heyoka in 80-bit arithmetic, run anew each time; wall times are the least of three in
-turns, one core. ``pip install reboundx heyoka``.
+in 1/r^2, which REBOUNDx has as `gr_potential`. Errors of position [AU], of the innermost planet and the largest of the
+others, are those against heyoka in 80-bit arithmetic, which is run each time. Wall times are the least of three runs,
+which take turns on one core. ``pip install reboundx heyoka``.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def planets(
 ) -> Problem:
     """Return bodies on ellipses about a star of the given mass [solar masses], in the frame of their barycentre.
 
-    `elements`: mass [solar masses], semi-major axis [AU], eccentricity, inclination, argument of the pericentre, mean
-    anomaly [rad].
+    `elements` of each planet: mass [solar masses], semi-major axis [AU], eccentricity, inclination, argument of the
+    pericentre and mean anomaly [rad].
     """
     gm, q, v = [GM_SUN * star], [np.zeros(3)], [np.zeros(3)]
     for mass, axis, e, tilt, turn, mean in elements:
@@ -73,7 +73,7 @@ def planets(
 
 
 def chain(share: float) -> System:
-    """Return a system of seven planets with period ratios near 8:5, 5:3, 3:2, 3:2, 4:3, 3:2; `share` of 6 years."""
+    """Return seven planets with period ratios near 8:5, 5:3, 3:2, 3:2, 4:3, 3:2, for `share` times 6 years."""
     star = 0.0898
     days = np.array([1.510826, 2.421937, 4.049219, 6.101013, 9.207540, 12.352446, 18.772866])
     transits = np.array([7.55044, 8.58728, 7.06768, 7.82771, 7.07426, 7.71462, -0.39324])
@@ -86,14 +86,14 @@ def chain(share: float) -> System:
 
 
 def eccentric(share: float) -> System:
-    """Return a system of two planets, one at 0.5 AU with eccentricity 0.6, the other at 5 AU; `share` of 300 years."""
+    """Return two planets, one at 0.5 AU with eccentricity 0.6, the other at 5 AU, for `share` times 300 years."""
     elements = [(1e-3, 0.5, 0.6, 0.1, 0.3, 1.0), (2e-3, 5.0, 0.1, 0.0, 2.0, 4.0)]
     problem = planets(1.0, elements, 300.0 * share)
     return System(problem, 0.5**1.5, False, (240, 280, 320, 400), (32, 40, 50, 64), (30, 60, 120, 240, 480))
 
 
 def hot_jupiter(share: float) -> System:
-    """Return a system of three planets with relativity, the innermost at 0.04 AU; `share` of 10 years."""
+    """Return three planets with relativity, the innermost at 0.04 AU, for `share` times 10 years."""
     elements = [
         (1e-3, 0.04, 0.02, 0.0, 1.0, 0.0), (3e-5, 0.09, 0.01, 0.02, 2.0, 2.0), (3e-3, 1.4, 0.1, 0.05, 0.0, 4.0),
     ]  # fmt: skip
@@ -121,9 +121,9 @@ def methods(system: System) -> Methods:
 
 @dataclass(frozen=True, kw_only=True)
 class Exoplanets(Measurement[dict[str, dict[str, Row]]]):
-    """The command."""
+    """Command ``eip-scipy study exoplanets``."""
 
-    share: float = option(1.0, "share of the spans (%(default)s)", type=float)
+    share: float = option(1.0, "part of the full time spans that is run (default: %(default)s)", type=float)
 
     def measure(self, session: Session) -> dict[str, dict[str, Row]]:
         needed("reboundx", "reboundx")

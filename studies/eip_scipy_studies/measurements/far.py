@@ -1,8 +1,8 @@
 """``eip-scipy study far``: ten bodies over 100 000 years, longer than any reference, by methods of several kinds.
 
-The numbers are the distances of the runs from one of them with twice the steps. Two methods that share only the
-balances and reach the same positions are the evidence. The packaged reference, which ends after 10 000 years, gives the
-error of that run.
+The numbers are the distances of the runs from the finest one, which has twice the number of steps. The evidence for its
+accuracy is that two methods that share only the balances reach the same positions. Up to 10 000 years its error is
+known from the packaged reference.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Far(Measurement[Found]):
-    """The command."""
+    """Command ``eip-scipy study far``."""
 
-    years: float = option(100_000.0, "length of the runs (%(default)s)", type=float)
-    ias15: bool = option(False, "IAS15 too, which takes minutes")
+    years: float = option(100_000.0, "length of the runs in Julian years (default: %(default)s)", type=float)
+    ias15: bool = option(False, "also run IAS15, which takes minutes")
 
     def measure(self, session: Session) -> Found:
         needed("eip_scipy.integrations.rebound")  # checked before runs that take minutes

@@ -1,8 +1,8 @@
 """``eip-scipy study gpe``: cost of the rotating Gross-Pitaevskii equation compared with transforms and plain RK4.
 
-Processor time, the least of several; functions that are compared are called in turn, so that other load on the machine
-affects all equally. One thread. "transforms" are a library's alone, a pair along each axis: x, and then the other axes
-together.
+Times are processor times on one thread, the least of several. Functions that are compared are called in turn, so that
+other load on the machine affects all equally. "transforms" are the Fourier transforms of a library alone: a pair along
+x, and a pair along the other axes together.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def equation(shape: Shape, fft: str) -> tuple[GrossPitaevskii, np.ndarray]:
 
 
 def right_hand_side(shape: Shape, seconds: float) -> Times:
-    """Return least times [ms] of f and of its transforms, by each library."""
+    """Return the least times [ms] of f and of its transforms alone, for each library of transforms."""
     functions = {}
     for fft in (name for name in LIBRARIES if find_spec(name) is not None):
         gpe, psi = equation(shape, fft)
@@ -96,11 +96,11 @@ def named(shape: Shape) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class EquationCost(Measurement[dict[str, dict[Shape, Times]]]):
-    """The command."""
+    """Command ``eip-scipy study gpe``."""
 
     writes_files = True
-    seconds: float = option(6.0, "time for each row of the table (%(default)s)", type=float)
-    quick: bool = option(False, "the smallest grids only, a few turns")
+    seconds: float = option(6.0, "seconds of measurement for each row of the table (default: %(default)s)", type=float)
+    quick: bool = option(False, "measure the smallest grids only, a few times")
 
     def measure(self, session: Session) -> dict[str, dict[Shape, Times]]:
         shapes, stepped, seconds = (*FLAT, *FULL), STEPPED, self.seconds
@@ -147,7 +147,7 @@ class EquationCost(Measurement[dict[str, dict[Shape, Times]]]):
         }
 
     def figures(self, found: dict[str, dict[Shape, Times]]) -> Figures:
-        """Draw the cost of f against the number of points, with N log N."""
+        """Draw the cost of f against the number N of points, and a curve of N log N."""
         from eip_scipy.plotting import method_styles
 
         from ..plotting import blank_figure

@@ -35,15 +35,17 @@ SPLITTING_STEPS = (2.5e-3, 2e-3, 1.6e-3, 1.25e-3, 1e-3)
 
 
 def grid_error(gpe, turning, resting):
-    """Return the norm of the difference of the two frames' solutions, which is caused by the grid."""
+    """Return the norm of the difference between the solutions in both frames, which the grid causes."""
     angle = gpe.Omega * turning[0].t_span[1]
     return float(np.sqrt(gpe.mass(rotated(gpe, resting[1], angle).ravel() - turning[1])))
 
 
 def runners(psi, t_end, points):
-    """Return (run, steps) of each method, invariant errors by (method, h), the grid's error, and the error of a state.
+    """Return the methods, and what is needed to judge their results.
 
-    ``run(h) -> (seconds, y)``, where y is the difference from the reference of its frame.
+    These are (run, steps) of each method; the invariant errors by (method, h), which runs fill in; the error of the
+    grid; and a function that returns the norm of a difference. ``run(h) -> (seconds, y)``, where y is the difference of
+    the final state from the reference in the same frame.
     """
     gpe = ring_condensate(0.7, points=points)
     problem = gpe.problem(psi, t_end)
@@ -81,7 +83,7 @@ def runners(psi, t_end, points):
 
 
 class Found(NamedTuple):
-    """Points, the changes of mass and energy by method and step, and the difference that the grid causes."""
+    """Results of all methods and steps, changes of mass and energy by (method, h), and the error of the grid."""
 
     points: tuple[WorkPoint, ...]
     defects: dict[tuple[str, float], tuple[float, float]]
@@ -90,13 +92,15 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BaseMethods(Measurement[Found]):
-    """The command."""
+    """Command ``eip-scipy study gpe-methods``."""
 
     writes_files = True
-    t_end: float = option(0.2, "end of the runs (%(default)s)", type=float)
-    points: int = option(256, "points of the grid along each axis (%(default)s)", type=int)
-    only: Sequence[str] | None = option(None, "methods, by the names of the table", nargs="+", metavar="NAME")
-    repeats: int = option(3, "runs of each (%(default)s)", type=int)
+    t_end: float = option(0.2, "end of the runs (default: %(default)s)", type=float)
+    points: int = option(256, "points of the grid along each axis (default: %(default)s)", type=int)
+    only: Sequence[str] | None = option(
+        None, "methods to run, by their names in the table (default: all)", nargs="+", metavar="NAME"
+    )
+    repeats: int = option(3, "runs of each method and step (default: %(default)s)", type=int)
 
     def measure(self, session: Session) -> Found:
         gpe = ring_condensate(0.3, points=self.points)

@@ -62,7 +62,10 @@ def start(gpe):
 
 
 class Case:
-    """Return the equation on the first ranks, or on a single one without MPI if their number is 0."""
+    """The equation on the first `ranks` ranks, or, if `ranks` is 0, on a single one without MPI.
+
+    On the other ranks `here` is False, and there is nothing else.
+    """
 
     def __init__(self, shape, ranks):
         self.here = world().rank < max(ranks, 1)
@@ -86,7 +89,7 @@ class Case:
         return method(self.gpe.fun, 0.0, self.psi, 1e3, h=h, invariants=invariants, metric="euclidean")
 
     def measure(self):
-        """Return seconds of f, of a step without invariants and of one that keeps both."""
+        """Return the least seconds of f, of a step without invariants, and of one that keeps mass and energy."""
         functions = [lambda: self.gpe.rhs(0.0, self.psi, self.out), *(solver.step for solver in self.solvers)]
         return np.array([min(timed(function, self.comm) for _ in range(IN_A_ROW)) for function in functions])
 
@@ -101,7 +104,7 @@ class Case:
 
 
 def counts():
-    """Return 0 (no MPI), 1, 2, 4, ... and the number of all ranks."""
+    """Return the numbers of ranks to measure: 0 (without MPI), 1, 2, 4, ... and all of them."""
     return sorted({0, *(2**k for k in range(world().size.bit_length()) if 2**k <= world().size), world().size})
 
 
@@ -131,9 +134,9 @@ def compare(shape, seconds):
 
 @dataclass(frozen=True, kw_only=True)
 class RanksCost(Measurement[dict[str, dict[int, list[float]]]]):
-    """The command."""
+    """Command ``eip-scipy study gpe-mpi``."""
 
-    quick: bool = option(False, "small grids, a second each")
+    quick: bool = option(False, "measure small grids, a second each")
 
     def measure(self, session: Session) -> dict[str, dict[int, list[float]]]:
         shapes, seconds = (QUICK_SHAPES, 1.0) if self.quick else (SHAPES, SECONDS)

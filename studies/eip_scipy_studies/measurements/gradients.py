@@ -1,7 +1,8 @@
 """``eip-scipy study gradients``: cost of a compiled gradient compared with one written by hand.
 
-Each system runs by `integrate` with hand-written jitted gradients and without any, in turn; the ratio is that of the
-least times. The hand-written ones share common terms within a function, as their author would write them.
+Each system runs by `integrate` in turn with hand-written jitted gradients and without any, so that they are compiled
+from the invariants. The ratio is that of the least times. The hand-written gradients compute common terms once, as an
+author would write them.
 """
 
 from __future__ import annotations
@@ -169,9 +170,11 @@ def seconds(name: str, written: bool) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Gradients(Measurement[dict[str, dict[str, float]]]):
-    """The command."""
+    """Command ``eip-scipy study gradients``."""
 
-    repeats: int = option(7, "runs of each (%(default)s)", type=int, metavar="N")
+    repeats: int = option(
+        7, "runs of each system with each kind of gradient (default: %(default)s)", type=int, metavar="N"
+    )
 
     def measure(self, session: Session) -> dict[str, dict[str, float]]:
         kinds = {"by hand": True, "compiled": False}

@@ -4,8 +4,9 @@ Ten bodies from DE440, Newtonian, by EIPGJ14, EIPRKN12, IAS15 and WHFast, agains
 reference states. An error of longitude that comes from round-off alone grows as t^(3/2) (Brouwer 1937), one from a
 drift of the energy as t^2, one of a method that keeps the energy's error bounded as t.
 
-Each run is one draw of its rounding errors. EIPGJ14 with balances is therefore run in all six orders of the coordinate
-axes too, which change the rounding of the steps, but, unlike rotations, no bit of the start and of the references.
+Each run is one sample of its rounding errors. EIPGJ14 with balances is therefore also run in all six orders of the
+coordinate axes, which change the rounding of the steps, but, unlike rotations, no bit of the start and of the
+references.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def slope(times: np.ndarray, errors: np.ndarray) -> float:
 
 
 def spread(values: np.ndarray) -> list[str]:
-    """Return the median and the range as cells of a table."""
+    """Return the median and the range of values as cells of a table."""
     digits = ".1e" if np.max(values) < 0.01 else ".2f"
     return [f"{np.median(values):{digits}}", f"{np.min(values):{digits}} ... {np.max(values):{digits}}"]
 
@@ -59,7 +60,8 @@ def spread(values: np.ndarray) -> list[str]:
 class Found(NamedTuple):
     """Times, and for each method the seconds of the run and the errors (m, 10) of the bodies [AU].
 
-    `orders` has, for each number of steps a year, the errors (6, m, 10) of EIPGJ14 with balances in all orders of axes.
+    `orders` has, for each number of steps per year, the errors (6, m, 10) of EIPGJ14 with balances in the six orders of
+    the axes.
     """
 
     times: np.ndarray
@@ -85,10 +87,10 @@ def in_orders(problem: Problem, times: np.ndarray, truth: np.ndarray, steps: int
 
 @dataclass(frozen=True, kw_only=True)
 class Growth(Measurement[Found]):
-    """The command."""
+    """Command ``eip-scipy study growth``."""
 
     writes_files = True
-    years: float = option(10_000.0, "length of the runs (%(default)s)", type=float)
+    years: float = option(10_000.0, "length of the runs in Julian years (default: %(default)s)", type=float)
 
     def measure(self, session: Session) -> Found:
         needed("eip_scipy.integrations.rebound")  # checked before runs that take minutes

@@ -1,8 +1,9 @@
 """``eip-scipy study import-time``: duration of imports, compared with `scipy.integrate` and Numba.
 
-Each import runs in a fresh process, all in turn, so that a drifting speed of the machine does not decide; processor
-time minus that of an empty process in the same round. The first round is not counted: it writes the bytecode. The
-median over the rounds, and that of the ratio to `import scipy.integrate` in the same round.
+Each import runs in a fresh process. A round runs all of them in turn, so that a drifting speed of the machine affects
+all. A time is the processor time minus that of an empty process in the same round. The first round, which writes the
+bytecode, is not counted. The table has the median over the rounds of the time, and of its ratio to that of `import
+scipy.integrate` in the same round.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ IMPORTS = (
 
 
 def seconds(code: str) -> float:
-    """Return the processor time of a fresh process."""
+    """Return the processor time of a fresh process that runs `code`."""
     writing = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     before = os.times()
     subprocess.run([sys.executable, "-c", code], check=True, env=writing)
@@ -40,9 +41,9 @@ def seconds(code: str) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportTime(Measurement[dict[str, dict[str, float]]]):
-    """The command."""
+    """Command ``eip-scipy study import-time``."""
 
-    rounds: int = option(7, "rounds of fresh processes (%(default)s)", type=int, metavar="N")
+    rounds: int = option(7, "rounds of fresh processes (default: %(default)s)", type=int, metavar="N")
 
     def measure(self, session: Session) -> dict[str, dict[str, float]]:
         times: dict[str, list[float]] = {code: [] for code in IMPORTS}

@@ -44,16 +44,16 @@ PEERS = (
 
 @dataclass(frozen=True, kw_only=True)
 class LongOrbits(Measurement[list[TimedRun]]):
-    """The command."""
+    """Command ``eip-scipy study long-orbits``."""
 
-    years: float = option(1000.0, "length of the runs (%(default)s)", type=float)
+    years: float = option(1000.0, "length of the runs in Julian years (default: %(default)s)", type=float)
 
     def measure(self, session: Session) -> list[TimedRun]:
         problem = solar_system(years=self.years)
         assert problem.reference is not None
         truth = problem.reference(self.years)
         if truth is None:
-            raise UsageError(f"there is no reference state at {self.years:g} yr")
+            raise UsageError(f"there is no stored reference state at {self.years:g} years; choose another --years")
         methods: Methods = {
             f"h = {h:.5g} yr, {name}": (by_us(problem, EIPRKN12, **options), [h])
             for h in STEPS

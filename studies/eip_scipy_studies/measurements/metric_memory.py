@@ -1,14 +1,14 @@
 """``eip-scipy study metric-memory``: the projection's metric on problems whose error estimates mislead it.
 
-Cut-off problems, at fixed steps: forces with kinks or jumps (discs with a truncated Lennard-Jones force, backlash,
-soft walls, Hertz contacts, Huber springs), three steps by four methods each, the energy kept. SI units: charged
+There are three groups. Cut-off: forces with kinks or jumps (discs with a truncated Lennard-Jones force, backlash, soft
+walls, Hertz contacts, Huber springs) with the energy kept, three fixed steps by four methods each. SI units: charged
 particles whose momenta are near 1e-24. Mechanisms: constraints on positions and velocities, adaptive steps, with and
 without the energy.
 
-Each run is compared with the same run without projection. A run has failed when its status is -1, is accused when it is
-not trusted, and is worse when its final error exceeds three times that of the unprojected run and a tolerance of 1e-9.
-Errors are relative to the reference's largest component. For the discs, which are chaotic, the command also counts how
-often this happens by chance.
+Each run is compared with the same run without projection. A run is "failed" if its status is -1, "accused" if it is
+reported as not reliable (`trusted` is false), and "worse" if its final error exceeds three times that of the
+unprojected run and a tolerance of 1e-9. Errors are relative to the reference's largest component. For the discs, which
+are chaotic, the command also counts how often this happens by chance.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ADAPTIVE = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 
 @dataclass
 class Case:
-    """A problem with its invariants, and the steps or tolerances that it is run with."""
+    """A problem with its invariants, and the steps or tolerances with which it is run."""
 
     group: str
     name: str
@@ -54,7 +54,7 @@ class Case:
 
     @cached_property
     def reference(self) -> np.ndarray:
-        """Return the state at the end, by DOP853 at tight tolerances unless it is known."""
+        """Return the exact state at the end: the known one, or that by DOP853 at tight tolerances."""
         if self.known is not None:
             return self.known
         run = integrate(
@@ -70,7 +70,7 @@ class Case:
 
 @dataclass
 class Outcome:
-    """One run and the same run without invariants."""
+    """Results of one run, and the error of the same run without invariants."""
 
     case: str
     group: str
@@ -94,7 +94,7 @@ class Outcome:
 
 
 def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Outcome]:
-    """Yield all runs of a problem; `plain` stores the unprojected errors."""
+    """Run a problem by all methods and steps, and yield the results; `plain` stores the errors of unprojected runs."""
     for method in case.methods:
         for step in case.steps:
             control = {"h": step} if step >= 1e-3 or case.group == "SI units" else {"rtol": step, "atol": step}
@@ -121,7 +121,10 @@ def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Ou
 
 
 def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """Return the field of (q, v) with unit masses, and its energy v^2/2 + U(q); `slope(q, out)` is grad U."""
+    """Return the right-hand side of (q, v) with unit masses, and its energy v^2/2 + U(q).
+
+    ``force(q, out)`` fills in the force, ``energy(q)`` returns U, and ``slope(q, out)`` fills in grad U.
+    """
 
     @njit
     def fun(t, y, out):
@@ -147,7 +150,7 @@ def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invari
 
 
 def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """Return field and energy of (q, v) from U and grad U."""
+    """Return right-hand side and energy of (q, v) from U and grad U, as `second_order`, where the force is -grad U."""
 
     @njit
     def force(q, out):
@@ -159,7 +162,7 @@ def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
 
 
 def discs(seed: int, cut: float = 2.5) -> Case:
-    """Nine discs with a truncated Lennard-Jones force, in free space with walls of a soft box."""
+    """Return nine discs with a truncated Lennard-Jones force, in a box with soft walls."""
     shift = 4 * (cut**-12 - cut**-6)
 
     @njit
@@ -199,7 +202,7 @@ def discs(seed: int, cut: float = 2.5) -> Case:
 
 
 def backlash(stiffness: float, start: float, speed: float) -> Case:
-    """One body on a spring with a dead zone of half width 0.5."""
+    """Return one body on a spring with a dead zone of half width 0.5."""
 
     @njit
     def energy(q):
@@ -217,7 +220,7 @@ def backlash(stiffness: float, start: float, speed: float) -> Case:
 
 
 def gear(stiffness: float) -> Case:
-    """Two bodies that turn against each other with play, one of them on a soft spring."""
+    """Return two bodies that turn against each other with play, one of them on a soft spring."""
 
     @njit
     def energy(q):
@@ -238,7 +241,7 @@ def gear(stiffness: float) -> Case:
 
 
 def wall(stiffness: float, power: int, speed: float) -> Case:
-    """Free flight between soft walls at -1 and 1."""
+    """Return a body that flies freely between soft walls at -1 and 1."""
 
     @njit
     def energy(q):
@@ -256,7 +259,7 @@ def wall(stiffness: float, power: int, speed: float) -> Case:
 
 
 def round_wall(power: int) -> Case:
-    """Free flight inside a round soft wall in the plane; energy and angular momentum."""
+    """Return a body that flies freely inside a round soft wall in the plane; energy and angular momentum are kept."""
 
     @njit
     def energy(q):
@@ -331,7 +334,7 @@ def beads(count: int) -> Case:
 
 
 def huber(width: float, bodies: int) -> Case:
-    """Springs whose force is constant beyond `width`: one body, or a chain between walls."""
+    """Return springs whose force is constant beyond `width`: one body, or a chain between walls."""
 
     @njit
     def well(d):
@@ -437,7 +440,7 @@ def trap(name: str, exponent: int) -> Case:
 def constrained(
     mass: Callable[..., Any], forces: Callable[..., Any], jacobian: Callable[..., Any], bias: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Return the field of (q, u), q' = u, with M u' + G^T l = F and G u' = -bias."""
+    """Return the right-hand side of (q, u), q' = u, with M u' + G^T l = F and G u' = -bias."""
 
     def fun(t: float, y: np.ndarray) -> np.ndarray:
         n = y.size // 2
@@ -455,7 +458,7 @@ def constrained(
 def levels(
     constraints: Callable[..., Any], jacobian: Callable[..., Any], rates: Callable[..., Any], count: int
 ) -> tuple[Invariant, ...]:
-    """Return the constraints on positions and on velocities; rates(q, u) is the derivative of G u by q."""
+    """Return constraints on positions and velocities as invariants; ``rates(q, u)`` is the derivative of G u by q."""
 
     def places(t: float, y: np.ndarray) -> np.ndarray:
         return constraints(y[: y.size // 2])
@@ -479,7 +482,7 @@ def levels(
 
 
 def pendulum(links: int) -> tuple[Case, Case]:
-    """Return a chain of rods without mass in Cartesian coordinates, lengths kept; with and without the energy."""
+    """Return a chain of massless rods in Cartesian coordinates as two cases: with and without the energy kept."""
     n = 2 * links
 
     def differences(q: np.ndarray) -> np.ndarray:
@@ -527,7 +530,10 @@ def _with_energy(
 
 
 def knife_edge() -> tuple[Case, Case]:
-    """Return a knife edge on an inclined plane (Chaplygin's sleigh at its centre): x, y, angle; non-holonomic."""
+    """Return a knife edge on an inclined plane, (x, y, angle), with a non-holonomic constraint, as two cases.
+
+    It is Chaplygin's sleigh with the edge at its centre.
+    """
 
     def jacobian(q: np.ndarray) -> np.ndarray:
         return np.array([[-np.sin(q[2]), np.cos(q[2]), 0.0]])
@@ -695,7 +701,7 @@ DISC = 1.0, 1.0, 9.81, 0.25, 0.5  # mass, radius, gravity, moments of inertia ab
 
 
 def disc_mechanics() -> tuple[Callable[..., Any], ...]:
-    """Return the mass matrix, forces, constraints' matrix and its change for `disc`, as functions of (q[, u])."""
+    """Return, for `disc`, functions of (q[, u]): mass matrix, forces, matrix of the constraints, and its rate."""
     mass, radius, gravity, flat, axial = DISC
 
     # q = (x, y, a, b, c) of the point of contact's track; velocity of the centre: that of (x, y, radius sin b).
@@ -745,7 +751,10 @@ def disc_mechanics() -> tuple[Callable[..., Any], ...]:
 
 
 def disc() -> tuple[Case, Case]:
-    """A thin disc that rolls without slipping, wobbling: x, y, heading, lean, spin; two non-holonomic constraints."""
+    """Return a thin disc that wobbles and rolls without slipping, as two cases.
+
+    Its coordinates are x, y, heading, lean and spin; rolling is two non-holonomic constraints.
+    """
     mass, radius, gravity, flat, axial = DISC
     matrix, forces, jacobian, rates = disc_mechanics()
 
@@ -781,7 +790,7 @@ def disc() -> tuple[Case, Case]:
 
 
 def cut_off() -> Iterator[Case]:
-    """Problems whose forces have kinks or jumps."""
+    """Yield the problems whose forces have kinks or jumps."""
     for seed in range(3):
         yield discs(seed)
     yield discs(3, 2 ** (1 / 6))
@@ -826,7 +835,7 @@ def mean_ratio(found: Iterable[Outcome]) -> float:
 
 
 def row(name: str, found: list[Outcome]) -> tuple[str, list[str]]:
-    """Return a row of the table."""
+    """Return a row of the table: a label and the cells for these runs."""
     failed, accused, worse = (sum(getattr(one, what) for one in found) for what in ("failed", "accused", "worse"))
     worst = max((one.ratio for one in found if not one.failed and one.error > TOLERANCE), default=np.nan)
     counts = [str(len(found)), str(failed), str(accused), str(worse)]
@@ -851,7 +860,7 @@ def scatter(chosen: Iterable[Case]) -> str:
 
 
 class Found(NamedTuple):
-    """All runs, and how often those of the discs differ by chance."""
+    """All runs, and a text that says how often those of the discs differ by chance."""
 
     runs: list[Outcome]
     chance: str
@@ -859,11 +868,11 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class MetricMemory(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy study metric-memory``."""
 
     writes_files = False
-    only: str = option("", "problems whose group or name contains this", metavar="TEXT")
-    metric: str = option("error", "metric of the projection (%(default)s)", choices=("error", "euclidean"))
+    only: str = option("", "run only problems whose group or name contains TEXT", metavar="TEXT")
+    metric: str = option("error", "metric of the projection (default: %(default)s)", choices=("error", "euclidean"))
 
     def measure(self, session: Session) -> Found:
         chosen = [case for case in cases() if self.only in f"{case.group} {case.name}"]

@@ -1,7 +1,7 @@
 """``eip-scipy study metric-table``: effect of the projection's metric on the solar system.
 
-RK4, h = 0.002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; they differ in the
-planet that is changed for it. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged
+RK4, h = 0.002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; the rows differ in
+the planets that the corrections move. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged
 reference states after 100 and 2000 years. Then the gain of Mercury's position over plain RK4 in random rotations of the
 axes, with blocks of 3 and without.
 """
@@ -47,7 +47,10 @@ def turn(angle: np.ndarray) -> np.ndarray:
 
 
 def reference_longitudes(near: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return longitudes of the reference state, with turns counted by a run `near` it (all errors below pi)."""
+    """Return longitudes of the reference state, plus the whole turns that a nearby run has made.
+
+    `near` are the longitudes of that run, whose errors must be below pi.
+    """
     last = longitudes(near)[:, -1]
     return last + turn(longitudes(reference[:, None])[:, 0] - last)
 
@@ -58,7 +61,7 @@ def position_errors(y: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def momentum_weights(masses: np.ndarray) -> np.ndarray:
-    """Return weights in (q, v) of the euclidean metric in (q, p)."""
+    """Return the weights in (q, v) that correspond to the euclidean metric in (q, p)."""
     return np.concatenate([np.ones(30), np.repeat(1 / masses, 3)])
 
 
@@ -88,7 +91,10 @@ def metric_rows(years: float) -> dict[str, np.ndarray]:
 
 
 def rotation_gains(rotations: int, seed: int = 1) -> list[dict[str, float]]:
-    """Return Mercury's position error after 100 years, plain RK4's over EIP's, in random orientations of the axes."""
+    """Return, for random orientations of the axes, the error of Mercury's position by plain RK4 over that by EIP.
+
+    The runs end after 100 years.
+    """
     data = load("de440")
     scale = 365.25
     out = []
@@ -116,13 +122,13 @@ def rotation_gains(rotations: int, seed: int = 1) -> list[dict[str, float]]:
 
 @dataclass(frozen=True, kw_only=True)
 class MetricTable(Study[dict[str, Any]]):
-    """The command."""
+    """Command ``eip-scipy study metric-table``."""
 
     writes_files = False
     years: Sequence[float] = option(
-        (100.0, 2000.0), "lengths of the runs", type=float, nargs="+", choices=(100.0, 1000.0, 2000.0)
+        (100.0, 2000.0), "lengths of the runs in Julian years", type=float, nargs="+", choices=(100.0, 1000.0, 2000.0)
     )
-    rotations: int = option(5, "random rotations of the axes (%(default)s)", type=int)
+    rotations: int = option(5, "number of random rotations of the axes (default: %(default)s)", type=int)
 
     def measure(self, session: Session) -> dict[str, Any]:
         found: dict[str, Any] = {f"{years:g} years": metric_rows(years) for years in self.years}

@@ -1,13 +1,14 @@
 """``eip-scipy study multistep``: EIPGJ14 and EIPGJ12, one evaluation a step, against EIPRKN12 and other packages.
 
-1. Ten bodies, Newton, 1000 years: each run once in each of six rotations of the axes, in turns. Errors of position [AU]
-   against the packaged reference state: Mercury's, the least and the largest over the rotations, and the largest of
-   another planet. The ratios below the table are of least times.
+1. Ten bodies, Newton, 1000 years: each method runs once in each of six rotations of the axes, in turns. Errors of
+   position [AU] against the packaged reference state: Mercury's, the least and the largest over the rotations, and the
+   largest of another planet. The ratios below the table are those of the least times.
 2. The same over 10 000 years (IAS15 once), against the packaged states.
-3. Kepler's problem with e = 0.6 and the relativistic term to t = 600, compared with heyoka, which is compiled before.
+3. Kepler's problem with e = 0.6 and the relativistic term to t = 600, compared with heyoka, without its compilation.
 4. EIPRKN12 over 100 years with steps of 0.02 yr, with and without projection, in the same rotations.
 
-One core without other load: ratios of times are the result. Parts 1, 2 and 4 need REBOUND, part 3 heyoka.
+All runs use one core, which must have no other load, since ratios of times are the result. Parts 1, 2 and 4 need
+REBOUND, part 3 heyoka.
 """
 
 from __future__ import annotations
@@ -42,10 +43,12 @@ Table = dict[str, Row]
 
 @dataclass(frozen=True, kw_only=True)
 class Multistep(Measurement[dict[str, Table]]):
-    """The command."""
+    """Command ``eip-scipy study multistep``."""
 
-    parts: Sequence[int] = option((1, 2, 3, 4), "parts of the study", type=int, nargs="+", choices=(1, 2, 3, 4))
-    quick: bool = option(False, "0.1 of the spans and fewer rotations, as a trial")
+    parts: Sequence[int] = option(
+        (1, 2, 3, 4), "parts of the study to run (default: all)", type=int, nargs="+", choices=(1, 2, 3, 4)
+    )
+    quick: bool = option(False, "a trial: 0.1 of the time spans and fewer rotations")
 
     def measure(self, session: Session) -> dict[str, Table]:
         if 3 in self.parts:  # before the minutes that the other parts take
@@ -149,7 +152,7 @@ def against_heyoka(quick: bool) -> Table:
 
 
 def kepler_table(found: Table) -> str:
-    """Lay out the results of `against_heyoka`, and the cost of the wanted error compared with heyoka."""
+    """Lay out the results of `against_heyoka`, and the cost of an error of given size compared with heyoka."""
     body = [(name, [f"{row['call']:.3f}", f"{row['steps']:.3f}", f"{row['error']:.1e}"]) for name, row in found.items()]
     lines = [table([["call [ms]"], ["steps [ms]"], ["error"]], body), ""]
     enough = {name: row for name, row in found.items() if row["error"] <= WANTED}
@@ -160,7 +163,7 @@ def kepler_table(found: Table) -> str:
 
 
 def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
-    """Make a run, and the seconds that its steps took."""
+    """Return a function that runs the problem, and one that returns the seconds of the steps of its last run."""
     last = [0.0]
 
     def run() -> np.ndarray:
@@ -172,7 +175,7 @@ def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Cal
 
 
 def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
-    """Make the run by heyoka, compiled before; return the seconds that it took."""
+    """Compile the problem for heyoka; return a function that runs it, and one for the seconds of the last run."""
     heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     assert problem.params is not None
     x, y, u, v = heyoka.make_vars("x", "y", "u", "v")
@@ -204,7 +207,7 @@ def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem
 
 
 def compared(found: Table, mercury: float, others: float) -> list[str]:
-    """Return the cost of the cheapest run with these errors, relative to WHFast's time for Mercury and IAS15's."""
+    """Compare the cheapest runs with errors of at most `mercury` and `others` with WHFast and IAS15, as text."""
     whfast = [row for name, row in found.items() if name.startswith("WHFast")]
     there = cost_to_reach([row["least"] for row in whfast], [row["worst"] for row in whfast], mercury)
     good = {name: row for name, row in found.items() if row["worst"] <= mercury and row["others"] <= others}
@@ -217,5 +220,5 @@ def compared(found: Table, mercury: float, others: float) -> list[str]:
 
 
 def least(found: Table, kind: str, part: str) -> float:
-    """Return the least time of a method; nan without a run of it."""
+    """Return the least value in the column `part` of the rows whose names begin with `kind`; nan if there is none."""
     return min((row[part] for name, row in found.items() if name.startswith(kind)), default=math.nan)

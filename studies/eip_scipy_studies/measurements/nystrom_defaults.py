@@ -1,11 +1,12 @@
 """``eip-scipy study nystrom-defaults``: two options of EIPRKN8 and EIPRKN12 that could be defaults.
 
-A projection only if the invariant error exceeds round-off (`every="auto"`) and compensated sums, against a run with
-neither. Ten bodies over 100 and 1000 years, orbits of exoplanets, the hard problems and all hard cases whose forces do
-not change with the velocity; fixed steps that bring EIPRKN12 to about 1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances.
-Each number is over three neighbouring steps or tolerances, because a single run's last digits are luck: the geometric
-mean of the errors at the end and of the largest changes of an invariant along the run (up to 4000 of its rows), the sum
-of the times, and how many runs were not reliable. Exoplanets need heyoka and REBOUNDx.
+The options are a projection only if the invariant error exceeds round-off (`every="auto"`), and compensated sums. Runs
+with either or both are compared with a run with neither. Ten bodies over 100 and 1000 years, orbits of exoplanets, the
+hard problems and all hard cases whose forces do not change with the velocity; fixed steps that bring EIPRKN12 to about
+1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances. Each number is over three neighbouring steps or tolerances, because a
+single run's last digits are luck: the geometric mean of the errors at the end and of the largest changes of an
+invariant along the run (up to 4000 of its rows), the sum of the times, and how many runs were not reliable. Exoplanets
+need heyoka and REBOUNDx.
 
 Result: the error is that of projecting each step, compensated or not, unless rounding is most of it; then both options
 together divide it by up to 1000 (1000 years). But compensation takes 10 to 40 % more time in most runs, "auto" leaves
@@ -52,7 +53,10 @@ MOST_ROWS = 4_000
 
 
 class System(NamedTuple):
-    """A problem and the error of its last state, relative to its largest component; `natively`: the run is timed."""
+    """A problem, and a function that returns the error of a final state.
+
+    `natively`: the run is compiled, so that its time is measured.
+    """
 
     problem: Problem
     error: Callable[[np.ndarray], float]
@@ -72,7 +76,7 @@ def by_reference(problem: Problem, size: float = 1.0) -> System:
 
 
 def systems() -> Iterator[tuple[str, Callable[[], System]]]:
-    """Yield the systems by name, made on demand."""
+    """Yield the names of the systems, each with a function that makes the system."""
     for years in (100.0, 1000.0):
         yield f"ten bodies, {years:g} yr", partial(_solar, years)
     for name in ("resonant chain", "e = .6", "hot Jupiter"):
@@ -94,7 +98,7 @@ def _scene(name: str) -> System:
 
 
 def exoplanets(name: str) -> System:
-    """Return a system of `exoplanets`."""
+    """Return a system of the study `exoplanets`."""
     from .exoplanets import SYSTEMS
     from .relativity import reference, speed_of_light
 
@@ -146,7 +150,7 @@ def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], ro
 
 
 def steps(system: System) -> list[int]:
-    """Return numbers of steps that bring EIPRKN12 with projected steps below the levels, as far as possible."""
+    """Return the least numbers of steps at which the error of EIPRKN12 with projection is below each of `LEVELS`."""
     found, n, left = list[int](), 8, list(LEVELS)
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     while left and n < (MOST_STEPS if system.natively else MOST_STEPS // 8):
@@ -160,7 +164,7 @@ def steps(system: System) -> list[int]:
 
 
 def settings(system: System) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Yield names of settings, and the neighbouring values of each."""
+    """Yield the name of each setting, and the options of three runs with neighbouring steps or tolerances."""
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     for n in steps(system):
         save = {"save_every": max(1, n // MOST_ROWS)}
@@ -175,7 +179,7 @@ def mean(values: list[float]) -> float:
 
 
 def rows(name: str, make: Callable[[], System]) -> Iterator[dict[str, Any]]:
-    """Yield a row for each method, setting and way."""
+    """Yield a row for each method, setting and way (a combination of both options)."""
     system = make()
     for setting, options in settings(system):
         for method in (EIPRKN8, EIPRKN12):
@@ -200,10 +204,10 @@ def rows(name: str, make: Callable[[], System]) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, kw_only=True)
 class NystromDefaults(Measurement[list[dict[str, Any]]]):
-    """The command."""
+    """Command ``eip-scipy study nystrom-defaults``."""
 
     system: list[str] | None = option(
-        None, "one system, may be repeated; default: all", action="append", metavar="NAME"
+        None, "name of a system to run, may be repeated; default: all", action="append", metavar="NAME"
     )
 
     def measure(self, session: Session) -> list[dict[str, Any]]:
@@ -216,7 +220,7 @@ class NystromDefaults(Measurement[list[dict[str, Any]]]):
         return found
 
     def table(self, found: list[dict[str, Any]]) -> str:
-        """Lay out errors and changes of each way, times over the first way's, and the number of unreliable runs."""
+        """Lay out errors, changes of invariants, times relative to the first way, and unreliable runs of each way."""
         heads = [[way if what == "error" else "", what] for way in WAYS for what in ("error", "drift", "time", "bad")]
         body = []
         for k in range(0, len(found), len(WAYS)):

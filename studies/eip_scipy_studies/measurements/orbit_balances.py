@@ -1,8 +1,9 @@
 """``eip-scipy study orbit-balances``: cost and gain of each quantity of the orbits, as a balance.
 
-Energies, angular momenta and Laplace vectors of all orbits (``balances=`` of `nbody`), in each combination, against
-runs without projection and runs that keep the totals. All runs are made in the six orders of the coordinate axes, in
-turns: times (of the processor) are the least of the six, errors of position are medians.
+Runs that keep energies, angular momenta and Laplace vectors of all orbits (``balances=`` of `nbody`), in each
+combination, are compared with runs without projection and with runs that keep the totals. All runs are made in the six
+orders of the coordinate axes, in turns. Times are processor times, the least of the six; errors of position are
+medians.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ UNIT = "E"  # the set whose time is 1
 
 
 class System(NamedTuple):
-    """The problem with these balances, its exact state at the end, and the options of its runs."""
+    """A function that makes the problem with given `balances`, the exact final state, and the options of its runs."""
 
     problem: Callable[..., Problem]
     truth: np.ndarray
@@ -55,7 +56,7 @@ def ten_bodies(years: float, **options: Any) -> System:
 
 
 def eccentric(years: float, **options: Any) -> System:
-    """Return a planet with a = 1 AU, e = 0.6 and a heavier one outside; the exact state has 20 times shorter steps."""
+    """Return a planet with a = 1 AU, e = 0.6 and a heavier one outside; 20 times shorter steps give its exact state."""
     sun, masses, e = 4 * math.pi**2, (1e-4, 1e-3), 0.6
     gm = sun * np.array([1, *masses])
     speed = math.sqrt(sun * (1 + masses[0]) * (1 + e) / (1 - e))
@@ -87,9 +88,9 @@ class Cost(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class OrbitBalances(Measurement[dict[str, dict[str, Cost]]]):
-    """The command."""
+    """Command ``eip-scipy study orbit-balances``."""
 
-    quick: bool = option(False, "0.1 of the spans, to see that it runs")
+    quick: bool = option(False, "a trial: 0.1 of the time spans")
 
     def measure(self, session: Session) -> dict[str, dict[str, Cost]]:
         found = {}
@@ -112,7 +113,7 @@ class OrbitBalances(Measurement[dict[str, dict[str, Cost]]]):
 
 
 def costs(system: System) -> dict[str, Cost]:
-    """Return the measurements of each set of balances."""
+    """Return the costs and errors of the runs with each set of balances."""
     problems = {kept: system.problem(balances=quantities or None) for kept, quantities in KEPT.items()}
     problems["nothing"] = replace(problems["nothing"], invariants=())
     found: dict[str, list[Cost]] = {kept: [] for kept in KEPT}
@@ -129,6 +130,6 @@ def costs(system: System) -> dict[str, Cost]:
 
 
 def best(runs: list[Cost]) -> Cost:
-    """Return the least time and the median errors."""
+    """Combine runs of one set of balances: the least time, and the median errors."""
     seconds, innermost, others = zip(*runs, strict=True)
     return Cost(min(seconds), float(np.median(innermost)), float(np.median(others)))

@@ -36,15 +36,15 @@ Row = dict[str, float]
 
 
 def by_rebound(problem: Problem, integrator: str, **options: Any) -> Runner:
-    """Make a run by an integrator of REBOUND, which must be installed; see `by_peer`."""
+    """Return a function that runs an integrator of REBOUND, which must be installed; see `by_peer`."""
     return by_peer(problem, needed("eip_scipy.integrations.rebound").run, integrator, **options)
 
 
 def rebound_states(problem: Problem, integrator: str, times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Run an integrator of REBOUND, WHFast with steps of a day, from the start to each time.
+    """Run an integrator of REBOUND (WHFast with steps of a day) from the start to each of `times`.
 
-    A time that is saved on the way would cut a step of IAS15. Returns the seconds of the last run, and the states
-    (6 N, m).
+    There is one run for each time, because a saved time would cut a step of IAS15. Return the seconds of the last run,
+    and the states (6 N, m).
     """
     run = needed("eip_scipy.integrations.rebound").run
     counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
@@ -58,17 +58,17 @@ def reordered(states: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
 
 
 def one_each(label: Callable[[float], str], run: Runner, steps: Iterable[float]) -> Methods:
-    """Make a row of the table for each step."""
+    """Make a row of the table for each step, with the name ``label(step)``."""
     return {label(h): (run, [h]) for h in steps}
 
 
 def yearly(name: str, run: Runner, *counts: int) -> Methods:
-    """Make a row for each number of steps in a year."""
+    """Make a row of the table for each number of steps per year."""
     return one_each(lambda h: f"{name}, 1/{round(1 / h)} yr", run, [1 / n for n in counts])
 
 
 def daily(name: str, run: Runner, *days: float) -> Methods:
-    """Make a row for each step in days."""
+    """Make a row of the table for each length of a step in days."""
     return one_each(lambda h: f"{name}, {h * YEAR_D:.3g} d", run, [d / YEAR_D for d in days])
 
 

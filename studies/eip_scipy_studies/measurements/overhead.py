@@ -1,7 +1,8 @@
 """``eip-scipy study overhead``: cost of an EIP class in solve_ivp compared with SciPy's own class, per step.
 
-Kepler's problem in plain NumPy, e = 0.6, two invariants (H, L) with analytic gradients; medians of paired runs, each
-class in turn with SciPy's on the same right-hand side, so that a drifting speed of the machine does not decide. Next to
+Kepler's problem in plain NumPy, e = 0.6, two invariants (H, L) with analytic gradients. Numbers are medians of pairs of
+runs: each class runs in turn with SciPy's on the same right-hand side, so that a drifting speed of the machine affects
+both. Next to
 the median of the ratios is the ratio of the least times, which other load on the machine hardly affects.
 """
 
@@ -70,7 +71,7 @@ PEERS = {EIPRK4: "RK45", EIPRK45: "RK45", EIPRK23: "RK23", EIPDOP853: "DOP853"}
 
 
 def per_step(options: dict[str, Any]) -> float:
-    """Return the seconds of one step."""
+    """Return the seconds per step of a run of `solve_ivp` with these options."""
     begin = time.perf_counter()
     solution = solve_ivp(fun, SPAN, Y0, **options)
     steps = STEPS if "t_eval" in options else solution.t.size - 1
@@ -79,9 +80,9 @@ def per_step(options: dict[str, Any]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Overhead(Measurement[dict[str, dict[str, Any]]]):
-    """The command."""
+    """Command ``eip-scipy study overhead``."""
 
-    pairs: int = option(15, "pairs of runs (%(default)s)", type=int, metavar="N")
+    pairs: int = option(15, "pairs of runs (default: %(default)s)", type=int, metavar="N")
 
     def measure(self, session: Session) -> dict[str, dict[str, Any]]:
         found = {}

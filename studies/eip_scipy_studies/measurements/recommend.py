@@ -1,8 +1,8 @@
 """``eip-scipy study recommend``: accuracy of `recommend` on the 35 hard cases.
 
-Wanted, expected and true error of the recommended run; the true one is that of `recommendation.run()` against the exact
-final state. Two counts: true errors between 0.1 and 10 times the wanted one, and those that are at most ten
-times it. Times: of the search, and of the run.
+The table has the wanted, the expected and the true error of the recommended run; the true one is that of
+`recommendation.run()` against the exact final state. Below it are the numbers of true errors between 0.1 and 10 times
+the wanted error, and of those that are at most 10 times the wanted error. Times are those of the search and of the run.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def recommended(case: HardCase, wanted: float) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Recommended(Measurement[list[dict[str, Any]]]):
-    """The command."""
+    """Command ``eip-scipy study recommend``."""
 
-    errors: Sequence[float] = option((1e-6,), "wanted errors", type=float, nargs="+")
-    cases: Sequence[str] | None = option(None, "names of some cases", nargs="+", metavar="NAME")
+    errors: Sequence[float] = option((1e-6,), "wanted errors (default: 1e-6)", type=float, nargs="+")
+    cases: Sequence[str] | None = option(None, "names of the cases to run (default: all)", nargs="+", metavar="NAME")
 
     def measure(self, session: Session) -> list[dict[str, Any]]:
         found, cases = [], hard_cases(self.cases)
@@ -94,7 +94,7 @@ class Recommended(Measurement[list[dict[str, Any]]]):
 
 
 def cells(row: dict[str, Any]) -> list[str]:
-    """Lay out one case."""
+    """Lay out the results of one case as cells of the table."""
     shown = {key: value for key, value in row["options"].items() if key not in ("atol", "compensated")}
     options = ", ".join(f"{k}={v:g}" if isinstance(v, float) else f"{k}={v}" for k, v in shown.items())
     return [

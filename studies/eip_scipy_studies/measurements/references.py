@@ -32,7 +32,7 @@ def _heyoka() -> Any:
 
 
 class Found(NamedTuple):
-    """Lines to print, the origin of the states, and the states."""
+    """Lines to print, a text about the origin of the states, and the states."""
 
     lines: list[str]
     about: str
@@ -40,7 +40,7 @@ class Found(NamedTuple):
 
 
 class Reference(Study[Found]):
-    """A study that makes reference states."""
+    """Base class of a study that makes reference states."""
 
     file = ""
 
@@ -62,7 +62,7 @@ class Reference(Study[Found]):
 
 
 def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
-    """Return the equations of motion in (x, v), as symbols of heyoka."""
+    """Return the equations of motion in (x, v), as expressions of heyoka."""
     heyoka = _heyoka()
     x, y, z, u, v, w = state = heyoka.make_vars("x", "y", "z", "u", "v", "w")
     r2 = x * x + y * y
@@ -77,7 +77,10 @@ def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
 
 
 def vector_potential(name: str, x: Any, number: Any) -> list[Any]:
-    """Return A in the arithmetic of `number`, for the canonical momenta."""
+    """Return the vector potential at `x`, for the canonical momenta, in the arithmetic of `number`.
+
+    ``number(value)`` converts a float to this arithmetic.
+    """
     half, one = number(0.5), number(1.0)
     if name == "uniform":
         return [-half * x[1], half * x[0], number(0.0)]
@@ -89,7 +92,7 @@ def vector_potential(name: str, x: Any, number: Any) -> list[Any]:
 
 
 def _log(r: Any, number: Any) -> Any:
-    """Return the logarithm of numbers near 1: Newton's method on exp, whose series is short there."""
+    """Return the logarithm of a number near 1 in the arithmetic of `number`, by Newton's method on exp."""
     result = number(float(np.log(float(r))))
     for _ in range(3):
         term = total = number(1.0)
@@ -101,7 +104,7 @@ def _log(r: Any, number: Any) -> Any:
 
 
 def particle_states(problem: ParticleProblem, times: np.ndarray, bits: int | None) -> np.ndarray:
-    """Return rows (x, v, p) at `times`; with bits=None from double precision."""
+    """Return rows (x, v, p) at `times`, computed with `bits` bits; None: in double precision."""
     heyoka = _heyoka()
 
     def number(value: float) -> Any:
@@ -124,11 +127,16 @@ def particle_states(problem: ParticleProblem, times: np.ndarray, bits: int | Non
 
 @dataclass(frozen=True, kw_only=True)
 class ParticleReference(Reference):
-    """Position, velocity and canonical momentum at each hundredth of the paper's intervals."""
+    """Command ``eip-scipy study particle-reference``.
+
+    It computes position, velocity and canonical momentum at each hundredth of the paper's intervals.
+    """
 
     file = "particle_references.json"
-    bits: int = option(113, "precision in bits (%(default)s)", type=int)
-    points: int = option(POINTS, "how many of the hundred states, from the first on (%(default)s)", type=int)
+    bits: int = option(113, "precision in bits (default: %(default)s)", type=int)
+    points: int = option(
+        POINTS, "number of states to compute, from the first of the hundred on (default: %(default)s)", type=int
+    )
 
     def measure(self, session: Session) -> Found:
         heyoka, lines, stored = _heyoka(), [], {}
@@ -194,10 +202,13 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneReference(Reference):
-    """Final states of the problems; the difference from 113 bits and, if REBOUND is installed, from IAS15."""
+    """Command ``eip-scipy study scene-reference``: final states of the hard problems.
+
+    It prints their differences from states computed in 113 bits and, if REBOUND is installed, by IAS15.
+    """
 
     file = "scene_references.json"
-    bits: int = option(160, "precision in bits (%(default)s)", type=int)
+    bits: int = option(160, "precision in bits (default: %(default)s)", type=int)
 
     def measure(self, session: Session) -> Found:
         heyoka, lines, stored = _heyoka(), [], {}

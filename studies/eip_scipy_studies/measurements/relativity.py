@@ -1,8 +1,9 @@
 """``eip-scipy study relativity``: ten bodies with relativity, against WHFast, SABA and IAS15 with REBOUNDx.
 
 The force is the potential in 1/r^2 of Nobili & Roxburgh, the same in both packages: `forces="gr-potential"` here,
-`gr_potential` there. Errors of position [AU] against heyoka in 80-bit arithmetic, run anew each time; wall times are
-the least of three, one core. REBOUNDx (GPL) and heyoka are optional: ``pip install reboundx heyoka``.
+`gr_potential` in REBOUNDx. Errors of position [AU] are those against heyoka in 80-bit arithmetic, which is run each
+time; wall times are the least of three, on one core. REBOUNDx (GPL) and heyoka are optional: ``pip install reboundx
+heyoka``.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def reference(gm: np.ndarray, y0: np.ndarray, years: float, c: float | None = sp
 
 
 def potential(sim: Any) -> Any:
-    """Add the force to a simulation; the caller keeps the result alive."""
+    """Add the relativistic force to a REBOUND simulation; the caller must keep the returned object alive."""
     extras = needed("reboundx", "reboundx").Extras(sim)
     force = extras.load_force("gr_potential")
     extras.add_force(force)
@@ -74,9 +75,9 @@ def methods(problem: Problem) -> Methods:
 
 @dataclass(frozen=True, kw_only=True)
 class Relativity(Measurement[dict[str, Row]]):
-    """The command."""
+    """Command ``eip-scipy study relativity``."""
 
-    years: float = option(100.0, "length of the runs (%(default)s)", type=float)
+    years: float = option(100.0, "length of the runs in Julian years (default: %(default)s)", type=float)
 
     def measure(self, session: Session) -> dict[str, Row]:
         needed("reboundx", "reboundx")

@@ -3,8 +3,8 @@
 All runs start from the ground state for kappa = 0.3 on the paper's 256 x 256 points, by its Fourier modes, in the trap
 of kappa = 0.7. They are splittings of order 4 with both invariants kept, in the frame at rest; the last one is what
 `eip-scipy gpe ring` does, RK4 in the rotating frame on 256 x 256 points. Error: the norm of the difference from the
-finest grid's field, modes that a grid lacks included. Edge: the largest amplitude among the modes with one of the three
-highest wavenumbers, as a part of the largest of all.
+finest grid's field, with modes that a grid lacks counted as 0. Edge: the largest amplitude among the modes with one of
+the three highest wavenumbers, divided by the largest of all amplitudes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def edge(field):
 
 
 class GridRun:
-    """A run's fields at the snapshots in the frame at rest, and its vortices in the rotating one."""
+    """A run: its fields at the snapshots in the frame at rest, and its vortices in the rotating frame."""
 
     def __init__(self, psi, points, t_end, *, shown, turning=False):
         gpe = ring_condensate(RING.kappas[1], points=points)
@@ -84,13 +84,15 @@ class GridRun:
 
 @dataclass(frozen=True, kw_only=True)
 class RingGrids(Measurement[list[dict[str, Any]]]):
-    """The command."""
+    """Command ``eip-scipy study ring-grids``."""
 
     writes_files = True
     points: Sequence[int] = option((192, 256, 384, 512), "points along each axis of the grids", type=int, nargs="+")
-    t_end: float = option(1.0, "end of the runs (%(default)s)", type=float)
-    start: Path | None = option(None, "ring.npz of `eip-scipy gpe ground-state`", type=Path, metavar="FILE")
-    quick: bool = option(False, "a rough start on few points, two grids, a short interval")
+    t_end: float = option(1.0, "end of the runs (default: %(default)s)", type=float)
+    start: Path | None = option(
+        None, "ring.npz that `eip-scipy gpe ground-state` has written", type=Path, metavar="FILE"
+    )
+    quick: bool = option(False, "a trial: a rough start on few points, two grids, a short interval")
 
     def measure(self, session: Session) -> list[dict[str, Any]]:
         start, tolerance, points, t_end = START_POINTS, TOLERANCE, self.points, self.t_end

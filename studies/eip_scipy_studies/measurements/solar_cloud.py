@@ -48,11 +48,11 @@ def clones(problem: Problem, members: int) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class SolarCloud(Measurement[dict[str, Row]]):
-    """The command."""
+    """Command ``eip-scipy study solar-cloud``."""
 
-    members: int = option(1000, "members of the ensemble (%(default)s)", type=int)
-    years: float = option(100.0, "length of the runs (%(default)s)", type=float)
-    sample: int = option(16, "members that run one at a time (%(default)s)", type=int)
+    members: int = option(1000, "members of the ensemble (default: %(default)s)", type=int)
+    years: float = option(100.0, "length of the runs in Julian years (default: %(default)s)", type=float)
+    sample: int = option(16, "number of members that are also run one at a time (default: %(default)s)", type=int)
 
     def measure(self, session: Session) -> dict[str, Row]:
         needed("eip_scipy.integrations.rebound")
@@ -77,7 +77,7 @@ class SolarCloud(Measurement[dict[str, Row]]):
         }
 
     def _runs(self, problem: Problem, starts: np.ndarray) -> dict[str, tuple[int, Callable[[], np.ndarray]]]:
-        """Return the number of members of each row of the table, and the run."""
+        """Return, for each row of the table, the number of members that it runs, and the run."""
         few, span = starts[: self.sample], (0.0, self.years)
         found: dict[str, tuple[int, Callable[[], np.ndarray]]] = {}
 

@@ -2,8 +2,9 @@
 
 Ten bodies under Newton's gravitation, from the state and the masses of `solar_system` in AU and Julian years, as the
 library's own runs have them. The method is the summed predictor of Gauss and Jackson of order 14, written here in
-NumPy's long double, with sums that carry their rounding. It evaluates at the predicted positions and corrects nothing.
-The truncation error of 2000 steps a year is below the rounding; a run with other steps shows what the rounding is.
+NumPy's long double, with compensated sums. It evaluates the accelerations at the predicted positions and has no
+corrector. The truncation error of 2000 steps a year is below the rounding error; the difference from a run with other
+steps shows how large the rounding error is.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ TIMES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
 
 
 class Gravity:
-    """Accelerations of N bodies and the Taylor series of their motion, in the arithmetic of the masses."""
+    """Accelerations of N bodies, and Taylor steps of their motion, in the floating-point type of the masses."""
 
     def __init__(self, gm: Array) -> None:
         self.first, self.second = np.triu_indices(gm.size, 1)
@@ -51,7 +52,7 @@ class Gravity:
         return self.pulls @ (d / (r2 * np.sqrt(r2))[:, None])
 
     def stepped(self, q: Array, v: Array, h: Any) -> tuple[Array, Array]:
-        """Return positions and velocities a time h later."""
+        """Return positions and velocities after a time `h`, by the Taylor series."""
         qs, ds, r2, w = [q, v], [], [], []
         for k in range(TERMS):
             ds.append(qs[k][self.second] - qs[k][self.first])
@@ -71,7 +72,7 @@ class Gravity:
 
 
 def inverse_powers(power: int, terms: int) -> list[Fraction]:
-    """Return the series of (-log(1 - x) / x)^-power."""
+    """Return the first `terms` coefficients of the power series of (-log(1 - x) / x)^-power."""
     L = [Fraction(1, k + 1) for k in range(terms)]
     series = [Fraction(1)] + [Fraction(0)] * (terms - 1)
     for _ in range(power):
@@ -83,7 +84,7 @@ def inverse_powers(power: int, terms: int) -> list[Fraction]:
 
 
 def ordinates(series: Sequence[Fraction]) -> Array:
-    """Return weights of the nodes, the oldest first, for a sum over backward differences of the newest."""
+    """Convert coefficients of backward differences at the newest node to weights of the nodes, the oldest first."""
     n = len(series)
     weights = [(-1) ** j * sum((series[k] * comb(k, j) for k in range(j, n)), Fraction(0)) for j in range(n)]
     return np.array([FLOAT(w.numerator) / FLOAT(w.denominator) for w in reversed(weights)])
@@ -97,7 +98,7 @@ def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def states(problem: Problem, years: Sequence[float], steps: int) -> Iterator[Array]:
-    """Yield the states (6 N,) at times in ascending order, by `steps` steps a year."""
+    """Yield the states (6 N,) at ascending times `years`, by the Gauss-Jackson method with `steps` steps a year."""
     q, v = problem.y0.astype(FLOAT).reshape(2, -1, 3)
     assert problem.params is not None
     gravity, per_year = Gravity(problem.params.astype(FLOAT)), FLOAT(steps)
@@ -131,7 +132,7 @@ def states(problem: Problem, years: Sequence[float], steps: int) -> Iterator[Arr
 
 
 def by_taylor(problem: Problem, years: Sequence[float]) -> Iterator[Array]:
-    """Yield the states by heyoka in 80 bits."""
+    """Yield the states at the times `years` by heyoka in 80 bits."""
     heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     assert problem.params is not None
     gm, start = problem.params.astype(FLOAT), problem.y0.astype(FLOAT).reshape(2, -1, 3)
@@ -159,12 +160,14 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SolarReference(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy study solar-reference``."""
 
-    years: Sequence[float] = option(TIMES, "times in Julian years", type=float, nargs="+")
-    steps: int = option(2000, "steps a year (%(default)s)", type=int)
-    others: int = option(1500, "steps a year of another run, for comparison (%(default)s)", type=int)
-    taylor: float = option(0.0, "compare with heyoka up to this time in years (%(default)g)", type=float)
+    years: Sequence[float] = option(TIMES, "times of the states in Julian years", type=float, nargs="+")
+    steps: int = option(2000, "steps a year (default: %(default)s)", type=int)
+    others: int = option(
+        1500, "steps a year of a second run, which shows the rounding error (default: %(default)s)", type=int
+    )
+    taylor: float = option(0.0, "compare with heyoka up to this time in years (default: %(default)g)", type=float)
 
     def measure(self, session: Session) -> Found:
         years, problem = sorted(self.years), solar_system()

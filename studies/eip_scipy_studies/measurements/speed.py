@@ -1,10 +1,11 @@
 """``eip-scipy study speed``: speed of the step, as ratios measured in one run on one core.
 
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
-   hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
+   hand for this one problem. Its time per step, and that of EIP-RK45 with adaptive steps, are also compared with that
+   of solve_ivp with SciPy's RK45.
 2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
-3. Compiled Kepler to t = 300 with 3001 times in t_eval against saving each step; a section of 1600 crossings against
-   the run without it. Times of whole calls.
+3. Compiled Kepler to t = 300 with 3001 times in t_eval, compared with saving each step; a Poincaré section of 1600
+   crossings, compared with the run without it. These are times of whole calls.
 4. A process: from its start to its first compiled step, with user functions that are not in any cache.
 """
 
@@ -34,7 +35,10 @@ njit = needed("numba", '"eip_scipy[numba]"').njit
 
 
 class Turns(NamedTuple):
-    """Numbers of runs, whole calls and processes. Runs are short: other load on a shared machine disturbs long ones."""
+    """Numbers of timed runs, of timed whole calls, and of timed processes.
+
+    Runs are short, because other load on a shared machine disturbs long ones.
+    """
 
     runs: int = 60
     calls: int = 7
@@ -94,7 +98,7 @@ def _weight(err, old, new, rtol, atol):
 
 @njit
 def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
-    """Kepler EIP-RK4 with everything written out: stages, error metric, 2 x 2 normal equations, check of the result."""
+    """Run EIP-RK4 on Kepler's problem, written out by hand: stages, metric, normal equations, check of the result."""
     rtol, atol = 1e-3, 1e-6
     worst = 0.0
     w = _pull(a, b)
@@ -166,7 +170,7 @@ def call_time(action: Callable[[], Any], calls: int) -> float:
 
 
 def of_integrate(h: float, **arguments: Any) -> Callable[[int], float]:
-    """Return the time of a run of n steps, without the time before them."""
+    """Return a function of n: the time of a run of n steps by `integrate`, without the time before the steps."""
     return lambda n: integrate(t_span=(0.0, n * h), h=h, **arguments).wall_time
 
 
@@ -277,9 +281,9 @@ def process_times(turns: Turns) -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Speed(Measurement[dict[str, float]]):
-    """The command."""
+    """Command ``eip-scipy study speed``."""
 
-    quick: bool = option(False, "each once")
+    quick: bool = option(False, "measure everything only once")
 
     def measure(self, session: Session) -> dict[str, float]:
         turns = QUICK if self.quick else Turns()

@@ -3,8 +3,9 @@
 The state-transition matrix of Kepler's problem against its closed form; periodic orbits of the restricted three-body
 problem; Lyapunov exponents compared with heyoka's variational equations, from one start and as means over a chaotic
 sea; MEGNO compared with REBOUND's variational particles, and with relativity, which these lack, compared with
-differences of orbits; the cost of columns of derivatives, by the source of the products with the Jacobian, and their
-gain in a fit. The figure is a map of MEGNO over the second of two planets' axis and eccentricity, by both.
+differences of orbits; the cost of columns of derivatives, for each source of the products with the Jacobian, and what
+they save in a fit. The figure is a map of MEGNO over the semi-major axis and the eccentricity of the second of two
+planets, by this package and by REBOUND.
 ``pip install "eip_scipy[heyoka,rebound,sympy]"``.
 """
 
@@ -68,7 +69,10 @@ def double_pendulum(heyoka: Any, a: Any, b: Any, p: Any, r: Any) -> Any:
 
 
 class Chaotic(NamedTuple):
-    """A Hamiltonian system: for us, for heyoka, and its start, step and factor of the length of the run."""
+    """A Hamiltonian system in the forms of this package and of heyoka, with start, step and length of the run.
+
+    The length is a factor, by which the setting `time` of the study is multiplied.
+    """
 
     text: str
     energy: Callable[..., Any]
@@ -95,14 +99,14 @@ SYSTEMS = {
 
 
 def after_revolutions(n: int) -> np.ndarray:
-    """Return the matrix after n periods in closed form: I - 3 T f (dH/dy) for each of them."""
+    """Return the state-transition matrix after n periods in closed form, I - 3 n T f (dH/dy)."""
     x, _, _, vy = PERICENTRE
     f, by_energy = np.array([0.0, vy, -1 / x**2, 0.0]), np.array([1 / x**2, 0.0, 0.0, vy])
     return np.eye(4) - 3 * PERIOD * n * np.outer(f, by_energy)
 
 
 def planets(numba: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return the equations of bodies and their energy, jitted."""
+    """Return the right-hand side of gravitating bodies and their energy, jitted."""
 
     @numba.njit
     def rates(t, y, out, m):
@@ -164,18 +168,20 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TangentMaps(Measurement[Found]):
-    """The command."""
+    """Command ``eip-scipy study tangent-maps``."""
 
     writes_files = True
-    revolutions: int = option(50, "revolutions of Kepler's problem, and ten times as many (%(default)s)", type=int)
-    time: float = option(4e5, "length of the runs for exponents (%(default)g)", type=float)
-    periods: int = option(2000, "periods of the two planets (%(default)s)", type=int)
-    grid: int = option(20, "points of the map, each way; 0: no map (%(default)s)", type=int)
-    starts: int = option(24, "starts in the chaotic sea, for means (%(default)s)", type=int)
-    map_periods: int = option(300, "periods of the runs of the map (%(default)s)", type=int)
+    revolutions: int = option(
+        50, "revolutions of Kepler's problem; a second run has ten times as many (default: %(default)s)", type=int
+    )
+    time: float = option(4e5, "length of the runs for Lyapunov exponents (default: %(default)g)", type=float)
+    periods: int = option(2000, "length of the runs of two planets in periods (default: %(default)s)", type=int)
+    grid: int = option(20, "points of the map along each axis; 0: no map (default: %(default)s)", type=int)
+    starts: int = option(24, "number of starts in the chaotic sea for the mean (default: %(default)s)", type=int)
+    map_periods: int = option(300, "length of the runs of the map in periods (default: %(default)s)", type=int)
 
     def measure(self, session: Session) -> Found:
-        numba, _ = needed("numba", 'pip install "eip_scipy[numba]"'), needed("sympy", 'pip install "eip_scipy[sympy]"')
+        numba, _ = needed("numba", '"eip_scipy[numba]"'), needed("sympy", '"eip_scipy[sympy]"')
         with session.bar(9, "tangent maps", "part") as bar:
             parts: dict[str, Any] = {}
             for part in (_kepler, _orbits, _exponents, _followed, _sea, _planets, _relativity, _costs, _fit):
@@ -186,7 +192,10 @@ class TangentMaps(Measurement[Found]):
             return Found(**parts, axes=axes, eccentricities=eccentricities, **maps)
 
     def _maps(self, axes: np.ndarray, eccentricities: np.ndarray, numba: Any, session: Session) -> dict[str, Any]:
-        """MEGNO and the exponents over the grid, by us and, if it is installed, by REBOUND from the same vectors."""
+        """Compute MEGNO and the exponents over the grid.
+
+        REBOUND, if it is installed, does the same from the same tangent vectors.
+        """
         peer = session.peer("rebound", "REBOUND's map of MEGNO")
         rates, energy = planets(numba)
         shape, end = (eccentricities.size, axes.size), self.map_periods * PERIOD
@@ -259,7 +268,7 @@ class TangentMaps(Measurement[Found]):
         return "\n\n".join(blocks)
 
     def _compared(self, found: Found) -> str:
-        """Return a comparison of the two maps: the regular points of both, and the exponents of the chaotic ones."""
+        """Return a text that compares both maps: points that are regular in both, and exponents of chaotic ones."""
         ours, theirs = found.map, found.rebound["megno"]
         regular, chaotic = (ours < CALM) & (theirs < CALM), (ours > WILD) & (theirs > WILD)
         opposite = (ours < CALM) & (theirs > WILD) | (ours > WILD) & (theirs < CALM)
@@ -367,10 +376,10 @@ def _exponents(study: TangentMaps, session: Session, numba: Any) -> dict[str, li
 
 
 def _sea(study: TangentMaps, session: Session, numba: Any) -> dict[str, Any]:
-    """Average the largest exponent over starts of the chaotic sea: states of one chaotic orbit at equal distances.
+    """Average the largest exponent over starts in the chaotic sea: equally spaced states of one chaotic orbit.
 
-    Rounding separates two integrations of a chaotic orbit, and each sticks to islands for long times now and then: only
-    the means can agree.
+    Only the means of this package and of heyoka can agree: rounding separates two integrations of a chaotic orbit, and
+    each of them stays near regular islands for long times now and then.
     """
     heyoka = session.peer("heyoka", "heyoka's variational equations")
     system = SYSTEMS["Hénon-Heiles, E = 1/6"]
@@ -394,7 +403,10 @@ def _sea(study: TangentMaps, session: Session, numba: Any) -> dict[str, Any]:
 
 
 def _followed(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float | None]]:
-    """Compare exponents along one orbit: in pieces that rounding does not separate, heyoka starts at our states."""
+    """Compare exponents along one orbit with heyoka.
+
+    The orbit is cut into pieces, so short that rounding does not separate the two; heyoka starts each at our state.
+    """
     heyoka = session.peer("heyoka", "heyoka's variational equations")
     found: dict[str, list[float | None]] = {}
     for name, system in SYSTEMS.items():
@@ -417,7 +429,10 @@ def _standard_error(values: np.ndarray) -> float:
 
 
 def _relativity(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float]]:
-    """Compare growth with a force that REBOUND's variational particles lack with that of orbits' distances."""
+    """Compare the growth of tangent vectors with that of the distance of two orbits, under relativity.
+
+    REBOUND's variational particles lack this force.
+    """
     found, t_end, eps = {}, 50 * PERIOD, 1e-6
     direction = np.random.default_rng(0).standard_normal(18)
     direction /= np.linalg.norm(direction)
@@ -460,7 +475,10 @@ def _planets(study: TangentMaps, session: Session, numba: Any) -> dict[str, list
 
 
 def _costs(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
-    """Compare all columns of Kepler's problem, without invariants and with both, by the source of their products."""
+    """Measure the cost of all columns of Kepler's problem, without invariants and with both.
+
+    There is one result for each source of the products of the Jacobian and a vector.
+    """
 
     def rates(t, y):
         r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
@@ -497,7 +515,7 @@ def _costs(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]
 
 
 def _costs_of_ready_problems() -> dict[str, float]:
-    """Compare k columns of ready problems with k + 1 plain runs, with all of their invariants."""
+    """Measure the cost of k columns of ready-made problems, relative to k + 1 plain runs, with all invariants."""
     bodies = solar_system()
     n = bodies.y0.size
     cases: dict[str, tuple[Any, float, Any, int]] = {
@@ -521,7 +539,7 @@ def _seconds(fun: Any, n: int, **options: Any) -> float:
 
 
 def _fit(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
-    """Fit an orbit to directions, with the Jacobian from columns and by differences of plain runs."""
+    """Fit an orbit to observed directions, with the Jacobian from columns and from differences of plain runs."""
     problem = hamiltonian(KEPLER, invariants={"L": "x*py - y*px"})
     options: dict[str, Any] = {"method": EIPDOP853, "h": PERIOD / 80}
     t = np.linspace(0.0, 20 * PERIOD, 200)

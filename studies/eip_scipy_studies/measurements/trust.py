@@ -1,15 +1,16 @@
 """``eip-scipy study trust``: whether faulty runs are reported, and correct ones are not. The runs are in trust_runs/.
 
-Faulty runs: quantities that are not invariants (their rate 0 at the start, or not), leaks, leaks that start late or act
-in places, wrong gradients, steps too long, light bodies, passages that blow up, members of ensembles; by all methods,
-fixed and adaptive, solve_ivp and integrate, compiled and interpreted, real and complex. A run is reported by ValueError
-or UserWarning at the start, by ProjectionWarning, status -1, or `trusted` false. Its error is that of the last state,
+Faulty runs have one of these faults: quantities that are not invariants (with a rate of 0 at the start, or another
+one), leaks of an invariant, leaks that start late or act only in some places, wrong gradients, too long steps, light
+bodies, and passages that blow up; some are members of ensembles. They use all methods, fixed and adaptive steps,
+solve_ivp and integrate, compiled and interpreted functions, real and complex states. A run is reported by ValueError or
+UserWarning at the start, by ProjectionWarning, status -1, or `trusted` false. Its error is that of the last state,
 relative to its largest component.
 
-Correct runs: each is compared with the same run without invariants; one whose error is over ten times the other's, and
-above the tolerance, would not be a correct one. Any report is a false alarm there.
+Each correct run is compared with the same run without invariants, to make sure that it is one: its error must not be
+over ten times the other one and above the tolerance. Any report about a correct run is a false alarm.
 
-Exit status 1 if less than 95 % of the faulty runs are reported, or more than 1 % of the correct ones.
+The exit status is 1 if less than 95 % of the faulty runs are reported, or more than 1 % of the correct ones.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def all_runs() -> list[Run]:
 
 
 def record(run: Run) -> dict[str, Any]:
-    """Carry out one run."""
+    """Carry out one run, and return its properties and results as plain data."""
     begin = time.perf_counter()
     outcome = carry_out(run)
     if (run.sick is False or run.group == LATE) and outcome.y is not None:
@@ -62,7 +63,7 @@ def record(run: Run) -> dict[str, Any]:
 
 
 def spoilt(run: Run, outcome: Outcome) -> bool:
-    """Return whether the projection spoilt a run that should be correct."""
+    """Return whether the projection made a run that should be correct much less accurate."""
     allowed = SPOILT * outcome.plain_error + TOLERANCE * run.options.get("rtol", 1e-12)
     return bool(outcome.error > allowed)
 
@@ -94,7 +95,7 @@ def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 
 def sick_table(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Count, group by group, how runs were reported, by the plainest of the ways of each run."""
+    """Count, in each group, how faulty runs were reported; of several ways the first one in `CHANNELS` counts."""
     table = [["what is wrong", "runs", *CHANNELS, "not reported"]]
     for group, own in {**groups(rows), "all": rows}.items():
         counts = [sum(row["first"] == channel for row in own) for channel in (*CHANNELS, SILENT)]
@@ -122,10 +123,10 @@ def markdown(table: list[list[str]]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Trust(Measurement[list[dict[str, Any]]]):
-    """The command."""
+    """Command ``eip-scipy study trust``."""
 
     writes_files = True
-    only: str = option("", "runs whose group, name or method contains this", metavar="TEXT")
+    only: str = option("", "carry out only runs whose group, name or method contains TEXT", metavar="TEXT")
     processes: int = field(default_factory=cores)
 
     def measure(self, session: Session) -> list[dict[str, Any]]:
@@ -170,7 +171,7 @@ class Trust(Measurement[list[dict[str, Any]]]):
         return {"trust.csv": [{**row, "told": ", ".join(row["told"])} for row in found]}
 
     def figures(self, found: list[dict[str, Any]]) -> Figures:
-        """Give the tables of the page on trust, as Markdown."""
+        """Yield the tables for the page on trust, as Markdown files."""
         yield "trust.md", lambda path: path.write_text("\n\n".join(tables(found)) + "\n", encoding="utf-8")
 
 
@@ -180,5 +181,5 @@ def split(found: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[
 
 
 def tables(found: list[dict[str, Any]]) -> list[str]:
-    """Return the tables of both kinds that there are."""
+    """Return the tables of faulty and of correct runs, each only if there are such runs."""
     return [markdown(make(own)) for make, own in zip((sick_table, healthy_table), split(found), strict=True) if own]

@@ -8,9 +8,9 @@ sine-Gordon equation that meet, two solitons of the Korteweg-de Vries equation t
 3. EIPDOP853, projected, and
 4. DOP853 of `scipy.integrate.solve_ivp`, both by tolerances, rtol = atol.
 
-Errors at the end: the largest one of the field against the closed form, and the largest of the invariants, relative.
-Then errors in longer runs, in time. Processor time, the least of three runs of each, which take turns;
-runs of more than a second are made once. One thread.
+The first tables have the errors at the end: the largest difference of the field from the closed form, and the largest
+relative error of an invariant. The last ones have errors at several times in longer runs. Times are processor times on
+one thread, the least of three runs, which take turns; runs of more than a second are made once.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def by_scipy(problem: Any, t: Any, tolerance: float) -> tuple[np.ndarray, int | 
 
 
 def methods(problem: Any, steps: Any, tolerances: Any) -> dict[tuple[str, float], Any]:
-    """Runs by method and step or tolerance, each a function of the times at which states are wanted."""
+    """Return the runs, by (method, step or tolerance): functions of the times at which states are wanted."""
     runs: dict[tuple[str, float], Any] = {}
     for h in steps:
         runs[OWN, h] = lambda t, h=h: by_own(problem, t, h)
@@ -75,13 +75,13 @@ def methods(problem: Any, steps: Any, tolerances: Any) -> dict[tuple[str, float]
 
 
 def errors(problem: Any, t: float, y: np.ndarray) -> tuple[float, float]:
-    """Return the field's largest error, and the invariants' largest relative one."""
+    """Return the largest error of the field, and the largest relative error of an invariant."""
     start, end = (np.array([item.fun(0.0, state) for item in problem.invariants]) for state in (problem.y0, y))
     return float(np.abs(y - problem.reference(t)).max()), float(np.abs(end / start - 1).max())
 
 
 def costs(problem: Any, steps: Any, tolerances: Any, times: Any, repeats: int) -> list[dict[str, Any]]:
-    """Return a row for each run: its processor time, calls of f, and errors at the times."""
+    """Return a row for each run: its processor time, calls of f, and errors at `times`."""
     runs = methods(problem, steps, tolerances)
     rows: dict[tuple[str, float], dict[str, Any]] = {}
     for _ in range(repeats):
@@ -101,7 +101,7 @@ def costs(problem: Any, steps: Any, tolerances: Any, times: Any, repeats: int) -
 
 
 def rows_table(rows: list[dict[str, Any]], times: Any) -> str:
-    """Lay out rows with the errors of the field at the times."""
+    """Lay out the rows of `costs`, with the errors of the field at `times`."""
     body = []
     for row in rows:
         fields = [f"{error:.1e}" for error in row["fields"]]
@@ -113,10 +113,10 @@ def rows_table(rows: list[dict[str, Any]], times: Any) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Waves(Measurement[dict[str, dict[str, list[dict[str, Any]]]]]):
-    """The command."""
+    """Command ``eip-scipy study waves``."""
 
     writes_files = True
-    quick: bool = option(False, "a twentieth of each wave, each method once, no longer runs")
+    quick: bool = option(False, "a trial: 0.05 of each time span, each method once, no longer runs")
 
     def measure(self, session: Session) -> dict[str, dict[str, list[dict[str, Any]]]]:
         found: dict[str, dict[str, list[dict[str, Any]]]] = {"costs": {}, "growth": {}}

@@ -1,8 +1,9 @@
 """``eip-scipy study with-and-without``: a comet by RK45 and by EIPRK45, a satellite with drag by DOP853 and EIPDOP853.
 
-SciPy's `solve_ivp` runs all of them. EIPRK45 keeps the comet's two invariants. The numbers are calls of `fun` and the
-largest errors of energy and position in the first and the last period; positions are compared with Kepler's equation.
-EIPDOP853 keeps the balances of the satellite; places are compared with a run with tolerances of 1e-13.
+SciPy's `solve_ivp` runs all of them. EIPRK45 keeps the comet's energy and angular momentum. The numbers are calls of
+`fun` and the largest errors of energy and position in the first and the last period; positions are compared with
+Kepler's equation. EIPDOP853 keeps the balances of the satellite; its positions are compared with those of a run with
+tolerances of 1e-13.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def momentum(t, y):
 
 
 class Errors(NamedTuple):
-    """Times of a run, its errors of the energy and of the place, and its calls of `fun`."""
+    """Times of a run of the comet, its errors of the energy and of the position, and its calls of `fun`."""
 
     t: np.ndarray
     energy: np.ndarray
@@ -64,7 +65,7 @@ class Errors(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """Times of a run [days], Kepler's energy of the satellite [km^2/s^2], errors of its place [m], calls of `fun`."""
+    """Times of a run [days], Kepler energy of the satellite [km^2/s^2], errors of its position [m], calls of `fun`."""
 
     t: np.ndarray
     energy: np.ndarray
@@ -109,7 +110,7 @@ def flights() -> dict[str, Flight]:
 
 @dataclass(frozen=True, kw_only=True)
 class WithAndWithout(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy study with-and-without``."""
 
     def measure(self, session: Session) -> Found:
         kept = {"invariants": [Invariant(energy), Invariant(momentum)]}
@@ -145,7 +146,7 @@ class WithAndWithout(Study[Found]):
 
 
 def comet_figure(found: dict[str, Errors]) -> Any:
-    """Draw the errors of the energy and of the place of the comet."""
+    """Draw the errors of the energy and of the position of the comet."""
     labels = {"RK45": "RK45", "EIPRK45": "EIPRK45, energy and angular momentum kept"}
     figure, energies, places, colours = two_panels(
         "periods of the comet", T_END / PERIOD, "error of the energy, |ΔH/H|"
@@ -160,7 +161,7 @@ def comet_figure(found: dict[str, Errors]) -> Any:
 
 
 def satellite_figure(found: dict[str, Flight]) -> Any:
-    """Draw the energy of the satellite, which falls, and the error of its place."""
+    """Draw the energy of the satellite, which decreases, and the error of its position."""
     labels = {"DOP853": "DOP853", "EIPDOP853": "EIPDOP853, balances kept"}
     figure, energies, places, colours = two_panels("days", DAYS, "change of the energy [km²/s²]")
     for (name, run), colour in zip(found.items(), colours, strict=True):
@@ -173,7 +174,7 @@ def satellite_figure(found: dict[str, Flight]) -> Any:
 
 
 def two_panels(time: str, end: float, energy: str) -> tuple[Any, Any, Any, tuple[str, str]]:
-    """Return a figure, its panels for energies and places, and the colours of runs without and with invariants.
+    """Return a figure, its panels for energies and positions, and the colours of runs without and with invariants.
 
     The panels go from time 0 to `end`; `time` and `energy` are labels.
     """

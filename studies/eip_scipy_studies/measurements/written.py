@@ -1,7 +1,7 @@
 """``eip-scipy study written``: cost of a problem written as an expression, compared with functions written by hand.
 
-Henon and Heiles' Hamiltonian to t = 10 000. The time of the fresh process includes the start of Python, imports, the
-use of SymPy, Numba's compilation, the run. The compiled runs are measured in turn, and the least times compared.
+Henon and Heiles' Hamiltonian to t = 10 000. The time of a fresh process includes the start of Python, imports, the
+work of SymPy, Numba's compilation and the run. The compiled runs are measured in turn, and their least times compared.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ CASES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Written(Measurement[dict[str, Any]]):
-    """The command."""
+    """Command ``eip-scipy study written``."""
 
-    quick: bool = option(False, "each once")
+    quick: bool = option(False, "measure everything only once")
 
     def measure(self, session: Session) -> dict[str, Any]:
         processes, turns = (1, 1) if self.quick else (PROCESSES, TURNS)

@@ -36,7 +36,10 @@ FINEST = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
 
 
 def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
-    """Return the mechanism of n windows, in the coordinates of the cranks' ends; all cranks begin upright at 1 m/s."""
+    """Return the N-four-bar mechanism of `n` windows, in the coordinates of the ends of its cranks.
+
+    All cranks start upright, and their ends move at 1 m/s.
+    """
     ends = n + 1
     M, weights = np.eye(ends) / 3, np.full(ends, 0.5)
     for i in range(n):
@@ -72,7 +75,7 @@ def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
 
 
 def _crank(n: int, t: float) -> np.ndarray:
-    """Return the angle of all cranks from the vertical, and its rate."""
+    """Return the angle of the cranks from the vertical, which is the same for all, and its rate, at time `t`."""
     factor = G * ((n + 1) / 2 + n) / ((n + 1) / 3 + n)
     return solve_ivp(lambda t, y: [y[1], factor * np.sin(y[0])], (0, t), [0.0, 1.0], **FINEST).y[:, -1]
 
@@ -179,7 +182,7 @@ CAR_MASS, REST_LENGTH, BUMP, BUMPS = 5e-4, 0.5, 0.1, 10.0  # of an end of the ax
 
 
 def car_axis() -> MechanicsProblem:
-    """Return the car axis: its ends and their velocities, with constraints that depend on t."""
+    """Return the car axis, in the coordinates of its ends, with constraints that depend on t."""
     return mechanism(
         np.full(4, CAR_MASS),
         _car_forces,
@@ -225,7 +228,7 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1
 def bricard(section: float = 0.1, axes: bool = True, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
     """Return Bricard's mechanism of five rods of 1 kg with a square section of this side, with gravity along -y.
 
-    Its coordinates are those of the corners P2 to P5 and, if `axes`, those of the axes of the joints there: 24
+    Its coordinates are those of the corners P2 to P5 and, if `axes` is true, of the axes of the joints there: 24
     constraints of rank 23. Otherwise the axes follow from the rods, which are then slender: 12 constraints of rank 11.
     """
     whole, weights = np.zeros((6, 6)), np.zeros(6)
@@ -275,7 +278,7 @@ def bricard(section: float = 0.1, axes: bool = True, t_end: float = 10.0, **opti
 
 
 def knife_edge(t_end: float = 10.0) -> MechanicsProblem:
-    """Return a knife edge on a slope along x of acceleration 1, which turns at the rate 1."""
+    """Return a knife edge that turns at the rate 1 on a slope, along which the acceleration is 1 in the direction x."""
 
     def reference(t: float) -> np.ndarray:
         x, y = np.sin(t) ** 2 / 2, (t - np.sin(2 * t) / 2) / 2

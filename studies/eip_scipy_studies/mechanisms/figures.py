@@ -1,4 +1,4 @@
-"""The four-bar linkage at several times, above its errors against costs."""
+"""Figures of the four-bar linkage at several times, and of its errors against costs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def joints(y: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
 
 
 def four_bar_figures(panels: Sequence[Any]) -> tuple[Any, Any]:
-    """Draw the linkage by RK45 without projection and with all invariants kept: above two `CostPanel`, and alone."""
+    """Draw the linkage by RK45 without projection and with all invariants kept.
+
+    Return two figures: one with the panels of errors against costs below the linkages, and one of the linkages alone.
+    """
     from ..plotting import Linkage, linkage_figure, linkages_figure
 
     problem = four_bar()

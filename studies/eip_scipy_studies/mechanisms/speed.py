@@ -21,11 +21,11 @@ class Speed(NamedTuple):
     Attributes
     ----------
     compiled : float
-        The compiled right-hand side, in a run without projection: the run's time by its number of calls.
+        Microseconds of the compiled right-hand side: the time of a run without projection, divided by its calls.
     lambdified : float
-        The right-hand side as users write it, with lambdify(cse=True) and numpy.linalg.solve.
+        Microseconds of the right-hand side as users write it, with lambdify(cse=True) and numpy.linalg.solve.
     first : float
-        From a SymPy model whose equations are derived to the last state of a run, in a new process.
+        Seconds from a SymPy model whose equations are derived to the last state of a run, in a new process.
     """
 
     compiled: float
@@ -34,7 +34,7 @@ class Speed(NamedTuple):
 
 
 def speed() -> Speed:
-    """Measure."""
+    """Measure these times."""
     problem = four_bar()
     kept(problem, (), TOLERANCE)  # compiles
     state, plain = problem.y0, lambdified(problem, 0.0)
@@ -52,7 +52,10 @@ def speed() -> Speed:
 
 
 def first_result() -> float:
-    """Return the processor time from the derived model to the first result; nothing is compiled or imported before."""
+    """Return the processor time from the derived model to the first result.
+
+    It is measured in a new process, in which nothing is compiled or imported before.
+    """
     four_bar_model()
     began = time.process_time()
     problem = four_bar()

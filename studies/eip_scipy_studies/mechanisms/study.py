@@ -2,7 +2,7 @@
 
 Each mechanism runs by DOP853 without projection, with its constraints kept, and with its energy as well; by SciPy's
 LSODA and Radau; by IDA of SUNDIALS with the constraints as equations, if scikit-sundae is installed; the four-bar
-linkage also with Baumgarte's terms, -2 alpha g' - alpha^2 g in the accelerations' equations of the constraints. The
+linkage also with Baumgarte's terms, which add -2 alpha g' - alpha^2 g to the constraints on the accelerations. The
 error is the largest one of the last positions, against a closed form, a published state, or a run at a tolerance of
 1e-13. Calls are those of the right-hand side, or of IDA's residual. Right-hand sides are compiled, except Baumgarte's.
 """
@@ -34,7 +34,10 @@ WEIGHED = ("andrews", "bricard", "wobbling disc", "steady disc", "knife edge")
 
 
 class Line(NamedTuple):
-    """A run: the error is NaN if it did not come to its end; processor time, the least of several runs."""
+    """Results of a method at one tolerance.
+
+    The error is NaN if the run did not reach its end. The processor time is the least of several runs.
+    """
 
     mechanism: str
     method: str
@@ -55,14 +58,14 @@ class Found(NamedTuple):
 
     @property
     def by_mechanism(self) -> dict[str, list[Line]]:
-        """The lines of each mechanism."""
+        """The results (`Line`) of each mechanism."""
         names = dict.fromkeys(line.mechanism for line in self.lines)
         return {name: [line for line in self.lines if line.mechanism == name] for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mechanisms(Study[Found]):
-    """See the file's docstring."""
+    """Command ``eip-scipy mechanisms``."""
 
     only: Sequence[str] | None = some_of("mechanism", EXAMPLES)
     tolerances: tuple[float, ...] = TOLERANCES
@@ -156,7 +159,7 @@ class Mechanisms(Study[Found]):
 
 
 def _costs(lines: Sequence[Line]) -> str:
-    """Lay out what each method pays for each error; runs that did not come to their end are left out."""
+    """Lay out the cost of each method at each error; runs that did not reach their end are left out."""
     done = [line for line in lines if np.isfinite(line.error)]
     by_calls, by_time = curves(done, "calls"), curves(done, "seconds")
     heads = [[f"{level:g}", what] for what in ("calls", "ms") for level in LEVELS]
@@ -175,17 +178,20 @@ def _four_bar_checks(found: Found) -> Iterable[Check]:
         ours, plain = by[BOTH, tolerance], by[NEITHER, tolerance]
         best = min(by[f"Baumgarte {factor:g}", tolerance].error for factor in FACTORS)
         yield Check(
-            f"four-bar at {tolerance:g}: {plain.error / ours.error:.0f} times nearer than DOP853 (at least 30), "
+            f"four-bar at {tolerance:g}: {plain.error / ours.error:.0f} times smaller error than DOP853 (at least 30), "
             f"{ours.calls / plain.calls:.3f} times its calls (at most 1.05)",
             ours.error <= plain.error / 30 and ours.calls <= 1.05 * plain.calls,
         )
         yield Check(
-            f"four-bar at {tolerance:g}: {best / ours.error:.1f} times nearer than the best of Baumgarte (at least 1)",
+            f"four-bar at {tolerance:g}: {best / ours.error:.1f} times smaller error than the best of Baumgarte (at "
+            "least 1)",
             ours.error <= best,
         )
     if (times := found.speed) is not None:
         ratio = times.lambdified / times.compiled
-        yield Check(f"the compiled right-hand side is {ratio:.0f} times faster (at least 20)", ratio >= 20)
+        yield Check(
+            f"the compiled right-hand side is {ratio:.0f} times faster than by lambdify (at least 20)", ratio >= 20
+        )
         yield Check(f"{times.first:.1f} s from the model to the first result (at most 5)", times.first <= 5)
 
 
@@ -196,7 +202,7 @@ def _published_checks(found: Found) -> Iterable[Check]:
 
 
 def _weights_checks(lines: Sequence[Line]) -> Iterable[Check]:
-    """Yield errors relative to those of runs without projection, which the weights of corrections decide."""
+    """Yield checks that projection does not increase the errors, as it would with wrong weights of the corrections."""
     by = {(line.mechanism, line.method, line.tolerance): line.error for line in lines}
     for name in dict.fromkeys(line.mechanism for line in lines if line.mechanism in WEIGHED):
         for what in (CONSTRAINTS, BOTH):

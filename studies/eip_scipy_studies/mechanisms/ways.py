@@ -45,9 +45,9 @@ class _TooManyCallsError(Exception):
 
 
 def ways(problem: MechanicsProblem, session: Session) -> dict[str, Way]:
-    """Return the ways to run a mechanism by their names.
+    """Return, by their names, functions that run a mechanism at a given tolerance.
 
-    IDA is left out, with a line at the end of the command, if scikit-sundae is not installed.
+    If scikit-sundae is not installed, IDA is left out, and the command prints a line about it at its end.
     """
     found: dict[str, Way] = {NEITHER: partial(_projected, problem, ())}
     found[CONSTRAINTS] = partial(_projected, problem, problem.constraints)
@@ -155,7 +155,7 @@ def _by_ida(problem: MechanicsProblem, ida: Any, tolerance: float) -> Outcome:
 def lambdified(problem: MechanicsProblem, factor: float) -> Callable[[float, np.ndarray], np.ndarray]:
     """Return the right-hand side of the four-bar linkage as users write it: lambdify and numpy.linalg.solve.
 
-    The accelerations' equations of the constraints get Baumgarte's terms, -2 `factor` g' - `factor`^2 g.
+    Baumgarte's terms, -2 `factor` g' - `factor`^2 g, are added to the constraints on the accelerations.
     """
     import sympy
 

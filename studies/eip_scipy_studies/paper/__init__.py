@@ -1,1 +1,1 @@
-"""``reproduce``: the paper's tables and figures."""
+"""The command ``eip-scipy reproduce``: the paper's tables and figures."""

@@ -33,7 +33,7 @@ STUDIES: dict[str, Make] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce(Command):
-    """The command."""
+    """Command ``eip-scipy reproduce``."""
 
     table: Sequence[str] = option(
         (),
@@ -46,7 +46,10 @@ class Reproduce(Command):
     studies: Mapping[str, Make] = field(default_factory=lambda: STUDIES)
 
     def run(self, session: Session) -> int:
-        """Run each as its own command would, and write one JSON of all, with two lists of the numbers of all tables."""
+        """Run the studies of the chosen tables and figures in turn, and write one JSON file of all.
+
+        The lists `cells` and `orders` in it hold the numbers of all tables.
+        """
         check_outputs(session.out, session.json)
         wanted = list(dict.fromkeys(self.studies if "all" in self.table else self.table))
         content: dict[str, Any] = {"cells": [], "orders": []}

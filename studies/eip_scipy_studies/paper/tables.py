@@ -48,9 +48,9 @@ class Value:
     paper : str
         The number as printed, its misprints corrected.
     ours, mpmath : float
-        The same number from this package in double precision, and in 50 digits (nan if that is out of reach).
+        The same number from this package in double precision, and computed in 50 digits (nan if this takes too long).
     roundoff : float
-        Possible change by round-off.
+        Largest change of the number that round-off may cause.
     printed : str or None
         The misprint of the paper, if there is one.
     """
@@ -63,12 +63,12 @@ class Value:
 
     @property
     def paper_digits(self) -> int:
-        """Return the significant digits that the paper prints."""
+        """Return the number of significant digits that the paper prints."""
         return len(Decimal(self.paper).as_tuple().digits)
 
     @property
     def digits(self) -> int:
-        """Return the leading significant digits that agree once both numbers are rounded to them."""
+        """Return the number of significant digits to which both numbers agree when rounded."""
         paper, ours = Decimal(self.paper), Decimal(self.ours)
         for count in range(self.paper_digits, 0, -1):
             place = Decimal(1).scaleb(paper.adjusted() - count + 1)
@@ -85,7 +85,7 @@ class Value:
     def within_roundoff(self) -> bool:
         """Return True if our number is within round-off of the paper's number, or of the number in 50 digits.
 
-        In the second case the round-off is the paper's.
+        In the second case the paper's number differs by the paper's own round-off.
         """
         half_unit = 0.5 * 10.0 ** int(Decimal(self.paper).as_tuple().exponent)
         from_paper, from_exact = abs(self.ours - float(self.paper)), abs(self.ours - self.mpmath)
@@ -117,7 +117,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Series:
-    """One method at successively shorter steps, as stored."""
+    """The paper's numbers of one method at successively shorter steps, as they are stored."""
 
     table: int
     name: str
@@ -134,12 +134,12 @@ class Series:
 
     @property
     def steps(self) -> list[float]:
-        """Lengths of the steps."""
+        """Return the lengths of the steps."""
         return [float(self.h) / d for d in self.divisors]
 
     @property
     def solver(self) -> type[EIPSolver]:
-        """The solver class."""
+        """Return the solver class of the method."""
         return METHODS[self.method]
 
 
@@ -150,7 +150,7 @@ def _data() -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class PaperTable(Study[list[Cell]]):
-    """One of the paper's tables in the paper's setting: fixed steps, euclidean metric.
+    """Study of one of the paper's tables in the paper's setting: fixed steps, euclidean metric.
 
     Table 5 takes minutes: 37500 steps on 128 x 128 points for each of nine columns. Its runs share the cores.
     """
@@ -159,7 +159,7 @@ class PaperTable(Study[list[Cell]]):
     processes: int = field(default_factory=cores)
 
     def measure(self, session: Session) -> list[Cell]:
-        """Method by method, from the longest step to the shortest."""
+        """Compute all numbers, method by method, from the longest step to the shortest."""
         number = TABLES.index(self.name) + 1
         stored = [Series(**s) for s in _data()["series"] if s["table"] == number]
         cells = []
@@ -219,12 +219,16 @@ def _orders(series: Series, errors: list[float], exact: list[float], roundoff: f
 
 
 def _multiplier_errors(series: Series) -> list[float]:
-    """Table 1: |lambda_hat - lambda_star| of the last step."""
+    """Return the errors in table 1: |lambda_hat - lambda_star| of the last step."""
     return [_multiplier_error(series, h) for h in series.steps]
 
 
 def _multiplier_error(series: Series, h: float) -> float:
-    """Compare lambda_hat of the projection with lambda_star, the paper's closed form at the same raw result."""
+    """Return |lambda_hat - lambda_star| in the last step of a run.
+
+    lambda_hat is the multiplier of the projection, and lambda_star the paper's closed form, both at the same
+    unprojected state.
+    """
     problem = harmonic(OMEGA)
     sol = solve_ivp(
         problem.fun,
@@ -248,7 +252,7 @@ def _multiplier_error(series: Series, h: float) -> float:
 
 
 def _raw_step(solver: type[EIPSolver], problem: Problem, y: np.ndarray, h: float) -> np.ndarray:
-    """Return the state after a step without projection, of equations that do not depend on time."""
+    """Return the state after a step without projection; the equations must not depend on time."""
     K = np.empty((solver.B.size, y.size))
     for i, row in enumerate(solver.A):
         K[i] = problem.fun(0.0, y + h * (row[:i] @ K[:i]))
@@ -257,7 +261,7 @@ def _raw_step(solver: type[EIPSolver], problem: Problem, y: np.ndarray, h: float
 
 
 def _last_defects(series: Series) -> list[float]:
-    """Tables 2 and 4: the last residual of the first preserved invariant."""
+    """Return the errors in tables 2 and 4: the last residual of the first preserved invariant."""
     problem = harmonic(OMEGA) if series.table == 2 else kepler(eccentricity=0.6, relativistic=0.005)
     return [_last_defect(problem, series, h) for h in series.steps]
 
@@ -268,7 +272,7 @@ def _last_defect(problem: Problem, series: Series, h: float) -> float:
 
 
 def _differences(series: Series) -> list[float]:
-    """Table 3: largest difference, over the components, of the ends of two successive steps."""
+    """Return the errors in table 3: largest differences of a component between the ends of runs with successive h."""
     problem = kepler(eccentricity=0.6, relativistic=0.005)
     steps = [2 * series.steps[0], *series.steps]
     ends = [_run(problem, series, h).y[:, -1] for h in steps]
@@ -276,12 +280,15 @@ def _differences(series: Series) -> list[float]:
 
 
 def _field_differences(series: Series) -> list[float]:
-    """Table 5: largest modulus of the difference of the fields at the ends of two successive steps."""
+    """Return the errors in table 5: largest moduli of the difference between the final fields for successive h."""
     return _field_changes([_field_end(series, h) for h in _field_steps(series)])
 
 
 def _shared(stored: list[Series], start: Callable[..., Callable[[], Any]]) -> Callable[[Series], list[float]]:
-    """Return the same function after queueing the runs of all series, those with most steps first."""
+    """Queue the runs of all series, and return a function that does what `_field_differences` does with their results.
+
+    Runs with most steps come first. `start` is what `workers` yields.
+    """
     runs = [(series, h) for series in stored for h in _field_steps(series)]
     waiting = {(series.name, h): start(_field_end, series, h) for series, h in sorted(runs, key=lambda run: run[1])}
     return lambda series: _field_changes([waiting[series.name, h]() for h in _field_steps(series)])
@@ -320,7 +327,7 @@ _ERRORS = {1: _multiplier_errors, 2: _last_defects, 3: _differences, 4: _last_de
 
 
 def passed(cells: Iterable[Cell]) -> bool:
-    """Return True if no number differs by more than round-off."""
+    """Return True if no number in these cells differs by more than round-off."""
     return all(value.status != "differs" for cell in cells for value in (cell.error, cell.order) if value is not None)
 
 
@@ -365,7 +372,7 @@ def _head(width: int, exact: bool) -> list[str]:
 
 
 def _values_text(cell: Cell) -> str:
-    """Lay out one line's numbers; those in 50 digits if a printed digit differs."""
+    """Lay out the numbers of one line of the table, with those in 50 digits if a printed digit differs."""
     text = _value_text(cell.error, WIDE)
     if cell.order is not None:
         text += _value_text(cell.order, NARROW)
@@ -381,7 +388,7 @@ def _value_text(value: Value, width: int) -> str:
 
 
 def _summary(cells: list[Cell]) -> list[str]:
-    """Return how many numbers agree, and why the others do not."""
+    """Return lines that say how many numbers agree, and why the others do not."""
     errors = [cell.error for cell in cells]
     orders = [cell.order for cell in cells if cell.order is not None]
     counts = [f"{sum(v.matched for v in values)} of {len(values)}" for values in (errors, orders)]

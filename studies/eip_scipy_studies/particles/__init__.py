@@ -1,1 +1,1 @@
-"""``charged-particle``."""
+"""The command ``eip-scipy charged-particle``, and ``reproduce fig-particle`` and ``fig-tokamak``."""

@@ -21,7 +21,10 @@ Found = dict[str, ParticleStudy]
 
 @dataclass(frozen=True, kw_only=True)
 class ChargedParticle(Study[Found]):
-    """The command, in both fields; `paper_only` selects the content of the paper's figures, under their names."""
+    """Command ``eip-scipy charged-particle``, in both fields.
+
+    `paper_only`: do only the runs of the paper's figures, and name the files as in ``eip-scipy reproduce``.
+    """
 
     scenes: Sequence[str] = SCENES
     paper_only: bool = False
@@ -33,7 +36,10 @@ class ChargedParticle(Study[Found]):
 
     def measure(self, session: Session) -> Found:
         if find_spec("numba") is None:
-            warn('the fields are Python here, which takes hours; with pip install "eip_scipy[numba]" it is a minute')
+            warn(
+                "without Numba the fields run in Python, which takes hours; a minute is enough after "
+                'pip install "eip_scipy[numba]"'
+            )
         runs = len(self.chosen()) * (1 + (len(PAPER_METHODS) if self.paper_only else len(METHODS) + 1))
         with session.bar(runs, "charged particle") as bar:
             return {name: study(name, paper_only=self.paper_only, callback=bar.update) for name in self.chosen()}
@@ -63,17 +69,17 @@ class ChargedParticle(Study[Found]):
 
 @dataclass(frozen=True, kw_only=True)
 class Uniform(ChargedParticle):
-    """The uniform field alone."""
+    """Command ``eip-scipy charged-particle uniform``."""
 
     scenes: Sequence[str] = SCENES[:1]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tokamak(ChargedParticle):
-    """The tokamak alone."""
+    """Command ``eip-scipy charged-particle tokamak``."""
 
     scenes: Sequence[str] = SCENES[1:]
-    orbit: str | None = option(None, "one orbit; default: both", choices=tuple(ORBITS))
+    orbit: str | None = option(None, "run only this orbit; default: both", choices=tuple(ORBITS))
 
     def chosen(self) -> Sequence[str]:
         """Return the problems of the orbit."""

@@ -26,7 +26,7 @@ TITLES = {
 
 
 class RangeCheck(NamedTuple):
-    """A number that must lie between two bounds."""
+    """Check of a number that must lie between two bounds."""
 
     scene: str
     what: str
@@ -41,7 +41,7 @@ class RangeCheck(NamedTuple):
 
     @property
     def text(self) -> str:
-        """One line."""
+        """Return the check as a line of text."""
         whole = float(self.value).is_integer() and self.low == self.high
         number = f"{self.value:.0f}" if whole else compact(self.value, 5 if "tip" in self.what else 4)
         if self.low == self.high:
@@ -56,7 +56,7 @@ class RangeCheck(NamedTuple):
 
 
 def checks(found: ParticleStudy) -> list[RangeCheck]:
-    """Compare with the reference and with what the methods are known to do over the paper's interval."""
+    """Compare the runs with the reference, and with the known behaviour of the methods over the paper's interval."""
     got = found.numbers
     kept = [
         RangeCheck(found.scene, f"{name}, largest relative error of {symbol}", got[name][key], 0.0, ROUND_OFF)
@@ -176,7 +176,7 @@ def _cell(key: str, value: float) -> str:
 
 
 def rows(found: ParticleStudy) -> Iterator[dict[str, Any]]:
-    """Make the lines of the CSV file, about a thousand of each method."""
+    """Yield the lines of the CSV file, about a thousand for each method."""
     for name, line in {"reference": found.reference, **found.lines}.items():
         every = max((line.orbit.t.size - 1) // ROWS, 1)
         for k in range(0, line.orbit.t.size, every):
@@ -192,14 +192,14 @@ def rows(found: ParticleStudy) -> Iterator[dict[str, Any]]:
 
 
 def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -> Iterator[tuple[str, Any]]:
-    """Make the figures one by one: that of the uniform field, and one of both of the tokamak's orbits.
+    """Make the figures one by one: one for the uniform field, and one for both orbits in the tokamak.
 
     Parameters
     ----------
     studies : mapping of str to ParticleStudy
         Runs by problem.
     paper_only : bool, optional
-        Only the rows of the paper's figures, RK4 and EIP-HL, and EIP-H in the uniform field.
+        Draw only the rows of the paper's figures: RK4 and EIP-HL, and EIP-H in the uniform field.
 
     Yields
     ------

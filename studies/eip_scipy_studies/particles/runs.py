@@ -55,11 +55,12 @@ class ParticleStudy:
     Attributes
     ----------
     scene : str
+        Name of the problem, one of `SCENES`.
     problem : ParticleProblem
     reference : ParticleRun
-        DOP853 with 1/4 of the step, compensated.
+        Run by DOP853 with 1/4 of the step and compensated sums.
     reference_error : float
-        Its largest distance from the states stored with the problem; nan if the run has none.
+        Largest distance of the reference from the states stored with the problem; nan if none of their times is saved.
     lines : dict of str to ParticleRun
         The runs by the methods' names.
     """
@@ -72,7 +73,7 @@ class ParticleStudy:
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, float]]:
-        """Return the results of each method, the reference first; distances and angles against the reference.
+        """Return the results of each method, the reference first; distances and angles are relative to the reference.
 
         All problems have ``energy_error``, ``momentum_error`` (relative, largest), ``phase_error`` (of the gyration at
         the end, rad), ``position_error`` (at the end), ``nfev`` and ``wall_time``. Uniform field: ``gyroradius_first``
@@ -139,7 +140,9 @@ def _boris(problem: ParticleProblem) -> Any:
 def study(
     name: str, *, paper_only: bool = False, callback: Callable[[], Any] = lambda: None, **options: Any
 ) -> ParticleStudy:
-    """Run the methods on one problem, in the canonical form, except Boris, which is a method for (x, v).
+    """Run the methods on one problem.
+
+    All use the canonical form of the equations, except Boris, which is a method for (x, v).
 
     Parameters
     ----------
@@ -185,7 +188,7 @@ def _line(problem: ParticleProblem, run: Any) -> ParticleRun:
 
 
 def _distance(problem: ParticleProblem, orbit: ParticleOrbit) -> float:
-    """Return the largest distance from the stored positions."""
+    """Return the largest distance of an orbit from the stored positions; nan if none of their times is saved."""
     assert problem.reference is not None
     every = max((orbit.t.size - 1) // 100, 1)
     known = [(k, problem.reference(float(orbit.t[k]))) for k in range(every, orbit.t.size, every)]

@@ -1,1 +1,1 @@
-"""``solar-system``, ``solar-system frontier`` and ``solar-system truth``."""
+"""The commands ``eip-scipy solar-system``, ``solar-system frontier`` and ``solar-system truth``."""

@@ -57,7 +57,7 @@ class TimedRun:
     ----------
     method : str
     step : float
-        Years; the tolerance for heyoka; nan for IAS15, which chooses its steps.
+        Step in years; for heyoka the tolerance; nan for IAS15, which chooses its steps.
     wall_time : float
         Seconds.
     errors : ndarray, shape (9,)
@@ -71,17 +71,20 @@ class TimedRun:
 
     @property
     def mercury(self) -> float:
-        """Return Mercury's error."""
+        """Return the error of Mercury's position."""
         return float(self.errors[MERCURY])
 
     @property
     def others(self) -> float:
-        """Return the largest error of another planet."""
+        """Return the largest error of the other planets' positions."""
         return float(np.delete(self.errors, MERCURY).max())
 
 
 def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
-    """Make a run over the problem's interval with the step that the runner passes, in years; nan if it failed."""
+    """Return ``run(step)``, which runs the problem by `integrate` with this step in years.
+
+    It returns the seconds and the final state, which is nan if the run failed.
+    """
 
     def run(step: float) -> tuple[float, np.ndarray]:
         name = f"{method.__name__}, h = {step:.4g} yr"
@@ -92,7 +95,7 @@ def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
 
 
 def by_verlet(problem: Problem) -> Runner:
-    """Make the run by Stoermer-Verlet."""
+    """Return ``run(step)`` by Stoermer-Verlet, as `by_us` does."""
 
     def run(step: float) -> tuple[float, np.ndarray]:
         result = leapfrog(problem, step, None)
@@ -102,9 +105,9 @@ def by_verlet(problem: Problem) -> Runner:
 
 
 def by_peer(problem: Problem, peer: Peer, integrator: str, **options: Any) -> Runner:
-    """Make the run by an integrator of REBOUND, whose steps are shortened to divide the interval.
+    """Return ``run(step)`` by an integrator of REBOUND, as `by_us` does; steps are shortened to divide the interval.
 
-    IAS15 chooses its own steps, for which the argument is nan.
+    `peer` is the function `run` of `eip_scipy.integrations.rebound`. IAS15 chooses its own steps; for it `step` is nan.
     """
     assert problem.params is not None
     gm, years = problem.params[: problem.y0.size // 6], problem.t_span[1]
@@ -130,7 +133,7 @@ def timed(
     Parameters
     ----------
     methods : mapping
-        As `work_precision` takes it.
+        Functions and steps, as for `work_precision`.
     truth : ndarray, shape (60,)
         The state at the end of all runs.
     repeats, enough_seconds, callback
@@ -154,7 +157,7 @@ def timed(
 
 
 def panels(runs: Sequence[TimedRun], time: str = "wall time [s]") -> list[list[Any]]:
-    """Return Mercury's error and the largest of the others, for `eip_scipy_studies.plotting.cost_figure`."""
+    """Return panels for `eip_scipy_studies.plotting.cost_figure`: Mercury's error, and the largest of the others."""
     from ..plotting import CostPanel
 
     kinds = {"mercury": "Mercury", "others": "the worst of the other planets"}
@@ -174,13 +177,13 @@ def cost(
     Parameters
     ----------
     scene : SolarScene
-        Problem over the span to be timed.
+        The problem, over the time span to be timed.
     methods : mapping
         From `cost_methods`.
     peer : callable or None
         REBOUND, if it is installed.
     repeats : int
-        Repeats of each method and step, unless one took more than `ENOUGH_SECONDS`.
+        Number of runs of each method and step; a run longer than `ENOUGH_SECONDS` is not repeated.
     callback : callable, optional
         ``callback()`` after each run, including those that are left out.
 
@@ -205,15 +208,15 @@ def cost_methods(
     ----------
     scene : SolarScene
     method : type
-        Timed with and without its projection, together with EIPRK5 (EIPRK4 for EIPRK5), EIPRKN12 and
-        EIPGJ14.
+        The method asked for. It is timed with and without its projection; EIPRK5 (or EIPRK4 if `method` is EIPRK5),
+        EIPRKN12 and EIPGJ14 are timed as well.
     metric : {"error", "euclidean"}
     peer : callable or None
 
     Returns
     -------
     dict
-        As `work_precision` takes it.
+        Functions and steps by method, as for `work_precision`.
     """
     other = EIPRK4 if method is EIPRK5 else EIPRK5
     own, problem = metric_of(method, metric), scene.problem
@@ -237,5 +240,5 @@ def cost_methods(
 
 
 def _steps(scene: SolarScene, wanted: Sequence[float]) -> list[float]:
-    """Shorten steps to divide the span: a shortened last one would spoil a symplectic method."""
+    """Shorten steps to divide the time span, because a shortened last step would spoil a symplectic method."""
     return sorted({scene.years / whole_number(scene.years / h) for h in wanted}, reverse=True)

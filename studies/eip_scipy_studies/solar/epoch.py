@@ -92,7 +92,9 @@ class AnyEpoch:
     epoch: Epoch | None = option(
         None, f'start at any epoch of a JPL kernel: {FORMS}; needs "eip_scipy[jpl]"', type=_epoch
     )
-    kernel: Path | None = option(None, "a kernel of your own (.bsp) instead of DE440", type=Path, metavar="FILE")
+    kernel: Path | None = option(
+        None, "file of a planetary kernel (.bsp) to use instead of DE440", type=Path, metavar="FILE"
+    )
 
 
 def kernels() -> Any:
@@ -102,7 +104,7 @@ def kernels() -> Any:
 
 @contextmanager
 def one_line() -> Iterator[None]:
-    """Report in one line that an epoch, a kernel or a model cannot be used."""
+    """Turn errors about an epoch, a kernel or a force model into a UsageError with a message of one line."""
     try:
         yield
     except (ImportError, OSError, ValueError) as error:

@@ -24,7 +24,11 @@ TIGHT_POSITION = {"IAS15": 1e-8, TIGHT: 1e-7}  # AU, after 2000 years
 
 
 class PointErrors(NamedTuple):
-    """Errors of one run at one time; longitudes have a sign, in rad, and are nan if turns cannot be counted."""
+    """Errors of one run at one time, and the reference to which they are relative.
+
+    Errors of longitude are signed, in rad, and nan if whole turns cannot be counted. Errors of position are distances
+    in AU.
+    """
 
     year: float
     reference: str
@@ -48,17 +52,17 @@ class SolarRuns:
     """Name of the run that another core did in parallel; empty if all runs were done one after the other."""
 
     def errors(self, year: float) -> dict[str, PointErrors]:
-        """Return the errors of the runs at a time, if they are known."""
+        """Return, by name, the errors of those runs whose errors at this time are known."""
         found = {run.name: errors_at(self.scene, run, year, self.tight) for run in self.runs}
         return {name: errors for name, errors in found.items() if errors is not None}
 
     def checks(self) -> list[Check]:
-        """Do the command's checks for the runs that there are."""
+        """Return the command's checks for the runs that are completed."""
         return checks(self.scene, self.order, self.runs[0], self.tight) if self.runs else []
 
 
 def ecliptic(scene: SolarScene, vectors: np.ndarray) -> np.ndarray:
-    """Turn vectors (k, 3, m) from the data's axes to those of the ecliptic."""
+    """Rotate vectors (k, 3, m) from the axes of the data to those of the ecliptic."""
     if scene.data.axes != "ICRF":
         return vectors
     c, s = math.cos(OBLIQUITY), math.sin(OBLIQUITY)
@@ -121,13 +125,13 @@ def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun |
     run : MethodRun
     year : float
     tight : MethodRun or None
-        The run that counts the turns, and the reference if no state is stored.
+        The run along which whole turns are counted. It is also the reference if no reference state is stored.
 
     Returns
     -------
     PointErrors or None
-        None if nothing is known: no reference at that time, the run is that reference, or it ended before.
-        Longitudes are nan without `tight`. Positions are relative to the centre of mass.
+        None if the errors are not known: there is no reference at that time, the run is the reference itself, or the
+        run ended before. Longitudes are nan without `tight`. Positions are relative to the centre of mass.
     """
     state, source = stored_state(scene, year), "stored states"
     if state is None and tight is not None and tight is not run:
@@ -141,7 +145,7 @@ def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun |
 
 
 def _turns(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None, wrapped: np.ndarray) -> np.ndarray:
-    """Return the whole turns to be added to an error in (-pi, pi], as counted along the tightest run."""
+    """Return the whole turns, as angles, to be added to errors in (-pi, pi]; they are counted along the run `tight`."""
     if tight is None or _state_at(tight, year) is None:
         return np.full_like(wrapped, np.nan)
     counted = longitude_errors(scene, run, tight)[:, _index(tight, year)]
@@ -158,7 +162,7 @@ def _state_at(run: MethodRun, year: float) -> np.ndarray | None:
 
 
 def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | None) -> list[Check]:
-    """Check conditions that hold for any sensible arguments; a failure says that the numbers are not reliable.
+    """Check conditions that hold for any sensible settings; if one fails, the results are not reliable.
 
     Parameters
     ----------
@@ -166,7 +170,7 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
     order : int
         Order of the method asked for.
     main : MethodRun
-        Its run.
+        The run of this method.
     tight : MethodRun or None
         The tightest run.
 
@@ -187,7 +191,7 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
 
 
 def _reference_checks(scene: SolarScene, tight: MethodRun) -> list[Check]:
-    """Check that the run that counts turns follows the stored states, at the last of them."""
+    """Check that the tightest run, along which turns are counted, agrees with the last stored state in its span."""
     stored = [year for year in report_times(scene) if stored_state(scene, year) is not None]
     at_end = errors_at(scene, tight, stored[-1], tight) if stored else None
     if at_end is None:

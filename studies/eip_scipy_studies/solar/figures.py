@@ -1,4 +1,4 @@
-"""The figures of ``eip-scipy solar-system``: from a `SolarRuns` to the functions of `eip_scipy_studies.plotting`."""
+"""The figures of ``eip-scipy solar-system``, made from a `SolarRuns` with `eip_scipy_studies.plotting`."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, 
     Parameters
     ----------
     study : SolarRuns
-        The runs, with the reference run, and for the last figure with the timings.
+        The runs, including the reference run; the last figure also needs the timings.
     part : slice, optional
-        Slice of `FIGURES` to make.
+        Slice of `FIGURES`: the figures to make.
 
     Yields
     ------
@@ -63,7 +63,7 @@ def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def osculating_orbits(scene: SolarScene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
-    """Compute the ellipses that the planets would follow around the inner bodies, if those were a single one.
+    """Compute the osculating ellipses: the planets' orbits if all bodies inside each were a single one.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _span(study: SolarRuns) -> str:
 
 
 def _longitudes(study: SolarRuns) -> dict[str, np.ndarray]:
-    """Draw longitude errors along each run except the reference."""
+    """Return the errors of longitude along each run except the reference, by name."""
     tight = study.tight
     if tight is None:
         return {}
@@ -138,7 +138,7 @@ def _longitude_figure(study: SolarRuns, styles: Any) -> Any:
 
 
 def _shown(study: SolarRuns) -> dict[str, MethodRun]:
-    """Draw Stoermer-Verlet and the method asked for, as in the paper, and the reference."""
+    """Return the runs that the figures of orbits show: Stoermer-Verlet and the method asked for, and the reference."""
     verlet = next(run for run in study.runs if run.name == "SV")
     shown = {"Störmer-Verlet": verlet, study.runs[0].name: study.runs[0]}
     if study.tight:
@@ -147,7 +147,10 @@ def _shown(study: SolarRuns) -> dict[str, MethodRun]:
 
 
 def _sample(run: MethodRun) -> np.ndarray:
-    """Choose some saved states, not equally spaced: equal spacing may show a precession only at its own period."""
+    """Return the indices of some saved states.
+
+    They are not equally spaced, because equal spacing could hide a precession with the same period.
+    """
     golden = np.arange(1, ELLIPSES) * (np.sqrt(5.0) - 1) / 2 % 1.0
     return np.unique(np.append((golden * run.t.size).astype(int), [0, run.t.size - 1]))
 

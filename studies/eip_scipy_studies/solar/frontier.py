@@ -36,12 +36,12 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
         The ten bodies, in AU and years.
     years : float
     peer, heyoka : callable or None
-        ``run`` of the integrations, if they are installed.
+        The functions ``run`` for REBOUND and for heyoka, if these packages are installed.
 
     Returns
     -------
     dict of str to (callable, sequence of float)
-        As `work_precision` takes it.
+        Functions and steps or tolerances by method, as for `work_precision`.
     """
 
     def own(method: Any, *steps: float, **options: Any) -> tuple[Runner, Sequence[float]]:
@@ -75,7 +75,7 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
 
 
 def _dividing(years: float, wanted: Sequence[float]) -> list[float]:
-    """Return steps shortened to divide the span."""
+    """Return the wanted steps, shortened to divide the time span."""
     return [years / whole_number(years / h) for h in wanted]
 
 
@@ -113,13 +113,13 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Frontier(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy solar-system frontier``."""
 
-    years: float = option(1000.0, "length in Julian years: 1, 2, 5, 10 ... 10000 (%(default)g)", type=positive)
+    years: float = option(1000.0, "length in Julian years: 1, 2, 5, 10 ... 10000 (default: %(default)g)", type=positive)
     repeats: int = 3
 
     def check_settings(self) -> None:
-        """Raise an error if there is no state to compare with."""
+        """Raise an error if no reference state is stored for this length."""
         if self.years not in reference_states():
             known = ", ".join(f"{t:g}" for t in reference_states())
             raise UsageError(f"there is no stored reference state: --years must be one of {known}, got {self.years:g}")

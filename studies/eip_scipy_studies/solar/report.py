@@ -19,7 +19,7 @@ __all__ = ["cost_rows", "csv_rows", "json_content", "text"]
 
 
 def text(study: SolarRuns, settings: Any) -> str:
-    """Lay out the head, the table, the notes and the checks, 90 columns for the usual names."""
+    """Lay out the head, the table, the notes and the checks, 90 characters wide with the usual names."""
     parts = [_head(study, settings), _table(study), _notes(study), *_check_lines(study)]
     return "\n".join(["", *parts])
 
@@ -76,7 +76,7 @@ def _cell(study: SolarRuns, run: MethodRun, errors: PointErrors | None, quantity
 
 
 def _counts(tight: MethodRun | None) -> bool:
-    """Return whether there is a run to count turns along."""
+    """Return whether there is a run along which whole turns can be counted."""
     return tight is not None and not tight.failure
 
 
@@ -125,7 +125,7 @@ def cost_rows(study: SolarRuns) -> list[dict[str, Any]]:
 
 
 def csv_rows(study: SolarRuns) -> list[dict[str, Any]]:
-    """Make a row for each method and time with a reference, all planets in it."""
+    """Make a row for each method and each time with a reference; it has columns for all planets."""
     rows = []
     planets = study.scene.planets
     for year in report_times(study.scene):
@@ -151,7 +151,7 @@ def csv_rows(study: SolarRuns) -> list[dict[str, Any]]:
 
 
 def json_content(study: SolarRuns) -> dict[str, Any]:
-    """Collect all numbers."""
+    """Collect all numbers for the JSON file."""
     scene = study.scene
     times = {year: study.errors(year) for year in report_times(scene)}
     methods = [

@@ -1,6 +1,7 @@
 """The solar system run by several methods: the common problem, the runs, and their states.
 
-This module prints and writes nothing. REBOUND is passed as a function (`Peer`), so that no extra is needed.
+This module prints and writes nothing. REBOUND's `run` is passed as a function (`Peer`) or None, so that the extra is
+optional.
 """
 
 from __future__ import annotations
@@ -69,9 +70,9 @@ class SolarScene:
     data : SolarSystemData
     years, h : float
     n_saves : int
-        Number of states saved after the start, equally spaced.
+        Number of equally spaced states that are saved after the start.
     every : int
-        Steps between them.
+        Number of steps between two saved states.
     """
 
     problem: Problem
@@ -83,7 +84,7 @@ class SolarScene:
 
     @property
     def interval(self) -> float:
-        """Return the years between saved states."""
+        """Return the time between two saved states in years."""
         return self.years / self.n_saves
 
     @property
@@ -100,17 +101,17 @@ class MethodRun:
     ----------
     name : str
     head : tuple of str
-        The name on the lines of a table's head.
+        The name, divided into the lines of a table's head.
     step : float or None
-        Years; None if the method chooses its steps.
+        Step in years; None if the method chooses its steps.
     wall_time : float
-        Seconds, without compilation and the reading of states.
+        Seconds of the run, without compilation and without reading states.
     t : ndarray, shape (m,)
     y : ndarray, shape (60, m)
     energy_error, momentum_error : ndarray, shape (m,)
         |H - H(0)| / |H(0)| and |L - L(0)| / |L(0)|.
     failure : str
-        Why the run did not reach its end; empty if it did.
+        Reason why the run did not reach its end; empty if it did.
     """
 
     name: str
@@ -125,7 +126,10 @@ class MethodRun:
 
 
 class PendingRun(NamedTuple):
-    """A run that is still to be done: ``start(progress)``; `has_bar` says whether it shows its own progress bar."""
+    """A run that is still to be done.
+
+    ``start(progress)`` does it and returns a `MethodRun`. `has_bar` says whether the run shows its own progress bar.
+    """
 
     name: str
     start: Callable[[bool], MethodRun]
@@ -151,7 +155,8 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScen
     Raises
     ------
     ValueError
-        If a step does not fit into the span or is below the spacing of numbers there, or if the data are unknown.
+        If the step is longer than the run or too small to change the time in floating-point arithmetic, or if the data
+        are unknown.
     """
     FixedSteps.of((0.0, years), h, None)
     n_saves = whole_number(years / max(_save_interval(years), h))
@@ -162,7 +167,10 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScen
 
 
 def _save_interval(years: float) -> float:
-    """Return an interval short enough to count turns and to draw curves, such that 1, 10, 100 ... years are saved."""
+    """Return the time between saved states in years.
+
+    It is short enough to count turns and to draw curves, and such that states at 1, 10, 100 ... years are saved.
+    """
     for least_years, interval in ((200.0, 1.0), (100.0, 0.5), (40.0, 0.2), (1.0, 0.1)):
         if years >= least_years:
             return max(interval, years / MOST_SAVES)
@@ -170,7 +178,7 @@ def _save_interval(years: float) -> float:
 
 
 def whole_number(ratio: float) -> int:
-    """Round the ratio up, unless it is a whole number to rounding."""
+    """Round the ratio up, unless it is a whole number up to rounding errors."""
     nearest = round(ratio)
     return max(1, nearest if abs(ratio - nearest) <= 1e-9 * ratio else math.ceil(ratio))
 
@@ -182,7 +190,7 @@ def plan(
     peer: Peer | None,
     checkpoint_of: Callable[[str], dict[str, Any]] = lambda name: {},
 ) -> list[PendingRun]:
-    """List the runs of the comparison: first the method asked for, last the tightest, which serves as reference.
+    """List the runs of the comparison: first that of `method`, last the most accurate one, which serves as reference.
 
     Parameters
     ----------
@@ -227,12 +235,12 @@ def plan(
 
 
 def metric_of(method: type[EIPSolver], metric: str) -> str:
-    """Return the metric that a method uses: euclidean without an error estimate."""
+    """Return the metric that a method uses: `metric`, or "euclidean" if the method has no error estimate."""
     return metric if method.TABLEAU.has_estimate else "euclidean"
 
 
 def eip_name(method: type[EIPSolver], metric: str) -> str:
-    """Name a method with its metric."""
+    """Return the name of a method with its metric."""
     return f"{method.__name__} ({metric})"
 
 
@@ -264,12 +272,12 @@ def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **checkpo
 
 
 def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run the tightest method that is available without REBOUND: the method of order 12 with half of its step."""
+    """Run the most accurate method that needs no REBOUND: EIPRKN12 with half of its usual step."""
     return _high_order(scene, TIGHT, "tight", 2, progress, **checkpoint)
 
 
 def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run the method for small errors over long times, its step divided by `shorter`."""
+    """Run EIPRKN12, the method for small errors over long times, with its usual step divided by `shorter`."""
     per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
     return _long(scene, EIPRKN12, name, word, per_save, progress, **KEPT, **checkpoint)
 
@@ -280,13 +288,13 @@ def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRu
 
 
 def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
-    """Return the options that keep each planet's energy about the Sun instead of the totals."""
+    """Return the options with which `integrate` keeps each planet's energy about the Sun instead of the totals."""
     problem = solar_system(data, balances="kepler")
     return {"invariants": problem.invariants, "frame": problem.frame}
 
 
 def _balanced(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Keep each planet's energy about the Sun as a balance, instead of the totals."""
+    """Run EIPGJ14 with each planet's energy about the Sun kept as a balance, instead of the totals."""
     per_save = whole_number(scene.interval / MULTISTEP_STEP)
     return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **orbits_kept(scene.data), **checkpoint)
 
@@ -315,7 +323,10 @@ def leapfrog(problem: Problem, step: float, save_every: int | None) -> StormerVe
 
 
 def rebound_run(scene: SolarScene, peer: Peer, name: str, integrator: str, per_save: int, progress: bool) -> MethodRun:
-    """Run REBOUND; with fixed steps timed in a run without saves, each of which costs a synchronisation."""
+    """Run an integrator of REBOUND.
+
+    Integrators with fixed steps are timed in a second run without saves, because each save costs a synchronisation.
+    """
     step = scene.interval / per_save
     run = partial(peer, scene.problem.params, scene.problem.y0, integrator, h=step, n_steps=scene.n_saves * per_save)
     result = run(save_every=per_save)

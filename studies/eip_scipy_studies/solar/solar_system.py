@@ -1,4 +1,4 @@
-"""``eip-scipy solar-system``: the paper's Experiment II as a table, figures and files; settings and order of events."""
+"""``eip-scipy solar-system``: the paper's Experiment II as a table, figures and files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ BESIDE_FIGURES, OWN_FIGURES = (
 
 
 class Found(NamedTuple):
-    """The runs, REBOUND if it is installed, and the process that runs the longest one in parallel and draws."""
+    """The runs, REBOUND's `run` if it is installed, and the second process, which does the longest run and draws."""
 
     runs: SolarRuns
     peer: Peer | None
@@ -46,16 +46,17 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
-    """The command.
+    """Command ``eip-scipy solar-system``.
 
-    A second process does the longest run, from `beside_years` on: in shorter runs its cost exceeds its gain.
+    From a length of `beside_years` on, a second process does the longest run; in shorter runs it costs more than it
+    gains.
     """
 
-    years: float = option(2000.0, "length in Julian years (%(default)g)", type=positive)
-    h: float = option(0.002, "step in years, shortened to divide the run (%(default)s)", type=positive)
-    method: str = option("EIPRK4", "the method to show (%(default)s)", choices=list(fixed_step_methods()))
-    metric: str = option("error", "its metric (%(default)s)", choices=METRICS)
-    data: str | None = option(None, f"initial data that the package carries ({DATA})", choices=TEN_BODIES)
+    years: float = option(2000.0, "length in Julian years (default: %(default)g)", type=positive)
+    h: float = option(0.002, "step in years, shortened to divide the run (default: %(default)s)", type=positive)
+    method: str = option("EIPRK4", "method to show (default: %(default)s)", choices=list(fixed_step_methods()))
+    metric: str = option("error", "metric of its projection (default: %(default)s)", choices=METRICS)
+    data: str | None = option(None, f"initial data that the package carries (default: {DATA})", choices=TEN_BODIES)
     repeats: int = 3
     beside_years: float = 200.0
     timed_methods: Callable[..., Mapping[str, Any]] = cost_methods
@@ -64,7 +65,9 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         if self.data is not None and self.epoch is not None:
             raise UsageError("argument --epoch: not allowed with argument --data")
         if self.kernel is not None and self.epoch is None:
-            raise UsageError("--kernel goes with --epoch, which says where in the kernel to start")
+            raise UsageError(
+                "--kernel goes with --epoch, which is missing: give the time in the kernel at which to start"
+            )
         super().check_settings()
 
     def arguments(self) -> dict[str, Any]:
@@ -73,7 +76,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return known | start
 
     def measure(self, session: Session) -> Found:
-        """Do the runs; an interrupt by the user keeps the completed ones."""
+        """Do the runs; if the user interrupts, the completed ones are kept."""
         method = fixed_step_methods()[self.method]
         with one_line():
             runs = SolarRuns(make_scene(self._start(), self.years, self.h), method.TABLEAU.order, repeats=self.repeats)
@@ -96,7 +99,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return data
 
     def _integrate(self, runs: SolarRuns, session: Session, peer: Peer | None, beside: Beside | None) -> None:
-        """Do the runs, the last of them in parallel if possible."""
+        """Do the runs, the last of them in the second process if there is one."""
         method = fixed_step_methods()[self.method]
         tasks = plan(runs.scene, method, self.metric, peer, self.checkpoint_options)
         starts: list[Callable[[], MethodRun]] = [partial(task.start, session.shown) for task in tasks]
@@ -141,7 +144,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return report.json_content(found.runs)
 
     def figures(self, found: Found) -> Figures:
-        """Draw the figures of the second process, and the others."""
+        """Yield the figures that the second process has drawn, and draw the others."""
         drawn = images(found.runs, slice(None) if found.beside is None else OWN_FIGURES)
         if found.beside is not None:
             drawn = found.beside.result() | drawn

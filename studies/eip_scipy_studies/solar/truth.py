@@ -1,4 +1,4 @@
-"""``eip-scipy solar-system truth``: effect of each force, measured against the ephemeris DE440 itself."""
+"""``eip-scipy solar-system truth``: error of each force model against the ephemeris DE440."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Model(NamedTuple):
 
 
 class ModelRun(NamedTuple):
-    """Errors of a model against the ephemeris: years (m,), and for each planet km and arcsec (m,)."""
+    """Errors of a model against the ephemeris: times `years` (m,), and for each planet errors in km and arcsec (m,)."""
 
     model: Model
     years: np.ndarray
@@ -58,12 +58,12 @@ class ModelRun(NamedTuple):
 
 
 def models(forces: Sequence[str] | None) -> list[Model]:
-    """Return the models to be compared: Newton and the one asked for, or the standard ones.
+    """Return the models to be compared: Newton's gravitation and the model with these `forces`, or the standard ones.
 
     Raises
     ------
     ValueError
-        If forces exclude each other.
+        If two of the forces exclude each other.
     """
     asked = STANDARD if forces is None else ((), tuple(forces))
     found = [Model(check_forces(name for name in names if name != MOON), MOON in names) for names in asked]
@@ -78,7 +78,7 @@ def save_times(years: float, h: float) -> tuple[np.ndarray, int, float]:
     Raises
     ------
     ValueError
-        If the step is longer than the time between saved states.
+        If the step is longer than the run.
     """
     span = abs(years)
     interval = span / 100 if span < 1 else 0.1 if span <= 200 else 1.0
@@ -106,7 +106,7 @@ def run_model(
     ----------
     model : Model
     data : SolarSystemData
-        Data with the Moon if the model has it.
+        Initial data, with the Moon as a separate body if the model has it.
     times : ndarray, shape (m,)
         Years, from `save_times`, with `every` and `step`.
     truth : dict of str to ndarray, shape (m, 3)
@@ -155,7 +155,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 class Found(NamedTuple):
-    """The models' runs, the start in words, and the step in years."""
+    """The runs of all models, the start in words, and the step in years."""
 
     runs: list[ModelRun]
     start: str
@@ -168,13 +168,13 @@ def _span(text: str) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(AnyEpoch, Study[Found]):
-    """The command."""
+    """Command ``eip-scipy solar-system truth``."""
 
-    years: float = option(100.0, "length in Julian years, negative to go back (%(default)g)", type=_span)
-    h: float | None = option(None, f"step in years, shortened to divide the run ({STEP:g})", type=positive)
+    years: float = option(100.0, "length in Julian years, negative to go back (default: %(default)g)", type=_span)
+    h: float | None = option(None, f"step in years, shortened to divide the run (default: {STEP:g})", type=positive)
     forces: Sequence[str] | None = option(
         None,
-        f"one model in place of the standard ones, of {', '.join(KNOWN)}",
+        f"forces of one model in place of the standard ones; some of {', '.join(KNOWN)}",
         type=one_of("force", KNOWN),
         nargs="+",
         metavar="FORCE",
@@ -185,7 +185,7 @@ class Truth(AnyEpoch, Study[Found]):
         return {"years": self.years, "h": self.h, "forces": self.forces}
 
     def measure(self, session: Session) -> Found:
-        """Run the models; an interrupt by the user keeps the completed runs."""
+        """Run the models; if the user interrupts, the completed runs are kept."""
         h = min(STEP, abs(self.years)) if self.h is None else self.h
         epoch, jpl = self.epoch or PAPER_EPOCH, kernels()
         with one_line():
@@ -210,7 +210,7 @@ class Truth(AnyEpoch, Study[Found]):
         return found
 
     def checks(self, found: Found) -> list[Check]:
-        """Check that the step adds only a small share to an error."""
+        """Check that the error of the steps is only a small part of each error."""
         return [
             Check(
                 f"{run.model.name}: halving the step moves {body} by {moved:.2g} km, "
@@ -270,7 +270,7 @@ def reported(years: np.ndarray) -> list[int]:
 
 
 def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
-    """Return the numbers of the table."""
+    """Return the rows of the table as numbers."""
     return [
         _row(run, place, body) | {"step_km": run.step_km[body] if place == run.years.size - 1 else None}
         for run in runs
@@ -280,12 +280,12 @@ def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
 
 
 def csv_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
-    """Return all saved times except the start, at which there is no error."""
+    """Return rows for all saved times except the start, at which there is no error."""
     return [_row(run, k, body) for run in runs for k in range(1, run.years.size) for body in run.km]
 
 
 def _row(run: ModelRun, k: int, body: str) -> dict[str, Any]:
-    """Return the errors of a body at a saved time."""
+    """Return a row with the errors of a body at the saved time `k`."""
     return {
         "model": run.model.name,
         "years": float(run.years[k]),

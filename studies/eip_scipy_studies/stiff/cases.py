@@ -32,11 +32,12 @@ class Case:
     y0 : ndarray, shape (n,)
     invariants : list of Invariant
     size : float or ndarray
-        Size of the components, by which the absolute tolerance and errors are measured.
+        Typical size of the components, to which the absolute tolerance and errors are relative.
     view : callable, optional
-        Function of the last state whose values are compared; default: the state itself, relative to `size`.
+        Function of the last state whose values are compared with the reference; default: the state divided by `size`.
     truth : callable, optional
-        Returns the expected value of `view`; default: that of SciPy's Radau at small tolerances.
+        Function without arguments that returns the true value of `view`; default: that by SciPy's Radau at small
+        tolerances.
     """
 
     fun: Callable[[float, Array], Array]
@@ -55,7 +56,7 @@ class Case:
 
     @cached_property
     def reference(self) -> Array:
-        """Return the state with which the last one of a run is compared."""
+        """Return the true value of `view` at the end."""
         if self.truth is not None:
             return np.asarray(self.truth())
         atol = 1e-2 * TIGHT * self.size
@@ -65,7 +66,7 @@ class Case:
         return y / self.size if self.view is None else self.view(y)
 
     def error(self, method: Any, rtol: float, share: float = 1e-2, **options: Any) -> tuple[float, int]:
-        """Run, and return the error of the last state and the calls, those for Jacobians included.
+        """Run the problem; return the error of the last state, and the number of calls, including those for Jacobians.
 
         Parameters
         ----------
@@ -91,7 +92,7 @@ def _linear(weights: Any, name: str = "mass") -> Invariant:
 
 
 def robertson() -> Case:
-    """Robertson's autocatalytic reaction; mass."""
+    """Return Robertson's autocatalytic reaction; its invariant is the mass."""
 
     def fun(t: float, y: Array) -> Array:
         a, b, c = 0.04 * y[0], 1e4 * y[1] * y[2], 3e7 * y[1] ** 2
@@ -101,7 +102,7 @@ def robertson() -> Case:
 
 
 def hires() -> Case:
-    """HIRES of the test set for initial value problem solvers; the sum of the last two species."""
+    """Return HIRES of the test set for initial value problem solvers; the sum of the last two species is invariant."""
 
     def fun(t: float, y: Array) -> Array:
         bound = 280 * y[5] * y[7]
@@ -123,7 +124,7 @@ def hires() -> Case:
 
 
 def pyrolysis() -> Case:
-    """E5 of the test set, the pyrolysis of a gas; a balance of three species."""
+    """Return E5 of the test set, the pyrolysis of a gas; its invariant is a linear relation between species."""
     A, B, M, C = 7.89e-10, 1.1e7, 1e6, 1.13e3
 
     def fun(t: float, y: Array) -> Array:
@@ -138,7 +139,7 @@ def pyrolysis() -> Case:
 
 
 def enzyme() -> Case:
-    """Return the reaction of Michaelis and Menten with fast binding; enzyme and substrate."""
+    """Return the reaction of Michaelis and Menten with fast binding; its invariants are total enzyme and substrate."""
 
     def fun(t: float, y: Array) -> Array:
         binding, back, made = 1e6 * y[0] * y[1], 1e3 * y[2], 1e1 * y[2]
@@ -149,7 +150,7 @@ def enzyme() -> Case:
 
 
 def ozone() -> Case:
-    """Ozone after Chapman, in units of the oxygen; atoms."""
+    """Return Chapman's ozone chemistry, in units of the oxygen; its invariant is the number of oxygen atoms."""
 
     def fun(t: float, y: Array) -> Array:
         atom, molecule, ozone = y
@@ -160,7 +161,7 @@ def ozone() -> Case:
 
 
 def magnet() -> Case:
-    """Return a magnetic moment with strong damping after Landau and Lifshitz in a field that turns; its length."""
+    """Return a magnetic moment in a rotating field, with strong Landau-Lifshitz damping; its length is invariant."""
 
     def fun(t: float, m: Array) -> Array:
         field_ = 1e3 * np.array([np.cos(t), np.sin(t), 0.5]) + 1e3 * np.array([0.0, 0.0, m[2]])
@@ -172,7 +173,7 @@ def magnet() -> Case:
 
 
 def dumbbell() -> Case:
-    """Two masses in the plane on a stiff spring with friction, in a harmonic trap; angular momentum."""
+    """Return two masses in the plane on a stiff spring with friction, in a harmonic trap; the invariant is L_z."""
     k, c = 1e6, 1e4
 
     def fun(t: float, y: Array) -> Array:
@@ -197,9 +198,9 @@ def dumbbell() -> Case:
 
 
 def satellite() -> Case:
-    """Return a tumbling body with a fluid inside that hardly slips; the length of its angular momentum.
+    """Return a tumbling body with a fluid inside that hardly slips; the invariant is the length of angular momentum.
 
-    The kinetic energy changes slowly, and is not kept: the length alone then increases the errors of the direction.
+    The kinetic energy changes slowly and is not kept. Keeping the length alone increases the errors of the direction.
     """
     inertia, fluid, friction = np.array([1.0, 2.0, 3.0]), 0.5, 1e4
 
@@ -213,7 +214,7 @@ def satellite() -> Case:
 
 
 def separation() -> Case:
-    """Return the equation of Cahn and Hilliard on a ring of 48 points; mass."""
+    """Return the equation of Cahn and Hilliard on a ring of 48 points; its invariant is the mass."""
     n = 48
     ring = np.roll(np.eye(n), 1, axis=0) + np.roll(np.eye(n), -1, axis=0) - 2 * np.eye(n)
     step = 1.0 / n
@@ -227,7 +228,10 @@ def separation() -> Case:
 
 
 def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> Case:
-    """Return the chain with dampers, against the same in angles; its constraints."""
+    """Return the chain with dampers, with its constraints as invariants.
+
+    Its reference is the same chain in angles.
+    """
     made, (fun, start, state) = chain(angles), chain_by_angles(angles)
 
     def truth() -> Array:
@@ -237,7 +241,10 @@ def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> C
 
 
 def governor_case(end: float = 5.0) -> Case:
-    """Return the height of the flyball governor's slider, against the same in angles; its constraints and L_z."""
+    """Return the flyball governor, with its constraints and L_z as invariants.
+
+    The height of the slider is compared with that of the same governor in angles.
+    """
     made, (fun, start, height) = governor(), governor_by_angles()
 
     def truth() -> Array:

@@ -1,15 +1,15 @@
 """``eip-scipy study stiff``: SciPy's Radau and BDF compared with `EIPRadau` and `EIPBDF`.
 
 1. A plane chain of three links with rotational dampers of 1e4 N m s between them, 20 s, from five starts at rest, with
-   its constraints; absolute and relative tolerance alike.
-2. The flyball governor of the multibody benchmark library, 10 s, with constraints and angular momentum; the error is
-   that of the slider's height.
+   its constraints kept; the absolute tolerance equals the relative one.
+2. The flyball governor of the multibody benchmark library, 10 s, with constraints and angular momentum kept; the error
+   is that of the slider's height.
 3. Ten stiff problems with invariants, and one whose invariant alone increases the error (the satellite, whose energy
    changes slowly and is not kept). In 2 and 3 absolute tolerances are 0.01 of the relative one, times the components'
    sizes.
 
-References of the mechanisms are in angles, those of the others by Radau at small tolerances. Calls are all evaluations
-of the right-hand side, those for numerical Jacobians included. Means are geometric.
+References are runs in angles for the mechanisms, and runs by Radau at small tolerances for the others. Calls are all
+evaluations of the right-hand side, those for numerical Jacobians included. Means are geometric.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def of(rows: Sequence[dict[str, Any]], **wanted: Any) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Stiff(Study[Found]):
-    """The command."""
+    """Command ``eip-scipy study stiff``."""
 
-    quick: bool = option(False, "one start of the chain, 2 s of each mechanism, two problems, one tolerance")
+    quick: bool = option(False, "a trial: one start of the chain, 2 s of each mechanism, two problems, one tolerance")
 
     def measure(self, session: Session) -> Found:
         tolerances = (1e-5,) if self.quick else (1e-4, 1e-5, 1e-6, 1e-7)

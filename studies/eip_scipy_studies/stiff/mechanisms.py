@@ -123,7 +123,10 @@ def chain(angles: Sequence[float], damping: float = 1e4) -> Natural:
 
 
 def chain_by_angles(angles: Sequence[float], damping: float = 1e4) -> tuple[Any, Array, Any]:
-    """Make the same chain in angles: right-hand side, start, and the state in the coordinates of `chain`."""
+    """Make the same chain in angles.
+
+    Return the right-hand side, the start, and a function that converts a state to the coordinates of `chain`.
+    """
     n = len(angles)
     places = np.arange(n)
     beyond = n - np.maximum.outer(places, places)
@@ -201,7 +204,7 @@ def governor_by_angles() -> tuple[Any, Array, Any]:
     swing = 2 * (ROD_MASS / 3 + BALL) * ROD**2  # of both rods
 
     def inertia(angle: float) -> tuple[float, float]:
-        """About the axis, and its derivative by the angle."""
+        """Return the moment of inertia about the axis, and its derivative by the angle."""
         out, slope = ROD * np.cos(angle), -ROD * np.sin(angle)
         rods = ROD_MASS * (JOINT**2 + JOINT * out + out**2 / 3) + BALL * (JOINT + out) ** 2
         return AXIS_INERTIA + 2 * rods, 2 * slope * (ROD_MASS * (JOINT + out / 1.5) + 2 * BALL * (JOINT + out))

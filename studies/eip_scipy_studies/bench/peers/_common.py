@@ -32,16 +32,16 @@ class Peer:
     takes : str
         `PYTHON`, `COMPILED` or `OWN`.
     prepare : callable
-        ``prepare(scene, **extra) -> solve``: imports the package, and builds what it needs once; `extra` goes to the
-        package's own call.
+        ``prepare(scene, **extra) -> solve`` imports the package and does the work that is needed once.
+        ``solve(setting)`` returns the state at the end. `extra` are further arguments of the package's own call.
     steps : bool
         True if the setting is a number of steps, not a tolerance.
     scenes : tuple of str
-        Equations for which it is run; empty: all.
+        Keys of the equations for which the method is run; empty: all.
     warm : bool
         True if each setting compiles its own code, so that an uncounted run comes first.
     projects : bool
-        True if it also gets the problem's invariants.
+        True if the method is also given the problem's invariants.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Peer:
 
     @property
     def keeps(self) -> bool:
-        """Return True if the method always gets the problem's invariants."""
+        """Return True if the method is always given the problem's invariants."""
         return self.ours or self.projects
 
     @property
@@ -65,7 +65,7 @@ class Peer:
 
 
 def package(name: str) -> Any:
-    """Import another package, in the process that runs it: no other module here imports it."""
+    """Import another package; this function is called only in the process that runs the package."""
     return import_module(name)
 
 

@@ -42,7 +42,7 @@ def _run(method: str, arguments: dict[str, Any], t_end: float, options: dict[str
 
 
 def _right_hand_side(method: str, functions: Functions) -> dict[str, Any]:
-    """Return the argument of `integrate` that a user writes: the accelerations if the method needs no more."""
+    """Return the right-hand side as an argument of `integrate`: the accelerations if the method needs only these."""
     if method in ("EIPRKN12", "EIPGJ12", "EIPGJ14"):
         return {"acceleration": functions.acc}
     return {"fun": functions.fun}

@@ -1,1 +1,1 @@
-"""Runs of `trust`: systems, faulty runs, correct runs."""
+"""Runs of the study `trust`: systems, faulty runs, correct runs."""

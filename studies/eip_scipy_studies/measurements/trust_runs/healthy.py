@@ -1,4 +1,4 @@
-"""Correct runs, which must not be reported: true invariants, steps that suit."""
+"""Correct runs, which must not be reported: the invariants are true ones, and the steps are suitable."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def two_pendulums() -> Problem:
 
 
 def each(before: str, options: Iterable[str], after: str = "") -> str:
-    """Return settings of a method with one option after the other, as text for `runs`."""
+    """Return settings as text for `runs`, one for each of the options, with `before` and `after` around it."""
     return ", ".join(f"{before} {option} {after}" for option in options)
 
 

@@ -87,7 +87,7 @@ def two_oscillators() -> Problem:
 
 
 def late_leaks() -> Iterator[Run]:
-    """Yield faulty runs with leaks of five kinds."""
+    """Yield faulty runs with late or local leaks of five kinds."""
     leak = partial(runs, LATE)
     for make, more in (
         (friction_from_5, ""),

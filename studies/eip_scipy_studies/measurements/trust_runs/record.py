@@ -1,4 +1,4 @@
-"""A run, its execution, and its result."""
+"""Definition of a run, its execution, and its result."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ CHANNELS = (ERROR, START, WARNING, FAILED, UNTRUSTED)
 
 @dataclass(frozen=True)
 class Run:
-    """One run.
+    """Definition of one run.
 
-    `way`: "solve_ivp"; "integrate", compiled where the functions are; "interpreted", by integrate; "ensemble", with
-    y0s and perhaps params in the options. `sick`: whether it must be reported; for an ensemble the members that must.
-    `truth`: if false, the true end is not computed.
+    `way` is "solve_ivp", "integrate" (compiled if the functions are jitted), "interpreted" (by integrate, not
+    compiled), or "ensemble" (with y0s and perhaps params in the options). `sick`: whether the run is faulty and must be
+    reported; for an ensemble, the indices of the faulty members. `truth`: if false, the true final state is not
+    computed.
     """
 
     group: str
@@ -44,7 +45,7 @@ class Run:
 
     @property
     def label(self) -> str:
-        """Method, steps and way."""
+        """Return method, step or tolerance, options and way of the run as text."""
         given = {key: value for key, value in self.options.items() if key in SHOWN}
         shown = ", ".join(
             f"{key} {value:g}" if isinstance(value, float) else f"{key} {value}" for key, value in given.items()
@@ -69,9 +70,10 @@ def runs(
     user: Any = None,
     **more: Any,
 ) -> Iterator[Run]:
-    """One system in several ways, "RK45 1e-6, RK4 h=0.05 every=10 integrate": method, tolerance or options, way.
+    """Yield runs of one system, as the text `ways` describes: "RK45 1e-6, RK4 h=0.05 every=10 integrate".
 
-    Options other than words are keywords; `user` is the one-step method that "user" stands for.
+    Each part names the method, then a tolerance or options, then the way if it is not "solve_ivp". The method "user" is
+    the one-step method in `user`. Further options that are not text are given as keywords.
     """
     for text in ways.split(","):
         word, *rest = text.split()
@@ -92,7 +94,7 @@ def _option(item: str) -> dict[str, Any]:
 
 @dataclass
 class Outcome:
-    """Outcome of a run: how it was reported, its end, and for a correct run whether the projection spoilt it."""
+    """Result of a run: how it was reported (`told`), its last state, and its error with and without projection."""
 
     told: list[str]
     status: int | None = None
@@ -105,7 +107,7 @@ class Outcome:
 
 
 def carry_out(run: Run) -> Outcome:
-    """Return the run, and its warnings."""
+    """Carry out the run, and return its result with the warnings."""
     act = {"solve_ivp": _by_scipy, "ensemble": _members}.get(run.way, partial(_by_integrate, way=run.way))
     with warnings.catch_warnings(record=True) as said, np.errstate(all="ignore"):
         warnings.simplefilter("always")
@@ -124,7 +126,7 @@ def carry_out(run: Run) -> Outcome:
 
 
 def carry_out_plain(run: Run, t: float) -> Outcome:
-    """Carry out the run without invariants, to the time that it reached."""
+    """Carry out the same run without invariants, to the time `t` that it reached."""
     problem = run.problem()
     options = {key: value for key, value in run.options.items() if key not in ("metric", "every")}
     options |= {"invariants": ()}
@@ -175,7 +177,7 @@ def _members(run: Run, problem: Problem, options: dict[str, Any]) -> Outcome:
 
 
 def _error(run: Run, problem: Problem, outcome: Outcome) -> float:
-    """Return the largest component of the error at the end, in units of the largest component."""
+    """Return the largest error of a component of the last state, relative to the largest true component."""
     truth = _truth(run.problem, outcome.t)
     assert outcome.y is not None
     return float(np.max(np.abs(outcome.y - truth)) / np.max(np.abs(truth)))

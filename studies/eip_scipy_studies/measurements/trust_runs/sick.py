@@ -199,7 +199,7 @@ def other_trap() -> Problem:
 
 
 def wrong_joint() -> Problem:
-    """Return a condensate that is shaken from t = 0 on, and the joint invariants of one at rest."""
+    """Return a condensate that is shaken from t = 0 on, with the joint invariants of a condensate that is not."""
     grid = Grid((16, 16), -4.0, 4.0)
     x, y = grid.mesh()
     psi = np.exp(-((x - 0.5) ** 2 + y**2) / 2)
@@ -211,7 +211,7 @@ FALLING = np.array([[1.0, 3.0], [-2.0, -1.0], [1.0, -1.0]])
 
 
 def falling_bodies(third: float = 5.0, softening: float = 0.0) -> Problem:
-    """Return three bodies that fall from rest, and an energy with a wrong mass of the third body."""
+    """Return three bodies that fall from rest, with an energy that has a wrong mass of the third body."""
     masses = np.array([3.0, 4.0, 5.0])
     other = n_body([3.0, 4.0, third], 1.0, 2)
 
@@ -236,7 +236,7 @@ def late() -> Problem:
 
 
 def relativistic_planets() -> Problem:
-    """Post-Newtonian terms, and Newton's energy and angular momentum."""
+    """Return planets with post-Newtonian terms, and Newton's energy and angular momentum as invariants."""
     planets = solar_system(years=1.0, forces="1pn")
     masses = solar_system().params
     assert masses is not None
@@ -327,7 +327,7 @@ def swapped(G, k, m):
 
 
 def spoilt(spoil: Callable[..., None], y0: Any, problem: Problem | None = None, k: int = 1, m: int = 2) -> Problem:
-    """Return a correct energy whose gradient has wrong components k and m, changed by `spoil`."""
+    """Return a problem with a correct energy and a wrong gradient, changed by ``spoil(gradient, k, m)``."""
     problem = problem or replace(s.henon_heiles(), y0=np.array(y0), t_span=(0.0, 10.0))
     (energy,) = problem.invariants
 
@@ -399,7 +399,10 @@ def other_inertia() -> Problem:
 
 
 def other_coefficient() -> Problem:
-    """Return predators and prey from u = 1, where the predators' rate vanishes; the claim has 3 in place of 2."""
+    """Return predators and prey that start at u = 1, where the rate of the predators is 0, with a wrong invariant.
+
+    It has the coefficient 3 in place of 2.
+    """
     return s.claimed(
         "Lotka-Volterra",
         lotka_volterra().fun,
@@ -414,7 +417,7 @@ def other_coefficient() -> Problem:
 
 
 def falling_probe() -> Problem:
-    """Return a geodesic that starts at a turning point, and the mass shell with a wrong mass."""
+    """Return a geodesic that starts at a turning point, with a mass shell that has a wrong mass."""
     shell, scale = schwarzschild(), np.array([1, 1.1, 1, 1, 1, 1])
 
     def value(t, y):

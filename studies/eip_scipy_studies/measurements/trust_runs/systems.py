@@ -1,4 +1,4 @@
-"""Small systems with claimed invariants, which may be wrong; each function returns a `Problem`."""
+"""Small systems with quantities that are claimed to be invariants, rightly or wrongly, as `Problem`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def claimed(name: str, fun: Callable[..., Any], y0: Any, end: float, *kept: Inva
 
 
 def equations(name: str, system: CaseEquations, y0: Any, end: float, of: CaseEquations | None = None) -> Problem:
-    """One of the hard cases' systems; `of`: the system whose invariants are claimed, when it is another one."""
+    """Return a system of the hard cases with the claimed invariants of the system `of`; default: its own invariants."""
     of = of or system
     return claimed(name, system.fun, y0, end, Invariant(of.values, of.gradients, name="I"))
 
@@ -43,7 +43,10 @@ def mechanics(
     end: float,
     masses: Any = 1.0,
 ) -> Problem:
-    """q'' = acceleration(t, q, v), and the claim that m v^2 / 2 + potential(q) is kept; slope is its derivative."""
+    """Return q'' = acceleration(t, q, v) with the claimed energy m v^2 / 2 + potential(q).
+
+    `slope` is the derivative of the potential.
+    """
     n = np.size(q0)
 
     def fun(t, y):
@@ -65,24 +68,24 @@ def mechanics(
 
 
 def turning() -> Invariant:
-    """Angular momentum of motion in the plane, y = (x, z, u, v)."""
+    """Return the angular momentum of motion in the plane, y = (x, z, u, v)."""
     return Invariant(
         lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"
     )
 
 
 def norm() -> Invariant:
-    """Return the sum of squares."""
+    """Return the sum of squares as an invariant."""
     return Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="norm")
 
 
 def component(k: int, name: str) -> Invariant:
-    """Return the component y_k."""
+    """Return the component y_k as an invariant."""
     return Invariant(lambda t, y: float(y[k]), lambda t, y: np.arange(y.size) == k + 0.0, name=name)
 
 
 class Verlet:
-    """A user's one-step method for q'' = force(t, q, v)."""
+    """Velocity Verlet for q'' = force(t, q, v), as a one-step method that a user has written."""
 
     order = 2
 
@@ -100,7 +103,7 @@ class Verlet:
 
 
 def pendulum(friction: float = 0.0, sign: float = 1.0, end: float = 20.0, q0: float = 2.0, v0: float = 0.0) -> Problem:
-    """Pendulum with friction; `sign` of the potential claimed."""
+    """Return a pendulum with friction; the potential in the claimed energy has the factor `sign`."""
     return mechanics(
         f"pendulum, friction {friction:g}",
         lambda t, q, v: -np.sin(q) - friction * v,
@@ -113,12 +116,12 @@ def pendulum(friction: float = 0.0, sign: float = 1.0, end: float = 20.0, q0: fl
 
 
 def spring(force: Callable[[float, Array, Array], Any], q0: float = 1.0, v0: float = 0.0, end: float = 20.0) -> Problem:
-    """q'' = force(t, q, v), and the claim that q'^2 / 2 + q^2 / 2 is kept."""
+    """Return q'' = force(t, q, v) with the claimed energy q'^2 / 2 + q^2 / 2."""
     return mechanics("spring", force, lambda q: q[0] ** 2 / 2, lambda q: q, q0, v0, end)
 
 
 def duffing(cubic: float = 1.0, q0: float = 0.5, end: float = 20.0) -> Problem:
-    """q'' = q - q^3, claimed with another factor of the quartic term."""
+    """Return q'' = q - q^3; the quartic term in the claimed energy has the factor `cubic`."""
     return mechanics(
         "Duffing's oscillator",
         lambda t, q, v: q - q**3,
@@ -144,7 +147,7 @@ def falling(drag: float, v0: float = 0.0, end: float = 10.0) -> Problem:
 
 
 def henon_heiles(cubic: float = 1.0, q0: Any = (0.3, 0.2), v0: Any = (0.0, 0.0), end: float = 50.0) -> Problem:
-    """Henon and Heiles; `cubic`: factor of the cubic terms claimed."""
+    """Return the system of Henon and Heiles; the cubic terms in the claimed energy have the factor `cubic`."""
     return mechanics(
         "Henon-Heiles",
         lambda t, q, v: np.array([-q[0] - 2 * q[0] * q[1], -q[1] - q[0] ** 2 + q[1] ** 2]),
@@ -159,7 +162,7 @@ def henon_heiles(cubic: float = 1.0, q0: Any = (0.3, 0.2), v0: Any = (0.0, 0.0),
 def central(
     name: str, extra: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant, strength: float = 1.0
 ) -> Problem:
-    """Kepler's attraction and another acceleration extra(t, y)."""
+    """Return Kepler's attraction plus the acceleration extra(t, y) in the plane, with the claimed invariants `kept`."""
 
     def fun(t, y):
         return np.concatenate([y[2:], -strength * y[:2] / np.hypot(y[0], y[1]) ** 3 + extra(t, y)])
@@ -194,7 +197,7 @@ def laplace_x() -> Invariant:
 def planar_field(
     name: str, acceleration: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant
 ) -> Problem:
-    """q'' = acceleration(t, y) in the plane."""
+    """Return q'' = acceleration(t, y) in the plane, with the claimed invariants `kept`."""
     return claimed(name, lambda t, y: np.concatenate([y[2:], acceleration(t, y)]), y0, end, *kept)
 
 
@@ -213,7 +216,10 @@ def chain(
     masses: Any = 1.0,
     claimed_masses: Any = 1.0,
 ) -> Problem:
-    """Springs in a row between walls: `force` as a function of the elongations, `spring_energy` as claimed."""
+    """Return masses in a row between walls, connected by springs, with a claimed energy.
+
+    `force` is a function of the elongations. `spring_energy` and its derivative `claimed_force` are the claimed ones.
+    """
     q0 = np.array(q0, dtype=float)
 
     def stretched(q):
@@ -238,7 +244,7 @@ def chain(
 
 
 def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bool = False) -> Problem:
-    """Toda's lattice, one mass displaced."""
+    """Return Toda's lattice with one mass displaced; the claimed energy may be that of harmonic springs."""
     q0 = np.where(np.arange(n) == n // 2, 0.8, 0.0)
     v0 = np.where(np.arange(n) == n // 2, 0.5, 0.0) if moving else None
     if claim_harmonic:
@@ -249,7 +255,7 @@ def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bo
 def fput(
     alpha: float = 0.25, claimed_alpha: float | None = None, n: int = 16, end: float = 50.0, **more: Any
 ) -> Problem:
-    """Fermi, Pasta, Ulam and Tsingou's chain, first mode."""
+    """Return the chain of Fermi, Pasta, Ulam and Tsingou, which starts in the first mode."""
     own = alpha if claimed_alpha is None else claimed_alpha
     q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
     return chain(
@@ -266,7 +272,7 @@ def fput(
 def sine_gordon(
     claimed_coupling: float | None = None, n: int = 64, end: float = 20.0, friction: float = 0.0
 ) -> Problem:
-    """Sine-Gordon by lines: a kink and an antikink at rest."""
+    """Return the sine-Gordon equation by the method of lines: a kink and an antikink at rest."""
     x = np.linspace(-10, 10, n, endpoint=False)
     h = x[1] - x[0]
     c = 1 / h**2
@@ -301,7 +307,7 @@ def waves(
     start: Callable[[Array], Array] = lambda x: np.exp(-((x - 1) ** 2) / 2),
     keep: Sequence[str] = ("mass", "energy"),
 ) -> Problem:
-    """Schroedinger's equation on a line, i psi' = -psi''/2 + V psi + beta |psi|^2 psi; mass and energy as claimed."""
+    """Return i psi' = -psi''/2 + V psi + beta |psi|^2 psi on a line, with claimed mass and energy."""
     x = np.linspace(-8, 8, n, endpoint=False)
     dx = x[1] - x[0]
     k2 = (2 * np.pi * np.fft.fftfreq(n, dx)) ** 2
@@ -361,7 +367,7 @@ def compiled_spring(
     y0: Any = (1.0, 0.0),
     h: float | None = None,
 ) -> Problem:
-    """Spring with friction and a driving force, jitted; its energy claimed."""
+    """Return a spring with friction and a driving force, jitted, with the claimed energy of a free spring."""
     params = np.array([square, friction, force, frequency])
     return Problem(
         name="spring",
@@ -396,7 +402,7 @@ def _pendulum_gradient(t, y, out, params):
 def compiled_pendulum(
     friction: float = 0.0, end: float = 20.0, y0: Any = (2.0, 0.0), h: float | None = None
 ) -> Problem:
-    """Pendulum with friction, jitted; its energy claimed."""
+    """Return a pendulum with friction, jitted, with the claimed energy of one without."""
     params = np.array([friction])
     return Problem(
         name="pendulum",
@@ -440,7 +446,7 @@ def _trap_gradient(t, y, out, params):
 
 
 def compiled_trap(square: float, end: float = 20.0, h: float | None = None) -> Problem:
-    """Anisotropic trap, jitted, started on an axis; angular momentum claimed."""
+    """Return a body in an anisotropic trap that starts on an axis, jitted, with a claimed angular momentum."""
     params = np.array([square])
     return Problem(
         name="trap",
