@@ -1,4 +1,4 @@
-"""The step in C++. Written by .ci/stub."""
+"""Engine of eip_scipy in C++. Written by .ci/stub."""
 
 from typing import Any, NamedTuple
 
@@ -113,12 +113,12 @@ HAS_V3: bool
 
 def spanned(frame: object, G: numpy.typing.NDArray[numpy.float64], share: float) -> list:
     """
-    Return for each row of G whether the frame removes all but this share of it.
+    Return a list of bool: True for each row of `G` of which the frame removes all but at most the fraction `share`.
     """
 
 class Work:
     """
-    Buffers of a run, in memory of the engine; each attribute is an array over one.
+    Buffers of a run in the engine's memory; each attribute is an array that shows one buffer.
     """
 
     def __init__(self, n: int, dtype: object, stages: int, n_invariants: int, n_blocks: int, n_balances: int = 0) -> None: ...
@@ -127,7 +127,9 @@ class Work:
         """Return all arrays by name."""
 
     def share(self, other: Work, names: set[Any]) -> None:
-        """Use the buffers of these names of others from now on."""
+        """
+        Use the buffers of `other` with these names from now on, in place of own ones.
+        """
 
     def __getstate__(self) -> tuple[Any, ...]: ...
 
@@ -276,77 +278,93 @@ class Work:
 
 class Engine:
     """
-    The step of one run, on its arrays. `functions` says in `native` whether it holds addresses.
+    Engine of one run, which makes its steps on its arrays. ``functions.native`` is True if `functions` holds addresses.
     """
 
     def __init__(self, method: Any, options: Options, work: Work, functions: Any, schedule: Schedule | None = None, hooks: Any = None) -> None: ...
 
     def advance(self, k_end: int, y: numpy.typing.NDArray[numpy.inexact], y_new: numpy.typing.NDArray[numpy.inexact], t_saved: numpy.typing.NDArray[numpy.float64], y_saved: numpy.typing.NDArray[numpy.inexact], pieces: numpy.typing.NDArray[numpy.float64] | None) -> int:
         """
-        Step on to step k_end, or to what stops the loop. pieces (rows, floats) receives the interpolants of all steps if it has rows.
+        Make steps up to step `k_end`, or until something else stops the loop, and return the reason as a code. If `pieces` (rows, floats) has rows, it is filled with the interpolants of all steps.
         """
 
     def sweep(self, members: object, steps: int, y: numpy.typing.NDArray[numpy.inexact], y_new: numpy.typing.NDArray[numpy.inexact], t_saved: numpy.typing.NDArray[numpy.float64]) -> int:
         """
-        Run members of an ensemble one after the other, so many steps in all; the `where` of the record `members` says how far they are.
+        Run members of an ensemble one after the other, for `steps` steps in all (slightly more if a multistep method is near its end). Return OK, or a code for what happened to the current member. `members.where` holds the current member and whether it has begun.
         """
 
     def side_by_side(self, functions: object) -> None:
         """
-        Functions of eight members, by which `sweep_octets` runs them from now on; `functions` holds addresses, as those of the run.
+        Set the functions for eight members with which `sweep_octets` runs members from now on. Like those of the run, `functions` holds addresses.
         """
 
     def sweep_octets(self, members: object, steps: int, y: numpy.typing.NDArray[numpy.inexact], y_new: numpy.typing.NDArray[numpy.inexact], t_saved: numpy.typing.NDArray[numpy.float64]) -> int:
         """
-        Do what `sweep` does with eight members side by side, by steps of all eight. Whose status is not set has to run by itself.
+        Run members like `sweep`, in batches of eight that step together; `steps` counts steps of a batch. A member whose status is not set afterwards must be run alone.
         """
 
     def step(self, k: int, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> tuple[int, float, numpy.ndarray, numpy.ndarray]:
         """
-        Step k from the state y at t with the derivative f. Returns (status, t_new, y_new, f_new).
+        Make step `k` from the state `y` at time `t`, where the derivative is `f`. Return (status, t_new, y_new, f_new).
         """
 
     def project(self, t_old: float, y: numpy.typing.NDArray[numpy.inexact], t: float, last: bool, y_new: numpy.typing.NDArray[numpy.inexact]) -> int:
-        """Project work.y_hat into y_new."""
+        """
+        Project the state work.y_hat onto the invariants, write the result to `y_new`, and return the code.
+        """
 
     def values(self, t: numpy.typing.NDArray[numpy.float64], y: numpy.typing.NDArray[numpy.inexact], out: numpy.typing.NDArray[numpy.float64], params: numpy.typing.NDArray[numpy.float64] | None = None) -> None:
         """
-        Fill out (m, l) with the invariants at states y (m, n), each with its own params (m, p) where they are given.
+        Fill `out` (m, l) with the invariants at the times `t` (m,) and states `y` (m, n). If `params` (m, p) is given, each state has its own row of parameters.
         """
 
     def start(self, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], tau: float) -> None:
-        """Set the invariants' terms at the start, from work.values and work.G."""
+        """
+        Set the sizes of the invariants' terms at the start of a run, from the state `y`, the derivative `f`, the length `tau` of a step, work.values and the gradients work.G.
+        """
 
     def sample(self, dense: object) -> None:
-        """Make dense output from now on by this record."""
+        """Make dense output from now on, with the buffers of the record `dense`."""
 
     def describe(self, t_old: float, y_old: numpy.typing.NDArray[numpy.inexact], t: float, y: numpy.typing.NDArray[numpy.inexact], piece: numpy.typing.NDArray[numpy.float64]) -> None:
-        """Fill piece with the interpolant over the step made last."""
+        """
+        Fill `piece` with the interpolant over the last step, from (t_old, y_old) to (t, y).
+        """
 
     def interpolate(self, piece: numpy.typing.NDArray[numpy.float64], t: numpy.typing.NDArray[numpy.float64], out: numpy.typing.NDArray[numpy.inexact]) -> None:
-        """Fill out (m, n) with the states at times t (m,) by an interpolant."""
+        """
+        Fill `out` (m, n) with the states at the times `t` (m,), computed with the interpolant `piece`.
+        """
 
     def show(self, t: float, y: numpy.typing.NDArray[numpy.inexact], out: numpy.typing.NDArray[numpy.inexact]) -> None:
-        """Fill out (n,) with the last state, y at t, as the run hands it out."""
+        """
+        Fill `out` (n,) with the state `y` at `t` in the form in which the run saves its last state.
+        """
 
 class LibraryFunction:
     __name__: str
-    """A function of one of the library's problems."""
+    """A function in C++ of one of the package's problems."""
 
     def __call__(self, /, *args: Any) -> Any:
         """Call self as a function."""
 
     @property
     def takes_f(self) -> bool:
-        """Whether it takes the derivative of the state."""
+        """
+        True if the function takes the derivative f of the state as an argument.
+        """
 
     @property
     def in_place(self) -> bool:
-        """Whether it fills an array."""
+        """
+        True if the function fills an argument `out`; False if it returns its value.
+        """
 
     @property
     def handle(self) -> int:
-        """The first argument of the function at `call_address`."""
+        """
+        Address of this function's record, the first argument of the function at `call_address`.
+        """
 
     @property
     def call_address(self) -> int:
@@ -354,28 +372,34 @@ class LibraryFunction:
 
     @property
     def fits_address(self) -> int:
-        """Of ``bool fits(int64_t n, int64_t p)``."""
+        """
+        Address of ``bool fits(int64_t n, int64_t p)``, which returns True if the function accepts states of n numbers and p parameters.
+        """
 
     @property
     def numbers(self) -> int:
-        """How many numbers, or states, it fills."""
+        """
+        Number of numbers, or of rows of the state's size, that the function fills; if it is negative, its absolute value is the number for each orbit.
+        """
 
     @property
     def fills_states(self) -> bool:
-        """Whether these are of the state's size."""
+        """True if the function fills rows of the state's size."""
 
     @property
     def octet_address(self) -> int:
-        """For eight states side by side, 0 where there is none."""
+        """Address of the version for eight states at once; 0 if there is none."""
 
     def bound(self, params: object) -> LibraryFunction:
         """
-        Return the function with parameters of its own, which replace those of a run.
+        Return the function with fixed parameters `params`, which it uses instead of the parameters of a run.
         """
 
     @property
     def own(self) -> list[float]:
-        """Its own parameters; empty if it takes those of the run."""
+        """
+        Fixed parameters of the function; empty if it uses the parameters of a run.
+        """
 
     def __repr__(self) -> str: ...
 
@@ -387,7 +411,7 @@ def are_finite(numbers: numpy.typing.NDArray[numpy.float64]) -> bool:
 
 def are_calm(figures: numpy.typing.NDArray[numpy.float64], beyond_doubt: float, together: float) -> bool:
     """
-    Return True if no figure, (..., N_FIGURES), may be that of a faulty run.
+    Return True if no row of `figures` (..., N_FIGURES) may belong to a faulty run.
     """
 
 class InvariantFunctions:
@@ -403,17 +427,17 @@ class InvariantFunctions:
 
     def is_in_order(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], tau: float, interval: tuple[float, float], directions: numpy.typing.NDArray[numpy.inexact]) -> bool:
         """
-        Whether precision, gradients and invariance are beyond doubt at a state with these gradients and values.
+        Return True if the checks of precision, gradients and invariance find nothing at the state `y`, where the gradients are `G` and the values are `here`.
         """
 
     def rates_by_values(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray:
         """
-        Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink. Rates that are within the rounding of the values are 0.
+        Return the rates of change (l,) of the invariants along `f`, by short differences to both sides. A rate is NaN if the two differences disagree, as at a kink, and 0 if it is within the rounding errors of the values.
         """
 
     def note_rates(self, figures: numpy.typing.NDArray[numpy.float64], t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], own: numpy.typing.NDArray[numpy.float64] | None = None) -> None:
         """
-        Raise the largest rates of change along f, by gradients and by values, in the figures (l, N_FIGURES): without the rates `own`, in units of their terms.
+        Update the largest rates of change along `f` in `figures` (l, N_FIGURES), computed from gradients and from values. The rates are relative to their terms, and the rates `own` of balances are subtracted first.
         """
 CHECK_STEP: float = 6e-06
 CHECK_TOLERANCE: float = 0.0001
@@ -650,19 +674,19 @@ class comparators:
     @staticmethod
     def take_steps(scheme: str, constant: float, functions: object, work: Work, steps: object, y: numpy.typing.NDArray[numpy.float64], rows: numpy.typing.NDArray[numpy.inexact]) -> int:
         """
-        Take all steps from y, which moves; rows (saved, n) receives the states to save. Returns the number of evaluations.
+        Make all steps from the state `y`, which is overwritten, and fill `rows` (saved, n), whose first row is the start, with the states to save. Return the number of evaluations.
         """
 
 class gradients:
     @staticmethod
     def complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float) -> numpy.ndarray:
         """
-        Return the gradient (..., n) of ``fun(t, y, *args)`` along the components of y (n,): the imaginary parts over the step.
+        Return the derivatives (..., n) of ``fun(t, y, *args)`` with respect to the components of `y` (n,), by complex steps of length `step`.
         """
     @staticmethod
     def checked_complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float, direction: numpy.typing.NDArray[numpy.float64], floors: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray | None:
         """
-        Return the same, or None where it disagrees with a difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not analytic.
+        Return the value of `complex_step`, or None if it disagrees with differences of ``fun`` along ``direction * (abs(y) + floors)``, as it does if ``fun`` is not analytic.
         """
 
 class gravity:
@@ -674,17 +698,19 @@ class gravity:
     @staticmethod
     def work_alone(alone: bool) -> bool:
         """
-        Keep the calling thread from sharing the sums over many bodies with other threads, or let it share them. Returns the previous setting.
+        If `alone` is True, keep the calling thread from sharing sums over many bodies with other threads; if False, let it share them. Return the previous setting.
         """
     @staticmethod
     def end_threads() -> None:
-        """End the threads that share these sums, for good."""
+        """
+        End the threads that share sums over many bodies. They are not started again.
+        """
 
 class multibody:
     @staticmethod
     def solve(matrices: numpy.typing.NDArray[numpy.float64], tolerance: float, acceleration: numpy.typing.NDArray[numpy.float64], multipliers: numpy.typing.NDArray[numpy.float64]) -> int:
         """
-        Fill u' (n,) and the multipliers (m,) of M u' + G^T lambda = F, G u' = -gamma, from M, F, G and gamma one after the other. Returns the rank of G, or MASS_IS_SINGULAR or NOT_FINITE.
+        Fill `acceleration` with u' (n,) and `multipliers` with lambda (m,), the solution of M u' + G^T lambda = F, G u' = -gamma. `matrices` holds M, F, G and gamma, one after the other. Return the rank of G, or MASS_IS_SINGULAR or NOT_FINITE.
         """
     @staticmethod
     def solve_address() -> int:

@@ -95,7 +95,7 @@ def test_rates_by_values_next_to_a_kink():
 
 def test_functions_are_not_called_with_states_of_another_kind():
     known = InvariantSet(ENERGY, 0.0, np.ones(2), np.ones(2), TAU)
-    with pytest.raises(ValueError, match="a state of another kind"):
+    with pytest.raises(ValueError, match="y has another dtype or size"):
         known.values(0.0, np.ones(3))
-    with pytest.raises(ValueError, match="a state of another kind"):
+    with pytest.raises(ValueError, match="y has another dtype or size"):
         known.values(0.0, np.ones(2, complex))

@@ -306,10 +306,10 @@ def test_what_the_engine_gets_is_looked_at():
             ):
                 with pytest.raises(ValueError, match=message):
                     advance(members._replace(**wrong), 10)
-            with pytest.raises(ValueError, match="members need a step or more"):
+            with pytest.raises(ValueError, match="`steps` must be at least 1"):
                 advance(members, 0)
         driver.t = driver.t[:5].copy()
-        with pytest.raises(ValueError, match="need room for all rows"):
+        with pytest.raises(ValueError, match="a row for each saved state"):
             driver.sweep_octets(members._replace(rows=np.zeros((9, 5, 4))), 10)
 
 

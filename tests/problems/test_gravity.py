@@ -284,13 +284,13 @@ def test_arguments_are_converted_or_refused():
     np.testing.assert_array_equal(out[30:].reshape(-1, 3), accelerations(gm, single.astype(float)))
     with pytest.raises(TypeError, match="Cannot cast array data from dtype"):
         rhs(0.0, y.astype(complex), out, gm)
-    with pytest.raises(ValueError, match=r"gravity.rhs takes .* and every G m; got 60 numbers and 9 parameters"):
+    with pytest.raises(ValueError, match=r"gravity.rhs expects .* got y with 60 numbers, and 9 parameters"):
         rhs(0.0, y, out, gm[1:])
-    with pytest.raises(ValueError, match="fills 60 numbers for this state; out has 59"):
+    with pytest.raises(ValueError, match="fills 60 numbers for this state, but out has 59"):
         rhs(0.0, y, out[1:], gm)
-    with pytest.raises(ValueError, match="f has 59 numbers, y has 60"):
+    with pytest.raises(ValueError, match="f has 59 numbers, but y has 60"):
         energy_gradient(0.0, y, out[1:], out, gm)
-    with pytest.raises(TypeError, match=r"takes \(t, y, out, params\), 4 arguments; got 3"):
+    with pytest.raises(TypeError, match=r"takes the 4 arguments \(t, y, out, params\); got 3"):
         rhs(0.0, y, gm)
     with pytest.raises(TypeError, match="takes no keywords"):
         rhs(0.0, y, out, params=gm)

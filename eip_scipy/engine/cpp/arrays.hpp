@@ -1,5 +1,6 @@
-// NumPy's arrays as arguments, each looked at before its memory is used: by the type that a function asks for, or by the
-// lengths that a run has. Included before all headers of the standard library, as Python asks.
+// Arguments that are NumPy arrays. Each array is checked before its memory is used: its type against the one that the
+// function asks for, or its lengths against those of the run. This header must be included before all headers of the
+// standard library, because Python.h requires that.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -88,8 +89,9 @@ constexpr auto FLOATS = nb::detail::const_name("numpy.typing.NDArray[numpy.float
 constexpr auto INTEGERS = nb::detail::const_name("numpy.typing.NDArray[numpy.int64]");
 constexpr auto UNSIGNED = nb::detail::const_name("numpy.typing.NDArray[numpy.uint64]");
 
-// An argument of a function in Python: an array of T with the given number of axes, which is written to unless T is const. Where T is
-// double and `STATES`, one of a state's type, float64 or complex128; complex numbers are pairs of floats here.
+// An argument of a function in Python: an array of T with the given number of axes, which is written to unless T is
+// const. If `STATES` is true and T is double, the array has the type of a state, float64 or complex128; complex numbers
+// are pairs of floats here.
 template <class T, int AXES, bool STATES = false>
 struct ArrayOf {
     static constexpr auto ARGUMENT = nb::detail::const_name<STATES>(
@@ -114,8 +116,8 @@ struct ArrayOf {
 template <class T, int AXES>
 using StatesOf = ArrayOf<T, AXES, true>;
 
-// As above, with any number of axes, of floats, or in PAIRS of complex numbers or an even number of floats; `columns` along
-// the last axis.
+// An array argument with any number of axes. Its numbers are floats or, if PAIRS, complex numbers or an even number of
+// floats. `columns` is the length of its last axis.
 template <class T, bool PAIRS>
 struct PointsOf {
     static constexpr auto ARGUMENT = nb::detail::const_name<PAIRS>(NUMBERS, FLOATS);
@@ -148,7 +150,7 @@ using ConstReals = PointsOf<const double, false>;
 
 template <class First, class... Others>
 void require_one_length(const First &first, const Others &...others) {
-    require(((first.points == others.points) && ...), "expected arrays of as many points");
+    require(((first.points == others.points) && ...), "expected arrays with the same number of points");
 }
 
 // Lets other threads run while a large array is worked on.

@@ -1,4 +1,4 @@
-// What stands around the engine's work when Python calls it.
+// Set-up and error handling around each call of the engine from Python.
 #pragma once
 
 #include "system.hpp"
@@ -43,7 +43,7 @@ class [[maybe_unused]] FloatingPoint {
     Mode mode_;
 };
 
-// The Python error of a call that was `Broken`, but where one is set already.
+// Raises the Python error for a user's function that failed (`Broken`); an error that is already set is kept.
 [[noreturn]] void raise_broken(const System &system);
 
 }  // namespace eip

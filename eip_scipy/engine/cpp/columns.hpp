@@ -8,7 +8,8 @@
 
 namespace eip {
 
-// Each row's numbers of the state, one after the other at its front; the columns of derivatives in it are not needed.
+// Moves the numbers of the state in each row to the front of the row; the columns of derivatives in it are not needed
+// and may be overwritten.
 inline void pack_rows(const Columns &columns, double *rows, int64_t count, int64_t stride) {
     const int64_t cut = columns.cut();
     for (int64_t i = 0; i < count; ++i) {
@@ -17,7 +18,7 @@ inline void pack_rows(const Columns &columns, double *rows, int64_t count, int64
     }
 }
 
-// Column c of a state y, and the same back.
+// Copies column c out of a state y (`take_column`) and back into it (`put_column`).
 inline void take_column(const Columns &columns, int64_t c, const double *y, double *column) {
     const int64_t cut = columns.cut();
     copy(y + columns.first(c), column, cut);

@@ -23,7 +23,7 @@ inline void compensated_step(const double *y, double h, const Method &m, const W
     }
 }
 
-// As above, for the balances, whose values at the end of the step become the targets.
+// Computes the values of the balances at the end of the step, in the same way; these values become the targets.
 template <class W>
 inline void compensated_levels(double h, const Method &m, const Balances &balances, const W &w) {
     for (int64_t b = 0; b < w.balances; ++b) {
@@ -54,7 +54,8 @@ inline void restore_levels(const Balances &balances, const W &w) {
     for (int64_t b = 0; b < w.balances; ++b) w.target[balances.place[b]] = w.level[b];
 }
 
-// As above, for q + h v + h^2 sum_j (b + b_low)[j] a_j and v + h sum_j (b_v + b_v_low)[j] a_j.
+// Does what `compensated_step` does for a Nystrom method: q + h v + h^2 sum_j (b + b_low)[j] a_j, and for the
+// velocities v + h sum_j (b_v + b_v_low)[j] a_j.
 template <class W>
 inline void compensated_nystrom(const double *y, double h, const Method &m, const W &w) {
     const int64_t half = w.m / 2;

@@ -76,7 +76,7 @@ class Columns {
         PyArrayObject *gradient = gradient_.get();
         require(axes + 1 == PyArray_NDIM(gradient) &&
                     PyArray_CompareLists(PyArray_DIMS(value), PyArray_DIMS(gradient), axes),
-                "the function's values differ in shape");
+                "the function returned values of different shapes; return the same shape in each call");
     }
 
     npy_intp n_;
@@ -171,14 +171,13 @@ std::optional<Array> checked_complex_step(nb::handle fun, nb::handle t, State y,
 }  // namespace
 
 void add_gradients(nb::module_ module) {
-    module.def(
-        "complex_step", complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a,
-        "Return the gradient (..., n) of ``fun(t, y, *args)`` along the components of y (n,): the imaginary parts "
-        "over the step.");
+    module.def("complex_step", complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a,
+               "Return the derivatives (..., n) of ``fun(t, y, *args)`` with respect to the components of `y` (n,), by "
+               "complex steps of length `step`.");
     module.def("checked_complex_step", checked_complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a, "direction"_a,
                "floors"_a,
-               "Return the same, or None where it disagrees with a difference of ``fun`` along ``direction * (abs(y) + "
-               "floors)``, as that of a function does which is not analytic.");
+               "Return the value of `complex_step`, or None if it disagrees with differences of ``fun`` along "
+               "``direction * (abs(y) + floors)``, as it does if ``fun`` is not analytic.");
 }
 
 }  // namespace eip

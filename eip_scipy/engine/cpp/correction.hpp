@@ -40,7 +40,7 @@ inline void evaluate_carried(const AnyRun &run, double t, const Value *y, const 
     run.system.inv(run.work, t, y, run.work.values);
     add_carried(run, carry, G);
 }
-// As above, by the carry and the current gradients.
+// Computes w.values = I(y) like `evaluate_carried`, with the carry w.carry_hat and the current gradients w.G.
 template <class AnyRun, class Value>
 inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
     evaluate_carried<AnyRun, Value>(run, t, y, run.work.carry_hat, run.work.G);
@@ -393,9 +393,10 @@ inline Code project_step(const AnyRun &run, const Step &step) {
     return project_evaluated(run, step);
 }
 
-// The rest of it, where the gradients at w.y_hat and the invariants' values are known. NEAR_SINGULAR: the step avoids
-// singular positions, and at its end more gradients are nearly dependent than at its start. From there derivatives would be
-// those of a state off the manifold, divided by the distance from the singular position, and steps would become very short.
+// Second part of `project_step`, when the gradients at w.y_hat and the values of the invariants are known.
+// NEAR_SINGULAR: the step avoids singular positions, and at its end more gradients are nearly dependent than at its
+// start. Derivatives after such a step would be those of a state off the manifold, divided by the distance from the
+// singular position, and steps would become very short.
 template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
@@ -429,7 +430,8 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     return status;
 }
 
-// As above, or the shorter way of joint invariants where that will do, or a hook's.
+// Projects by a hook if there is one: by joint invariants if one pass over them is enough, or by other code in Python.
+// Otherwise it calls `project_step`.
 template <class AnyRun>
 inline Code project_any(const AnyRun &run, const Step &step) {
     if (run.hooks && run.hooks->joint && run.hooks->project_jointly(step)) return OK;

@@ -1,5 +1,6 @@
-// What a run holds: its method, options, buffers and clock. All memory is that of NumPy arrays, which Python reads while
-// the run goes on; a complex state of n components stands here as 2 n floats, so that Re<., .> is the ordinary product.
+// Data of a run: its method, options, buffers and clock. NumPy arrays show all of this memory, so that Python can read
+// it during the run. A complex state of n components is stored here as 2 n floats, so that Re<., .> is the ordinary
+// product.
 #pragma once
 
 #include <cstdint>
@@ -21,18 +22,20 @@ EIP_ENUM(Direction, NEW, OLD, MIDPOINT);
 EIP_ENUM(Metric, EUCLIDEAN, BY_ERROR, GIVEN);
 constexpr int64_t AUTO = 0;  // the option `every`
 
-// Places of the numbers that the step counts and leaves for the next one. From HAVE_ERROR on: whether an estimate of the
-// step's error is available, projections begun without one, steps since the last projection, what stood out in them,
-// whether the last row of K holds f at the raw result, and how many gradients of the last accepted projection, and of the
-// last one that was tried, are clearly independent. HAVE_F may be OF_STATE, see state_alone.hpp.
+// Indices of the counters, which the step updates and leaves for the next one. From HAVE_ERROR on they are: whether an
+// estimate of the step's error is available; the number of projections begun; the steps since the last projection; how
+// many figures stood out; whether the last row of K holds f at the raw result; and how many gradients of the last
+// accepted projection, and of the last one that was tried, are clearly independent. HAVE_F may also be OF_STATE, see
+// state_alone.hpp.
 EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED,
          HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, N_COUNTERS);
 constexpr int64_t OF_STATE = 2;
-// Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
+// Indices of the clock of a run: the current time, the time at the end of the step tried last and its length, and the
+// length to try next.
 EIP_ENUM(Clock, TIME, TIME_NEW, LENGTH, NEXT_LENGTH);
 EIP_ENUM(Place, STEP, ROW, PENDING);
-// Places in that of a multistep method's history: whether there is one, the newest node and its row, nodes since the last
-// projection, and estimates collected.
+// Indices of `place` in the record of a multistep method: whether there is a history, the number of the newest node and
+// its row, the nodes since the last projection, and the number of estimates collected.
 EIP_ENUM(Node, HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES);
 EIP_ENUM(Interpolant, CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM);
 
@@ -52,11 +55,11 @@ EIP_ENUM(Figure, START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MA
 EIP_ENUM(SuspectPlace, REASON, SUSPECT_FROM, SUSPECT_TO, SUSPECT_WAITED, N_SUSPECT);
 EIP_ENUM(Reason, NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW);
 
-// Rows of `slow`, with a column for each balance: sums of the sizes of rates and of their terms over the whole run, sums of
-// the same that forget, and the number of samples.
+// Rows of `slow`, with a column for each balance: sums of the sizes of rates and of their terms over the whole run, the
+// same sums with earlier samples gradually forgotten, and the number of samples.
 EIP_ENUM(SlowRow, ALL_RATES, ALL_TERMS, LATE_RATES, LATE_TERMS, SAMPLES, N_SLOW);
-// The late sums of a balance remember this share of the samples so far, and LEAST_MEMORY samples at least, because rate and
-// terms vary within a period.
+// The late sums of a balance remember this share of the samples so far, and at least LEAST_LATE samples, because rate
+// and terms vary within a period.
 constexpr double LATE_SHARE = 1.0 / 8.0, LEAST_LATE = 16.0;
 
 // Changes of LARGE local errors are noted, and defects of DISTANT and LARGE_SHARE of the terms before and after projections.
@@ -78,7 +81,8 @@ struct Sizes {
     bool tableau = true;  // whether a method has one
 };
 
-// Several places of one kind, each after its name; those of arrays after the lengths of their axes.
+// Visits several fields of the same kind, each given as its name and its place. For arrays the lengths of their axes
+// come first.
 template <class Visit, class Place, class... Others>
 void each(Visit &visit, const char *name, Place &place, Others &&...others) {
     visit(name, place);
@@ -184,7 +188,8 @@ void fields(Method &m, Visit &visit) {
     visit.in_python("multistep", "Multistep | None", true);
 }
 
-// Blocks of floats: member[start[b]] to member[start[b + 1]]. `size` is that of consecutive blocks alike, else 0.
+// Blocks of floats: block b contains the floats with the indices member[start[b]] to member[start[b + 1] - 1]. `size`
+// is the size of all blocks if they are consecutive and equally large, otherwise 0.
 struct Blocks {
     const uint64_t *member, *start;
     int64_t members, starts, count, width, size;
@@ -198,8 +203,8 @@ void fields(Blocks &b, Visit &visit) {
     b.count = b.starts - 1;
 }
 
-// Linear invariants that corrections must not touch: non-zeros of C and, after them, of M^T, M = S (C S)^-1. Where x, y
-// and z of bodies have rows alike, `bodies` (2, groups, count) holds their weights instead.
+// Linear invariants that corrections must not change: the non-zeros of C and, after them, those of M^T, where M = S (C
+// S)^-1. If the x, y and z of bodies have equal rows, `bodies` (2, groups, count) holds their weights instead.
 struct Frame {
     const uint64_t *start, *place;
     const double *value;
@@ -231,9 +236,9 @@ void fields(Balances &b, Visit &visit) {
     visit("rated", b.rated, Bound{b.stages});
 }
 
-// Groups of kept values that are projected each by itself: the values of a group by their places, its directions, and the
-// floats that move along a direction, each by its weight. `size` is 3 if what is said of a float holds of three, along a direction
-// of its own each: x, y and z of a body; else it is 1.
+// Groups of values of the invariants, each of which is projected separately: the indices of the values of a group, its
+// directions, and the floats that move along a direction, each with its weight. `size` is 3 if a float stands for x, y
+// and z of a body, each with a direction of its own; otherwise it is 1.
 struct Groups {
     const int64_t *value, *first_value, *first_direction, *first_float, *place;
     const double *weight;
@@ -354,8 +359,8 @@ struct WorkOf {
     Value *figures(int64_t i) const { return trust + i * N_FIGURES; }
 };
 
-// All buffers of a run, by name and shape, for code that creates them or passes them on. Those of a state's type hold w.n of its
-// numbers to a row.
+// Visits all buffers of a run, by name and shape, for code that creates the buffers or passes them on. Buffers with the
+// type of a state hold w.n of its numbers in each row.
 template <class V, class Visit>
 void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
     const int64_t n = w.n, l = w.l, m = w.m;

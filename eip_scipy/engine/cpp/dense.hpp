@@ -59,7 +59,7 @@ struct Piece {
           balance(balance_old + d.work.balances),
           balance_rows(balance + d.work.balances) {}
 
-    // As above, for the balances, as if they were the state.
+    // Returns the part of this interpolant that belongs to the balances, in the form of an interpolant of a state.
     Piece of_balances() const {
         Piece piece(*this);
         piece.y_old = balance_old;
@@ -87,7 +87,7 @@ struct DenseRun {
     DenseRun(const Dense &d, System &system) : dense(d), work(d.work), run{none, d.options, work, system, nullptr} {}
 };
 
-// The evaluations made since, among those of the run.
+// Adds the evaluations of f that the dense output has made to those of the run.
 inline void count_calls(const DenseRun &dense, const Work &step) {
     step.counters[NFEV] += std::exchange(dense.work.counters[NFEV], 0);
 }

@@ -112,7 +112,7 @@ struct Eight {
 
     Options flat_options_{};
 
-    // As above, buffers as those of one state of 8 n floats, as far as the raw step needs them.
+    // Sets up `flat`: the same buffers seen as those of one state of 8 n floats, as far as the raw step needs them.
     void flatten(const Work &w) {
         flat.n = flat.m = LANES * w.n;
         flat.l = w.l;

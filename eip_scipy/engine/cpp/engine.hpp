@@ -1,4 +1,4 @@
-// What the binding asks of the engine: templates that are compiled once, in engine.cpp.
+// Functions of the engine that the binding calls. Their templates are compiled once, in engine.cpp.
 #pragma once
 
 #include "eight.hpp"
@@ -6,7 +6,8 @@
 
 namespace eip {
 
-// As `advance`, `sweep` and `sweep_octets`, which say what comes back.
+// These functions call `advance` (loop.hpp), `sweep` (members.hpp) and `sweep_octets` (side_by_side.hpp); comments
+// there explain the codes that are returned.
 Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
                  const Saved &saved);
 Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,

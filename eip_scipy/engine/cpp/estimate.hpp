@@ -5,11 +5,12 @@
 
 namespace eip {
 
-// Without an estimate of their own, this number of projections are compared with one at first, then one in this number.
+// The first SAMPLED_FIRST projections of a run are examined. After them every SAMPLED_EACH-th one is, if the method has
+// no error estimate of its own.
 constexpr int64_t SAMPLED_FIRST = 8, SAMPLED_EACH = 16;
-// With an estimate of their own, every OWN_EACH-th projection looks at rates of change along the flow, and every
-// ADAPTIVE_EACH-th one of adaptive steps, which are longer, if f at the raw result is known anyway. Every RESOLUTION_EACH-th
-// projection compares local errors with what the step changes in each block.
+// If the method has an error estimate of its own, every OWN_EACH-th projection is examined for rates of change along
+// the flow. With adaptive steps, which are longer, every ADAPTIVE_EACH-th one is, if f at the raw result is known
+// anyway. Every RESOLUTION_EACH-th projection compares local errors with what the step changes in each block.
 constexpr int64_t OWN_EACH = 32, ADAPTIVE_EACH = 4, RESOLUTION_EACH = 64;
 
 // Square of component i of a in units of atol + rtol max(|y|, |y_hat|); a complex one is a pair of floats.
@@ -35,7 +36,7 @@ inline double error_norm(const double *err, const double *y, const double *y_hat
     return std::sqrt(total / n);
 }
 
-// As above, of a run whose columns of derivatives do not count.
+// Returns the norm of the error of the state alone, for a run with columns of derivatives, which do not count.
 [[gnu::noinline]] inline double error_norm_of_state(const double *err, const double *y, const double *y_hat,
                                                     const Options &o) {
     const Columns &columns = o.columns;
@@ -54,7 +55,8 @@ inline double norm_of_error(const double *y, const Options &o, const W &w) {
     return error_norm(w.err, y, w.y_hat, o, w.n);
 }
 
-// As above, for DOP853's pair of estimates; then err <- err |err| / hypot(err, low / 10), by component.
+// Returns the norm of the error from DOP853's pair of estimates, and replaces err by err |err| / hypot(err, low / 10),
+// by component.
 inline double paired_error_norm(double *err, const double *low, const double *y, const double *y_hat, const Options &o,
                                 int64_t n) {
     const int64_t width = o.blocks.width;

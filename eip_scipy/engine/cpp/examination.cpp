@@ -41,7 +41,8 @@ class InvariantFunctions {
         for (const nb::handle call : values) l_ += inv_.emplace_back(call, type_, n, kept_).floats();
         int64_t floats = 0;
         for (const nb::handle call : gradients) floats += grad_.emplace_back(call, type_, n, kept_).floats();
-        require(floats == l_ * m_, "invariants: gradients of another number of values");
+        require(floats == l_ * m_,
+                "invariants: the gradients do not have l * n numbers for the l values of the invariants");
     }
 
     Array values(double t, State y) {
@@ -102,7 +103,8 @@ class InvariantFunctions {
     // terms, without what the values change by anyway.
     void note_rates(ArrayOf<double, 2> figures, double t, State y, State f, Rows G, Numbers here, Numbers target,
                     Numbers scales, std::optional<Numbers> own) {
-        require(figures.shape[0] == l_ && figures.shape[1] == N_FIGURES, "invariants: another number of figures");
+        require(figures.shape[0] == l_ && figures.shape[1] == N_FIGURES,
+                "invariants: figures must have the shape (l, N_FIGURES)");
         const Array by_values = rates_by_values(t, y, f, G, here, target, scales);
         for (int64_t i = 0; i < l_; ++i) {
             const double *row = G.data + i * m_, expected = own ? known(*own)[i] : 0.0;
@@ -126,16 +128,17 @@ class InvariantFunctions {
     };
 
     const double *checked(const State &y) const {
-        require(kept_.is_valid() && y.type == type_ && y.shape[0] == n_, "invariants: a state of another kind");
+        require(kept_.is_valid() && y.type == type_ && y.shape[0] == n_,
+                "invariants: y has another dtype or size than the run");
         return y.data;
     }
     const double *checked_rows(const Rows &rows, int64_t count) const {
         require(rows.type == type_ && rows.shape[0] == count && rows.shape[1] == n_,
-                "invariants: rows of another kind");
+                "invariants: G must have the shape (l, n), directions the shape (2, n), and both the dtype of the run");
         return rows.data;
     }
     const double *known(const Numbers &numbers) const {
-        require(numbers.shape[0] == l_, "invariants: another number of values");
+        require(numbers.shape[0] == l_, "invariants: expected one number for each value of the invariants");
         return numbers.data;
     }
 
@@ -251,7 +254,7 @@ bool are_finite(PointsOf<const double, false> numbers) { return all_finite(numbe
 
 // True if no row of figures has one that may be that of a faulty run, which is the usual case.
 bool are_calm(PointsOf<const double, false> figures, double beyond_doubt, double together) {
-    require(figures.columns == N_FIGURES, "trust: rows of another number of figures");
+    require(figures.columns == N_FIGURES, "trust: the rows of figures must have N_FIGURES numbers");
     for (const double *row = figures.data; row < figures.data + figures.points; row += N_FIGURES) {
         const bool none = row[SHARE] == 0.0 && row[RAW] == 0.0 && row[RAW_MANY] == 0.0 && row[MANY] == 0.0;
         if (!none || row[NU] > beyond_doubt || row[SUM] > together * row[EXPECTED]) return false;
@@ -264,7 +267,7 @@ bool are_calm(PointsOf<const double, false> figures, double beyond_doubt, double
 void add_examination(nb::module_ &module) {
     module.def("are_finite", &are_finite, "numbers"_a, "Return True if no number is NaN or infinite.");
     module.def("are_calm", &are_calm, "figures"_a, "beyond_doubt"_a, "together"_a,
-               "Return True if no figure, (..., N_FIGURES), may be that of a faulty run.");
+               "Return True if no row of `figures` (..., N_FIGURES) may belong to a faulty run.");
     using Functions = InvariantFunctions;
     nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
                           "The invariants of a run and their gradients, each as a `Call`.")
@@ -274,15 +277,18 @@ void add_examination(nb::module_ &module) {
         .def("gradients", &Functions::gradients, "t"_a, "y"_a, "f"_a, "Return all gradients (l, n).")
         .def("is_in_order", &Functions::is_in_order, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "tau"_a, "interval"_a,
              "directions"_a,
-             "Whether precision, gradients and invariance are beyond doubt at a state with these gradients and values.")
+             "Return True if the checks of precision, gradients and invariance find nothing at the state `y`, where "
+             "the gradients are `G` and the values are `here`.")
         .def("rates_by_values", &Functions::rates_by_values, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a,
              "scales"_a,
-             "Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a "
-             "kink. Rates that are within the rounding of the values are 0.")
+             "Return the rates of change (l,) of the invariants along `f`, by short differences to both sides. A rate "
+             "is NaN if the two differences disagree, as at a kink, and 0 if it is within the rounding errors of the "
+             "values.")
         .def("note_rates", &Functions::note_rates, "figures"_a, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a,
              "scales"_a, "own"_a = nb::none(),
-             "Raise the largest rates of change along f, by gradients and by values, in the figures (l, N_FIGURES): "
-             "without the rates `own`, in units of their terms.");
+             "Update the largest rates of change along `f` in `figures` (l, N_FIGURES), computed from gradients and "
+             "from values. The rates are relative to their terms, and the rates `own` of balances are subtracted "
+             "first.");
     module.attr("CHECK_STEP") = CHECK_STEP;
     module.attr("CHECK_TOLERANCE") = CHECK_TOLERANCE;
     module.attr("CHECK_NOISE") = CHECK_NOISE;

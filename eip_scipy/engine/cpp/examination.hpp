@@ -1,5 +1,5 @@
-// A first look at the invariants of a run, at one of its states. What it does not find in order is examined in Python
-// (core/invariant_checks.py), where what is wrong gets its words.
+// First checks of the invariants of a run, at one of its states. If a check finds something, core/invariant_checks.py
+// examines it in Python, and writes the messages.
 #pragma once
 
 namespace eip {

@@ -21,15 +21,15 @@ Array out_of(PyObject *object, const LibraryFunction &function, int64_t n) {
     const int64_t expected = function.filled(n), has = out.size();
     if (has == expected) return out;
     PyArray_DiscardWritebackIfCopy(out.get());
-    refuse(PyExc_ValueError, "%s fills %lld numbers for this state; out has %lld", function.name,
+    refuse(PyExc_ValueError, "%s fills %lld numbers for this state, but out has %lld", function.name,
            static_cast<long long>(expected), static_cast<long long>(has));
 }
 
 void require_count(const LibraryFunction &function, Py_ssize_t count, bool by_f) {
     const Py_ssize_t expected = 3 + by_f + !function.returns() - !function.own.empty();
     if (count == expected || (count > expected && !function.own.empty())) return;
-    refuse(PyExc_TypeError, "%s takes (t, y%s%s, params), %zd arguments; got %zd", function.name, by_f ? ", f" : "",
-           function.returns() ? "" : ", out", expected, count);
+    refuse(PyExc_TypeError, "%s takes the %zd arguments (t, y%s%s%s); got %zd", function.name, expected,
+           by_f ? ", f" : "", function.returns() ? "" : ", out", function.own.empty() ? ", params" : "", count);
 }
 
 nb::object called(const LibraryFunction &function, PyObject *arguments) {
@@ -48,8 +48,8 @@ nb::object called(const LibraryFunction &function, PyObject *arguments) {
     Array f;
     if (by_f) f = vector_of(argument(2));
     if (by_f && f.size() != n)
-        refuse(PyExc_ValueError, "%s: f has %lld numbers, y has %lld", function.name, static_cast<long long>(f.size()),
-               static_cast<long long>(n));
+        refuse(PyExc_ValueError, "%s: f has %lld numbers, but y has %lld; they must have the same size", function.name,
+               static_cast<long long>(f.size()), static_cast<long long>(n));
     Array out = function.returns() ? new_array({function.filled(n)}) : out_of(argument(2 + by_f), function, n);
     function.one(t, y.floats(), by_f ? f.floats() : nullptr, out.floats(), params, n, p);
     if (!function.returns()) {
@@ -93,42 +93,47 @@ uintptr_t address(Pointer pointer) {
 
 PyObject *name_of(PyObject *self, void *) { return PyUnicode_FromString(nb::inst_ptr<LibraryFunction>(self)->name); }
 
-PyGetSetDef named[] = {{"__name__", name_of, nullptr, "Its name in `library`.", nullptr}, {}};
+PyGetSetDef named[] = {{"__name__", name_of, nullptr, "Name of the function in `library`.", nullptr}, {}};
 PyType_Slot slots[] = {{Py_tp_call, reinterpret_cast<void *>(call)}, {Py_tp_getset, named}, {0, nullptr}};
 
 }  // namespace
 
 void require_sizes(const LibraryFunction &function, int64_t n, int64_t p) {
     if (function.fits(n, function.own.empty() ? p : std::ssize(function.own))) return;
-    refuse(PyExc_ValueError, "%s takes %s; got %lld numbers and %lld parameters", function.name, function.sizes,
-           static_cast<long long>(n), static_cast<long long>(p));
+    refuse(PyExc_ValueError, "%s expects %s; got y with %lld numbers, and %lld parameters", function.name,
+           function.sizes, static_cast<long long>(n), static_cast<long long>(p));
 }
 
 void add_library(nb::module_ &module) {
     using Function = LibraryFunction;
     nb::class_<Function>(module, "LibraryFunction", nb::type_slots(slots),
-                         "A function of one of the library's problems.")
+                         "A function in C++ of one of the package's problems.")
         .def_prop_ro(
-            "takes_f", [](const Function &f) { return f.takes_f(); }, "Whether it takes the derivative of the state.")
+            "takes_f", [](const Function &f) { return f.takes_f(); },
+            "True if the function takes the derivative f of the state as an argument.")
         .def_prop_ro(
-            "in_place", [](const Function &f) { return !f.returns(); }, "Whether it fills an array.")
+            "in_place", [](const Function &f) { return !f.returns(); },
+            "True if the function fills an argument `out`; False if it returns its value.")
         .def_prop_ro(
             "handle", [](const Function &f) { return address(&f); },
-            "The first argument of the function at `call_address`.")
+            "Address of this function's record, the first argument of the function at `call_address`.")
         .def_prop_ro(
             "call_address", [](const Function &) { return address(call_by_handle); },
             "Address of `call_by_handle`, whose signature is in library.cpp.")
         .def_prop_ro(
             "fits_address", [](const Function &f) { return address(f.fits); },
-            "Of ``bool fits(int64_t n, int64_t p)``.")
+            "Address of ``bool fits(int64_t n, int64_t p)``, which returns True if the function accepts states of n "
+            "numbers and p parameters.")
         .def_prop_ro(
             "numbers", [](const Function &f) { return f.numbers == 0 ? 1 : f.numbers; },
-            "How many numbers, or states, it fills.")
+            "Number of numbers, or of rows of the state's size, that the function fills; if it is negative, its "
+            "absolute value is the number for each orbit.")
         .def_prop_ro(
-            "fills_states", [](const Function &f) { return !f.is_numbers(); }, "Whether these are of the state's size.")
+            "fills_states", [](const Function &f) { return !f.is_numbers(); },
+            "True if the function fills rows of the state's size.")
         .def_prop_ro(
             "octet_address", [](const Function &f) { return f.own.empty() ? address(f.eight) : 0; },
-            "For eight states side by side, 0 where there is none.")
+            "Address of the version for eight states at once; 0 if there is none.")
         .def(
             "bound",
             [](const Function &f, nb::handle params) {
@@ -138,9 +143,11 @@ void add_library(nb::module_ &module) {
                 out.own.assign(given.floats(), given.floats() + given.size());
                 return out;
             },
-            nb::arg("params"), "Return the function with parameters of its own, which replace those of a run.")
+            nb::arg("params"),
+            "Return the function with fixed parameters `params`, which it uses instead of the parameters of a run.")
         .def_prop_ro(
-            "own", [](const Function &f) { return f.own; }, "Its own parameters; empty if it takes those of the run.")
+            "own", [](const Function &f) { return f.own; },
+            "Fixed parameters of the function; empty if it uses the parameters of a run.")
         .def("__repr__", [](const Function &f) { return nb::str("<{} of eip_scipy>").format(f.name); })
         // Pickled by its name, so that it can be sent to other processes.
         .def("__reduce__", [](const Function &f) {

@@ -23,8 +23,8 @@ struct Given {
 template <class T>
 using LibraryPointer = void (*)(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p);
 
-// The derivative of a state of n numbers, or the accelerations at n numbers of positions, in `out`; in `pulls` those of
-// `accelerate_apart` of p bodies.
+// Fills `out` with the derivative of a state of n numbers, or with the accelerations at n numbers of positions, and
+// `pulls` with the pulls that `accelerate_apart` computes for p bodies.
 using ApartPointer = void (*)(const double *y, double *out, double *pulls, const double *params, int64_t n, int64_t p);
 
 // A problem's functions at one state in one pass, in which they share their terms, with the bits of the functions one by one:
@@ -41,11 +41,13 @@ void plain(double t, const T *y, const T *f, T *out, const T *params, int64_t n,
     FUNCTION({t, y, f, out, params, n, p});
 }
 
-// Kind of its value: the derivative of the state, of its size, in place; the accelerations at positions; numbers, of
-// a single one is returned directly; rates of numbers, which take f; gradients of these numbers, in place.
+// Kind of a function's value: the derivative of the state, in place, of the state's size; the accelerations at
+// positions; numbers, of which a single one is returned directly; rates of numbers, which take f; gradients of these
+// numbers, in place.
 enum class Value { DERIVATIVE, ACCELERATION, NUMBERS, RATES, GRADIENT, GRADIENT_BY_F };
 
-// A multiple of it in place of the number of numbers: this many numbers for each of the N - 1 orbits of N bodies.
+// Stands for the number of numbers of functions that fill N - 1 numbers, one for each orbit of N bodies; k times it
+// stands for k numbers for each orbit.
 constexpr int64_t EACH_ORBIT = -1;
 
 struct LibraryFunction {

@@ -43,9 +43,9 @@ struct Saved {
     int64_t rows;
 };
 
-// Roots that the loop has found since someone looked: of which event, when, in which state. `left`: how often an event may
-// still happen before it ends the run. The roots of a step for whose states there is too little room
-// are `pending_*`.
+// Roots that the loop has found since Python last read them: the event, the time and the state of each. `left`: how
+// often an event may still happen before it ends the run. If there is too little room for the states of a step's roots,
+// or a root cannot be found, these roots are stored in `pending_*`.
 struct Roots {
     int64_t *event, *pending_event;
     double *t, *y, *pending_t;
@@ -260,7 +260,8 @@ inline bool wants_samples(const AnyRun &run, const Samples *samples, const Sched
     return false;
 }
 
-// How far the steps go before someone looks: a multistep method makes many at once.
+// Returns the step up to which steps are made at once: the next one, or a later one if a multistep method makes many
+// steps at once and nothing between them is needed.
 inline int64_t next_stop(const Method &method, const Samples *samples, const Schedule &s, int64_t k, int64_t k_end) {
     const bool each = s.n_events > 0 || (samples && samples->interpolants.capacity > 0);
     if (!method.multistep || method.multistep->brief || each) return k + 1;
@@ -273,8 +274,9 @@ inline int64_t next_stop(const Method &method, const Samples *samples, const Sch
     return std::max(stop, k + 1);
 }
 
-// The step to which a member at step k advances within the given number of steps: to its end where a multistep method is near it,
-// whose last states cost a step of the method that starts, each of them that is asked for.
+// Returns the step to which a member at step k advances within the given number of steps. A member of a multistep
+// method that is close to its end advances to the end: each of the last states costs a step of the starting method
+// whenever one of them is needed.
 inline int64_t last_of(const Method &method, const Span &span, int64_t k, int64_t steps) {
     const bool at_end = method.multistep && span.n_steps - method.multistep->middle <= k + steps;
     return at_end ? span.n_steps : k + steps;

@@ -5,8 +5,8 @@
 
 namespace eip {
 
-// All members: `count` starts, parameters and lengths of the first steps, and what each comes to. `where` holds the
-// current member and whether it has begun; rows are saved for each member, or for none if `kept` is false.
+// All members: `count` starts, parameters and lengths of first steps, and the results of each member. `where` holds the
+// current member and whether it has begun. Rows are saved for each member, or for none if `kept` is false.
 struct Members {
     int64_t count, n_rows, evaluations;
     bool kept;
@@ -53,7 +53,8 @@ inline void clear_notes(const Members &members, const Options &o, const W &w) {
     for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = ENDLESS;
 }
 
-// Targets and gradients at the start y, with f there in the first row of K; whether all of it is finite.
+// Computes targets and gradients at the start y, where the first row of K holds f. Returns whether all of them are
+// finite.
 template <class System, class W, class Value>
 inline Truth<Value> evaluate_start(System &system, const W &w, double t0, const Value *y) {
     system.inv(w, t0, y, w.target);
@@ -65,7 +66,8 @@ inline Truth<Value> evaluate_start(System &system, const W &w, double t0, const 
     return finite;
 }
 
-// Everything as at the start of a run; false where it has none that is finite, which is then to be explained.
+// Sets everything as at the start of a run. Returns false if some value at the start is not finite; the caller then has
+// to explain that.
 inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, const Members &members, double *y) {
     const auto &w = run.work;
     const Options &o = run.options;

@@ -64,13 +64,14 @@ inline void weighted_squares(const double *weights, const Value *a, Value *out, 
     }
 }
 
-// Squares so small or large that they are not to be trusted.
+// Returns whether a square is so small or so large that it cannot be relied on, because it may have underflowed or may
+// overflow in sums.
 template <class Value>
 inline Truth<Value> is_extreme(const Value &square) {
     return !((square > 1e-280) & (square < 1e280));
 }
 
-// Per component, where each stands alone: what `block_sizes` does.
+// Does what `block_sizes` does if each component is a block.
 template <class Value, class W>
 inline Truth<Value> component_sizes(const Value *__restrict y, double rounding, const Options &o, const W &w) {
     const double *__restrict rtol = o.rtol;
@@ -87,7 +88,8 @@ inline Truth<Value> component_sizes(const Value *__restrict y, double rounding, 
     return extreme;
 }
 
-// Per block: w.scale = max(|rtol y|, |rtol y_hat|), w.ratio = |(err, rounding y_hat)|; whether some are too extreme.
+// Computes for each block w.scale = max(|rtol y|, |rtol y_hat|) and w.ratio = |(err, rounding y_hat)|; returns whether
+// some sizes are too extreme for squares.
 template <class Value, class W>
 inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &o, const W &w) {
     if (o.blocks.size == 1) return component_sizes(y, rounding, o, w);
@@ -111,7 +113,8 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
     return extreme;
 }
 
-// As above, squares taken in a unit of each block's own, so that they neither vanish nor overflow.
+// Does what `block_sizes` does for extreme sizes: squares are taken in a unit of each block's own, so that they neither
+// vanish nor overflow.
 [[gnu::cold, gnu::noinline]] inline void extreme_block_sizes(const double *y, double rounding, const Options &o,
                                                              const Work &w) {
     for (int64_t b = 0; b < o.blocks.count; ++b) {

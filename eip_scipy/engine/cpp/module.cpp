@@ -64,10 +64,9 @@ class Busy {
   public:
     explicit Busy(std::atomic<bool> &flag) : flag_(flag) {
         if (flag.exchange(true, std::memory_order_acquire))
-            refuse(
-                PyExc_RuntimeError,
-                "engine: a run cannot be stepped, nor its dense output evaluated, from its own functions, nor by two "
-                "threads at once");
+            refuse(PyExc_RuntimeError,
+                   "engine: the run is in use: its own functions, or a second thread, must not step it or evaluate its "
+                   "dense output; use a separate run for that");
     }
     ~Busy() { flag_.store(false, std::memory_order_release); }
     Busy(const Busy &) = delete;
@@ -80,7 +79,7 @@ class Busy {
 template <class Array>
 void require_shape(const Array &array, const char *name, Lengths shape) {
     if (std::equal(shape.begin(), shape.end(), array.shape)) return;
-    refuse(PyExc_ValueError, "engine: %s is an array of another shape than the run's", name);
+    refuse(PyExc_ValueError, "engine: %s has another shape than the run expects", name);
 }
 
 class Engine {
@@ -93,7 +92,7 @@ class Engine {
         data_.work = buffers.work;
         const bool has_tableau = hooks.is_none() || nb::object(hooks.attr("one_step")).is_none();
         data_.method = method_of(method, has_tableau, kept_);
-        require(data_.method.stages == data_.work.stages, "engine: work has room for another number of stages");
+        require(data_.method.stages == data_.work.stages, "engine: work and method have different numbers of stages");
         data_.options = options_of(options, data_.work, buffers.blocks, kept_);
         if (!schedule.is_none()) schedule_ = schedule_of(schedule, kept_);
         System &system = data_.system;
@@ -101,14 +100,15 @@ class Engine {
         const bool native = truth(functions.attr("native"));
         const nb::object python = native ? nb::object(functions.attr("python")) : functions;
         require(data_.work.balances == 0 || data_.options.balances.stages == data_.work.stages,
-                "engine: the balances do not fit the stages");
+                "engine: the record of the balances has another number of stages than the method");
         read_balances(functions, data_.work, system);
         if (native)
             read_pointers(functions, data_.work, data_.options.columns, python.is_none() ? events : 0, kept_, system);
         if (!python.is_none()) {
             functions_ = std::make_unique<PythonFunctions>(python, buffers.owner(), data_.work, type_, kept_);
             system.python = functions_.get();
-            require(functions_->events() == events, "engine: another number of events than their values have room for");
+            require(functions_->events() == events,
+                    "engine: the number of event functions differs from that in the schedule");
         }
         if (!hooks.is_none()) {
             const Run steps{data_.method, data_.options, data_.work, data_.system, nullptr};
@@ -120,8 +120,9 @@ class Engine {
             data_.method.multistep = &data_.multistep;
             const bool jacobian = native ? system.jacobian_pointer.pointer || system.jacobian_pointer.library
                                          : functions_->has_jacobian();
-            require(!hooks_ && data_.options.compensated && (data_.multistep.count == 0 || jacobian),
-                    "engine: the options do not fit a multistep method");
+            require(
+                !hooks_ && data_.options.compensated && (data_.multistep.count == 0 || jacobian),
+                "engine: a multistep method needs compensated summation, no hooks, and a Jacobian if it is corrected");
         }
         require(!(data_.method.nystrom || system.second_order) || data_.work.m % 2 == 0,
                 "engine: a state of positions and velocities has an even length");
@@ -143,7 +144,7 @@ class Engine {
         double *from = checked(y, "y"), *to = checked(y_new, "y_new");
         const Saved saved{t_saved.data, checked(y_saved, "y_saved", t_saved.shape[0]), t_saved.shape[0]};
         if (samples_) {
-            require(pieces.has_value(), "engine: pieces are missing");
+            require(pieces.has_value(), "engine: `pieces` is None, but dense output needs it");
             require_shape(*pieces, "pieces", {pieces->shape[0], dense().floats()});
             samples_->interpolants.first = pieces->data;
             samples_->interpolants.capacity = pieces->shape[0];
@@ -159,7 +160,7 @@ class Engine {
         double *from = checked(y, "y"), *to = checked(y_new, "y_new");
         const Members all = swept(members, steps, t_saved, kept);
         require(!functions_ && !hooks_ && (schedule().n_events == 0 || samples_),
-                "engine: members are swept by native functions");
+                "engine: `sweep` needs functions given by addresses, no hooks, and dense output if there are events");
         check_room(all.saved(0, data_.work));
         if (samples_) samples_->interpolants.capacity = 0;
         return stepped([&](const Run &run) { return sweep_members(run, samples(), *schedule_, all, steps, from, to); });
@@ -180,7 +181,8 @@ class Engine {
         const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (samples_ && all.kept));
         const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
         require(eight_ && fixed && (!all.kept || all.n_rows >= saved),
-                "engine: members side by side take fixed steps, and need room for all rows");
+                "engine: `sweep_octets` needs functions for eight members, fixed steps without events, a row for each "
+                "saved state, and dense output and kept rows for t_eval");
         if (samples_) samples_->interpolants.capacity = 0;
         const Octets octets{*eight_, samples()};
         return stepped([&](const Run &run) { return sweep_eights(run, octets, s, all, steps, from, to); });
@@ -264,14 +266,15 @@ class Engine {
         start_figures(checked(y, "y"), checked(f, "f"), tau, data_.method, hooks_.get(), data_.options, data_.work);
     }
 
-    // Visitors for the garbage collector.
+    // The objects that the garbage collector visits.
     nb::handle kept() const { return kept_; }
 
   private:
     // The memory of a state, or of `rows` of them.
     template <class T, int AXES>
     T *checked(const StatesOf<T, AXES> &array, const char *name, npy_intp rows = 1) const {
-        if (array.type != type_) refuse(PyExc_ValueError, "engine: %s is of another type than the run's states", name);
+        if (array.type != type_)
+            refuse(PyExc_ValueError, "engine: %s has another dtype than the states of the run", name);
         if constexpr (AXES == 1)
             require_shape(array, name, {data_.work.n});
         else
@@ -279,11 +282,12 @@ class Engine {
         return array.data;
     }
     const Schedule &schedule() const {
-        if (!schedule_) refuse(PyExc_RuntimeError, "engine: this one has no schedule");
+        if (!schedule_)
+            refuse(PyExc_RuntimeError, "engine: this call needs a schedule, but the engine was made without one");
         return *schedule_;
     }
     const Dense &dense() const {
-        if (!samples_) refuse(PyExc_RuntimeError, "engine: no dense output");
+        if (!samples_) refuse(PyExc_RuntimeError, "engine: this engine has no dense output; call `sample` first");
         return samples_->dense;
     }
     Samples *samples() { return samples_ ? &*samples_ : nullptr; }
@@ -297,7 +301,9 @@ class Engine {
             const int64_t roots = *samples_->roots.count, pieces = *samples_->interpolants.count;
             good &= roots >= 0 && pieces >= 0 && pieces <= samples_->interpolants.capacity;
         }
-        require(good, "engine: place or counts are outside the rows, or there are too few");
+        require(good,
+                "engine: the position in the schedule or the counts of dense output are outside their rows, or there "
+                "are too few rows");
     }
 
     // Members of an ensemble as a sweep takes them.
@@ -305,14 +311,15 @@ class Engine {
         const int64_t rows = t_saved.shape[0];
         Members found = members_of(members, data_, schedule(), rows, type_, kept);
         found.t_saved = t_saved.data;
-        require(steps >= 1 && rows >= 2, "engine: members need a step or more, and two rows or more");
+        require(steps >= 1 && rows >= 2, "engine: `steps` must be at least 1, and t_saved must have at least two rows");
         return found;
     }
 
     // Make a step or more by `call`, which takes a Run, without the GIL if no function is Python's.
     template <class Call>
     Code stepped(Call call) {
-        if (!kept_.is_valid()) refuse(PyExc_RuntimeError, "engine: not set up");
+        if (!kept_.is_valid())
+            refuse(PyExc_RuntimeError, "engine: this engine has been cleared or was never set up; make a new one");
         const FloatingPoint mode;
         try {
             std::optional<nb::gil_scoped_release> released;
@@ -337,41 +344,44 @@ class Engine {
 
 void add_engine(nb::module_ &m) {
     nb::class_<Engine>(m, "Engine", nb::type_slots(Collected<Engine>::slots),
-                       "The step of one run, on its arrays. `functions` says in `native` whether it holds addresses.")
+                       "Engine of one run, which makes its steps on its arrays. ``functions.native`` is True if "
+                       "`functions` holds addresses.")
         .def(nb::init<nb::object, nb::object, nb::object, nb::object, nb::object, nb::object>(), "method"_a,
              "options"_a, "work"_a, "functions"_a, "schedule"_a = nb::none(), "hooks"_a = nb::none(),
              nb::sig("def __init__(self, method: typing.Any, options: Options, work: Work, functions: typing.Any, "
                      "schedule: Schedule | None = None, hooks: typing.Any = None) -> None"))
         .def("advance", &Engine::advance, "k_end"_a, "y"_a, "y_new"_a, "t_saved"_a, "y_saved"_a, "pieces"_a.none(),
-             "Step on to step k_end, or to what stops the loop. pieces (rows, floats) receives the interpolants of all "
-             "steps if it has rows.")
-        .def(
-            "sweep", &Engine::sweep, "members"_a, "steps"_a, "y"_a, "y_new"_a, "t_saved"_a,
-            "Run members of an ensemble one after the other, so many steps in all; the `where` of the record `members` "
-            "says how far they are.")
+             "Make steps up to step `k_end`, or until something else stops the loop, and return the reason as a code. "
+             "If `pieces` (rows, floats) has rows, it is filled with the interpolants of all steps.")
+        .def("sweep", &Engine::sweep, "members"_a, "steps"_a, "y"_a, "y_new"_a, "t_saved"_a,
+             "Run members of an ensemble one after the other, for `steps` steps in all (slightly more if a multistep "
+             "method is near its end). Return OK, or a code for what happened to the current member. `members.where` "
+             "holds the current member and whether it has begun.")
         .def("side_by_side", &Engine::side_by_side, "functions"_a,
-             "Functions of eight members, by which `sweep_octets` runs them from now on; `functions` holds addresses, "
-             "as "
-             "those of the run.")
+             "Set the functions for eight members with which `sweep_octets` runs members from now on. Like those of "
+             "the run, `functions` holds addresses.")
         .def("sweep_octets", &Engine::sweep_octets, "members"_a, "steps"_a, "y"_a, "y_new"_a, "t_saved"_a,
-             "Do what `sweep` does with eight members side by side, by steps of all eight. Whose status is not set has "
-             "to run by itself.")
+             "Run members like `sweep`, in batches of eight that step together; `steps` counts steps of a batch. A "
+             "member whose status is not set afterwards must be run alone.")
         .def("step", &Engine::step, "k"_a, "t"_a, "y"_a, "f"_a,
-             "Step k from the state y at t with the derivative f. Returns (status, t_new, y_new, f_new).")
+             "Make step `k` from the state `y` at time `t`, where the derivative is `f`. Return (status, t_new, y_new, "
+             "f_new).")
         .def("project", &Engine::project, "t_old"_a, "y"_a, "t"_a, "last"_a, "y_new"_a,
-             "Project work.y_hat into y_new.")
+             "Project the state work.y_hat onto the invariants, write the result to `y_new`, and return the code.")
         .def("values", &Engine::values, "t"_a, "y"_a, "out"_a, "params"_a = nb::none(),
-             "Fill out (m, l) with the invariants at states y (m, n), each with its own params (m, p) where they are "
-             "given.")
+             "Fill `out` (m, l) with the invariants at the times `t` (m,) and states `y` (m, n). If `params` (m, p) is "
+             "given, each state has its own row of parameters.")
         .def("start", &Engine::start, "y"_a, "f"_a, "tau"_a,
-             "Set the invariants' terms at the start, from work.values and work.G.")
-        .def("sample", &Engine::sample, "dense"_a, "Make dense output from now on by this record.")
+             "Set the sizes of the invariants' terms at the start of a run, from the state `y`, the derivative `f`, "
+             "the length `tau` of a step, work.values and the gradients work.G.")
+        .def("sample", &Engine::sample, "dense"_a,
+             "Make dense output from now on, with the buffers of the record `dense`.")
         .def("describe", &Engine::describe, "t_old"_a, "y_old"_a, "t"_a, "y"_a, "piece"_a,
-             "Fill piece with the interpolant over the step made last.")
+             "Fill `piece` with the interpolant over the last step, from (t_old, y_old) to (t, y).")
         .def("interpolate", &Engine::interpolate, "piece"_a, "t"_a, "out"_a,
-             "Fill out (m, n) with the states at times t (m,) by an interpolant.")
+             "Fill `out` (m, n) with the states at the times `t` (m,), computed with the interpolant `piece`.")
         .def("show", &Engine::show, "t"_a, "y"_a, "out"_a,
-             "Fill out (n,) with the last state, y at t, as the run hands it out.");
+             "Fill `out` (n,) with the state `y` at `t` in the form in which the run saves its last state.");
 }
 
 // The integers of an enumeration, by the text of its names.
@@ -411,9 +421,10 @@ void add_constants(nb::module_ &m) {
 NB_MODULE(EIP_MODULE, m) {
     if (_import_array() < 0) throw nanobind::python_error();
     nanobind::set_leak_warnings(false);  // objects that live until the end of the process are not leaks
-    m.doc() = "The step in C++.";
-    eip::failed_call_error = PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError",
-                                                       "A function by pointer failed.", nullptr, nullptr);
+    m.doc() = "Engine of eip_scipy in C++: steps, projections, dense output and ensembles.";
+    eip::failed_call_error =
+        PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError",
+                                  "Error for a user's function, called by its address, that failed.", nullptr, nullptr);
     m.attr("FailedCallError") = eip::owned(eip::failed_call_error);
     eip::add_constants(m);
     eip::add_records(m);

@@ -60,7 +60,7 @@ inline Value scaled(const Pair &scale, const Value &total, const Value &rest, co
     return fused(spread<Value>(scale.value), sum, scale.rest * sum);
 }
 
-// The above into `out`, to the rows' ends.
+// Writes the scaled sums that `scaled` returns to `out`, up to the ends of the rows.
 inline void predict(const Rows &rows, const Pair &scale, const double *total, const double *rest, double *out) {
     in_blocks(rows.stride, [&]<class Value, int COUNT>(int64_t i) {
         Value sums[COUNT];
@@ -277,7 +277,7 @@ inline void finish_balances(const Run &run, double t, double length) {
     restore_levels(run.options.balances, w);
 }
 
-// As before the first step.
+// Resets the history to what it is before the first step.
 inline void forget_history(const Multistep &ms, int64_t l) {
     std::fill_n(ms.place, static_cast<int64_t>(N_NODE_PLACES), 0);
     fill(ms.levels, 0.0, 3 * l);
@@ -491,7 +491,7 @@ inline Truth<Value> estimate_nodes(const Multistep &ms, const Options &o, Value 
     return smooth;
 }
 
-// How far the values in w.values are from where they began, into w.target.
+// Computes how far the values w.values are from those at the start, into w.target.
 template <class W>
 inline void defects_of_values(const Multistep &ms, const W &w) {
     const auto *levels = as_values<typename W::Value>(ms.levels);
@@ -545,7 +545,8 @@ inline void soften_defects(const Multistep &ms, const Options &o, const W &w) {
     }
 }
 
-// And after it: the targets as they were, and what was left. `those`: whose projection it was.
+// To be called after the projection that `soften_defects` has prepared: restores the targets, and records what was left
+// of the defects. `those`: the members that were projected.
 template <class W>
 inline void note_what_is_left(const Multistep &ms, const Truth<typename W::Value> &those, const W &w) {
     using Value = typename W::Value;
@@ -557,7 +558,7 @@ inline void note_what_is_left(const Multistep &ms, const Truth<typename W::Value
     }
 }
 
-// The projection between both.
+// Projects between `soften_defects` and `note_what_is_left`.
 inline Code project_softly(const Run &run, const Step &step) {
     const Multistep &ms = *run.method.multistep;
     soften_defects(ms, run.options, run.work);
@@ -575,7 +576,7 @@ inline void gather_errors(const Value &size, const Value &since, const W &w) {
     w.counters[WAITED] = 0;
 }
 
-// The correction w.move of `those` into the sums.
+// Adds the correction w.move to the sums, for the members `those`.
 template <class W>
 inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those, const W &w) {
     using Value = typename W::Value;
@@ -592,7 +593,7 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     }
 }
 
-// The projection, whose correction goes into the sums; the history stays as it is.
+// Projects the newest state and adds the correction to the sums; the accelerations of the history remain unchanged.
 [[gnu::noinline]] inline Code project_nodes(const Run &run, double *scratch) {
     const Multistep &ms = *run.method.multistep;
     const Options &o = run.options;

@@ -36,7 +36,7 @@ struct OctetSystem {
         require(rhs_pointer.pointer(t, y, out, floats_of(params.data())));
     }
 
-    // As System's.
+    // Computes the accelerations like `System::acceleration`.
     template <class W>
     void acceleration(const W &w, double t, const double *y, double *f, double *a) {
         const int64_t half = w.m / 2;

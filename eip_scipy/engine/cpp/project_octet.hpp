@@ -73,8 +73,9 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
     return more;
 }
 
-// The rest of a projection of eight members, where the gradients at w.y_hat and the invariants' values are known, from y
-// at the step's beginning into eight.y_new; returns those of `alive` who have to do it by themselves.
+// Second part of a projection of eight members, when the gradients at w.y_hat and the values of the invariants are
+// known. The step begins at y, and the result is written to eight.y_new. Returns the members of `alive` that must be
+// projected alone.
 template <class W>
 [[gnu::flatten]] inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Octet *y,
                                                      const Mask &alive, const Work &single) {
@@ -128,7 +129,8 @@ template <class W>
     return alive & !done;
 }
 
-// As `project_step`. W is the work of all eight, or the same of a length that the compiler knows.
+// Projects eight members as `project_step` projects one. W is the work of all eight, or the same with a length that the
+// compiler knows.
 template <class W>
 inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask &alive, const Work &single) {
     const Options &o = eight.options;
@@ -141,8 +143,9 @@ inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask
     return noticed | project_octet_evaluated(eight, w, step.t_new, eight.y, alive & !noticed, single);
 }
 
-// As `project_nodes`, of a multistep method. Members whose steps are not stable leave those of `alive`; those who have to do
-// it by themselves come back, with their gathered errors as they were in w.err_low.
+// Projects eight members of a multistep method as `project_nodes` projects one. Members whose steps are not stable are
+// removed from `alive`. Returns the members that must be projected alone; the errors gathered for them before are in
+// w.err_low.
 inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
     const Options &o = eight.options;
     const WorkOf<Octet> &w = eight.work;

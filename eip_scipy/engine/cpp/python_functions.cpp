@@ -43,7 +43,7 @@ PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb:
       in_place_(truth(description.attr("in_place"))) {
     const nb::handle args = kept_attribute(description, "args", kept);
     if (!nb::isinstance<nb::tuple>(args)) throw nb::type_error("engine: args must be a tuple");
-    require(nb::len(args) <= MOST_ARGUMENTS, "engine: too many further arguments");
+    require(nb::len(args) <= MOST_ARGUMENTS, "engine: args has more than MOST_ARGUMENTS items");
     for (const nb::handle argument : nb::borrow<nb::tuple>(args)) args_.push_back(argument);
     value_type_ = truth(description.attr("real")) ? static_cast<int>(NPY_DOUBLE) : type;
     const nb::object shape = description.attr("shape");
@@ -52,7 +52,7 @@ PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb:
     floats_ = width_of(value_type_);
     for (int k = 0; k < n_dimensions_; ++k) {
         dimensions_[k] = nb::cast<npy_intp>(shape[k]);
-        require(dimensions_[k] >= 0, "engine: negative length");
+        require(dimensions_[k] >= 0, "engine: shape contains a negative length");
         floats_ *= dimensions_[k];
     }
     const nb::handle entry = kept_attribute(description, "entry", kept);
@@ -140,7 +140,10 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
     nb::object found = nb::borrow(value);
     if (!PyArray_CheckExact(value) || !plain(value)) {
         found = convert_(nb::handle(value), nb::handle(t));
-        if (!plain(found.ptr())) refuse(PyExc_TypeError, "engine: convert returned %.80R", found.ptr());
+        if (!plain(found.ptr()))
+            refuse(PyExc_TypeError,
+                   "engine: convert returned %.80R, expected an array of the shape and dtype of the function's values",
+                   found.ptr());
     }
     std::memcpy(out, PyArray_DATA(reinterpret_cast<PyArrayObject *>(found.ptr())), floats_ * sizeof(double));
 }
@@ -172,7 +175,7 @@ PythonFunctions::PythonFunctions(nb::handle functions, nb::handle owner, const W
     const nb::object jacobian = functions.attr("jacobian");
     if (jacobian.is_none()) return;
     jacobian_.emplace(jacobian, type, sizes.n / 2, kept);
-    require(jacobian_->floats() == m_ / 2, "engine: jacobian must fill half as many numbers as the state has");
+    require(jacobian_->floats() == m_ / 2, "engine: jacobian must fill n / 2 numbers for a state of n numbers");
 }
 
 void PythonFunctions::add_owner(nb::handle owner, nb::list &kept) {

@@ -10,7 +10,7 @@
 
 namespace eip {
 
-// Further arguments of a function at most.
+// The largest number of further arguments of a function.
 constexpr int MOST_ARGUMENTS = 8;
 
 // A function fun(t, y) that Numba has compiled: it returns 0, or another number after an exception. An array is passed as
@@ -19,9 +19,8 @@ using NumbaCode = int32_t(void *value, void **exception, double t, void *memory,
                           int64_t item_size, const double *data, int64_t shape, int64_t stride);
 using NumbaRelease = void(void *memory);
 
-// One function: fun(t, y[, f][, out], *args). What it returns is taken as it is where it is an array of the right kind,
-// or a float; else `convert(value, t)` makes that of it,
-// or raises.
+// One function: fun(t, y[, f][, out], *args). Its value is used as it is if it is a float or an array of the right
+// kind. Otherwise `convert(value, t)` converts it, or raises an error.
 class PythonCall {
   public:
     // `description` has the attributes fun, args, convert, shape (of the value: () for a number), takes_f, in_place.
@@ -65,7 +64,7 @@ class PythonFunctions final : public Functions {
     bool has_jacobian() const { return jacobian_.has_value(); }
     int64_t events() const { return static_cast<int64_t>(event_.size()); }
 
-    // Memory of another owner's is filled too.
+    // Adds an owner of memory that functions in place fill as well.
     void add_owner(nb::handle owner, nb::list &kept);
 
   private:
@@ -88,7 +87,7 @@ class PythonHooks final : public Hooks {
     int project_elsewhere(const Step &step) override;
     bool all_agree(bool here) override;
 
-    // The array that the steps to come lead to.
+    // Sets the array to which the next steps write their states.
     void set_state(nb::handle to) { to_ = to; }
 
   private:

@@ -182,7 +182,8 @@ void add_record(nb::module_ &module, const char *name) {
             .attr("namedtuple")(name, names.names, "defaults"_a = names.defaults, "module"_a = "eip_scipy.engine.data");
     type.attr("__annotations__") = names.types;
     type.attr("__doc__") =
-        "A record that the engine reads; engine/cpp has its fields and what they mean, see `fields` in data.hpp.";
+        "Record that the engine reads. The functions `fields` in engine/cpp (data.hpp, loop.hpp, members.hpp) list its "
+        "fields, and comments there explain them.";
     module.attr(name) = type;
 }
 
@@ -194,7 +195,7 @@ Method method_of(nb::handle method, bool has_tableau, nb::list &kept) {
     if (!has_tableau) return m;
     require(m.columns >= m.stages - 1, "engine: A has too few columns");
     require(m.n_e <= m.stages + 1 && m.n_e_v <= m.stages + 1 && (!m.paired || m.n_e_low >= m.n_e),
-            "engine: the weights of the error estimate do not fit the stages");
+            "engine: e or e_v has more weights than the stages plus one, or e_low has fewer weights than e");
     return m;
 }
 
@@ -205,7 +206,7 @@ static void check_places(const uint64_t *start, int64_t count, const uint64_t *p
     for (int64_t k = 0; k + 1 < count; ++k) good &= start[k] <= start[k + 1];
     good &= count == 0 || start[count - 1] <= static_cast<uint64_t>(size);
     for (int64_t p = 0; p < size; ++p) good &= place[p] < static_cast<uint64_t>(bound);
-    if (!good) refuse(PyExc_ValueError, "engine: %s names places outside the state", name);
+    if (!good) refuse(PyExc_ValueError, "engine: %s contains indices outside the state, or starts that decrease", name);
 }
 
 Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept) {
@@ -216,7 +217,7 @@ Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept) {
     const bool sizes =
         fits && ms.order >= 4 && ms.pitch % 4 == 0 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
     require(ms.balances == w.balances && (ms.balances == 0 || !ms.brief),
-            "engine: the history does not fit the balances");
+            "engine: the multistep record has another number of balances than work, or is brief and has balances");
     require(w.m % 2 == 0 && sizes && ms.middle < ms.order && ms.substeps >= 1 && ms.spacing >= 1 && ms.h != 0.0,
             "engine: the record of the multistep method does not fit the run");
     return ms;
@@ -225,7 +226,7 @@ Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept) {
 void check_history(const Multistep &ms) {
     const int64_t at = ms.place[NEWEST_ROW];
     require(!ms.place[HAVE_NODES] || (at >= ms.order - 1 && at < ms.rows),
-            "engine: the newest node is in none of the history's rows");
+            "engine: the row of the newest node must be at least order - 1 and less than the number of rows");
 }
 
 static void check_blocks(const Blocks &b, int64_t m) {
@@ -270,7 +271,7 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
     read(o, options, NPY_DOUBLE, {.n = w.n, .m = w.m, .l = w.l, .blocks = blocks}, kept);
     check_blocks(o.blocks, w.m);
     check_blocks(o.kinds, w.m);
-    require(o.blocks.count == blocks, "engine: work has room for another number of blocks");
+    require(o.blocks.count == blocks, "engine: work and options have different numbers of blocks");
     check_places(o.frame.start, 2 * o.frame.starts, o.frame.place, o.frame.values, w.m, "frame");
     require(o.frame.groups == 0 || (o.frame.count >= 1 && 3 * o.frame.groups * o.frame.count == w.m),
             "engine: the frame's bodies do not fit the state");
@@ -282,7 +283,7 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
     w.products = o.frame.products;
     o.has_limits = std::any_of(o.most_left, o.most_left + w.l, [](double share) { return share < ENDLESS; });
     require(o.balance_groups.count == 0 || (o.direction == NEW && !o.has_limits),
-            "engine: groups of balances take one Newton step along their own directions");
+            "engine: groups of balances need direction NEW and most_left without finite limits");
     return o;
 }
 
@@ -332,14 +333,15 @@ Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, 
     const Buffers &buffers = buffers_of(work);
     kept.append(work);
     d.work = buffers.work;
-    require(buffers.type == type && d.work.n == run.work.n && d.work.l == run.work.l && d.work.stages >= 0 &&
-                d.work.balances == run.work.balances,
-            "engine: the buffers for dense output do not fit the run");
+    require(
+        buffers.type == type && d.work.n == run.work.n && d.work.l == run.work.l && d.work.stages >= 0 &&
+            d.work.balances == run.work.balances,
+        "engine: dense.work has another dtype, or other numbers of components, invariants or balances, than the run");
     d.options = options_of(dense.attr("options"), d.work, run.options.blocks.count, kept);
-    require(buffers.blocks == run.options.blocks.count, "engine: the buffers for dense output do not fit the run");
+    require(buffers.blocks == run.options.blocks.count, "engine: dense.work has another number of blocks than the run");
     d.multistep = run.method.multistep;
     read(samples, dense, type, {.n = d.work.n, .events = events}, kept);
-    require(!d.own_slopes || d.work.stages >= 1, "engine: the buffers for dense output do not fit the run");
+    require(!d.own_slopes || d.work.stages >= 1, "engine: dense.work needs at least one stage if own_slopes is True");
     check_interpolant(d, run.work.stages);
     samples.roots.count = samples.counts;
     samples.interpolants.count = samples.counts + 1;
@@ -354,7 +356,7 @@ Members members_of(nb::handle members, const Data &run, const Schedule &schedule
     read(m, members, type,
          {.n = w.n, .m = w.m, .l = w.l, .events = schedule.n_events, .params = run.system.n_params, .rows = rows},
          kept);
-    require(m.where[0] >= 0 && m.where[0] <= m.count, "engine: where is outside the members");
+    require(m.where[0] >= 0 && m.where[0] <= m.count, "engine: members.where is outside the members");
     return m;
 }
 
@@ -381,12 +383,13 @@ static Function pointer_of(nb::handle object, const char *name, int64_t floats, 
         require_sizes(*function, n, p);
         take(*function, out.library);
         if (out.library && function->filled(n) == floats) return out;
-        refuse(PyExc_ValueError, "engine: %s fills %lld floats where %lld are expected", function->name,
+        refuse(PyExc_ValueError, "engine: %s fills %lld floats, expected %lld", function->name,
                static_cast<long long>(out.library ? function->filled(n) : 0), static_cast<long long>(floats));
     }
     const auto address = static_cast<uintptr_t>(PyLong_AsUnsignedLongLong(object.ptr()));
     if (PyErr_Occurred()) throw nb::python_error();
-    if (!address || floats < 0) refuse(PyExc_ValueError, "engine: a function of %s is missing", name);
+    if (!address || floats < 0)
+        refuse(PyExc_ValueError, "engine: %s contains an address that is 0, or a negative number of floats", name);
     out.pointer = reinterpret_cast<decltype(out.pointer)>(address);
     return out;
 }
@@ -439,7 +442,8 @@ void read_balances(nb::handle functions, const Work &w, System &system) {
     for (const nb::handle pair : nb::object(rates.attr("items"))) {
         Balance balance;
         std::tie(balance.item, balance.floats) = nb::cast<std::pair<int64_t, int64_t>>(pair);
-        require(balance.item >= 0 && balance.item < items && balance.floats >= 0, "engine: a balance has no function");
+        require(balance.item >= 0 && balance.item < items && balance.floats >= 0,
+                "engine: an item of rates has an index outside the invariants, or a negative number of values");
         system.balances.push_back(balance);
         total += balance.floats;
     }
@@ -519,7 +523,7 @@ OctetSystem octet_system_of(nb::handle functions, const Data &run) {
     const bool steps =
         ms ? !ms->brief && !ms->level && (ms->count == 0 || !jacobian.is_none()) : !o.compensated && o.every >= 1;
     require(!run.system.python && w.n == w.m && !o.adaptive && o.iterations == 1 && o.direction == NEW && steps,
-            "engine: a run of this kind does not go side by side with others");
+            "engine: members with these options cannot be run in batches of eight");
     return system;
 }
 
@@ -603,7 +607,8 @@ const nb::dict &Buffers::arrays(const char *only) const {
 }
 
 void Buffers::share(const Buffers &other, const nb::set &names) {
-    require(other.work.l == work.l, "engine: buffers of other lengths are not shared");
+    require(other.work.l == work.l,
+            "engine: buffers can be shared only between runs with the same number of invariant values");
     for_each_buffer(work, blocks, type, [&]<class T>(const char *name, T *&place, int, auto) {
         if (names.contains(name)) place = static_cast<T *>(PyArray_DATA(other.array(name).get()));
     });
@@ -613,7 +618,7 @@ void Buffers::share(const Buffers &other, const nb::set &names) {
 
 const Buffers &buffers_of(nb::handle work) {
     const Buffers *found = nullptr;
-    if (!nb::try_cast(work, found) || !found) throw nb::type_error("engine: work is no Work");
+    if (!nb::try_cast(work, found) || !found) throw nb::type_error("engine: work must be an object of the class Work");
     return *found;
 }
 
@@ -631,15 +636,17 @@ void add_records(nb::module_ &module) {
     add_record<Members>(module, "Members");
     add_record<Samples>(module, "Dense");
     module.def("spanned", &spanned, "frame"_a, "G"_a, "share"_a,
-               "Return for each row of G whether the frame removes all but this share of it.");
-    nb::class_<Buffers> type(module, "Work",
-                             "Buffers of a run, in memory of the engine; each attribute is an array over one.");
+               "Return a list of bool: True for each row of `G` of which the frame removes all but at most the "
+               "fraction `share`.");
+    nb::class_<Buffers> type(
+        module, "Work", "Buffers of a run in the engine's memory; each attribute is an array that shows one buffer.");
     type.def(nb::init<int64_t, nb::handle, int64_t, int64_t, int64_t, int64_t>(), "n"_a, "dtype"_a, "stages"_a,
              "n_invariants"_a, "n_blocks"_a, "n_balances"_a = 0)
         .def(
             "arrays", [](const Buffers &own) { return own.arrays(); },
             nb::sig("def arrays(self) -> dict[str, numpy.typing.NDArray[typing.Any]]"), "Return all arrays by name.")
-        .def("share", &Buffers::share, "other"_a, "names"_a, "Use the buffers of these names of others from now on.")
+        .def("share", &Buffers::share, "other"_a, "names"_a,
+             "Use the buffers of `other` with these names from now on, in place of own ones.")
         .def("__getstate__", &Buffers::state)
         .def("__setstate__", [](Buffers &own, const nb::tuple &state) { new (&own) Buffers(state); });
     Work any{};

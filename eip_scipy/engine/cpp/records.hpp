@@ -1,6 +1,6 @@
-// From the records that Python makes (`fields` in data.hpp, loop.hpp and members.hpp) and the functions' addresses to what
-// the steps take. What comes from Python is looked at here, once; the arrays of a run keep their memory, so that Python reads
-// what the engine writes.
+// Conversion of the records that Python makes (`fields` in data.hpp, loop.hpp and members.hpp) and of the addresses of
+// functions to the structures that the steps use. Everything that comes from Python is checked here, once. The arrays
+// of a run keep their memory, so that Python reads what the engine writes.
 #pragma once
 
 #include "arrays.hpp"
@@ -11,14 +11,15 @@
 
 namespace eip {
 
-// Buffers of a run in memory of the engine's own, which arrays over it keep. A complex state has two floats to a number.
+// Buffers of a run in the engine's own memory, which is kept alive by the arrays that show it. A complex state has two
+// floats per number.
 class Buffers {
   public:
     Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks, int64_t balances);
 
     Buffers(const Buffers &) = delete;
     Buffers &operator=(const Buffers &) = delete;
-    // Buffers with the numbers of others, which have this state.
+    // Restores buffers from the value of `state()`, for pickling.
     explicit Buffers(const nb::tuple &state);
     nb::tuple state() const;
 
@@ -40,7 +41,7 @@ class Buffers {
     mutable nb::dict arrays_;  // those that were asked for
 };
 
-// Flags of a Python object.
+// Returns the buffers in a Python object of the class Work.
 const Buffers &buffers_of(nb::handle work);
 
 // Objects to which the steps of a run refer.
@@ -57,7 +58,7 @@ Method method_of(nb::handle method, bool has_tableau, nb::list &kept);
 // Data of a multistep method in addition to the buffers of the run; its history, which Python may fill.
 Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept);
 void check_history(const Multistep &multistep);
-// Sets what the buffers hold of them too: targets, scratch of the frame.
+// Reads the options, and also sets what the buffers contain of them: the targets, and scratch memory of the frame.
 Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept);
 Schedule schedule_of(nb::handle schedule, nb::list &kept);
 Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, nb::list &kept);

@@ -95,7 +95,7 @@ inline void take_history(const Run &run, Eight &eight, int64_t lane) {
     w.counters[LAST_RANK] = eight.rank[lane];
 }
 
-// And what they may have changed of it.
+// For a multistep method: copies back what the projection of one member may have changed.
 inline void give_history(const Run &run, Eight &eight, int64_t lane) {
     const auto &w = run.work;
     const WorkOf<Octet> &eights = eight.work;
@@ -114,8 +114,8 @@ inline void give_history(const Run &run, Eight &eight, int64_t lane) {
     eight.at(eights.max_correction, lane) = w.max_correction[0];
 }
 
-// As OneState: nodes are added to eight histories at once, and projected; what is rare is done for one member after the
-// other.
+// Does for eight members what OneState does for one: nodes are added to eight histories at once, and projected. What is
+// rare is done for one member after the other.
 struct EightStates {
     const Eight::Run &run;
     const Run &single;
@@ -157,7 +157,7 @@ struct EightStates {
         for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = those.lane(lane);
     }
 
-    // A member for which it fails has to run by itself.
+    // Calls `action` for each member in `those`. A member for which it fails must be run alone.
     template <typename Action>
     void each(const Mask &those, Action action) const {
         for (int64_t lane = 0; lane < LANES; ++lane) {
@@ -214,7 +214,7 @@ inline void take_shown(const Run &run, Eight &eight, int64_t lane) {
     while (is_due(s, eight.row, step.t_new)) ++eight.row;
 }
 
-// The next step of all eight, which is the one that comes back.
+// Makes the next step of all eight members, and returns the number of steps made so far.
 inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members,
                           double *y, double *y_new) {
     const Span &span = s.span;
@@ -343,8 +343,8 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
     }
 }
 
-// Runs batches of members from where[0] on, up to the given number of steps. OK if none is left or more calls are needed. Whose
-// status is not set has to run by itself.
+// Runs batches of members from where[0] on, up to the given number of steps. Returns OK if no member is left or if more
+// calls are needed. A member whose status is not set afterwards must be run alone.
 inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
                          double *y, double *y_new) {
     const auto &[eight, samples] = octets;

@@ -179,7 +179,7 @@ inline void combine_blocks(const double *y, double scale, const Rows &rows, doub
         combine_part<Float, COUNT, ADD>(y, scale, rows, out, i < n - LENGTH ? i : n - LENGTH);
 }
 
-// As above, for short rows, float by float: the last row has just been written so, and a load of several floats would wait
+// Combines short rows, float by float: the last row has just been written so, and a load of several floats would wait
 // until all those stores are done.
 template <bool ADD, int COUNT = 2 * WIDTH - 1>
 inline void combine_short(const double *y, double scale, const Rows &rows, double *out, int64_t n) {

@@ -38,10 +38,11 @@ class Functions {
 
 struct Step;
 
-// Parts of a step that are replaced: one-step methods of a user's own, the end of the step by a subclass, the projection of
-// `JointInvariants`, which may decline, and then that of a state whose parts lie on several processes. These have to agree
-// whether a raw result is finite, too. Codes as the step's own. drives: the raw step is that of a solver which controls its
-// error and its length, and `drive` makes it, `again` in place of one whose projection has failed.
+// Parts of a step that Python code replaces: the raw step of a user-defined one-step method, the end of the step by a
+// subclass, the projection by `JointInvariants`, which may decline, and the projection of a state whose parts lie on
+// several processes. Such processes also have to agree whether a raw result is finite. The codes are those of the step.
+// If `drives`, the raw step is that of a solver which controls its error and its length: `drive` makes it, and with
+// `again` repeats one whose projection has failed.
 class Hooks {
   public:
     virtual ~Hooks() = default;
@@ -69,7 +70,8 @@ struct Balance {
     Native<GradientPointer> rate{};
 };
 
-// A call by pointer that failed: of which functions, which one, where, and the status that it returned.
+// A call by pointer that failed: the kind of the function, its index among the functions of that kind, its arguments,
+// and the status that it returned.
 struct FailedCall {
     const char *functions = "";
     int64_t index = 0;
@@ -104,9 +106,10 @@ struct System {
     bool all_at_raw = false;             // whether values and gradients are known at the raw result of the step
     Shifts shifts;                       // for gradients without a function
     FailedCall failed;
-    // With columns of derivatives behind the state, in runs by pointer: these, otherwise null. The functions of the invariants
-    // then take the state alone, as `rhs_pointer` also does if it `takes_state`. The derivatives of all invariants by the
-    // parameters behind the state, (l, parameters).
+    // The description of the columns, in runs by pointer whose states have columns of derivatives behind them;
+    // otherwise null. The functions of the invariants then take the state alone, and so does `rhs_pointer` if
+    // `takes_state`. `by_parameters` are the derivatives of all invariants with respect to the parameters behind the
+    // state, (l, parameters).
     const Columns *columns = nullptr;
     bool takes_state = false;
     std::vector<Native<ValuePointer>> by_parameters;
@@ -231,7 +234,8 @@ struct System {
         rhs_pointer.library.apart(y, out, pulls.data(), params, second_order ? w.m / 2 : w.m, n_params);
     }
 
-    // And the rates by these, for a state (q, v) at which they were found.
+    // Computes the rates of all balances from `pulls`, at the state (q, v) for which `accelerate_with_pulls` computed
+    // them.
     template <class W>
     void rates_from_pulls(const W &w, double t, const double *y, double *out) {
         for (const Balance &balance : balances) {
@@ -433,7 +437,7 @@ struct Sized : WorkOf<Value> {
     static constexpr int64_t n = M, m = M;
 };
 
-// As above, with a number of invariants that the compiler knows.
+// A short real state whose number of invariants is also known to the compiler.
 template <int64_t M, int64_t L, class Value = double>
 struct SizedWith : Sized<M, Value> {
     explicit SizedWith(const WorkOf<Value> &w) : Sized<M, Value>(w) {}

@@ -369,7 +369,8 @@ inline void note(const Step &step, double errors, double rounding, const double 
         keep_accepted(step, w);
 }
 
-// As above, for a step, whose estimates, where they are gathered in quadrature, are of errors that add.
+// Records the projection of a step like `note`. If the estimates of several steps are gathered in quadrature, the
+// errors of these steps may nevertheless add up, hence the factor.
 template <class W>
 inline void take_note(const Step &step, const double *y_old, const Options &o, const W &w) {
     if (!o.watched) return raise_to(w.defect, w.max_defect, w.l);

@@ -1,4 +1,4 @@
-// What the implicit schemes for the Gross-Pitaevskii equation do point by point.
+// Pointwise loops of the implicit schemes for the Gross-Pitaevskii equation.
 #include "../module.hpp"
 
 #include <nanobind/stl/array.h>
@@ -29,7 +29,8 @@ void multiply_modes(Field modes, ConstField factor) {
 double right_side(ConstField start, ConstField mean, ConstField rotation, ConstReals W, double w, double c, Field out) {
     require_one_length(start, mean, W, out);
     const bool rotates = rotation.points > 0;
-    require(!rotates || rotation.points == out.points, "right_side: expected rotation at no point or at all");
+    require(!rotates || rotation.points == out.points,
+            "right_side: rotation must be empty or have one value for each point");
     const Released released(out.points);
     double total = 0.0;
     for (npy_intp i = 0; i < out.points; ++i) {

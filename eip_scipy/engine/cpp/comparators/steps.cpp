@@ -84,14 +84,17 @@ FixedSteps steps_of(nb::handle record, const StatesOf<double, 2> &rows, int64_t 
                        rows.data};
     bool good = s.rows > 0 && s.saved[0] == 0 && rows.shape[0] == s.rows && rows.shape[1] == n;
     for (int64_t r = 1; good && r < s.rows; ++r) good = s.saved[r] > s.saved[r - 1];
-    require(good, "take_steps: the steps to save must rise from 0, with a row for each");
+    require(good,
+            "take_steps: the numbers of saved steps must increase from 0, and rows must have one row of n numbers for "
+            "each");
     return s;
 }
 
 void require_scheme(std::string_view name, int64_t n) {
     const bool halves = name == "kick-drift-kick" || name == "drift-kick-drift";
     require((halves && n % 2 == 0) || (name == "boris" && n == 6) || name == "implicit-midpoint",
-            "take_steps: no such scheme, or a state of another size than it has");
+            "take_steps: unknown scheme, or a state whose size the scheme does not accept (even for kick-drift-kick "
+            "and drift-kick-drift, 6 for boris)");
 }
 
 int64_t take_steps(const char *name, double constant, nb::object functions, const Buffers &buffers, nb::object record,
@@ -99,7 +102,7 @@ int64_t take_steps(const char *name, double constant, nb::object functions, cons
     nb::list kept;
     const Work &work = buffers.work;
     require(work.m == y.shape[0] && work.n == work.m && rows.type == NPY_DOUBLE && work.stages >= 1,
-            "take_steps: y or rows do not fit the buffers");
+            "take_steps: work must be real, with the size of y and at least one stage, and rows must be float64");
     require_scheme(name, work.n);
     const FixedSteps steps = steps_of(record, rows, work.n);
     System system;
@@ -125,8 +128,8 @@ int64_t take_steps(const char *name, double constant, nb::object functions, cons
 
 void add_comparators(nb::module_ module) {
     module.def("take_steps", take_steps, "scheme"_a, "constant"_a, "functions"_a, "work"_a, "steps"_a, "y"_a, "rows"_a,
-               "Take all steps from y, which moves; rows (saved, n) receives the states to save. Returns the number of "
-               "evaluations.");
+               "Make all steps from the state `y`, which is overwritten, and fill `rows` (saved, n), whose first row "
+               "is the start, with the states to save. Return the number of evaluations.");
 }
 
 }  // namespace eip

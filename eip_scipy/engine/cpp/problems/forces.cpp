@@ -319,10 +319,14 @@ bool with_columns(int64_t n, int64_t p) { return p > N_ENTRIES && n > 0 && n % (
 bool of_bodies(int64_t n, int64_t p) { return p > N_ENTRIES && n == 6 * (p - N_ENTRIES); }
 bool at_positions(int64_t n, int64_t p) { return p > N_ENTRIES && n == 3 * (p - N_ENTRIES); }
 bool of_two(int64_t n, int64_t p) { return n == 12 && p == 2 + N_ENTRIES; }
-constexpr const char *COLUMNS = "a state of 6 numbers a body, columns of as many, every G m and 12 entries";
-constexpr const char *BODIES = "positions and velocities, 6 numbers a body, every G m and 12 entries";
-constexpr const char *POSITIONS = "positions, 3 numbers a body, every G m and 12 entries";
-constexpr const char *TWO = "12 numbers, two G m and 12 entries";
+constexpr const char *COLUMNS =
+    "a state of 6 numbers per body, columns of the same size, and as parameters G m of every body and 12 entries of "
+    "the forces";
+constexpr const char *BODIES =
+    "positions and velocities, 6 numbers per body, and as parameters G m of every body and 12 entries of the forces";
+constexpr const char *POSITIONS =
+    "positions, 3 numbers per body, and as parameters G m of every body and 12 entries of the forces";
+constexpr const char *TWO = "a state of 12 numbers, and as parameters G m of both bodies and 12 entries of the forces";
 
 const LibraryFunction functions[] = {
     {"forces.rhs", Value::DERIVATIVE, 0, plain<double, rhs>, nullptr, of_bodies, BODIES},

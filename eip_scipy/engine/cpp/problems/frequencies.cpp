@@ -109,11 +109,11 @@ void add_gravity(nb::module_ module) {
     module.def("frequencies", frequencies, "gm"_a, "y"_a, "duration"_a,
                "Return the largest angular frequency of each body on its orbit about the heaviest one, and that of all "
                "other pairs.");
-    module.def(
-        "work_alone", work_alone, "alone"_a,
-        "Keep the calling thread from sharing the sums over many bodies with other threads, or let it share them. "
-        "Returns the previous setting.");
-    module.def("end_threads", end_threads, "End the threads that share these sums, for good.");
+    module.def("work_alone", work_alone, "alone"_a,
+               "If `alone` is True, keep the calling thread from sharing sums over many bodies with other threads; if "
+               "False, let it share them. Return the previous setting.");
+    module.def("end_threads", end_threads,
+               "End the threads that share sums over many bodies. They are not started again.");
     nb::module_::import_("atexit").attr("register")(module.attr("end_threads"));
 }
 

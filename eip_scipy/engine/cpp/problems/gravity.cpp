@@ -42,9 +42,10 @@ bool with_columns(int64_t n, int64_t p) { return p > 0 && n > 0 && n % (6 * p) =
 bool in_phase_space(int64_t n, int64_t p) { return p > 0 && n == 6 * p; }
 bool at_positions(int64_t n, int64_t p) { return p > 0 && n == 3 * p; }
 bool at_positions_first(int64_t n, int64_t p) { return n > 0 && n % 3 == 0 && p >= n / 3; }
-constexpr const char *COLUMNS = "a state of 6 numbers a body, columns of as many and every G m";
-constexpr const char *BODIES = "positions and velocities, 6 numbers a body, and every G m";
-constexpr const char *POSITIONS = "positions, 3 numbers a body, and every G m";
+constexpr const char *COLUMNS =
+    "a state of 6 numbers per body, columns of the same size, and G m of every body as parameters";
+constexpr const char *BODIES = "positions and velocities, 6 numbers per body, and G m of every body as parameters";
+constexpr const char *POSITIONS = "positions, 3 numbers per body, and G m of every body as parameters";
 
 #define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
 #define EIP_OF_BODIES(function) plain<double, of_bodies<double, function>>, plain<Octet, of_bodies<Octet, function>>

@@ -161,8 +161,8 @@ template <int64_t SIZE, int64_t COLUMNS>
 bool with_columns(int64_t n, int64_t p) {
     return n >= SIZE * (1 + COLUMNS) && n % SIZE == 0 && p == 1;
 }
-constexpr const char *FOURS = "a state of 4 numbers, columns of as many and 1 parameter";
-constexpr const char *TWOS = "a state of 2 numbers, columns of as many and 1 parameter";
+constexpr const char *FOURS = "a state of 4 numbers, columns of 4 numbers, and 1 parameter";
+constexpr const char *TWOS = "a state of 2 numbers, columns of 2 numbers, and 1 parameter";
 constexpr const char *FOUR = "a state of 4 numbers and 1 parameter", *TWO = "2 numbers and 1 parameter";
 
 #define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>

@@ -267,10 +267,10 @@ int64_t solve_checked(ArrayOf<const double, 1> matrices, double tolerance, Array
 }  // namespace
 
 void add_multibody(nb::module_ module) {
-    module.def(
-        "solve", solve_checked, "matrices"_a, "tolerance"_a, "acceleration"_a, "multipliers"_a,
-        "Fill u' (n,) and the multipliers (m,) of M u' + G^T lambda = F, G u' = -gamma, from M, F, G and gamma one "
-        "after the other. Returns the rank of G, or MASS_IS_SINGULAR or NOT_FINITE.");
+    module.def("solve", solve_checked, "matrices"_a, "tolerance"_a, "acceleration"_a, "multipliers"_a,
+               "Fill `acceleration` with u' (n,) and `multipliers` with lambda (m,), the solution of M u' + G^T lambda "
+               "= F, G u' = -gamma. `matrices` holds M, F, G and gamma, one after the other. Return the rank of G, or "
+               "MASS_IS_SINGULAR or NOT_FINITE.");
     module.def(
         "solve_address", [] { return reinterpret_cast<uintptr_t>(solve); },
         "Return the address of `solve` in multibody.cpp, for compiled code.");

@@ -255,7 +255,8 @@ void laplace_rate(const Given<double> &g) {
 }
 
 bool of_orbits(int64_t n, int64_t p) { return n >= 12 && n % 6 == 0 && p > n / 6; }
-constexpr const char *SIZES = "positions and velocities, 6 numbers a body, and the entries of their orbits";
+constexpr const char *SIZES =
+    "positions and velocities, 6 numbers per body, and as parameters G m of every body and the entries of the orbits";
 
 #define EIP_ORBIT(name, function, value, numbers) \
     {name, Value::value, numbers, plain<double, function>, nullptr, of_orbits, SIZES}

@@ -451,8 +451,9 @@ inline void accelerate_all(const double *q, const double *gm, int64_t n, double 
     accelerate_all<false>(q, gm, n, out, nullptr);
 }
 
-// As above, bit for bit; and pulls (3 n): for the first body its acceleration, for any other body the pulls of all but the first,
-// plus the acceleration of the first body by this one. The difference of both is what perturbs the motion about the first body.
+// Computes the accelerations of `accelerate`, bit for bit, and pulls (3 n): for the first body its acceleration; for
+// any other body the pulls of all bodies except the first, plus the acceleration of the first body by this one. The
+// difference of both is what perturbs the motion about the first body.
 [[gnu::flatten, gnu::noinline]] inline void accelerate_apart(const double *q, const double *gm, int64_t n, double *out,
                                                              double *pulls) {
     accelerate_all<true>(q, gm, n, out, pulls);
@@ -495,8 +496,9 @@ inline Octet difference(const Octet *q, int64_t i, int64_t j, Octet *d) {
     }
 }
 
-// As above, for eight members: every pair once, sums in the same order. Bodies that one state leaves to its last block get
-// their sums in streams: those of body i stand in `sums` from 3 streams (i - first) on.
+// Computes the accelerations for eight members: every pair once, and sums in the same order as for one state. Bodies
+// that are in the last block of one state get their sums in streams: the sums of body i begin at index 3 streams (i -
+// first) of `sums`.
 inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
     if (n >= MANY) return accelerate_each(q, gm, n, out);
     if (n < 4) return accelerate_few(q, gm, n, out);
@@ -629,7 +631,8 @@ inline double energy_sum(const double *y, const double *gm, int64_t n) {
     return total;
 }
 
-// As above, for eight members: the bodies' energies added as one state adds its lanes.
+// Returns the energy of body i with its later partners, for eight members. The bodies' energies are added in the order
+// in which the code for one state adds its lanes.
 inline Carried energy_of_body(const Octet *y, const Octet *gm, int64_t n, int64_t i) {
     Carried square, potential;
     for (int64_t j = i + 1; j < n; ++j) {

@@ -135,7 +135,7 @@ void energy_rate(const Given<double> &g) {
     });
 }
 
-// As above, by the pulls of `accelerate_apart` instead of f: nothing large cancels.
+// Computes the same rate from the pulls of `accelerate_apart`, which are in the place of f; no large terms cancel then.
 void energy_rate_by_pulls(const Given<double> &g) {
     const Planets p(g);
     p.each([&](int64_t k) { p.put(p.relative(p.v, k).dot(p.relative(g.f, k)), k); });
@@ -153,7 +153,8 @@ void energy_rate_newton(const Given<double> &g) {
 
 bool of_planets(int64_t n, int64_t p) { return n >= 12 && n % 6 == 0 && p == n / 3 - 1; }
 constexpr const char *SIZES =
-    "positions and velocities, 6 numbers a body, every G m and an energy for each but the first";
+    "positions and velocities, 6 numbers per body, and as parameters G m of every body and an energy for every body "
+    "except the first";
 
 #define EIP_PLANETS(name, function, value) \
     {name, Value::value, EACH_ORBIT, plain<double, function>, nullptr, of_planets, SIZES}

@@ -72,7 +72,7 @@ inline void tidal_block(const double *y, const double *gm, int64_t n, int64_t fi
     }
 }
 
-// As above, for fewer than four bodies.
+// Computes accelerations and their derivatives along the columns for fewer than four bodies.
 inline void tides_of_few(const double *y, const double *gm, int64_t n, int64_t columns, double *out) {
     const int64_t half = 3 * n, size = 6 * n;
     accelerate_few(y, gm, n, out + half);
