@@ -24,9 +24,8 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     broken = [name for name, row in zip(invariants.names, work.G, strict=True) if not np.isfinite(row).all()]
     because = f"; the gradient of {broken[0]!r} is not finite there" if broken else ""
     return (
-        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r} has a residual of "
-        f"{work.defect[worst]:.3g}; the gradients have rank {int(work.counters[LAST_RANK])} of {invariants.size}"
-        f"{because}"
+        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
+        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}{because}"
     )
 
 

@@ -292,7 +292,7 @@ def test_classes_of_scipy_by_eip_method():
     assert eip_method(EIPBDF) is EIPBDF
     assert pickle.loads(pickle.dumps(EIPRadau)) is EIPRadau
     for other in (LSODA, type("Mine", (Radau,), {"_step_impl": lambda self: (False, "no")})):
-        with pytest.raises(TypeError, match="only SciPy's Radau and BDF can take up a projected state"):
+        with pytest.raises(TypeError, match="only SciPy's Radau and BDF can be projected"):
             eip_method(other)
     assert eip_method(RK45).__name__ == "EIPRK45"
 

@@ -462,8 +462,7 @@ def test_contradiction_on_the_way(driver, iterations):
     run = driver(oscillator, (0, 1), [1.0, 2.0], **options)
     assert run.status == -1
     assert not run.success
-    assert run.message.startswith("projection failed at t=0.5: invariant 'drifting' has a residual of 5e-05; ")
-    assert "rank 1 of 2" in run.message
+    assert run.message.startswith("projection failed at t=0.5: invariant 'drifting', residual 5e-05, rank 1 of 2")
     np.testing.assert_allclose(run.t, np.arange(5) * 0.1, atol=1e-15)
     assert run.y.shape == (2, 5)
     np.testing.assert_allclose((run.y**2).sum(axis=0), 5.0, rtol=4 * EPS)

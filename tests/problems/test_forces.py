@@ -434,7 +434,7 @@ def test_the_pole_turns_with_the_axes():
 
 def test_smeared_moon_needs_the_barycentre():
     for name in ("de440-moon", "paper"):
-        with pytest.raises(ValueError, match=f"'{name}' has none"):
+        with pytest.raises(ValueError, match=f"'{name}' does not"):
             solar_system(name, forces="moon-quadrupole")
 
 

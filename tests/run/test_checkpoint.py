@@ -954,7 +954,7 @@ def test_declared_sizes_are_checked_before_they_are_allocated(shape, tmp_path):
 def test_foreign_archives(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, x=np.arange(3))
-    with pytest.raises(CheckpointError, match=r"not a checkpoint of eip_scipy: its members are \['x\.npy'\]"):
+    with pytest.raises(CheckpointError, match=r"not a checkpoint of eip_scipy: .* its members are \['x\.npy'\]"):
         checkpoint.read(path)
     for versions, named in (({}, "unknown"), ({"versions": {"eip_scipy": "0.2.0"}}, "0.2.0")):
         forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 2, **versions})
@@ -969,7 +969,7 @@ def test_foreign_archives(tmp_path):
     old = io.BytesIO()
     npy.write_array(old, np.zeros(1), version=(2, 0))
     forged(path, "x.npy", old.getvalue())
-    with pytest.raises(CheckpointError, match=r"x\.npy has another format"):
+    with pytest.raises(CheckpointError, match=r"x\.npy does not have version 1\.0 of the npy format"):
         checkpoint.read(path)
     # Members of the same bytes: 40 arrays of 1 kB in a file of a few.
     with zipfile.ZipFile(path, "w") as archive:
