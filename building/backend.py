@@ -30,12 +30,12 @@ __all__ = [
 
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
-    """Return the packages that building a wheel requires: those of setuptools, and perhaps a compiler."""
+    """Return the packages that building a wheel requires: those of setuptools, and ziglang if zig is the compiler."""
     return [*build_meta.get_requires_for_build_wheel(config_settings), *_compiler()]
 
 
 def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
-    """Return the packages that an editable install requires: those of setuptools, and perhaps a compiler."""
+    """Return the packages that an editable install needs: those of setuptools, and ziglang if zig is the compiler."""
     return [*build_meta.get_requires_for_build_editable(config_settings), *_compiler()]
 
 

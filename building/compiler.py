@@ -50,7 +50,7 @@ class Compiler(NamedTuple):
 
     @property
     def executables(self) -> dict[str, list[str]]:
-        """Return the commands for setuptools to call, by the names that it has for them; empty if `own`."""
+        """Return compiling and linking commands by the names under which setuptools stores them; empty if `own`."""
         if self.own:
             return {}
         system = target().system
@@ -88,12 +88,12 @@ def chosen() -> Compiler:
 
 
 def required() -> list[str]:
-    """Return the packages that have to be installed before this build, in addition to those of every build."""
+    """Return the package ziglang if zig compiles the engine, and no package otherwise."""
     return [PACKAGE] if "ziglang" in chosen().command else []
 
 
 def _compiles(command: tuple[str, ...]) -> bool:
-    """Return whether a command compiles C++20 with the vectors of g++ 12 and clang 15."""
+    """Return whether a command compiles C++20 and the vector extensions that g++ 12 and clang 15 have in common."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder, "probe.cpp")
         source.write_text(PROBE)

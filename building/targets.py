@@ -44,12 +44,12 @@ class Target(NamedTuple):
     machine : str
         The processor: x86_64, aarch64 or arm64 among others.
     tag : tuple of str or None
-        The three parts of the wheel's tag: Python, binary interface, platform. None: a build for this machine.
+        The three parts of the wheel's tag: Python, binary interface, platform. None for a build for this machine.
     triple : str
-        The target triple for zig. Empty: this machine.
+        The target triple for zig; empty for a build for this machine.
     headers : Path or None
         The folder with the headers of the platform's Python (`python`) and NumPy (`numpy`), and for Windows with
-        Python's import library (`libs`). None: those of this Python.
+        Python's import library (`libs`). None: the build uses the headers of the Python that runs it.
     """
 
     system: str
@@ -65,7 +65,7 @@ class Target(NamedTuple):
 
     @property
     def suffix(self) -> str | None:
-        """Return the suffix of the file of an extension module. None: the suffix that this Python uses."""
+        """Return the suffix of the file of an extension module, or None for a build for this machine."""
         if self.tag is None:
             return None
         python = self.tag[0]
@@ -78,7 +78,7 @@ class Target(NamedTuple):
 
 
 def target() -> Target:
-    """Return the platform that the environment variable EIP_SCIPY_TARGET names, or this machine."""
+    """Return the target named by the environment variable EIP_SCIPY_TARGET, a wheel's tag; default: this machine."""
     if tag := os.environ.get(VARIABLE):
         python, abi, name = tag.split("-")
         if name not in PLATFORMS:

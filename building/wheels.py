@@ -58,7 +58,7 @@ SYSTEM = {
 
 
 def headers(tag: str, cache: Path) -> Path:
-    """Return the folder with the headers that a wheel is built with, and fetch them if the folder is missing."""
+    """Return the folder in `cache` with the headers of Python and NumPy for a wheel's tag; fetch missing ones."""
     python, _, platform = tag.split("-")
     folder = cache / f"{python}-{platform}"
     if folder.exists():
@@ -90,13 +90,16 @@ def headers(tag: str, cache: Path) -> Path:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack the headers (.h) and the import libraries (.lib) of an archive."""
+    """Unpack the headers (.h) and the import libraries (.lib) of a zip archive to `folder`."""
     with zipfile.ZipFile(archive) as file:
         file.extractall(folder, [name for name in file.namelist() if Path(name).suffix in (".h", ".lib")])
 
 
 def sources(to: Path, cache: Path) -> Path:
-    """Write the sdist, and return the folder with its files, where all wheels are built and share zig's cache."""
+    """Write the sdist to the folder `to`, and return the folder in `cache` to which the sdist is unpacked.
+
+    All wheels are built in that folder, so that they share zig's cache.
+    """
     folder = cache / "sources"
     shutil.rmtree(folder, ignore_errors=True)
     subprocess.run([sys.executable, "setup.py", "--quiet", "sdist", f"--dist-dir={to}"], check=True, cwd=ROOT)
@@ -107,7 +110,7 @@ def sources(to: Path, cache: Path) -> Path:
 
 
 def built(tag: str, unpacked: Path, to: Path, cache: Path) -> Path:
-    """Return the wheel with this tag, built from the unpacked sdist alone."""
+    """Build the wheel with this tag from the unpacked sdist alone, and return its path in the folder `to`."""
     shutil.rmtree(unpacked / "build", ignore_errors=True)
     pip = [
         sys.executable,
@@ -127,7 +130,7 @@ def built(tag: str, unpacked: Path, to: Path, cache: Path) -> Path:
 
 
 def checked(wheel: Path) -> str:
-    """Check a wheel, and return its row of the table.
+    """Check a wheel, and return a row of the printed table: its tag, its size in MB, and what it needs of a system.
 
     Stops the program if the wheel is too large, has another tag or other modules than expected, or needs something that
     its platform may lack.
@@ -151,7 +154,11 @@ def checked(wheel: Path) -> str:
 
 
 def need(module: Path, platform: str) -> str:
-    """Return the oldest system on which a module works; for Linux the newest symbol of glibc that it needs."""
+    """Return the requirement of an extension module as text for the table.
+
+    It is the newest symbol of glibc that the module needs, the oldest macOS on which it works, or the C runtime of
+    Windows. Stops the program if the module needs a library, a symbol or a glibc that the platform may lack.
+    """
     system = PLATFORMS[platform].system
     binary = lief.parse(str(module))
     foreign = [name for name in libraries(binary) if not name.startswith(SYSTEM[system])]
@@ -170,7 +177,7 @@ def need(module: Path, platform: str) -> str:
 
 
 def libraries(binary: lief.Binary) -> Iterator[str]:
-    """Yield the libraries that a module is linked with."""
+    """Yield the names of the libraries that a module is linked with."""
     if isinstance(binary, lief.ELF.Binary):
         yield from binary.libraries
     elif isinstance(binary, lief.PE.Binary):
@@ -181,7 +188,7 @@ def libraries(binary: lief.Binary) -> Iterator[str]:
 
 
 def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
-    """Return the newest symbol of glibc that a module needs, with its version."""
+    """Return the newest symbol of glibc that a module needs, as "symbol@version"; stop if it is newer than `GLIBC`."""
     found = []
     for symbol in binary.imported_symbols:
         if symbol.symbol_version and symbol.symbol_version.has_auxiliary_version:
@@ -195,7 +202,7 @@ def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
 
 
 def sought(binary: lief.MachO.Binary) -> Iterator[str]:
-    """Yield the symbols that no linked library provides: they are looked up in the process, such as Python's own."""
+    """Yield the symbols, such as those of Python, that no linked library provides: the process must provide them."""
     own = {symbol.name for symbol in binary.symbols if symbol.numberof_sections}
     for binding in binary.bindings:
         if binding.has_symbol and not binding.has_library and binding.symbol.name not in own:

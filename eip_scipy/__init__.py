@@ -1,7 +1,7 @@
 """Explicit invariants-preserving (EIP) integrators for SciPy.
 
-Public names are imported when they are first asked for (PEP 562), because SciPy takes 0.3 s. Numba is imported only if
-a function is to be compiled.
+Public names are imported when they are first asked for (PEP 562), because importing SciPy takes 0.3 s. Numba is
+imported only if a function is to be compiled.
 """
 
 from importlib import import_module as _import_module

@@ -1,4 +1,4 @@
-"""The former place of `eip_scipy_studies.comparators`."""
+"""Old name of the module `eip_scipy_studies.comparators`: its names are still available here, with a warning."""
 
 from .core.moved import moved_names
 

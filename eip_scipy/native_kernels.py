@@ -76,7 +76,7 @@ def _check_span(t_span: Any) -> tuple[float, float]:
 
 
 def _real_vector(values: Any, name: str) -> np.ndarray:
-    """Copy a 1-D array of real numbers to contiguous float64; `name` is the argument's name for error messages."""
+    """Return a contiguous float64 copy of a 1-D array of real numbers; `name` is the argument's name in messages."""
     refuse_units(**{name: values})
     if np.iscomplexobj(values):
         raise TypeError(f"{name} must be real, got complex numbers")
@@ -89,7 +89,7 @@ def _real_vector(values: Any, name: str) -> np.ndarray:
 
 
 def check_state(y0: Any) -> np.ndarray:
-    """Copy the initial state; raise ValueError unless all of its components are finite."""
+    """Return a float64 copy of the initial state; raise ValueError unless all of its components are finite."""
     y = _real_vector(y0, "y0")
     if not np.isfinite(y).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
@@ -235,7 +235,10 @@ def _run(
     constant: float = 0.0,
     second_order: bool = False,
 ) -> FixedStepResult:
-    """Make all steps from y, which is overwritten; call `fun` by its address or, if it has none, call `in_python`."""
+    """Make all steps from y, which is overwritten, and return the result.
+
+    `fun` is called by its address; if it has none, `in_python` is called.
+    """
     functions: NativeFunctions | PythonFunctions
     try:
         functions, reason = function_alone(fun, kind, name, params, second_order=second_order), ""

@@ -233,7 +233,7 @@ def _length(every: Any, start: Prepared, pieces: int) -> float:
 
 
 def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: float, options: Any) -> Iterator[_Piece]:
-    """Run from t[0] to t[1] with columns that are orthonormal at the start of each piece.
+    """Yield the pieces of a run from t[0] to t[1], in which the columns are orthonormal at the start of each piece.
 
     A piece is repeated with half its length if its columns become too long, too different in length, or not finite. A
     piece that fails for another reason is the last one.
@@ -345,7 +345,7 @@ def _ends(start: Prepared) -> tuple[float, float]:
     """Return the start and the end of the interval of a run; raise ValueError if the end is infinite."""
     span = start.schedule.span
     if not np.isfinite(span.t_bound):
-        raise ValueError("t_span must be a finite interval; these functions do not support runs without an end.")
+        raise ValueError("t_span must be a finite interval: lyapunov_spectrum and megno need a run with an end.")
     return float(span.t0), float(span.t_bound)
 
 
@@ -445,7 +445,7 @@ def _numbers(given: Any) -> Array:
 
 
 def _indicators(s: Array, L: Array) -> tuple[Array, Array]:
-    """Return MEGNO and its mean from the logarithms L at the times s, which start at 0."""
+    """Return MEGNO and its mean at the times s (m,), which start at 0, from log(size of the tangent vector), L (m,)."""
     if s.size < 2:
         return np.zeros(s.size), np.zeros(s.size)
     # At the start the integrals are 0, and so are the indicators.
@@ -595,7 +595,10 @@ def _odd(symmetry: Any, y: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Shooting:
-    """Function of (y, T) that integrates from y over the time `share` * T, with the state-transition matrix."""
+    """Function of (y, T) that integrates from y over the time `share` * T, with the state-transition matrix.
+
+    It returns a `_Reached`. RuntimeError is raised if the run fails.
+    """
 
     fun: Any
     options: dict[str, Any]
@@ -616,7 +619,7 @@ class _Shooting:
 
 @dataclass(frozen=True)
 class _Reached:
-    """The end of a run of one period, or of half of it."""
+    """Result of a run from `y0` over one `period`, or over half of it, and what follows from its end."""
 
     shooting: _Shooting
     y0: Array
@@ -639,7 +642,7 @@ class _Reached:
         return _start(self.shooting.fun, (0.0, self.period), y, {**self.shooting.options, "project_initial": False})
 
     def correction(self, free: Array) -> Array:
-        """Return the Newton step of smallest norm in (y0, T); fixed components do not change."""
+        """Return the Newton step (n + 1,) of smallest norm in (y0, T), which is 0 where the mask `free` is False."""
         odd, M = self.shooting.odd, self.run.stm[-1]
         f = self.begun_at(self.run.y[:, -1]).run.start.f
         rows = np.column_stack([M, self.shooting.share * f])
@@ -872,7 +875,8 @@ def _data(data: Any, shape: tuple[int, int]) -> Array:
     if found.shape != shape or np.isinf(found).any() or np.isnan(found).all():
         raise ValueError(
             f"data must be an array of shape {shape}, one row for each measured quantity and one column for each time, "
-            f"with nan for values that were not measured, got {shown(data)}."
+            "of finite numbers, with nan for values that were not measured and at least one value that was, got "
+            f"{shown(data)}."
         )
     return found
 

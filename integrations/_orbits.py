@@ -19,8 +19,8 @@ def run_orbits(
     """Integrate the states (q, p) of `starts` (orbits, 2 n); return the states (orbits, m, 2 n) at `times` (m,).
 
     ``system(t, w)`` is the derivative (dH/dp, -dH/dq), and ``system.energy(t, w)`` is H. `options` are those of
-    `integrate`; by default the method is `EIPDOP853`, the tolerances are 1e-10, and the invariants are those that
-    `kept_invariants` finds.
+    `integrate`; by default the method is `EIPDOP853`, the tolerances (without `h`) are 1e-10, and the invariants are
+    those that `kept_invariants` finds for the first orbit and `pattern_speed`.
 
     Raises
     ------

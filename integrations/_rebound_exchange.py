@@ -77,9 +77,9 @@ def problem_from_simulation(
     TypeError
         If `sim` is not a simulation, for example the path of an archive.
     ValueError
-        If `t_span` does not start at the time of the state, or if the simulation has features that the N-body problem
-        lacks (variational particles, softening, forces that are not known, collisions, boundaries ...): the message
-        says which and why it is not supported.
+        If `t_span` does not start at the time of the state, if `constants` are given without `forces`, or if the
+        simulation has features that the N-body problem lacks (variational particles, softening, forces that are not
+        known, collisions, boundaries ...): the message says which and why it is not supported.
 
     Warns
     -----
@@ -340,7 +340,7 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
 
 
 def state(sim: rebound.Simulation) -> np.ndarray:
-    """Return the state (q, v) of all particles."""
+    """Return the state (q, v) of all particles, shape (6 N,)."""
     q = np.empty((sim.N, 3))
     v = np.empty((sim.N, 3))
     sim.serialize_particle_data(xyz=q, vxvyvz=v)
@@ -353,7 +353,10 @@ def _set_state(sim: rebound.Simulation, y: np.ndarray) -> None:
 
 
 def _active(sim: rebound.Simulation) -> int:
-    """Return the number of leading particles that attract the others; N_active is -1, perhaps unsigned, for all."""
+    """Return the number of leading particles that attract the others.
+
+    If all do, REBOUND's N_active is -1, or, in versions in which N_active is unsigned, larger than N.
+    """
     return int(sim.N_active) if 0 <= sim.N_active < sim.N else int(sim.N)
 
 
@@ -365,17 +368,17 @@ def _attracting_masses(sim: rebound.Simulation) -> np.ndarray:
 
 
 def _names(sim: rebound.Simulation) -> tuple[str, ...]:
-    """Return the particles' names, or the number of a particle that has no name or shares it with another."""
+    """Return the particles' names, with the index of a particle in place of a name that is missing or not unique."""
     given = [getattr(particle, "name", None) for particle in sim.particles][: sim.N]
     return tuple(name if name is not None and given.count(name) == 1 else str(k) for k, name in enumerate(given))
 
 
 def _archived_names(archive: rebound.Simulationarchive) -> tuple[str, ...]:
-    """Return the names in the first snapshot.
+    """Return the particles' names in the first snapshot, as `_names` does.
 
-    REBOUND 5.2 finds names by their addresses in the process that wrote them. If a new address equals
-    an old one of another name, a particle gets the wrong name. The names of later snapshots are
-    stored at other addresses while the wrong ones exist.
+    The snapshot is read until no name occurs twice, at most four times: REBOUND 5.2 identifies names by their memory
+    addresses in the process that wrote the archive, and mixes up two names if one is read to the old address of the
+    other. The earlier copies are kept in memory meanwhile, so that the next one gets other addresses.
     """
     held: list[rebound.Simulation] = []
     while len(held) < 4:
@@ -397,12 +400,15 @@ def _units(sim: rebound.Simulation) -> str:
 
 
 def _named(size: float, known: dict[str, float], base: str) -> str:
-    """Return a unit by its name, or as a number of metres or seconds."""
+    """Return the name in `known` of a unit of `size` metres or seconds, or the size followed by `base` ("m" or "s")."""
     return next((name for name, own in known.items() if own == size), f"{float(size)!r} {base}")
 
 
 def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
-    """Return the names that `nbody` has for the forces that REBOUNDx has attached, and their constants."""
+    """Return the names that `nbody` has for the forces that REBOUNDx has attached, and their constants.
+
+    Without such forces, return () and None.
+    """
     if not sim._additional_forces:
         return (), None
     extras = getattr(sim, "_extras_ref", None)
@@ -425,7 +431,7 @@ def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants 
         if _parameter(sim.particles[k], "gr_source") is not None:
             raise ValueError(
                 f"REBOUNDx's {names[0]}: particle {k} is its source (gr_source); only the first particle is supported "
-                "as a source."
+                "as a source. Make the source the first particle."
             )
     return (REBOUNDX[names[0]],), ForceConstants(c=_parameter(extras.get_force(names[0]), "c"))
 
@@ -439,7 +445,7 @@ def _parameter(thing: Any, name: str) -> Any:
 
 
 def _force_names(extras: Any) -> list[str]:
-    """Return the names of the forces that REBOUNDx has attached: a list in C, for which it has no function."""
+    """Return the names of the forces that REBOUNDx has attached, from its list in C: no function of it returns them."""
     import reboundx
 
     names, node = [], extras._additional_forces
@@ -501,7 +507,11 @@ def _new(bodies: Bodies) -> rebound.Simulation:
 
 
 def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | None:
-    """Return REBOUND's names of the problem's units, with the unit of mass that gives G the required value."""
+    """Return REBOUND's names of the problem's units of length and time, and of a unit of mass.
+
+    The unit of mass is the one in which G has the given value, and "msun" if `G` is None. Return None if the problem
+    knows no units or REBOUND has no names for them.
+    """
     known = problem.unit_system
     if known is None:
         return None
@@ -521,7 +531,7 @@ def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | 
 
 
 def _like(template: rebound.Simulation, bodies: Bodies) -> rebound.Simulation:
-    """Return a copy of the template, after checking that it has these bodies."""
+    """Return a copy of the template, after checking that its G times the masses equal those of the bodies."""
     if not isinstance(template, rebound.Simulation):
         raise TypeError(f"to_simulation: template must be a rebound.Simulation, got {shown(template)}.")
     own = template.G * _attracting_masses(template)
@@ -545,7 +555,7 @@ def _refuse_unsupported(sim: rebound.Simulation) -> None:
         ),
         (
             any(map(bool, (sim._pre_timestep_modifications, sim._post_timestep_modifications))),
-            "additional forces or modifications of a step: their invariants are unknown",
+            "modifications before or after a step: the invariants of the modified motion are unknown",
         ),
         (sim._N_odes > 0, "further differential equations: our state has no place for them"),
         (sim.softening != 0, "softened gravity: the problem's potential is 1/r"),

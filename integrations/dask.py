@@ -41,13 +41,13 @@ PATIENCE, GRACE = 20.0, 1.0
 # Number of times that all workers of this machine may be lost without a result in between.
 LOSSES = 3
 KEPT = (
-    "What was done is in this exception's .partial; with out= or checkpoint= the same call with resume=True goes on "
+    "What was done is in this exception's .partial; with out= or checkpoint= the same call with resume=True continues "
     "from there"
 )
 
 
 class DaskExecutor:
-    """Dask client together with a permission, for ``ensemble(..., executor=)``.
+    """Dask client for ``ensemble(..., executor=)``, which may use a network without encryption if this is permitted.
 
     Parameters
     ----------
@@ -60,6 +60,8 @@ class DaskExecutor:
     ------
     PermissionError
         If the cluster listens beyond this machine without TLS, and `allow_insecure` is false.
+    RuntimeError
+        If the client is closed, and `allow_insecure` is false.
     """
 
     def __init__(self, client: distributed.Client, *, allow_insecure: bool = False) -> None:
@@ -100,7 +102,8 @@ def local_client(workers: int | None = None) -> distributed.Client:
         # Dask's own traceback shows a hundred lines of its internals and no further information.
         raise RuntimeError(
             f"a Dask worker of this machine died while it started ({error}): it was killed, there is too little memory "
-            "for these workers, or what Dask's configuration loads fails. Try fewer with local_client(workers)."
+            "for these workers, or what Dask's configuration loads fails. Try fewer with local_client(workers), or "
+            "correct the configuration."
         ) from None
     return distributed.Client(cluster)
 
@@ -111,7 +114,7 @@ def require_secure(client: distributed.Client) -> None:
     Raises
     ------
     PermissionError
-        If a scheduler or worker does; the message names the address and says what to do.
+        If the scheduler or a worker listens so; the message names the address and says what to do.
     RuntimeError
         If the client is closed.
     """
@@ -150,11 +153,18 @@ def pool(executor: Any, task: Task, key: str) -> DaskPool:
     ----------
     executor : "dask", distributed.Client or DaskExecutor
     task : Task
+        The part of the ensemble that all chunks share.
     key : str
+        Name under which a worker keeps the compiled task for further chunks.
 
     Returns
     -------
     DaskPool
+
+    Raises
+    ------
+    PermissionError, RuntimeError
+        As for `DaskExecutor`, and as for `local_client` if processes are started.
     """
     if isinstance(executor, DaskExecutor):
         _require_open(executor.client)
@@ -204,7 +214,7 @@ class DaskPool:
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """Replace errors in the block that a lost or closed cluster causes by a RuntimeError that says so."""
+        """Raise a RuntimeError that says so if the block fails because the client or its cluster is lost or closed."""
         try:
             yield
         except Exception as error:
@@ -239,10 +249,15 @@ class DaskPool:
             self._open.discard(future)
 
     def _look_after_workers(self) -> bool:
-        """Return whether there are any workers; start new processes if all local ones are gone.
+        """Return whether there are any workers; start new processes if all those of this machine are gone.
 
         Dask's supervisor of a worker (its "nanny") gives up on a process that dies while it starts, and Dask then waits
-        without end.
+        without end. If a cluster elsewhere has no workers, warn once.
+
+        Raises
+        ------
+        RuntimeError
+            If the processes of this machine were lost more than `LOSSES` times without a result in between.
         """
         if self._client.nthreads():
             return True
@@ -250,7 +265,11 @@ class DaskPool:
         if not isinstance(cluster, distributed.LocalCluster):
             if not self._warned:
                 self._warned = True
-                warnings.warn("the Dask cluster has no workers; waiting for some", RuntimeWarning, stacklevel=2)
+                warnings.warn(
+                    "the Dask cluster has no workers; waiting for some. Start workers that connect to its scheduler.",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
             return False
         self._losses += 1
         if self._losses > LOSSES:
@@ -267,9 +286,10 @@ class DaskPool:
         return False
 
     def _wait_for_workers(self) -> None:
-        """Wait until there is a worker, and replace local ones that died before their nanny knew that they had started.
+        """Wait until there is a worker; start new processes on this machine if none appears.
 
-        The nanny does not do so itself.
+        Dask's supervisor of a worker (its "nanny") does not replace a process that died before the nanny knew that it
+        had started.
         """
         until = time.monotonic() + PATIENCE
         while not self._client.nthreads():
@@ -282,7 +302,8 @@ class DaskPool:
     def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Iterable[Members]:
         """Run a chunk that killed its workers in halves, again and again, to find the member that kills them.
 
-        Return the results: that member has failed, and the others have been run.
+        Return the results of all members of the chunk, in their order. The status of a member that kills its workers is
+        `FAILED`; the others have been run.
         """
         m = len(chunk.y0s)
         if m == 1:

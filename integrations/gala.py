@@ -34,10 +34,11 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
     ----------
     hamiltonian : gala.potential.PotentialBase or gala.potential.Hamiltonian
     w0 : gala.dynamics.PhaseSpacePosition or array_like
-        One position or several, each of which is integrated by itself. An array has the units of the potential.
+        One initial state (positions and velocities) or several, each of which is integrated by itself. An array, shape
+        (2 n,) or (2 n, orbits) in n dimensions, has the units of the potential.
     options : dict, optional
         Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10 (as gala's
-        integrator "dopri853" in C), and the invariants above.
+        integrator "dopri853" in C) unless ``h`` is given, and the invariants above.
     **time_spec
         Times as gala takes them: ``dt, n_steps``; ``dt, t1, t2``; ``t``.
 
@@ -60,7 +61,10 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
 
 
 class _System:
-    """Derivative and energy of a Hamiltonian of gala at one state (q, p)."""
+    """Hamiltonian of gala: a call with a time and one state (q, p) returns its derivative, shape (2 n,).
+
+    `energy` returns the value of the Hamiltonian, which in a rotating frame is Jacobi's integral.
+    """
 
     def __init__(self, hamiltonian: Any) -> None:
         self.hamiltonian = hamiltonian

@@ -36,8 +36,9 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
 
     The energy (or Jacobi's integral, see `pattern_speed`) is kept unless the potential makes it change in time, and L_z
     if the potential is symmetric about the z axis. To find out, the rates of change of both are computed at random
-    states. Forces come from galpy's C functions, called from Python, if all potentials have them and the version of
-    galpy is 1.12, and otherwise from its Python functions.
+    states. Forces come from galpy's C functions, called from Python, if galpy's version is 1.12, its C library is
+    loaded, and all potentials have C functions that need no Python function of time; otherwise from its Python
+    functions.
 
     Parameters
     ----------
@@ -51,8 +52,8 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
         Angular velocity, in galpy's units, of a potential that rotates about the z axis. If it is not 0, Jacobi's
         integral is kept in place of the energy.
     **options
-        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10, and the
-        invariants above.
+        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10 unless ``h`` is
+        given, and the invariants above.
 
     Raises
     ------
@@ -73,7 +74,10 @@ def integrate(orbit: Any, t: Any, pot: Any, *, pattern_speed: float = 0.0, **opt
 
 
 class _System:
-    """Derivative and energy in potentials of galpy at one state (q, v)."""
+    """Motion in potentials of galpy: a call with a time and one state (q, v) returns its derivative, shape (6,).
+
+    `energy` returns the energy per unit mass. All numbers are in galpy's internal units.
+    """
 
     def __init__(self, pot: Any) -> None:
         self._pot = pot
@@ -114,14 +118,14 @@ class _System:
 
 
 def _rectangular(rows: np.ndarray) -> np.ndarray:
-    """Convert rows (R, vR, vT, z, vz, phi) to Cartesian (q, v)."""
+    """Convert states (R, vR, vT, z, vz, phi) to Cartesian states (q, v); both have shape (..., 6)."""
     R, vR, vT, z, vz, phi = np.moveaxis(rows, -1, 0)
     c, s = np.cos(phi), np.sin(phi)
     return np.stack([R * c, R * s, z, vR * c - vT * s, vR * s + vT * c, vz], axis=-1)
 
 
 def _cylindrical(rows: np.ndarray) -> np.ndarray:
-    """Convert rows of Cartesian (q, v) to (R, vR, vT, z, vz, phi)."""
+    """Convert Cartesian states (q, v) to states (R, vR, vT, z, vz, phi); both have shape (..., 6)."""
     x, y, z, vx, vy, vz = np.moveaxis(rows, -1, 0)
     R = np.hypot(x, y)
     return np.stack([R, (x * vx + y * vy) / R, (x * vy - y * vx) / R, z, vz, np.arctan2(y, x)], axis=-1)

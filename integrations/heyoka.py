@@ -56,16 +56,20 @@ class ProjectedTaylor:
     Attributes
     ----------
     targets : ndarray, shape (l,)
-        Values that are kept. After you have changed the state of the integrator, assign ``targets = values``.
+        Values of the invariants that are kept. After you have changed the state of the integrator, assign
+        ``targets = values``.
     max_residual : ndarray, shape (l,)
-        Largest magnitude of each invariant error before a projection.
+        Largest magnitude of each invariant error before a projection, since this object was made.
     n_projections : int
+        Number of projections of the integrator's state.
 
     Raises
     ------
-    TypeError, ValueError
-        If the integrator is of another kind, or an invariant contains unknown variables, depends on time, or is not
-        finite at the present state.
+    TypeError
+        If the integrator is not a ``heyoka.taylor_adaptive`` in double precision, or has variational equations.
+    ValueError
+        If there are no invariants, or an invariant contains variables or parameters that the integrator does not have,
+        depends on time, or is not finite at the present state.
     """
 
     def __init__(self, integrator: Any, invariants: Any, *, every: int | None = None) -> None:
@@ -139,14 +143,15 @@ class ProjectedTaylor:
         return (*found[:5], self._projected(np.concatenate(rows), self._known()))
 
     def _projected(self, y: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Return the projections of states (m, n) with known parameters and targets."""
+        """Return the projections (m, n) of the states `y` (m, n); `known` are the parameters and then the targets."""
         z = np.concatenate([y.T, np.repeat(known[:, None], len(y), axis=1)])
         return self._function(np.ascontiguousarray(z))[: y.shape[1]].T.copy()
 
     def _run(self, advance: Any, starts: list[Any] | None) -> tuple[Any, ...]:
         """Alternate calls of `advance` and projections until the end of the run; return what heyoka returns.
 
-        The run ends when a call of `advance` ends for another reason than its number of steps.
+        The run ends when a call of `advance` ends for another reason than its number of steps. If `starts` is a list,
+        the time and state at the start of each call are appended to it.
         """
         state, function = self.integrator.state, self._function
         z, out = np.concatenate([state, self._known()]), np.empty(state.size + len(self.names))
@@ -174,10 +179,10 @@ class ProjectedTaylor:
         return self._checked(np.concatenate([self.integrator.state, self.integrator.pars]))
 
     def _judge(self, before: np.ndarray) -> None:
-        """Warn about invariants whose errors are not those of accurate steps.
+        """Warn about each invariant whose errors are too large to be errors of accurate steps.
 
-        These are errors that the last projection did not reduce from `before`, and errors in the run that were a large
-        share of the terms of the invariant.
+        These are errors that the last projection did not reduce (`before` (l,) are the magnitudes before it), and
+        errors that were a large share of the size of the invariant's terms, see `_examination`.
         """
         values, terms = np.split(self._examined(), 2)
         after = np.abs(self.targets - values)
@@ -186,7 +191,7 @@ class ProjectedTaylor:
             if remains or self.max_residual[k] > LARGE_SHARE * terms[k]:
                 warnings.warn(
                     f"invariant {name!r} had errors of up to {self.max_residual[k]:.3g} before projections, and "
-                    f"{after[k]:.3g} after the last one, with terms of size {terms[k]:.3g}. Decrease tol or every, "
+                    f"{after[k]:.3g} after the last one; its terms are of size {terms[k]:.3g}. Decrease tol or every, "
                     "and check that it is an invariant of this system.",
                     ProjectionWarning,
                     stacklevel=4,
@@ -194,7 +199,10 @@ class ProjectedTaylor:
 
 
 class TaylorOutput:
-    """Dense output of a run from ``bounds[0]`` to ``bounds[1]``: times and states after the projections."""
+    """Dense output of a run: a function of times between ``bounds[0]`` and ``bounds[1]`` that returns projected states.
+
+    It stores the time and state after each projection, and integrates again from these.
+    """
 
     def __init__(self, flow: ProjectedTaylor, starts: Sequence[Any]) -> None:
         own = flow.integrator
@@ -246,8 +254,9 @@ def _named(invariants: Any, integrator: Any) -> dict[str, Any]:
 def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
     """Compile a function of state, parameters and targets that returns the projected state and the residuals.
 
-    It takes one Newton step: the correction x of smallest norm with G x = residuals, where the rows of G are the
-    gradients. They are made orthogonal one after the other.
+    The residuals (l,) are the targets minus the invariants. The function takes one Newton step: it adds the correction
+    x of smallest norm with G x = residuals, where the rows of G are the gradients, which are made orthogonal one after
+    the other.
     """
     targets = _variables("__target", len(expressions))
     basis: list[list[Any]] = []
@@ -273,9 +282,9 @@ def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> An
 
 
 def _examination(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
-    """Compile a function of state and parameters that returns the invariants, and the sizes of their terms.
+    """Compile a function of state and parameters that returns the invariants (l,) and the sizes of their terms (l,).
 
-    The size is the norm of (gradient component times state component).
+    The size of the terms of an invariant is the norm of the products of the components of its gradient and the state.
     """
     terms = [_dot(row := [heyoka.diff(item, name) * name for name in names], row) for item in expressions]
     return heyoka.cfunc(

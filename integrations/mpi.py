@@ -98,7 +98,7 @@ def together(comm: MPI.Comm) -> Iterator[None]:
     Raises
     ------
     RankError
-        On the ranks that have no error themselves, at their next call of `total` or `gathered`.
+        On the ranks that have no error themselves, at their next call of `total` or `gathered` or the end of the block.
 
     Examples
     --------
@@ -130,10 +130,17 @@ def total(comm: MPI.Comm, a: Any) -> Any:
     ----------
     comm : mpi4py.MPI.Comm
     a : array_like
+        Real numbers, in the same shape on all ranks.
 
     Returns
     -------
     float or ndarray
+        The sum, in the shape of `a`.
+
+    Raises
+    ------
+    RankError
+        If another rank has raised an error in a block of `together`.
     """
     sums = gathered(comm, a).sum(axis=0)
     return sums if sums.ndim else float(sums)
@@ -162,7 +169,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     Raises
     ------
     TypeError
-        If `method` is not the class of an explicit Runge-Kutta method.
+        If `method` is not the class of an explicit Runge-Kutta method, or is a class that `over_ranks` has returned.
 
     Notes
     -----
@@ -188,7 +195,10 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(f"over_ranks: method must be an EIP class such as EIPRK4, got {method!r}.")
     if method.TABLEAU.in_python:
-        raise TypeError(f"over_ranks: {method.__name__} is not a Runge-Kutta method; its step would see one rank only.")
+        raise TypeError(
+            f"over_ranks: {method.__name__} is not a Runge-Kutta method; its step would see one rank only. Use "
+            "EIPRK4, for example."
+        )
     if issubclass(method, SolverOfParts):
         raise TypeError(f"over_ranks: {method.__name__} is a class for ranks already.")
     members = {"COMM": MPI.COMM_WORLD if comm is None else comm, "__doc__": f"`{method.__name__}` over ranks."}
@@ -253,7 +263,9 @@ def _refuse(name: str, options: dict[str, Any]) -> None:
 
 
 def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.ndarray, h: float) -> None:
-    """Check gradients as a run on one rank does, on the plane through y along two random directions.
+    """Check that invariants are the same on all ranks, and that they agree with their gradients.
+
+    The gradients are checked as in a run on one rank, but only on the plane through y along two random directions.
 
     Raises
     ------

@@ -30,13 +30,14 @@ class Slab(Grid):
     ----------
     whole : Grid
     axis : int
+        Axis along which this is a part of the grid.
     part : slice
         Range of the points along `axis`; it must have a start and a stop.
 
     Attributes
     ----------
     whole, part
-        As given.
+        The parameters of these names.
     shape : tuple of int
         Number of points of the part along each axis. The other attributes are those of the whole grid.
     """
@@ -50,17 +51,19 @@ class Slab(Grid):
         return f"Slab({self.whole!r}, {self._axis}, {self.part!r})"
 
     def points(self, axis: int) -> np.ndarray:
-        """Return the coordinates along one axis of the points on this rank."""
+        """Return the coordinates along one axis of the points of this part."""
         points = self.whole.points(axis)
         return points[self.part] if axis == self._axis else points
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """Return all wavenumbers along one axis."""
+        """Return all wavenumbers of the whole grid along one axis, see `Grid.wavenumbers`."""
         return self.whole.wavenumbers(axis, odd=odd)
 
 
 class Transposition:
-    """Distribution of a field over the ranks in slabs of x, or transposed in slabs of y, and the exchange between both.
+    """Distribution of a field over the ranks in slabs of x or, after a transposition, in slabs of y.
+
+    `turn` and `turn_back` send the points from one distribution to the other.
 
     Parameters
     ----------
@@ -71,10 +74,10 @@ class Transposition:
     Attributes
     ----------
     slab, turned : Slab
-        This rank's part of the grid (J, K[, L]): j of the points x, (j, K[, L]), and transposed k of the points y,
-        (J, k[, L]).
-    here, image : ndarray
-        Buffers in the shape of `turned`: the field that `turn` fills, and the one that `turn_back` reads.
+        This rank's parts of the grid (J, K[, L]) in the two distributions: `slab` has j of the J points x, shape
+        (j, K[, L]), and `turned` has k of the K points y, shape (J, k[, L]).
+    here, image : ndarray, shape (J, k[, L])
+        Buffers: the field that `turn` fills, and the one that `turn_back` reads.
 
     Raises
     ------
@@ -111,7 +114,7 @@ class Transposition:
         ]
 
     def turn(self, field: np.ndarray) -> None:
-        """Fill `here` with the transposed field, after checking that no rank has failed."""
+        """Fill `here` with the transposed form of `field` (j, K[, L]), after checking that no rank has failed."""
         gathered(self._comm, ())
         for y, block in self._blocks:
             np.copyto(block, field[:, y])
@@ -119,7 +122,7 @@ class Transposition:
         self._comm.Alltoallv([self._sent, self._apart], [self.here, self._turned])
 
     def turn_back(self, out: np.ndarray) -> None:
-        """Fill `out` with the field whose transposed form is in `image`."""
+        """Fill `out` (j, K[, L]) with the field whose transposed form is in `image`."""
         self._comm.Alltoallv([self.image, self._turned], [self._sent, self._apart])
         for y, block in self._blocks:
             np.copyto(out[:, y], block)
@@ -143,7 +146,7 @@ class _TurnedMultiplier(Multiplier):
         super().__init__(way.turned, (0,), here)
 
     def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
-        """Fill `out` with the multiplied field."""
+        """Fill `out` with the field `psi` whose modes along x are multiplied by the factor."""
         self._way.turn(psi)
         super().apply(fft, self._way.here, self._way.image)
         self._way.turn_back(out)
@@ -216,18 +219,21 @@ class SlabGrossPitaevskii(GrossPitaevskii):
         self._options["comm"] = comm
 
     def part(self, whole: Any) -> np.ndarray:
-        """Cut this rank's part out of a field that every rank has as a whole."""
+        """Return this rank's part of a field that every rank has as a whole."""
         return np.ascontiguousarray(np.reshape(whole, self.grid.whole.shape)[self.grid.part], dtype=complex)
 
     def linear_terms(self) -> list[tuple[Axes, Any]]:
-        """Return the terms of `GrossPitaevskii.linear_terms`, with a separate one for x, which needs transpositions."""
+        """Return the terms of `GrossPitaevskii.linear_terms`.
+
+        Without rotation, the term of x, which needs transpositions, is separate from that of the other axes.
+        """
         if self.Omega != 0:
             return super().linear_terms()
         along_x, *others = (self.kinetic_factor(axis) for axis in range(self.grid.dim))
         return [((0,), along_x), (tuple(range(1, self.grid.dim)), sum(others))]
 
     def gather(self, psi: Any) -> np.ndarray | None:
-        """Return the whole field on rank 0, and None elsewhere."""
+        """Return on rank 0 the whole field, of which `psi` is this rank's part, and None on other ranks."""
         field = self.as_field(psi)
         sizes = self.comm.gather(field.size)
         whole = np.empty(self.grid.whole.shape, complex) if self.comm.rank == 0 else None

@@ -30,8 +30,8 @@ class IntegratorEIP(Integrator):
     """Integrator of qutip that keeps the norm and, if the Hamiltonian is constant, the energy.
 
     ``SESolver`` knows it under the name "eip". States are kets, or operators such as propagators: for these the sums of
-    the norms and of the energies of all columns are kept. The attribute ``solver_class`` is the class that makes the
-    steps, `EIPDOP853`; a subclass of this integrator with another one is registered by
+    the squared norms and of the energies of all columns are kept. The attribute ``solver_class``, `EIPDOP853`, is the
+    class that makes the steps; a subclass of this integrator with another ``solver_class`` is registered by
     ``qutip.SESolver.add_integrator(Subclass, "name")``.
 
     Raises
@@ -88,20 +88,22 @@ class IntegratorEIP(Integrator):
         self._is_set = True
 
     def get_state(self, copy: bool = True) -> tuple[float, Any]:
-        """Return the present time, and the state as qutip's data layer has it; `copy`: do not share memory."""
+        """Return the present time, and the state as an object of qutip's data layer: a copy if `copy` is true."""
         if not self._is_set:
             raise IntegratorException("The state is not set: call set_state first.")
         return self._t, Dense(self._y.reshape(self._shape), copy=copy)
 
     def integrate(self, t: float, copy: bool = True) -> tuple[float, Any]:
-        """Integrate to `t`, which must not be before the start of the last step; return time and state."""
+        """Integrate to `t`, which must not be before the start of the last step; return what `get_state` returns."""
         solver = self.solver
         while solver.t < t:
             message = solver.step()
             if solver.status == "failed":
                 raise IntegratorException(message)
         if t < self._t and (solver.t_old is None or t < solver.t_old):
-            raise IntegratorException(f"t={t} is before the last step, which starts at {solver.t_old}.")
+            raise IntegratorException(
+                f"t={t} is before the last step, which starts at {solver.t_old} (None: no step yet). Call set_state."
+            )
         self._t, self._y = float(t), solver.y if t == solver.t else solver.dense_output()(t)
         return self.get_state(copy)
 

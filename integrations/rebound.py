@@ -65,9 +65,9 @@ class ReboundRun:
     steps : int
         Number of steps; for "ias15" the number of accepted ones.
     energy_error : ndarray, shape (m,)
-        ``|E(t) - E(0)| / |E(0)|`` of the Newtonian energy.
+        ``|E(t) - E(0)| / |E(0)|`` of the Newtonian energy, or ``|E(t) - E(0)|`` if E(0) is 0.
     angular_momentum_error : ndarray, shape (m,)
-        ``|L(t) - L(0)| / |L(0)|``, Euclidean norms.
+        ``|L(t) - L(0)| / |L(0)|``, Euclidean norms, or ``|L(t) - L(0)|`` if L(0) is 0.
     """
 
     name: str
@@ -339,7 +339,7 @@ def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
     if not (h > 0 and math.isfinite(h)):
         raise ValueError(f"h must be positive and finite, got {h!r}")
     if (n_steps is None) == (t_end is None):
-        raise ValueError("give either n_steps or t_end")
+        raise ValueError("give either n_steps or t_end, and not both")
     if t_end is None:
         return count("n_steps", n_steps)
     if not (t_end > 0 and math.isfinite(t_end)):
@@ -398,7 +398,7 @@ def _take_steps(sim: rebound.Simulation, n: int) -> None:
 
 
 def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return relative errors of energy and angular momentum along y (m, 6 N); absolute ones if the first value is 0."""
+    """Return the errors (m,) of energy and angular momentum along y (m, 6 N), as `ReboundRun` defines them."""
     q, v = np.moveaxis(y.reshape(len(y), 2, -1, 3), 1, 0)
     energy = 0.5 * (v**2).sum(axis=2) @ gm
     for i in range(gm.size - 1):

@@ -123,7 +123,10 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
             "another file for a new run."
         ) from error
     if kind is not None and header.get("kind") != kind:
-        raise CheckpointError(f"{_name(path)} is a checkpoint of {header.get('kind')!r}, expected {kind!r}.")
+        raise CheckpointError(
+            f"{_name(path)} is a checkpoint of {header.get('kind')!r}, expected {kind!r}. Use the function that wrote "
+            "it, or another file."
+        )
     return header, arrays
 
 
@@ -156,7 +159,10 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
 
 
 def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, Any], *, stacklevel: int) -> None:
-    """Warn if a checkpoint was written by other versions or on another kind of machine: the last bits may differ."""
+    """Warn if a checkpoint was written by other versions of the packages, or on another kind of machine.
+
+    The last bits of the results may then differ from those of an uninterrupted run.
+    """
     there = {**(header.get("versions") or {}), "machine": header.get("machine")}
     here = {**_versions(), "machine": _machine()}
     other = [
@@ -200,7 +206,11 @@ def _machine() -> str:
 
 
 def origin() -> dict[str, Any]:
-    """Return the versions of the packages and the kind of machine, for the header of a checkpoint."""
+    """Return the entries ``versions`` and ``machine`` of the header of a checkpoint.
+
+    They are the versions of Python, of this package, NumPy, SciPy and, if it is loaded, Numba; and the names of the
+    operating system and the processor.
+    """
     # The version of Numba only if it is loaded: otherwise it has compiled no function of the run.
     decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
     return {"versions": decide, "machine": _machine()}
@@ -218,7 +228,7 @@ def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> No
 
 
 def _remove_leftovers(target: Path) -> None:
-    """Remove the temporary files of killed processes: those that have not been written to for an hour."""
+    """Remove temporary files of `write` for `target` whose processes were killed: those unchanged for an hour."""
     for leftover in target.parent.glob(f".{glob.escape(target.name)}-*.tmp"):
         with contextlib.suppress(OSError):  # another process may have removed it; the checkpoint is already written
             if time.time() - leftover.stat().st_mtime > LEFT_OVER:
@@ -226,7 +236,10 @@ def _remove_leftovers(target: Path) -> None:
 
 
 def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return header and arrays; the declared sizes are compared with that of the file before memory is allocated."""
+    """Return the header and the arrays of the checkpoint in `stream`.
+
+    The sizes that the file declares are compared with its own size before memory is allocated.
+    """
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if any(m.compress_type != zipfile.ZIP_STORED or m.file_size != m.compress_size for m in members):

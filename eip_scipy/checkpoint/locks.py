@@ -25,9 +25,9 @@ class Lock:
     """Exclusive right to write to a file or folder, until `close` or the end of the process.
 
     The lock is held on a separate file next to the place, because a checkpoint is replaced by another file each time it
-    is written. The lock file names its holder, and `close` removes it. Processes that are started or forked do not
-    inherit the lock. A file system without locks causes a RuntimeWarning. If the user may not create the lock file,
-    nothing is locked.
+    is written. The lock file contains the name of the process that holds the lock, and `close` removes it. Processes
+    that are started or forked do not inherit the lock. A file system without locks causes a RuntimeWarning. If the user
+    has no right to create the lock file, nothing is locked.
 
     Parameters
     ----------
@@ -44,7 +44,8 @@ class Lock:
     Raises
     ------
     CheckpointError
-        If another run holds the lock, in this process or another, or if the lock file cannot be created.
+        If another run holds the lock, in this process or another. Also if the lock file exists but cannot be opened, or
+        cannot be created for another reason than missing rights.
     """
 
     def __init__(self, place: str | os.PathLike[str]) -> None:
@@ -84,7 +85,7 @@ class Lock:
 
 
 def absolute(path: str | os.PathLike[str]) -> str:
-    """Return the absolute path; raise CheckpointError if the working directory no longer exists."""
+    """Return `path` as an absolute path; raise CheckpointError if it is relative to a folder that no longer exists."""
     try:
         return os.path.abspath(os.fsdecode(path))
     except FileNotFoundError as error:
@@ -104,7 +105,7 @@ def _write_holder(descriptor: int) -> None:
 
 
 def _holder(file: Path) -> str:
-    """Return the name of the process that holds the lock, from the lock file."""
+    """Return the name of the process that holds the lock, read from its file; "another process" if that fails."""
     try:
         found = file.read_text(errors="replace")
     except OSError:  # Windows does not allow reading it, and the holder may just have removed it

@@ -1,1 +1,1 @@
-"""Invariants, options, methods and results: everything that one step needs."""
+"""Invariants, projection options, problems, solvers and results: the code that all ways of running a method share."""

@@ -99,7 +99,7 @@ def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, .
 
 
 def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
-    """Return True if the value of `fun` at a state has `count` components."""
+    """Return True if `fun` returns an array (count,) at a state; False also if it raises an exception."""
     try:
         with np.errstate(all="ignore"):
             return np.shape(fun(t, state, *extra)) == (count,)
@@ -108,7 +108,10 @@ def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: n
 
 
 def _fills(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
-    """Return True if `fun` fills the first `count` components of its argument out, and no others."""
+    """Return True if `fun` fills the first `count` components of its argument out with finite numbers, and no others.
+
+    Return False also if `fun` raises an exception.
+    """
     out = np.full_like(state, np.nan)
     try:
         with np.errstate(all="ignore"):

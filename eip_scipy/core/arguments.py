@@ -26,12 +26,12 @@ class Packed(NamedTuple):
 
 
 def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
-    """Return the last arguments of the functions of a run: `args`, or ``(params,)``, or none.
+    """Return the last arguments of the functions of a run as a tuple: `args`, ``(params,)``, or () if both are None.
 
     Raises
     ------
     TypeError
-        If both are given, if `args` cannot be unpacked, or if `params` are not numbers.
+        If both are given, if `args` cannot be unpacked or contains a unit, or if `params` are not numbers.
     """
     if args is None:
         return () if params is None else (parameter_values(params).reshape(-1),)
@@ -81,7 +81,7 @@ def floats(extra: tuple[Any, ...]) -> np.ndarray:
 
 
 def names(extra: tuple[Any, ...]) -> tuple[str, ...]:
-    """Return the names of the further arguments for messages."""
+    """Return the names of the further arguments in messages: "params" for one array, else "args[0]", "args[1]", ..."""
     return ("params",) if _is_array(extra) else tuple(f"args[{k}]" for k in range(len(extra)))
 
 

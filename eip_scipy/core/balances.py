@@ -20,8 +20,8 @@ class Balance(Invariant):
     """A quantity F that changes slowly and at a known rate, such as an energy with friction; or several at once.
 
     Add it to the list of invariants of a run. The run integrates the rate with the stages of each step and projects the
-    state onto the resulting value. If the rate is small compared with its terms, the error of this value is about this
-    fraction of the error that F has without projection.
+    state onto the resulting value. The error of this value is about r times the error that F has without projection,
+    where r is the size of the rate divided by that of the terms of ``grad @ f`` (see `Diagnostics.slowness`).
 
     Parameters
     ----------
@@ -46,7 +46,8 @@ class Balance(Invariant):
         together restore the linear invariants of `frame`. Either all invariants of a run have components, or none has.
         `metric`, `direction` and `iterations` must be omitted if there are components.
     weights : array_like of float, shape (s,), optional
-        The correction is the shortest in units of these weights, such as the sizes of the components. Default: 1.
+        Weights of the components, or of the rows of components, such as their typical sizes. The correction is the
+        shortest in units of these weights. Default: 1.
     uses_f : bool, optional
         ``rate(t, y, f, *args)`` and ``grad(t, y, f, *args)``, if they are given, also receive f, the derivative of the
         state.
@@ -146,7 +147,7 @@ class Balance(Invariant):
 
 
 def _directions(components: Any, weights: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return components as integers (s, k) and their weights (s, k); None if no components are given."""
+    """Return `components` as integers (s, k), and the weights (s, k) of the components; None without components."""
     if components is None:
         if weights is not None:
             raise ValueError("Balance: weights are given without components; give both, or omit weights.")

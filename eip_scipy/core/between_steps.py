@@ -40,7 +40,7 @@ class Settings(NamedTuple):
 
 
 def kept_state(y: np.ndarray) -> bytes | np.ndarray:
-    """Return a copy of a state, for `is_state`."""
+    """Return a copy of a state in the form that `is_state` compares: the bytes of a short state, else an array."""
     return y.tobytes() if y.size <= SHORT else y.copy()
 
 
@@ -102,7 +102,7 @@ def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: 
 
 
 def _check_kind_of_steps(solver: Any, was: Settings) -> None:
-    """Refuse options of adaptive steps for a solver with a fixed step, and a fixed step for one with adaptive steps."""
+    """Raise ValueError if `h` or `h_abs` was set to a value that does not fit the fixed or adaptive steps."""
     if (solver.h is None) != (was.h is None):
         kind = "adaptive steps" if was.h is None else f"the fixed step h = {was.h:g}"
         raise ValueError(f"`h` was set to {shown(solver.h)} on a solver with {kind}; start a new solver.")

@@ -16,21 +16,22 @@ INDEX = np.uint64
 
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
-    """Return the option ``blocks`` as groups of floats, `width` of them for each of n components.
+    """Return the option ``blocks`` as groups of floats of a state of n components, each of which has `width` floats.
 
     Raises
     ------
     TypeError
         If a value has a unit.
     ValueError
-        If the size of blocks does not divide the state, or a block is not a list of indices, or two blocks overlap.
+        If the size of the blocks is not positive or does not divide n, a block is not a list of indices, or two blocks
+        overlap.
     """
     refuse_units(blocks=blocks)
     if blocks is None:
         return _consecutive(1, n, width)
     if isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):
         if blocks < 1 or n % blocks:
-            raise ValueError(f"blocks = {blocks} does not divide the state's {n} components.")
+            raise ValueError(f"blocks = {blocks} does not divide the state's {n} components; give a positive divisor.")
         return _consecutive(int(blocks), n, width)
     groups = _block_lists(blocks, n)
     if width == 2:
@@ -42,11 +43,11 @@ def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
 
 
 def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
-    """Return the groups of floats that have the same unit, as far as that is known.
+    """Return the groups of floats of a state y with the derivative f that have the same unit, as far as that is known.
 
-    The floats of a block have the same unit. Without blocks, coordinates have one unit and velocities or momenta
-    another if the state looks like (q, p): the derivative of its first half vanishes together with the second half, and
-    the product of both, which is twice a kinetic energy, is not negative.
+    The floats of a block have the same unit. Without blocks, a real state with an even number n of components is taken
+    as (q, p), and the two halves are the groups, if ``f[: n // 2]`` and ``p = y[n // 2 :]`` are both zero or both not,
+    and the sum of ``f[: n // 2] * sign(p)`` is not negative. Otherwise the groups are returned unchanged.
     """
     n = y.size
     if len(groups.start) - 1 < n or n % 2 or n == 0 or y.dtype.kind == "c":

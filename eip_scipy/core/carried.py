@@ -29,7 +29,10 @@ def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
 
 
 def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
-    """Return the value of a function at t as an array, after a check that it is real and has the expected shape."""
+    """Return the value of a function at t as an array, after a check that it is real and has the shape `expected`.
+
+    `what` names the function in messages. With ``expected=None`` any shape is accepted.
+    """
     if isinstance(value, float) and not expected:
         return np.array(float(value))
     refuse_units(**{f"{what} returned": value})
@@ -53,7 +56,7 @@ def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None
 def time_shift(tau: float, adaptive: bool, t_span: tuple[float, float]) -> float:
     """Return the shift in time, a power of two, for differences that give dF/dt of balances; 0 for an empty interval.
 
-    `tau` is the length of a step, and `adaptive` says whether it is that of the first adaptive step.
+    `tau` is the length of the fixed step or, if `adaptive`, of the first step.
     """
     t0, length = t_span[0], abs(t_span[1] - t_span[0])
     wanted = tau * (OF_FIRST if adaptive else OF_FIXED) if 0 < tau < math.inf else math.inf
@@ -69,6 +72,7 @@ class Carried:
     items : sequence of Invariant
         All invariants of the run.
     labels : sequence of str
+        Names of the items in messages.
     starts : sequence of int
         Index of the first value of each item among all values, and at the end the number of values.
     shapes : sequence of tuple
@@ -80,13 +84,13 @@ class Carried:
     ----------
     items : dict of int to Invariant
         The balances, by their indices among all items. After `compile_rates` a jitted balance without a given rate has
-        a compiled one, if it can be compiled.
+        a compiled rate, if its function can be compiled for dual numbers.
     places : ndarray of int64, shape (b,)
         Indices of the balances' values among all values.
     most_slowness : ndarray, shape (b,)
-        For each of these values, the bound for `Diagnostics.slowness` above which a run warns.
+        For each value of a balance, the bound for `Diagnostics.slowness` above which a run warns.
     mask : ndarray of bool, shape (l,)
-        Which values are those of balances.
+        True for the values of balances.
     """
 
     def __init__(
@@ -128,7 +132,7 @@ class Carried:
             self.items[k] = item
 
     def check(self, t: float, y: Array, f: Array) -> None:
-        """Check at the start that the given rates have the expected shapes and are finite."""
+        """Raise an error if a given rate at the start is not real and finite, or has another shape than the balance."""
         for k in sorted(self._given):
             value = self._rate(k, t, y, f)
             if not np.isfinite(value).all():
@@ -147,7 +151,7 @@ class Carried:
         return np.array([p for k in sorted(self._given) for p in range(self._starts[k], self._starts[k + 1])], np.intp)
 
     def given(self, t: float, y: Array, f: Array) -> Array:
-        """Return the given rates, in the order of `given_places`."""
+        """Return the rates that are given by functions of the user, at (t, y), in the order of `given_places`."""
         return self.known(t, y, f)[self.given_places]
 
     def rates(self, low: float, high: float, shift: float, functions: Sequence[Any] | None = None) -> Rates:

@@ -22,13 +22,14 @@ LEAST_ORDER = 2  # of dense output
 
 
 def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str, Any]:
-    """Return the attributes that SciPy's RungeKutta classes have for a method; NotImplemented for those that it lacks.
+    """Return, for a method, the attributes of SciPy's RungeKutta classes by name; NotImplemented for those it lacks.
 
     Parameters
     ----------
     method : Tableau, NystromTableau, GaussJackson, OneStep or Driven
     scipy_class : type or None
-        SciPy's own class of the same pair, whose attributes are returned as they are.
+        SciPy's class with the coefficients of `method`, whose attributes are returned as they are; None if SciPy has no
+        such class.
     """
     if scipy_class is not None:
         return {name: getattr(scipy_class, name, NotImplemented) for name in NAMES}
@@ -50,7 +51,7 @@ def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str,
 
 
 def tableau_of(solver: type[OdeSolver]) -> Tableau:
-    """Return the tableau of a class of another package from its coefficients; its step control is not used.
+    """Return a tableau with the coefficients of a solver class of another package, without its step control.
 
     Raises
     ------
@@ -98,7 +99,7 @@ def tableau_of(solver: type[OdeSolver]) -> Tableau:
 
 
 def is_same(solver: type[OdeSolver], own: type[OdeSolver]) -> bool:
-    """Return True if `solver` is a subclass of `own` with the same coefficients and the same functions `STEP`."""
+    """Return True if `solver` is a subclass of `own` with the same coefficients and the same methods in `STEP`."""
     if not issubclass(solver, own) or _own_functions(solver, own):
         return False
     pairs: Any = ((getattr(solver, name, None), getattr(own, name, None)) for name in NAMES)
@@ -115,7 +116,10 @@ def _floats(values: np.ndarray) -> Any:
 
 
 def _require_plain_steps(solver: type[OdeSolver]) -> None:
-    """Raise an error for a subclass of SciPy's RungeKutta that overrides the functions that make its steps."""
+    """Raise TypeError for a subclass of SciPy's RungeKutta that overrides one of the methods named in `STEP`.
+
+    A class with the error weights `E5` is accepted here, because `tableau_of` refuses it with another message.
+    """
     base: Any = RK45.__bases__[0]
     own = _own_functions(solver, base) if issubclass(solver, base) and _array(solver, "E5") is None else []
     if own:

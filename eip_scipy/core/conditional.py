@@ -31,7 +31,9 @@ VANISHES, UNSEEN = 0.05, 1e-8
 
 
 def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Derivative) -> Array | None:
-    """Move y by Newton's method towards the targets of all invariants, and return the state with the least residuals.
+    """Move y by Newton's method towards the targets of all invariants, and return the best state.
+
+    It is the state of the iteration whose largest residual, relative to the terms of its invariant, is least.
 
     Each Newton step is the shortest one in units of `span`. The function returns None if y itself is that state, for
     instance because all invariants have their target values there.
@@ -63,7 +65,9 @@ def is_kept_on_a_surface(
 
     For example, the rate of change of a length is the velocity along it, and a system that constrains the length keeps
     it while that velocity is 0. Near y there are states where this rate is 0, and there the flow does not change the
-    rate. If the invariant changes because of friction, a driving force or a wrong term, there is no such surface.
+    rate. If the invariant changes because of friction, a driving force or a wrong term, there is no such surface. The
+    function also returns False, without a search, for states with more than `MOST_COMPONENTS` floats that are not 0 or
+    change.
 
     Parameters
     ----------
@@ -72,8 +76,8 @@ def is_kept_on_a_surface(
     held : ndarray of bool, shape (l,)
         Mask of the invariants that the system keeps. The surface is first looked for at states where these invariants
         have the same values as at y. Otherwise a small violation of a constraint could do the work that compensates
-        friction. If there is no such surface, it is looked for at any state where at least one of these invariants
-        becomes 0, which it is not at y if y violates a constraint.
+        friction. If there is no such surface, all states are searched, and a state counts only if at
+        least one of these invariants, which is not 0 at y, becomes 0 there: y then violates a constraint.
     t : float
     y, f : ndarray, shape (n,)
         A state and its derivative there.
@@ -98,7 +102,7 @@ def is_kept_on_a_surface(
 
 
 class _Rate:
-    """The rate of change of invariant k as a function of the state's floats, and its derivatives times `weights`."""
+    """Rate of change of invariant k as a function of the m floats of a state, which move in units of `weights` (m,)."""
 
     def __init__(self, known: InvariantSet, k: int, t: float, y: Array, span: Array, rhs: Derivative) -> None:
         self._known, self._k, self._t, self._rhs, self._dtype = known, k, t, rhs, y.dtype
@@ -111,7 +115,7 @@ class _Rate:
         return float(self._known.gradients(self._t, state, f)[self._k].view(float) @ f.view(float))
 
     def slopes(self, floats: Array) -> Array:
-        """Return the derivatives by the m floats, each times its weight, from central differences."""
+        """Return the derivatives (m,) of the rate by the floats, times their weights, from central differences."""
         found = np.zeros(floats.size)
         for j in np.flatnonzero(self.weights):
             ends = []
@@ -123,7 +127,7 @@ class _Rate:
         return found
 
     def root(self, G: Array) -> Array | None:
-        """Return the floats of the nearest state at which the rate vanishes, or None.
+        """Return the floats of a nearby state at which the rate vanishes, or None.
 
         Newton's method moves only in directions in which invariants with the gradients G do not change. The function
         returns None if the method does not find such a state, or finds it far away.
@@ -143,7 +147,7 @@ class _Rate:
         return floats if abs(value) <= CONVERGED * abs(first) else None
 
     def is_kept_at(self, floats: Array | None) -> bool:
-        """Return True if the flow does not change the rate at a state."""
+        """Return True if the flow does not change the rate at the state `floats`; False if `floats` is None."""
         if floats is None:
             return False
         moving = self.weights > 0
@@ -153,7 +157,7 @@ class _Rate:
         return bool(abs(changes.sum()) <= share * np.abs(changes).sum())
 
     def _newton_step(self, slope: Array, value: float, G: Array) -> Array | None:
-        """Return the shortest move, in units of the weights, that makes the linearised rate 0; None if there is none.
+        """Return the shortest move (m,), in units of the weights, that makes the linearised rate 0, or None.
 
         The move leaves the invariants with the gradients G unchanged, to first order.
         """

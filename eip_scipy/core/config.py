@@ -1,4 +1,4 @@
-"""Report of the installation: versions, the build of the engine, extras."""
+"""Report of the installation: versions, the build of the engine, optional packages (extras)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ EXTRAS = {
 
 
 def show_config(mode: str = "stdout") -> dict[str, Any] | None:
-    """Show versions, the build of the engine and the extras, as `numpy.show_config` does, for bug reports.
+    """Show versions, the build of the engine and the optional packages, for bug reports, as `numpy.show_config` does.
 
     Parameters
     ----------

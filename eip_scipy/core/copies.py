@@ -23,7 +23,10 @@ BOUND = ("tableau", "work", "invariants", "trust")
 
 
 class RunParts(NamedTuple):
-    """The plain values and arrays from which a `Run` is made again, apart from its invariants."""
+    """The values and arrays from which `run_of` makes a `Run` again, apart from the invariants.
+
+    `values` are fields of the run, `work` is a copy of its buffers, and `doubts` and `failed` are those of its `Trust`.
+    """
 
     values: dict[str, Any]
     work: Work
@@ -34,8 +37,8 @@ class RunParts(NamedTuple):
 def parts_of(run: Run) -> RunParts:
     """Return the parts from which `run_of` makes a run again.
 
-    If a solver of SciPy makes the steps, the parts contain its values. They do not contain a user-defined one-step
-    method.
+    If a solver of SciPy makes the steps, the parts contain the attributes of that solver. A user-defined one-step
+    method is not part of them.
     """
     values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
     values["options"] = run.options._replace(joint=None)
@@ -68,12 +71,15 @@ def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: boo
 
 
 def scipy_values(solver: OdeSolver) -> dict[str, Any]:
-    """Return the attributes of a solver of SciPy, apart from its functions."""
+    """Return the attributes of a solver of SciPy that are not callable, by name."""
     return {name: value for name, value in vars(solver).items() if not callable(value)}
 
 
 def set_scipy_values(solver: OdeSolver, values: dict[str, Any]) -> None:
-    """Set attributes of a solver of SciPy; the stages K are filled in place, because K may be a view of an array."""
+    """Set attributes of a solver of SciPy to the values that `scipy_values` returned.
+
+    Arrays whose names begin with K, the stages, are filled in place, because K may be a view of another array.
+    """
     for name, value in values.items():
         if name.startswith("K"):
             getattr(solver, name)[...] = value

@@ -49,7 +49,7 @@ class Interpolants:
     engine : Engine
         Engine of the run, for which dense output is switched on.
     events : int
-        Number of events that the loop checks.
+        Number of event functions whose roots the engine's loop looks for.
     errors : callable
         ``errors()`` returns a context manager that replaces the engine's error in a compiled function by the user's
         exception, such as `Driver.own_errors`.
@@ -76,21 +76,21 @@ class Interpolants:
         return self.record.piece.size
 
     def over(self, t_old: float, y_old: Array, t: float, y: Array) -> ManifoldDenseOutput:
-        """Return the dense output over the last step."""
+        """Return the dense output over the last step, from (t_old, y_old) to (t, y)."""
         piece = np.empty(self.floats)
         with self._lock, self._errors():
             self._engine.describe(t_old, y_old, t, y, piece)
         return ManifoldDenseOutput(self, piece)
 
     def shown(self, t: float, y: Array) -> Array:
-        """Return the last state `y` at `t` in the form in which the run returns it."""
+        """Return a copy of the last state `y` at `t` as the run saves it: projected if its step left it unprojected."""
         out = np.empty_like(y)
         with self._lock, self._errors():
             self._engine.show(t, y, out)
         return out
 
     def states(self, piece: Array, times: Array) -> Array:
-        """Return the states (n, m) of an interpolant at times (m,)."""
+        """Return the states (n, m) at times (m,) from `piece`, the floats of an interpolant."""
         out = np.empty((times.size, self._n), self._dtype)
         with self._lock, self._errors():
             self._engine.interpolate(piece, times, out)
@@ -98,14 +98,14 @@ class Interpolants:
         return out.T
 
     def roots(self) -> tuple[Array, Array, Array]:
-        """Return three arrays for the events found since the last call: their numbers, times and states."""
+        """Return indices (k,), times (k,) and states (k, n) of the events found since the last call of `roots`."""
         record = self.record
         count = int(record.counts[0])
         record.counts[0] = 0
         return record.event[:count], record.t[:count], record.y[:count]
 
     def pending(self) -> tuple[Array, Array]:
-        """Return the numbers and times of events in the pending step whose states were left to the caller."""
+        """Return the indices and times (k,) of the events in a step that the engine's loop left to the caller."""
         record = self.record
         count = int(record.counts[2])
         record.counts[2] = 0
@@ -119,7 +119,7 @@ class Interpolants:
             missed[0] = 0
             warnings.warn(
                 f"dense output at t={missed[1]}{others}: no state near the interpolant has the required values of the "
-                "invariants; the unprojected state is returned",
+                "invariants; the unprojected state is returned. Take shorter steps, or correct grad",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -179,7 +179,7 @@ class ManifoldDenseOutput(AtRealTimes):
     the step, whose degree of 8, 16, 32 or 64 is chosen by its error. This polynomial meets the states at both ends
     exactly. In between it is within 1e-12 of the largest value of each component, and usually within 1e-14. It is less
     accurate if the projected interpolant is not smooth, which happens in steps so long that it lies far from the
-    manifold. A copy (`copy.copy`, `copy.deepcopy`) is the interpolant itself.
+    manifold. A copy (`copy.copy`, `copy.deepcopy`) is such an interpolant again, not the polynomial.
     """
 
     def __init__(self, interpolants: Interpolants, piece: Array) -> None:
@@ -206,7 +206,7 @@ class ManifoldDenseOutput(AtRealTimes):
 
 
 class _Pieces(Sequence[ManifoldDenseOutput]):
-    """The interpolants of all steps, each created when it is requested."""
+    """Sequence of the interpolants of all steps; each `ManifoldDenseOutput` is created when it is requested."""
 
     def __init__(self, interpolants: Interpolants, pieces: Array) -> None:
         self._interpolants, self._pieces = interpolants, pieces
@@ -227,7 +227,7 @@ class _Pieces(Sequence[ManifoldDenseOutput]):
 
 
 class _AtRest(AtRealTimes):
-    """The dense output of a run without steps: one state."""
+    """Dense output of a run without steps: it returns the state y at all times."""
 
     def __init__(self, t: float, y: Array) -> None:
         super().__init__(t, t)

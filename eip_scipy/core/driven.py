@@ -66,7 +66,8 @@ class Driven(Ordered):
     takes_complex : bool
         Whether the solver accepts complex states.
     polynomials : ndarray, shape (k, k)
-        Coefficients of x, x^2, ... of the interpolant, in terms of the rows that the stepper writes to work.K.
+        Coefficients of the interpolant in x = (t - t_old) / h: entry (p, j) is the coefficient of x^(p + 1) that
+        multiplies the j-th row that `Stepper._describe` fills.
 
     Attributes
     ----------
@@ -108,7 +109,7 @@ class Stepper:
     solver : OdeSolver
         The solver of SciPy; None before the first step.
     b, c, exponent, multistep
-        Attributes of a tableau that the engine reads. The number of entries of `b` is the number of rows in work.K.
+        Attributes of a tableau that the engine reads. The array work.K has one row more than `b` has entries.
     """
 
     multistep = None
@@ -128,7 +129,7 @@ class Stepper:
         Raises
         ------
         ValueError
-            If the state is complex or `rtol` differs between components, and SciPy's solver does not accept that.
+            If `rtol` differs between components, or the state is complex and SciPy's solver accepts real states only.
         """
         (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
         if y.dtype.kind == "c" and not self.method.takes_complex:
@@ -151,7 +152,13 @@ class Stepper:
         )  # fmt: skip
 
     def _made(self) -> Any:
-        """Make and return SciPy's solver. The Jacobian that it evaluates when it is made is not counted."""
+        """Make and return SciPy's solver, without counting the evaluations of its Jacobian at the start.
+
+        Raises
+        ------
+        NotImplementedError
+            If the installed version of SciPy lacks an attribute in `PRIVATE`.
+        """
         solver = self._make()
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
@@ -165,7 +172,7 @@ class Stepper:
         return solver
 
     def fill(self, w: Work, t: float, y: Array, again: bool) -> tuple[float, float] | None:
-        """Make a step from the state y into the buffers `w`.
+        """Make a step from (t, y), and write the state, its error estimate and the interpolant to the buffers `w`.
 
         With `again` the step replaces the last one, whose projection has failed, and is at most half as long. The
         function returns the time at the end of the step and the length of the next step, or None if the solver of SciPy
@@ -254,7 +261,7 @@ class Stepper:
         raise NotImplementedError
 
     def _slope(self, rows: Array) -> Array:
-        """Return the derivative at the end of the step."""
+        """Return the derivative (n,) of the state at the end of the step; `_describe` has filled the `rows` before."""
         raise NotImplementedError
 
 
@@ -313,7 +320,10 @@ class BDFStepper(Stepper):
         return solver.error_const[order] * difference
 
     def _describe(self, h: float, rows: Array) -> None:
-        """Fill `rows` with coefficients of powers of x = (t - t_old) / h; D is scaled to the next step's length."""
+        """Fill `rows` with the coefficients of x, x^2, ... in the interpolant, divided by h, where x = (t - t_old) / h.
+
+        The differences D of the solver are already those for the length of the next step.
+        """
         order = self.solver.order
         ratio = (abs(h) / self.solver.h_abs) ** np.arange(MOST_ORDER + 1)
         powers = (SHIFTED * ratio) @ NEWTON[:, : order + 1]
@@ -324,7 +334,7 @@ class BDFStepper(Stepper):
 
 
 def _newton() -> Array:
-    """Return the coefficients of powers of s in the polynomials s (s + 1) ... (s + k - 1) / k!, by columns."""
+    """Return an array whose column k contains the coefficients of 1, s, s^2, ... in s (s + 1) ... (s + k - 1) / k!."""
     out = np.zeros((MOST_ORDER + 1, MOST_ORDER + 1))
     out[0, 0] = 1.0
     for k in range(1, MOST_ORDER + 1):
@@ -335,7 +345,7 @@ def _newton() -> Array:
 
 
 def _shifted() -> Array:
-    """Return the coefficients of powers of x in the polynomials (x - 1)^j, by columns."""
+    """Return an array whose column j contains the coefficients of 1, x, x^2, ... in (x - 1)^j."""
     return np.array(
         [[(-1.0) ** (j - i) * math.comb(j, i) for j in range(MOST_ORDER + 1)] for i in range(MOST_ORDER + 1)]
     )

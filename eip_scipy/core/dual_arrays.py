@@ -27,7 +27,7 @@ inside = partial(njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class _NumPy(python_types.ModuleType):
-    """NumPy with some functions replaced."""
+    """Module that has the attributes `others`, and takes all further ones from NumPy."""
 
     def __init__(self, others: dict[str, Any]) -> None:
         super().__init__("numpy")
@@ -64,7 +64,7 @@ def _replaced(item: Any, others: dict[int, Any]) -> Any:
 
 
 def _names(code: python_types.CodeType) -> set[str]:
-    """Return the names in a function's code and in the code of its inner functions."""
+    """Return the names of globals and attributes in the code of a function and of its inner functions."""
     inside = (_names(item) for item in code.co_consts if isinstance(item, python_types.CodeType))
     return set(code.co_names).union(*inside)
 
@@ -78,7 +78,7 @@ def _of_floats(dtype: Any) -> bool:
 
 @cache
 def _array_functions(dual: Dual) -> dict[str, Callable[..., Any]]:
-    """Return replacements of NumPy's functions that make arrays, by name; only compiled code can call them."""
+    """Return replacements of NumPy's empty, zeros, ones, array and cross, by name; only compiled code calls them."""
 
     def empty(shape, dtype=float):
         pass
@@ -114,11 +114,11 @@ def _overload_maker(function: Any, numpy_function: Any, dual: Dual) -> None:
 
 
 def array(object):
-    """Replace `np.array` in compiled code."""
+    """Return what `np.array` returns, also for lists and tuples that contain duals; for compiled code only."""
 
 
 def cross(a, b):
-    """Replace `np.cross` in compiled code."""
+    """Return what `np.cross` returns, also for two vectors (3,) that contain duals; for compiled code only."""
 
 
 @overload(array)

@@ -44,7 +44,7 @@ class Dual(types.Type):
         return Conversion.safe if isinstance(other, PLAIN) else None
 
     def unify(self, typingctx: Any, other: Any) -> Any:
-        """Return the common type of a dual in one branch and a number in another: the dual type."""
+        """Return this type if `other` is a plain number or the same type, and None otherwise."""
         return self if isinstance(other, PLAIN) or other == self else None
 
 
@@ -197,7 +197,7 @@ def _is_dual(*kinds: Any) -> bool:
 
 
 def _define(emit: Callable[..., Any], *functions: Any, compares: bool = False) -> None:
-    """Define frequent operations directly in LLVM, because Numba takes longer to compile those written in Python.
+    """Define operations on duals directly in LLVM, because Numba takes longer to compile those written in Python.
 
     ``emit(builder, *values)`` returns the value and the derivative by each argument; with `compares` only the value.
     """
@@ -318,7 +318,7 @@ def _define_binary(function: Any, slope: Callable[..., Any], other: Callable[...
 
 
 def _define_flat(function: Any, arguments: int, *names: Any) -> None:
-    """Define a function whose derivative is 0 almost everywhere or undefined, as the plain function of the values."""
+    """Define a function of duals whose derivative is 0 or undefined: it returns the plain function of their values."""
 
     def typed(x, y):
         return (lambda x, y: function(value_of(x), value_of(y))) if _is_dual(x, y) else None
@@ -387,7 +387,12 @@ _define_flat(np.ceil, 1)
 
 
 def _power(x, y):
-    """Compute an integer power by products, as Numba does for floats, and any other power by the logarithm."""
+    """Return a function that computes x ** y for arguments of the Numba types x and y.
+
+    Return None unless both are scalars and at least one is a dual.
+
+    Integer powers are computed by products, as Numba does for floats, and all others by ``a ** b`` of the values.
+    """
     if not _is_dual(x, y):
         return None
     if isinstance(y, types.Integer):
@@ -460,7 +465,7 @@ for _function in ARRAY_FUNCTIONS:
 
 
 def _define_with_scalar(function: Any) -> None:
-    """Define an operation of an array and one dual by a loop, because Numba's array expressions do not support it."""
+    """Define an operation of an array and one dual by a loop: Numba supports no scalar duals in array expressions."""
 
     def typed(x, y):
         of_first = _is_array(x, 1, 2) and isinstance(y, Dual)

@@ -70,7 +70,8 @@ class Examiner:
     tau : float
         The length of a step.
     figures : ndarray, shape (l, N_FIGURES)
-        The figures of the run's corrections, in which the examiner also stores rates of change.
+        Numbers about the projections of the run, a row for each invariant, see `engine.trust`. The examiner also stores
+        rates of change there.
     resolution : callable
         ``resolution(rhs, t, h, y, end_of_run)``: `resolution.unresolved` with the method and the groups of the run.
     largest : float
@@ -84,11 +85,11 @@ class Examiner:
     largest: float = 0.0
 
     def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
-        """Return a finding about an invariant or a gradient at a state of the run, or None."""
+        """Return a sentence about an invariant or a gradient that is wrong at a state of the run, or None."""
         return self._unless_refused(_complaint, rhs, t, y, True)
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
-        """Return a finding about the step that the engine suspects, or None.
+        """Return a sentence about what is wrong in the step that the engine suspects, or None.
 
         `suspect` is the engine's record of that step. It is cleared, so that the engine may record another step.
         """
@@ -123,7 +124,7 @@ class _RefusedError(Exception):
 
 
 class _Guarded:
-    """Functions of invariants whose exceptions become `_RefusedError`."""
+    """The functions of a set of invariants, whose exceptions, except MemoryError, become `_RefusedError`."""
 
     def __init__(self, functions: Any) -> None:
         self._functions = functions
@@ -133,7 +134,7 @@ class _Guarded:
 
 
 def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function whose exceptions become `_RefusedError`, except MemoryError."""
+    """Return `function` with its exceptions, except MemoryError, replaced by `_RefusedError`."""
 
     def call(*args: Any) -> Any:
         try:
@@ -149,9 +150,10 @@ def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
 def _complaint(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, y: Array, on_manifold: bool
 ) -> str | None:
-    """Return a finding at a state, or None.
+    """Return the text of the first of the `complaints` at a state, or None, and note rates of change in the figures.
 
-    If the state is not on the manifold, findings about invariants that depend on others are ignored.
+    Without `on_manifold`, complaints about invariants that depend on other invariants are ignored. A state whose
+    derivative is not finite is not examined.
     """
     f = rhs(t, y)
     if not BUILD.are_finite(f.view(float)):
@@ -175,7 +177,7 @@ def _along_chord(
     ends: tuple[Array, Array],
     waited: int,
 ) -> str | None:
-    """Return a finding about states between the ends of a step with a large correction, or in steps before it, or None.
+    """Return a sentence about what is wrong between the ends of a step with a large correction, or before it, or None.
 
     The `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing
     is examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
@@ -196,7 +198,7 @@ def _along_chord(
 def _on_the_way(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, start: tuple[float, Array], h: float, steps: int
 ) -> str | None:
-    """Return a finding about the trajectory that led to `start`, or None.
+    """Return a sentence about what is wrong on the trajectory that led to `start`, a time and a state, or None.
 
     The trajectory is followed backwards for about `steps` steps of length h.
     """

@@ -17,7 +17,7 @@ __all__ = ["failure", "projection_failure"]
 def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     """Return the message for a failed projection: the largest residual, and the rank of the gradients.
 
-    Residuals are compared in units of the dead bands within which they are not corrected.
+    The largest residual is the one that most exceeds its dead band, within which it would not be corrected.
     """
     excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
@@ -30,7 +30,7 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
 
 
 def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
-    """Return the message for a failed step, from the status code and the clock of the engine."""
+    """Return the message for a failed step, from the engine's `status` and its `clock` of times and step lengths."""
     if status == NOT_FINITE:
         return _not_finite(run, clock[TIME], clock[LENGTH])
     if status == TOO_SMALL:
@@ -38,11 +38,11 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     if status == UNSTABLE:
         return _unstable(run)
     message = projection_failure(run.invariants, run.work, clock[TIME_NEW])
-    return f"{message}. Use a shorter step or tighter tolerances"
+    return f"{message}. Use a shorter step or tighter tolerances, or correct fun or grad of the invariant"
 
 
 def _unstable(run: Run) -> str:
-    """Return the message for a step that is too long for a multistep method."""
+    """Return the message for a multistep method whose history has too large differences of the accelerations."""
     history = run.method.multistep
     assert history is not None  # only multistep methods return this code
     t = history.t0 + int(history.place[NEWEST]) * history.h
@@ -54,7 +54,7 @@ def _unstable(run: Run) -> str:
 
 
 def _not_finite(run: Run, t: float, h: float) -> str:
-    """Return the message for a step that is not finite: in a stage, in the sum, or in the error estimate."""
+    """Return the message for a step in which a stage, the new state or the error estimate is not finite."""
     work, method = run.work, run.method
     history = method.multistep
     if history is not None and history.place[HAVE_NODES] and not np.isfinite(work.K[1]).all():

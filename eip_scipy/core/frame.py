@@ -30,7 +30,8 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     Raises
     ------
     ValueError
-        If the shapes disagree, C S is singular, or C or S is complex for a real state.
+        If the shapes disagree, C or S is not numeric, C S is singular or not finite, or C or S is complex for a real
+        state.
     """
     if frame is None:
         return NO_FRAME
@@ -62,7 +63,7 @@ def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width:
 
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
-    """Return a mask of the gradients (rows of G) that are linear combinations of rows of C.
+    """Return a mask (l,) of the gradients, the rows of G (l, n), that are linear combinations of rows of C.
 
     The frame removes corrections along such gradients.
     """
@@ -79,12 +80,14 @@ def _frame_matrices(C: np.ndarray, S: np.ndarray, width: int) -> tuple[np.ndarra
     S = S / np.maximum(np.abs(S).max(axis=0, keepdims=True), np.finfo(float).tiny)
     shifts = C @ S
     if not np.all(np.isfinite(shifts)) or not np.linalg.cond(shifts) < 1e12:
-        raise ValueError("frame: C S is singular; S must span shifts that change every row of C y.")
+        raise ValueError(
+            "frame: C S is singular; S must span shifts that change every row of C y, and C and S must be finite."
+        )
     return C, np.ascontiguousarray(np.linalg.solve(shifts.T, S.T))
 
 
 def _real_form(a: np.ndarray) -> np.ndarray:
-    """Return the real matrix that acts on (Re, Im) pairs as `a` does on complex components."""
+    """Return the real matrix (2 k, 2 n) that acts on pairs (Re, Im) as `a` (k, n) acts on complex components."""
     out = np.empty((a.shape[0], 2, a.shape[1], 2))
     out[:, 0, :, 0] = out[:, 1, :, 1] = a.real
     out[:, 1, :, 0], out[:, 0, :, 1] = a.imag, -a.imag
@@ -92,7 +95,11 @@ def _real_form(a: np.ndarray) -> np.ndarray:
 
 
 def _by_bodies(a: np.ndarray) -> np.ndarray:
-    """Return weights (k, b) if `a` (3 k, 3 k b) sums x, y and z of b bodies in each of k groups; else (0, 0) zeros."""
+    """Return the weights of bodies in a matrix of linear constraints.
+
+    Return the weights (k, b) if the rows of `a` (3 k, 3 k b) are weighted sums of x, y and z over the b bodies of one
+    of k groups, else an empty array of shape (0, 0).
+    """
     groups = a.shape[0] // 3
     if groups == 0 or a.shape[1] % (3 * groups):
         return np.zeros((0, 0))

@@ -47,7 +47,7 @@ class NumericalGradient:
     t, y
         Time and state at the start.
     floors : ndarray, shape (n,)
-        Sizes of small components, see `typical_sizes`.
+        Sizes that are added to those of the components in the lengths of difference steps, see `typical_sizes`.
     extra : tuple
         The run's arguments.
     """
@@ -61,7 +61,7 @@ class NumericalGradient:
         self.complex_step = takes_complex and y.dtype.kind == "f" and self._takes_complex_steps(t, y, extra)
 
     def __call__(self, t: float, y: Array, *extra: Any) -> Array:
-        """Return the gradient (..., n)."""
+        """Return the gradient (n,) at (t, y), or (l_i, n) of an invariant with l_i values."""
         if self.complex_step:
             try:
                 found = self._by_complex_step(t, y, extra)
@@ -109,10 +109,10 @@ class NumericalGradient:
 
 
 def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
-    """Return the gradient of value(y) by central differences of order 6, with shifts in units of |y_k| + floor_k.
+    """Return the gradient (..., n) of value(y) by central differences of order 6, shifted in units of |y_k| + floor_k.
 
     If differences of order 4 disagree, as near a singularity that is closer than the state's size, the shifts are
-    shortened until both agree. If they never agree, the shift with the best agreement is used. The engine's
+    shortened until both orders agree. If they never agree, the shift with the best agreement is used. The engine's
     differences (engine/cpp/differences.hpp) have the same bits.
     """
 
@@ -137,7 +137,7 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
 
 
 def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: complex) -> tuple[Array, float]:
-    """Return the differences of order 6 for y_k, not yet divided by the shift, and how far those of order 4 disagree.
+    """Return the differences of order 6 for y_k, not yet divided by the shift, and the disagreement with order 4.
 
     The disagreement is the largest one among the values, as a multiple of what is allowed.
     """

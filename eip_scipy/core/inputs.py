@@ -41,7 +41,7 @@ def refuse_units(**arguments: Any) -> None:
     Raises
     ------
     TypeError
-        If a value is a date, or a quantity or time of astropy, pint, unyt or a similar package.
+        If a value is a date or a duration, or a quantity or time of astropy, pint, unyt or a similar package.
     """
     for name, value in arguments.items():
         if is_plain(value):
@@ -68,7 +68,7 @@ def is_plain(value: Any) -> bool:
 
 
 def _leaves(value: Any) -> Any:
-    """Yield the items of nested lists and tuples and of object arrays; anything else is yielded unchanged."""
+    """Yield the items of nested lists, tuples and object arrays, or a single value; plain numbers are left out."""
     if type(value) in (list, tuple):
         for item in value:
             if type(item) not in PLAIN:
@@ -114,7 +114,7 @@ def real_array(name: str, value: Any, error: type[Exception] = ValueError) -> np
     TypeError
         If a value has a unit.
     ValueError
-        If a value is not a real number; the exception type is `error` if that is given.
+        If a value is not a real number; `error` replaces this type of exception.
     """
     refuse_units(**{name: value})
     found = reals(value)
@@ -132,7 +132,7 @@ def is_number(value: Any) -> bool:
 
 
 def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
-    """Return an integer option; raise ValueError unless it is from 1 to `most`."""
+    """Return the option `name` as an int; raise ValueError unless `value` is an integer from 1 to `most`."""
     if type(value) is int and 1 <= value <= most:
         return value
     refuse_units(**{name: value})
@@ -144,19 +144,20 @@ def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return a boolean option; raise ValueError unless it is True or False."""
+    """Return the option `name` as a bool; raise ValueError unless `value` is True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name} must be True or False, got {shown(value)}.")
     return bool(value)
 
 
 def require_arguments(fun: Callable[..., Any], given: Sequence[str], what: str, advice: str) -> None:
-    """Raise a clear TypeError if `fun` does not accept the arguments `given`; used after a TypeError in a call.
+    """Raise a TypeError that explains a failed call if `fun` does not accept arguments with the names `given`.
 
     Raises
     ------
     TypeError
-        If the arguments do not match; the message names `what` was called, its arguments, and gives `advice`.
+        If the arguments do not match. The message says with which arguments `what`, the name of the function, is
+        called, and ends with `advice`, or with advice about the time if only the time is missing.
     """
     try:
         signature = inspect.signature(fun)
@@ -182,14 +183,14 @@ def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool
 
 
 def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any, what: str, t: float) -> np.ndarray:
-    """Return the array that a user's in-place function fills; it is filled with NaN before the call.
+    """Return the array of this shape and type that a user's in-place function fills; before, all entries are NaN.
 
     Raises
     ------
     TypeError
         If the function returns anything but None or the array itself.
     ValueError
-        If the function does not fill the whole array, or reads it before it fills it.
+        If the function does not fill the whole array, or reads entries before it fills them.
     """
     out, ones = np.empty(shape, dtype), np.empty(shape, dtype)
     found, other = out.view(float), ones.view(float)

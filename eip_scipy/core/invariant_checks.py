@@ -58,18 +58,18 @@ MISSING = "Add that constraint to the invariants, and start on it"
 
 
 class Complaint(NamedTuple):
-    """A finding of a check.
+    """Something that a check of the invariants has found to be wrong.
 
     Attributes
     ----------
     is_error : bool
-        Whether the run must not start.
+        True if the run must not start.
     text : str
         Description of what is wrong.
     advice : str
         Consequence of the finding, or what to do about it.
     dependent : bool
-        Whether the finding is about an invariant that the system keeps only if other invariants hold.
+        True if the finding is about an invariant that the system keeps only if other invariants hold.
     category : type
         Class of the warning at the start of a run, if the finding is not an error.
     """
@@ -84,10 +84,10 @@ class Complaint(NamedTuple):
 class _Samples(NamedTuple):
     """A state, its derivative, and the invariants at and near the state.
 
-    `tau` is the length of a step, and `span` (n,) the distance that each component moves in about a step. `directions`
-    are the test directions (2, n), scaled by `span`. `G` (l, n) and `here` (l,) are the gradients and values at the
-    state. `ends` (2, 2, l) are the values at y + s * directions and y - s * directions, where s is the first of
-    `CHECK_STEPS`.
+    `tau` is the length of a step. `span` (n,) is |y| plus the distance that each component moves in a step, or while
+    the state changes by its own size if that is sooner. `directions` (2, n) are random ones, scaled by `span`. `G`
+    (l, n) and `here` (l,) are the gradients and values at the state. `ends` (2, 2, l) are the values at y + s *
+    directions and y - s * directions, where s is the first of `CHECK_STEPS`.
     """
 
     t: float
@@ -110,10 +110,10 @@ def complaints(
     rhs: Derivative | None,
     evaluated: tuple[Array, Array] | None = None,
 ) -> Iterator[Complaint]:
-    """Yield findings about the invariants at a state.
+    """Yield a `Complaint` for everything that is wrong with the invariants at a state.
 
-    Their precision is checked first. If there is no finding, their gradients are checked, and then, if there is no
-    finding again, their rates of change.
+    The precision of the invariants is checked first; if it is sufficient, then the gradients; and if these are correct,
+    the rates of change.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def complaints(
 
 
 def listed(names: list[str]) -> str:
-    """Return at most three names in quotes, and the number of the others."""
+    """Return at most three names in quotes, and the number of the other names, as one text."""
     quoted = [repr(name) for name in names[:MOST_NAMES]]
     more = len(names) - len(quoted)
     return ", ".join(quoted) + (f" and {more} more" if more else "")
@@ -168,13 +168,13 @@ def _blurred(at: _Samples) -> list[Array]:
 
 
 def _rounding(known: InvariantSet, at: _Samples, ways: Array) -> Array:
-    """Return the changes (k, l) of the derivatives along k vectors, `ways`, when the state changes by roundings."""
+    """Return the changes (k, l) of derivatives of invariants along `ways` (k, n) for states changed by roundings."""
     blurred = [known.gradients(at.t, state, at.f) - at.G for state in _blurred(at)]
     return BLUR * np.abs(np.array(blurred)[:, None] * ways[:, None]).sum(axis=3).max(axis=0)
 
 
 def _rounding_of_rates(known: InvariantSet, at: _Samples, unit: float, rhs: Derivative | None) -> Array:
-    """Return the rounding errors (l,) of rates, divided by `unit`, from those of gradients and right-hand side."""
+    """Return the rounding errors (l,) of the rates of invariants, in units of `unit`, due to gradients and `rhs`."""
     found = _rounding(known, at, at.f[None] / unit)[0]
     if rhs is None:
         return found
@@ -213,7 +213,7 @@ def _single_precision(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
 
 
 def _in_single_precision(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> str:
-    """Return a text that names the function in single precision: fun or a gradient; "" if there is none."""
+    """Return a text that says that fun or a gradient has single precision; "" if neither has."""
     states = at.y + CHECK_STEPS[0] * at.directions
     if rhs is not None and _vary_in_single([rhs(at.t, state) for state in states]):
         return "fun returns numbers of single precision (float32)"
@@ -225,7 +225,7 @@ def _in_single_precision(known: InvariantSet, at: _Samples, rhs: Derivative | No
 
 
 def _large_and_single(found: list[Array]) -> Array:
-    """Return a mask of the components that are in single precision and not much smaller than the largest one.
+    """Return a mask of the floats that have single precision in all arrays `found` and are not relatively small.
 
     Small components are left out because a sum of terms that cancel, as next to an equilibrium, has few digits too.
     """
@@ -235,7 +235,10 @@ def _large_and_single(found: list[Array]) -> Array:
 
 
 def _vary_in_single(found: list[Array]) -> bool:
-    """Return True if a component that varies is in single precision; constant components may be so on purpose."""
+    """Return True if a component that varies between the arrays `found` has single precision in all of them.
+
+    Components that do not vary may be in single precision on purpose.
+    """
     varies = np.ptp(np.array(found).view(float), axis=0) != 0
     return bool((_large_and_single(found) & varies).any())
 
@@ -244,7 +247,7 @@ def _vary_in_single(found: list[Array]) -> bool:
 
 
 def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
-    """Yield a finding for each gradient that is wrong in the first test direction in which any gradient is wrong."""
+    """Yield a `Complaint` for each gradient that is wrong in the first test direction in which any one is wrong."""
     along, terms = (at.directions @ at.G.conj().T).real, np.abs(at.directions) @ np.abs(at.G).T
     # The terms inside an invariant may be larger than its value and than the products of gradient and state.
     inner = known.norm_products(at.G, at.span)
@@ -294,11 +297,12 @@ def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, al
 
 
 class _Rates(NamedTuple):
-    """Rates of change (l,), the sums of their terms' absolute values, the partial time derivatives, the wrong rates.
+    """Rates of change of the invariants along the flow.
 
-    `in_time` is divided by the largest component of the state's derivative; `wrong` is a mask.
-
-    The given rate of a balance is subtracted from its rate of change. Balances without a given rate have NaN.
+    `rate` (l,) contains the rates; `terms` (l,) the sums of the absolute values of the terms of each rate; `in_time`
+    (l,) the partial time derivatives, divided by the largest component of the derivative of the state. `wrong` (l,) is
+    a mask of the rates that exceed their errors. The given rate of a balance is subtracted from its rate of change, and
+    `rate` is NaN for balances without a given rate.
     """
 
     rate: Array
@@ -342,9 +346,9 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
 def _complaints_of_rates(
     known: InvariantSet, at: _Samples, found: _Rates, wrong: Array, rhs: Derivative | None
 ) -> Iterator[Complaint]:
-    """Yield one finding for all quantities that are not invariants, and one for all that depend on other invariants.
+    """Yield a `Complaint` about the quantities that are not invariants, and one about those that depend on others.
 
-    Each text names the quantity with the largest relative rate first.
+    `wrong` (l,) is a mask of these quantities. Each text names the quantity with the largest relative rate first.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
@@ -363,7 +367,7 @@ def _complaints_of_rates(
 
 
 def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array) -> Complaint:
-    """Return one finding for all balances whose given rates are wrong, with the worst balance first."""
+    """Return one `Complaint` about the balances in the mask `wrong`, whose rates are wrong, with the worst first."""
     shares = np.where(wrong, np.abs(found.rate) / np.where(found.terms > 0, found.terms, 1.0), 0.0)
     worst = int(np.argmax(shares))
     others = [name for k, name in enumerate(known.names) if wrong[k] and k != worst]
@@ -393,7 +397,7 @@ def _depends_on_others(name: str, t: float, rate: float, terms: float) -> str:
 
 
 def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates | None:
-    """Return the rates of change at a state, or None if the derivative is too small to compute them."""
+    """Return the rates of change at a state, or None if the state's derivative is too small to compute them."""
     # Rates are divided by the largest component of f, because they could overflow for large states otherwise.
     unit = np.abs(at.f).max()
     if 0 < unit < np.finfo(float).tiny / EPS:
@@ -424,8 +428,8 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
 def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Array, tau: float) -> tuple[Array, Array]:
     """Return the partial time derivatives (l,) of the invariants and their rounding errors (l,).
 
-    Only times inside the run's interval are used. If the interval contains no time other than t, the rounding errors
-    are infinite, because the derivatives are then unknown.
+    Only times inside the run's interval are used. A derivative that is unknown has the value 0 and an infinite error:
+    if the interval contains no time other than t, or if the step `tau` is 0, infinite, or too short to change t.
     """
     none = np.zeros(known.size)
     low, high = min(known.t_span), max(known.t_span)

@@ -36,7 +36,7 @@ LARGE = 200
 
 
 class OwnArguments:
-    """A function of an invariant, to which the invariant's own `args` are passed if a call omits them.
+    """A function of an invariant that is called with the invariant's own `args` if a call omits these arguments.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class OwnArguments:
         self.__name__ = getattr(function, "__name__", type(function).__name__)
 
     def __call__(self, *given: Any) -> Any:
-        """Call the function."""
+        """Return the value of the function; `args` are added if exactly `first` arguments are given."""
         return self.function(*given, *(self.args if len(given) == self.first else ()))
 
 
@@ -209,7 +209,7 @@ class JointInvariants(tuple[Invariant, ...]):
     def __new__(
         cls, items: Iterable[Invariant], moments: Callable[..., None], shift: Callable[..., None]
     ) -> JointInvariants:
-        """Make the tuple of the items, with both functions."""
+        """Make the tuple of the items, with the functions `moments` and `shift` as attributes."""
         self = super().__new__(cls, items)
         self.moments, self.shift = moments, shift
         return self
@@ -226,7 +226,7 @@ def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
     Raises
     ------
     TypeError
-        If `invariants` is anything else.
+        If `invariants`, or an item of a sequence, is anything else.
     """
     if type(invariants) is tuple and all(isinstance(item, Invariant) for item in invariants):
         return invariants
@@ -329,7 +329,7 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
 def _first_gradient(
     invariant: Invariant, gradient: Call, label: str, start: tuple[float, Array, Array], extra: tuple
 ) -> Array:
-    """Return the gradient at `start`, which holds a time, a state and its derivative."""
+    """Return the gradient (n,) or (l_i, n) at `start`, which holds a time, a state and its derivative."""
     t, y, f = start
     what, states = f"gradient of invariant {label!r}", (y.copy(), f.copy()) if gradient.takes_f else (y.copy(),)
 
@@ -351,7 +351,7 @@ def _first_gradient(
 
 
 def _for_each_value(of_items: list[bool], sizes: list[int]) -> list[bool]:
-    """Repeat the flag of each item for each of its values."""
+    """Return a list in which the flag of each item is repeated as often as the item has values."""
     return [known for known, size in zip(of_items, sizes, strict=True) for _ in range(size)]
 
 
@@ -392,7 +392,7 @@ class InvariantSet:
     extra : tuple
         The run's further arguments: its `args`, or its `params` as one array.
     tell : bool
-        Whether to warn of the cost and the accuracy of gradients that are not given.
+        If True, warn of the cost and the accuracy of gradients that are not given.
     t_bound : float, optional
         The end of the run. Invariants are evaluated only at times from t0 to t_bound. Default: only at t0.
     rhs : callable, optional
@@ -405,9 +405,9 @@ class InvariantSet:
     kinds : Grouping or None
         Groups of components that have the same unit, see `kinds_of`. None if the units are unknown.
     given : ndarray of bool, shape (l,)
-        Which targets the user gave.
+        True for the values whose targets the user gave.
     computed : list of bool
-        Which of the l gradients are computed because none was given.
+        For each of the l values, True if its gradient is computed because none was given.
     """
 
     def __init__(
@@ -469,7 +469,7 @@ class InvariantSet:
         self.balances.check(t0, y0, f0)
 
     def _names(self, sizes: list[int]) -> list[str]:
-        """Return the names of all values."""
+        """Return names of the l values: the label of the item, with an index if it has several, or `value_names`."""
         return [
             (label if scalar else f"{label}[{j}]") if not item.value_names else item.value_names[j]
             for item, label, scalar, size in zip(self.items, self.labels, self.scalar, sizes, strict=True)
@@ -553,7 +553,7 @@ class InvariantSet:
         return self.balances.rates(low, high, time_shift(self.tau, adaptive, self.t_span), functions)
 
     def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
-        """Return the invariants with the values that the run keeps as their targets, for a run that continues it.
+        """Return the invariants for a run that continues this one, with the values that this run keeps as targets.
 
         With `at_end` the new run starts at the end of the last step, and balances continue from the values that this
         run has integrated. Otherwise it starts at another state, and balances start again from their values there.
@@ -572,7 +572,10 @@ class InvariantSet:
         )
 
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
-        """Add a compiled gradient to a jitted invariant that has none; return any other invariant unchanged."""
+        """Return a copy, with a compiled gradient, of a jitted invariant without one; any other invariant is unchanged.
+
+        If the gradient cannot be compiled, the copy has none, and the reason is stored in `why_not`.
+        """
         numbers = scalars(self.extra)
         if not _lacks_gradient(item) or numbers is None:
             return item
@@ -636,7 +639,7 @@ class InvariantSet:
         return target
 
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> Array:
-        """Return all gradients (l, n) at the start, after a check of their shapes."""
+        """Return the gradients (l, n) at the start; raise an error for wrong shapes and numbers that are not finite."""
         G = np.empty((self.size, *y.shape), y.dtype)
         for k, (item, label) in enumerate(zip(self.items, self.labels, strict=True)):
             rows = G[self.starts[k] : self.starts[k + 1]]
@@ -646,17 +649,17 @@ class InvariantSet:
         return G
 
     def values(self, t: float, y: Array) -> Array:
-        """Return all values (l,)."""
+        """Return the values (l,) of all invariants at (t, y)."""
         found: Array = self.functions.values(t, y)
         return found
 
     def gradients(self, t: float, y: Array, f: Array) -> Array:
-        """Return all gradients (l, n)."""
+        """Return the gradients (l, n) of all values at (t, y); f is the derivative of the state."""
         found: Array = self.functions.gradients(t, y, f)
         return found
 
     def term_sizes(self, t: float, y: Array, f: Array) -> Array:
-        """Return the size of the terms in each invariant: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
+        """Return the sizes (l,) of the terms in the invariants: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
         return self.sizes_of_terms(y, self.gradients(t, y, f), self.values(t, y))
 
     def sizes_of_terms(self, y: Array, G: Array, values: Array) -> Array:
@@ -695,10 +698,11 @@ class InvariantSet:
             return np.where(residual == 0, 0.0, residual / allowed)
 
     def note_rates(self, figures: Array, t: float, y: Array, f: Array, G: Array, here: Array) -> None:
-        """Update the largest rates of change along f in `figures`, relative to the terms of these rates.
+        """Update the largest rate of change of each value along f, relative to its terms, in `figures` (l, N_FIGURES).
 
-        `G` and `here` are the gradients and the values at the state. The given rate of a balance is subtracted from its
-        rate of change. Rates of balances without a given rate are not noted.
+        `figures` are the numbers about the projections of a run that `engine.trust` judges. `G` and `here` are the
+        gradients and the values at the state. The given rate of a balance is subtracted from its rate of change. Rates
+        of balances without a given rate are not noted.
         """
         own = None
         if self.balances.items:
@@ -734,12 +738,14 @@ class InvariantSet:
         Raises
         ------
         ValueError
-            If a given gradient disagrees with differences of its invariant's values, or values have single precision.
+            If a given gradient disagrees with differences of the invariant's values, or if these values have single
+            precision.
 
         Warns
         -----
         UserWarning
-            If an invariant changes along the flow of this system.
+            If an invariant changes along the flow of this system, if a computed gradient is not accurate, or if the
+            right-hand side or a gradient has single precision.
         ProjectionWarning
             If the rate of a balance is wrong.
         """
@@ -777,7 +783,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     Raises
     ------
     ValueError
-        If the gradient has the wrong shape, or `fun` is missing for ``uses_f``.
+        If the gradient has the wrong shape, or `fun` is missing for an invariant with ``uses_f=True``.
     """
     refuse_units(t=t, y=y)
     y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)

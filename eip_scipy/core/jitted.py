@@ -40,7 +40,7 @@ def is_jitted(fun: Any) -> bool:
 
 
 def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
-    """Return a `Call` with the code that Numba has compiled for states of type `dtype`, if there is any."""
+    """Return `call` with the code that Numba has compiled for states of type `dtype`, or `call` itself."""
     if not is_jitted(call.fun):
         return call
     from . import numba_entries
@@ -58,14 +58,14 @@ def jit_is_off() -> bool:
 
 
 def compilable(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Mark a function of this package as one that `jitted` may compile."""
+    """Mark a function of this package as one that `jitted` may compile, and return the function."""
     fun.compilable = True  # type: ignore[attr-defined]
     return fun
 
 
 @cache
 def jitted(fun: Any) -> Any:
-    """Jit a `compilable` function if Numba is installed; return any other function unchanged."""
+    """Return a `compilable` function jitted by Numba, if Numba is installed; return any other function unchanged."""
     if not getattr(fun, "compilable", False) or find_spec("numba") is None:
         return fun
     from numba import njit
@@ -79,7 +79,7 @@ def is_compiled(fun: Any) -> bool:
 
 
 def compiled_like(fun: Callable[..., Any], *others: Callable[..., Any]) -> Callable[..., Any]:
-    """Jit `fun` if Numba is installed and all of the `others`, which it calls, are compiled; otherwise return `fun`."""
+    """Return `fun` jitted if Numba is installed and all `others`, which `fun` calls, are compiled; else `fun`."""
     if not all(is_compiled(other) for other in others):
         return fun
     return cast(Callable[..., Any], jitted(compilable(fun)))

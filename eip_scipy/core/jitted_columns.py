@@ -29,6 +29,7 @@ def rhs_by_duals(
 ) -> Any:
     """Return ``rhs(t, Y, out, ...)``, the in-place right-hand side of a state with columns, for a jitted `fun`.
 
+    Y consists of the state (n,), the parameters with the indices `parameters`, and `columns` columns of derivatives.
     The derivatives of `fun` are computed with dual numbers and are exact up to rounding. `form` is that of `fun`, see
     `native_functions`. If `scalars` is not empty, `fun` takes numbers of these types instead of params, see `Packed`.
 
@@ -75,7 +76,11 @@ def rhs_by_duals(
 
 
 def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) -> Any:
-    """Return ``copied(params, Y, first)``, params as duals whose slopes are the columns of Y from `first` on."""
+    """Return ``copied(params, Y, first)``, which returns params as duals.
+
+    The derivatives of the duals are entries of the columns of Y from the column `first` on. Those of parameters that
+    are not in `parameters` are 0; if `parameters` is empty, params are returned unchanged.
+    """
     if not parameters:
         return inside(lambda params, Y, first: params)
     places, lanes = np.array(parameters, np.int64), dual.lanes
@@ -92,7 +97,7 @@ def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) 
 
 
 def _with_out(fun: Any, form: str, has_params: bool, one_by_one: bool) -> Any:
-    """Return ``call(t, x, out, params)``, which returns the value of `fun`, which has this `form`; it may use out."""
+    """Return ``call(t, x, out, params)``, which returns the value of `fun` at x; an in-place `fun` writes to `out`."""
     if form.endswith("place"):
         if one_by_one:
             return inside(lambda t, x, out, numbers: _second(fun(t, x, out, *numbers), out))
@@ -113,7 +118,10 @@ def _second(first, second):
 
 @lru_cache(maxsize=256)
 def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
-    """Return the in-place right-hand side of a state with columns, from jitted `fun` and ``jvp(t, y, dy, ...)``."""
+    """Return the in-place right-hand side of a state with `columns` columns of derivatives, from a jitted `fun`.
+
+    ``jvp(t, y, dy, ...)`` returns the derivative (n,) of the right-hand side along dy.
+    """
     taken = n // 2 if form.startswith("acceleration") else n
     offset, in_place = n - taken, form.endswith("place")
 
@@ -134,7 +142,10 @@ def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
 
 @lru_cache(maxsize=256)
 def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
-    """Return `rhs` as an in-place function of a state whose entries at `places` are the state of `rhs`."""
+    """Return the in-place right-hand side of a longer state, whose entries at `places` are the state of `rhs`.
+
+    The derivatives of the other entries are 0.
+    """
     order = np.array(places, np.int64)
 
     def in_place(t, Y, out, *extra):

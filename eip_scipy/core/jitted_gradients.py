@@ -29,8 +29,8 @@ SAYING = ("No implementation", "Cannot", "Unknown")
 def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
     """Return the gradient ``grad(t, y, out[, params])`` of a jitted invariant whose value has this `shape`.
 
-    It is computed with dual numbers and exact up to rounding. If `scalars` is not empty, the gradient takes numbers of
-    these types instead of params, ``grad(t, y, out, *numbers)``; see `Packed`.
+    The gradient fills `out` (*shape, n). It is computed with dual numbers and exact up to rounding. If `scalars` is not
+    empty, the gradient takes numbers of these types instead of params, ``grad(t, y, out, *numbers)``; see `Packed`.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
     """Return the rate ``rate(t, y, f[, params])`` of a jitted balance whose value has this `shape`.
 
     The rate is the derivative of the balance along (1, f) in (t, y), exact up to rounding. If `scalars` is not empty,
-    it takes numbers of these types instead of params, ``rate(t, y, f, *numbers)``; see `Packed`.
+    the rate takes numbers of these types instead of params, ``rate(t, y, f, *numbers)``; see `Packed`.
 
     Raises
     ------
@@ -78,18 +78,18 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
 
 
 def dual_along(directions: int) -> Dual:
-    """Return the dual type that gives derivatives along `directions` directions in the fewest calls of equal size."""
+    """Return the smallest dual type that needs the fewest calls for derivatives along `directions` directions."""
     passes = -(-directions // LANES)
     return Dual(-(-directions // passes))
 
 
 def new_state(dual: Any, n: int) -> Any:
-    """Return a function that allocates a state of `n` duals, on the stack if they are few."""
+    """Return a function that allocates an array of `n` duals, on the stack if n is at most `STACK`."""
     return inside((lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n)), forceinline=True)
 
 
 def _slopes_of(shape: tuple[int, ...]) -> Callable[..., Any]:
-    """Return a function that returns the derivatives, along one direction, of a dual value of this shape."""
+    """Return a function of a dual value of this shape, () or (l_i,), that returns its derivatives in the first lane."""
     if shape == ():
         return lambda value: slope(value, 0)
 

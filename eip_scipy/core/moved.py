@@ -43,12 +43,14 @@ def moved_names(module: str, stacklevel: int = 2) -> Callable[[str], Any]:
     Parameters
     ----------
     module : str
+        Full name of the module.
     stacklevel : int
         Stack level of the warning.
 
     Returns
     -------
     callable
+        ``look_up(name)``, which returns the value from its new place and issues a DeprecationWarning.
     """
     homes = MOVED[module]
 

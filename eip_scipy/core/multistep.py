@@ -33,9 +33,9 @@ DIFFERENCE = 1e-6
 class SecondOrder(NamedTuple):
     """A system q'' = a(t, q[, v]) in the form that a multistep method needs.
 
-    ``rhs(t, y) -> (n,)`` is the right-hand side of y = (q, v). ``jacobian(t, q, dq) -> (n/2,)`` is the derivative of
-    the accelerations along dq, or None. `frequencies` are the largest frequencies, as returned by the function of this
-    name of a `Problem`, or None if they are not known.
+    ``rhs(t, y) -> (n,)`` is the right-hand side of y = (q, v), and `start` is the `Start` of the run.
+    ``jacobian(t, q, dq) -> (n/2,)`` is the derivative of the accelerations along dq, or None. `frequencies` is the pair
+    (bodies, others) that ``Problem.frequencies`` returns, or None if it is not known.
     """
 
     rhs: Callable[[float, Array], Array]
@@ -57,14 +57,14 @@ def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Arra
 
 
 def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping, *, level: bool) -> None:
-    """Check the step of a run of a multistep method, and give the run its history.
+    """Check the step of a run of a multistep method, and add the history of the method to the run.
 
-    `level` is that of `RunSpec`.
+    `name` is the name of the method in messages. For `level`, see `RunSpec`.
 
     Raises
     ------
     ValueError
-        If the step is not stable at the start (not checked with ``check=False``); the message gives a stable one.
+        If the step is not stable at the start (not checked with ``check=False``); the message names a stable length.
         Also if a run with balances has too few steps for a history.
     """
     method: Any = run.tableau
@@ -81,7 +81,7 @@ def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping,
 
 
 def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, check: bool) -> slice:
-    """Return the slice of the floats of the accelerations that the Jacobian corrects.
+    """Return the slice of the floats of the accelerations that are corrected with the Jacobian.
 
     With `check`, raise a ValueError if the step h is not stable at the start.
     """
@@ -144,7 +144,7 @@ def _largest_damping(system: SecondOrder) -> float:
 
 
 def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
-    """Return the derivative of the accelerations along d in the `part` of the state, positions or velocities."""
+    """Return the derivative (n/2,) of the accelerations at the start along d in `part`, positions or velocities."""
     t, y, f, _ = system.start
     half, length = y.size // 2, DIFFERENCE * (float(np.linalg.norm(y[part])) or 1.0)
     moved = y.copy()
@@ -153,9 +153,9 @@ def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
 
 
 def _largest(product: Callable[[Array], Array], y: Array) -> float:
-    """Return the largest modulus of an eigenvalue of a matrix, to a few per cent.
+    """Return the largest modulus of an eigenvalue of a matrix, to a few per cent; 0 if products are 0 or not finite.
 
-    ``product(d)`` is the matrix times d. The vectors d have the type of y and half its size.
+    ``product(d)`` is the matrix times d. The vectors d have the type and half the size of the state y.
     """
     d, found = np.random.default_rng(0).standard_normal(y.size // 2).astype(y.dtype), 0.0
     for _ in range(ROUNDS):
@@ -201,7 +201,7 @@ def _record(
 
 
 def _aligned(shape: tuple[int, ...]) -> Array:
-    """Return zeros aligned to a cache line, because unaligned loads of vectors may take twice as long."""
+    """Return an array of zeros aligned to a cache line, because unaligned loads of vectors may take twice as long."""
     size = math.prod(shape)
     memory = np.zeros(size * 8 + ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % ALIGNMENT

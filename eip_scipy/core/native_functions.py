@@ -33,17 +33,17 @@ class Kind(NamedTuple):
     size : int
         Number of components of the state that the function receives.
     p : int
-        Number of its params; -1 if it takes none.
+        Length of the array params that the function receives; -1 if it receives none.
     dtype : str
         Type of the components of the state.
     real : bool
-        Whether the value is real even if the state is complex.
+        True if the value is real even if the state is complex.
     takes_f, in_place : bool
-        Whether the user's function takes f, and whether it fills an argument `out`.
+        True if the user's function takes f; True if it fills an argument `out`.
     gradient : bool
-        Whether the engine calls it with the arguments of a gradient, which include f.
+        True if the engine calls the function with the arguments of a gradient, which include f.
     scalars : str
-        Types of the numbers that it takes instead of params, see `Packed`.
+        Types of the numbers that the function takes instead of params, see `Packed`.
     """
 
     shape: tuple[int, ...]
@@ -58,7 +58,7 @@ class Kind(NamedTuple):
 
 
 class Native(NamedTuple):
-    """A function that has an address, and the number of floats that it fills.
+    """A function that the engine calls, and the number of floats that the function fills.
 
     `function` is None for a gradient, or the rate of a balance, that the engine computes itself.
     """
@@ -68,7 +68,7 @@ class Native(NamedTuple):
 
     @property
     def entry(self) -> Any:
-        """The form for the engine: a `LibraryFunction` or None itself, the address of any other function."""
+        """Form in which the engine receives the function: its address, or the `LibraryFunction` or None itself."""
         if self.function is None or isinstance(self.function, LibraryFunction):
             return self.function
         return self.function.address
@@ -77,7 +77,7 @@ class Native(NamedTuple):
 def native_functions(
     fun: Callable[..., Any], form: str, params: Packed | None, invariants: InvariantSet, y0: np.ndarray
 ) -> NativeFunctions:
-    """Return the addresses of the functions of a run, without its events.
+    """Return the addresses of the functions of a run, without those of its events.
 
     Parameters
     ----------
@@ -92,8 +92,9 @@ def native_functions(
     Raises
     ------
     NotCompilableError
-        If one of them is neither a function of the library's problems, nor a C function by pointer, nor a lazily
-        jitted Numba function of the arguments that `integrate` documents.
+        If one of these functions is neither a function of the library's problems, nor a C function by pointer, nor a
+        Numba function of the arguments that `integrate` documents; or if an invariant has `args`, or no gradient that
+        can be compiled.
     """
     n, second_order = y0.size, form.startswith("acceleration")
     size = n // 2 if second_order else n
@@ -137,8 +138,8 @@ def native_functions(
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
     """Return the function that the engine calls for `fun`, and its signature.
 
-    For a function of a state with columns of derivatives both come from its `OfState`; otherwise they are `fun` and
-    `number` themselves.
+    For a function of a state with columns of derivatives, its attribute `of_state` has both. Otherwise the function
+    returns `fun` and `number`.
     """
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
@@ -147,7 +148,7 @@ def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
 def function_alone(
     fun: Callable[..., Any], kind: Kind, name: str, params: np.ndarray | None, *, second_order: bool = False
 ) -> NativeFunctions:
-    """Return the address of a right-hand side of the signature `kind`, without invariants and events.
+    """Return `NativeFunctions` with a right-hand side of the signature `kind`, without invariants and events.
 
     Raises
     ------
@@ -170,7 +171,7 @@ def function_alone(
 def with_events(
     functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
-    """Return the functions with the addresses of the events.
+    """Return a copy of `functions` with the addresses of the events.
 
     Raises
     ------
@@ -190,7 +191,7 @@ def with_events(
 def with_jacobian(
     functions: NativeFunctions, jacobian: Callable[..., Any], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
-    """Return the functions with the address of ``jacobian(t, q, dq, out[, params])``, the Jacobian times a vector.
+    """Return a copy of `functions` with the address of ``jacobian(t, q, dq, out[, params])``, the Jacobian times dq.
 
     Raises
     ------
@@ -207,7 +208,7 @@ def with_jacobian(
 def with_rates(
     functions: NativeFunctions, invariants: InvariantSet, params: Packed | None, y0: np.ndarray, adaptive: bool
 ) -> NativeFunctions:
-    """Return the functions with the addresses of the rates of balances.
+    """Return a copy of `functions` with the addresses of the rates of balances.
 
     Raises
     ------
@@ -229,7 +230,10 @@ def with_rates(
 
 
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:
-    """Raise the exception of a call that failed in the engine; the other arguments are those of its `FailedCallError`.
+    """Raise the exception of a function whose call failed in the engine.
+
+    The arguments after `functions` are those of the `FailedCallError` that the engine raised: `group` and `k` identify
+    the function, which was called with t, y and f, and returned `status`.
 
     Raises
     ------
@@ -249,10 +253,10 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
 
 
 def _native(fun: Any, kind: Kind, name: str, floats: int, **others: Any) -> Native:
-    """Return a function with its address.
+    """Return a function as `Native`, compiled if it is a Numba function.
 
-    `name` is its name in messages, and `floats` the number of floats that it fills. Its signature is `kind`, of which
-    `others` replaces some fields.
+    `name` is the name of the function in messages, and `floats` the number of floats that the function fills. The
+    signature is `kind` with the fields `others`.
     """
     if isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)

@@ -1,4 +1,4 @@
-"""The code that Numba has compiled already for a user's functions, which the engine calls without Python's objects."""
+"""Code that Numba has already compiled for a user's functions; the engine calls it without making Python objects."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ WORD, ADDRESS = ir.IntType(64), ir.IntType(8).as_pointer()
 
 
 def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
-    """Return the description of a Numba function ``fun(t, y)`` with its compiled code, if it has the expected form.
+    """Return `call`, of a Numba function ``fun(t, y)``, with the function's compiled code for states of type `dtype`.
 
-    Nothing is compiled: the code exists as soon as the function has been called once with such a state.
+    Return `call` itself if there is no such code, or if the engine cannot call it. Nothing is compiled here: the code
+    exists as soon as the function has been called once with such a state.
     """
     if call.args or call.takes_f or call.in_place or len(call.shape) > 2:
         return call

@@ -37,9 +37,12 @@ def register() -> None:
 
 @cache
 def _jitted(function: Any) -> Any:
-    """Return a jitted function that calls a `LibraryFunction` with arguments of any layout."""
+    """Return a jitted function that calls a `LibraryFunction` with arrays of any memory layout."""
     if function.own or function.numbers < 0:
-        raise TypeError(f"{function.__name__} cannot be called by jitted functions.")
+        raise TypeError(
+            f"{function.__name__} cannot be called by jitted functions, because it has fixed parameters, or a value of "
+            "no fixed size."
+        )
     fill = _inlined(_filling(function))
     if function.in_place and function.takes_f:
         return _inlined(lambda t, y, f, out, params: fill(t, y, f, out, params))
@@ -52,7 +55,10 @@ def _jitted(function: Any) -> Any:
 
 
 def _value_of(function: Any, fill: Any) -> Callable[..., Any]:
-    """Return a function that returns what `fill` writes: a number if there is only one, otherwise an array."""
+    """Return ``value(t, y, f, params)``, which returns the one number that `fill` writes, or an array.
+
+    A function that takes f, such as a gradient, always returns an array.
+    """
     numbers, of_state = function.numbers, function.fills_states
 
     def number(t, y, f, params):
@@ -106,7 +112,7 @@ def _is_plain(array: Any) -> bool:
 
 
 def _floats(values: Any) -> Any:
-    """Return an array itself if its memory is that of C floats, otherwise a copy; for jitted functions."""
+    """Return `values` itself if it is a C-contiguous array of float64, else a flat copy; for jitted functions."""
     raise NotImplementedError
 
 
@@ -144,7 +150,7 @@ def _write_back_to(values, out):
 
 @_inlined
 def _apart(values, out):
-    """Return `values`, or a copy if `out` shares memory with them, because the library's functions read them again."""
+    """Return `values`, or a copy if `out` shares memory with them, as library functions read them after writing."""
     distance = out.ctypes.data - values.ctypes.data
     if -8 * out.size < distance < 8 * values.size:
         return values.copy()

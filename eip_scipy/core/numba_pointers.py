@@ -49,7 +49,7 @@ class Compiled(NamedTuple):
         return self.pointer.address
 
     def failure(self, t: float, y: bytes, f: bytes, params: np.ndarray) -> RuntimeError:
-        """Call the function again, so that its exception propagates; return an error if it raises nothing then."""
+        """Call the function again at t and y, so that its exception propagates; return an error if it raises none."""
         kind = self.kind
         state = np.frombuffer(y, kind.dtype)[: kind.size].copy()
         slope = np.frombuffer(f or bytes(len(y)), kind.dtype).copy()
@@ -70,7 +70,8 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
     Raises
     ------
     NotCompilableError
-        If the function does not compile for the arguments that `integrate` documents.
+        If the function does not compile for the arguments that `integrate` documents, or returns a list, a tuple or,
+        in some branches, None.
     """
     try:
         pointer = _compile(fun, kind, number)
@@ -86,7 +87,7 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
 
 @lru_cache(maxsize=256)
 def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
-    """Compile a function; the same function, signature and `number` are compiled once in a process."""
+    """Return the `Pointer` to a Numba function; equal functions, `kind` and `number` are compiled once in a process."""
     call = _with_all_arguments(fun, kind, _inlined)
 
     def array(scalar: Any, ndim: int) -> Any:
@@ -104,9 +105,9 @@ def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
 
 
 def _c_function(compiled: Any, kind: Kind) -> Pointer:
-    """Wrap a function compiled for (t, y, f, out, params) as a C function that returns 0, or -1 after an exception.
+    """Return the pointer to a C function that calls `compiled(t, y, f, out, params)` and returns 0, or -1 if it raises.
 
-    The wrapper is written in LLVM's language, because Numba's `cfunc` would take twice as long to compile, and each
+    The C function is written in LLVM's language, because Numba's `cfunc` would take twice as long to compile, and each
     call would go through another function.
     """
     name = f"eip_scipy.{next(_serial)}"
@@ -130,7 +131,7 @@ def _c_function(compiled: Any, kind: Kind) -> Pointer:
 
 
 def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tuple[int, ...]) -> Any:
-    """Return the C array of this shape at `data` as a value of Numba's array type `kind`, without an owner."""
+    """Return the C array of this shape at `data` as a value of Numba's array type `kind`, which does not own it."""
     array = context.make_array(kind)(context, builder)
     item = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     strides = np.cumprod((item, *shape[:0:-1]))[::-1].tolist()

@@ -33,7 +33,7 @@ class OneStepMethod(Protocol):
         Evaluations of the right-hand side, or of a part of it, in one step: each step adds this number to ``nfev``.
         Default: 0, because evaluations inside a user-defined method cannot be counted.
     name : str, optional
-        Default: the name of the object's class.
+        Name in messages. Default: the name of the object's class.
     """
 
     order: int
@@ -52,8 +52,8 @@ class OneStepMethod(Protocol):
         Returns
         -------
         y_hat : ndarray, shape (n,)
-            With `error_estimator_order` the pair ``(y_hat, err)``, the estimate of shape (n,). Both must depend on
-            the arguments only, not on the calls before.
+            State at t + h. If the method has `error_estimator_order`, the pair ``(y_hat, err)`` with the error estimate
+            `err` (n,). The result must depend on the arguments only, not on earlier calls.
         """
         ...  # pragma: no cover
 
@@ -77,9 +77,9 @@ class OneStep(Ordered):
     Raises
     ------
     TypeError
-        If the object is not a `OneStepMethod`.
+        If the object is not an instance of `OneStepMethod`.
     ValueError
-        If an order is not an integer >= 1.
+        If an order is not an integer >= 1, or `evaluations` is not an integer >= 0.
 
     Notes
     -----

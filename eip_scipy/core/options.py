@@ -87,13 +87,13 @@ class ProjectionDetails(TypedDict, total=False):
 
 
 class ProjectionKeywords(ProjectionDetails, total=False):
-    """The names of `ProjectionOptions` as keywords, for type checkers."""
+    """The options of the projection as keywords, with the invariants, for type checkers."""
 
     invariants: Invariant | Callable[..., Any] | Iterable[Invariant | Callable[..., Any]]
 
 
 def _text(kind: str, text: str) -> dict[str, str]:
-    """Return the type and the description of an option for docstrings."""
+    """Return the type (`kind`) and the description (`text`) of an option, which its docstrings show."""
     return {"kind": kind, "text": " ".join(text.split())}
 
 
@@ -153,7 +153,7 @@ class ProjectionOptions:
         default=1,
         metadata=_text(
             "int",
-            "Number of Newton steps of the projection. 1 (default) is the EIP method, more the standard projection.",
+            "Number of Newton steps of the projection. 1 (default) gives the EIP method, more the standard projection.",
         ),
     )
     every: int | str | None = field(
@@ -207,13 +207,13 @@ class ProjectionOptions:
 
     @classmethod
     def of(cls, keywords: Mapping[str, Any]) -> tuple[ProjectionOptions, dict[str, Any]]:
-        """Return the options contained in keywords, and the other keywords."""
+        """Return the `ProjectionOptions` made from keywords, and the dictionary of the other keywords."""
         own, others = cls.split(keywords)
         return cls(**own), others
 
     @classmethod
     def split(cls, keywords: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the keywords that are options, and the others."""
+        """Return two dictionaries: the keywords that are options of the projection, and the other keywords."""
         names = cls.names()
         own = {name: value for name, value in keywords.items() if name in names}
         return own, {name: value for name, value in keywords.items() if name not in own}
@@ -224,7 +224,7 @@ class ProjectionOptions:
         Raises
         ------
         TypeError, ValueError
-            If a value is wrong, or the method does not support an option.
+            If a value is wrong, or `method` or an invariant does not support an option.
         """
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
@@ -307,7 +307,7 @@ class ProjectionOptions:
         }
 
     def _require_plain(self) -> None:
-        """Raise ValueError for options that do not apply to balances with components."""
+        """Raise ValueError if an option is given that does not apply to balances with components."""
         if self.metric is not None or self.direction != "new" or self.iterations != 1:
             raise ValueError(
                 "metric, direction and iterations do not apply to balances with components, which have their own "
@@ -355,7 +355,7 @@ def _far_by_tolerances(rtol: np.ndarray) -> float:
 
 
 def _band(method: AnyMethod, compensated: bool) -> float:
-    """Return the dead band of an invariant, in units of the rounding error of its terms."""
+    """Return the size of residuals that are not corrected, in units of the rounding error of the invariant's terms."""
     if method.has_history:  # these methods correct only a part of an error within rounding
         return BAND_MULTISTEP
     return BAND_COMPENSATED if compensated else BAND
@@ -378,7 +378,7 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
 
 
 def _balances(method: AnyMethod, known: InvariantSet) -> Balances:
-    """Return the balances of a run; there are none if a single state is projected."""
+    """Return the engine's record of the balances of a run; it is empty if `project` projects a single state."""
     if not known.balances.items or method is AT_REST:
         return NO_BALANCES
     return Balances(known.balances.places, steppers.rated(method))
@@ -390,7 +390,7 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
     Raises
     ------
     ValueError
-        If some items have components and others do not, components are outside the state, or the state is complex.
+        If some invariants have components and others do not, components are outside the state, or the state is complex.
     """
     lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.subspaces]
     if len(lacking) == len(known.items):
@@ -428,7 +428,7 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
 
 
 def _are_of_bodies(components: np.ndarray, weight: np.ndarray) -> bool:
-    """Return True if the directions come in triples x, y, z, each with the same bodies and the same weights."""
+    """Return True if the rows of `components` (s, k) are triples x, y, z of k bodies with the same `weight` (s, k)."""
     if len(components) % 3:
         return False
     alike = (weight.reshape(-1, 3, weight.shape[1]) == weight[::3, None]).all()
@@ -440,14 +440,14 @@ def _starts(sizes: list[int]) -> np.ndarray:
 
 
 def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
-    """Return True if `JointInvariants` can make the projections of a run with these options cheaper."""
+    """Return True if the run can project by the functions `moments` and `shift` of `JointInvariants`."""
     plain = (options.metric, options.direction, options.iterations) == (EUCLIDEAN, NEW, 1)
     free = options.frame.products.size == 0 and options.every != AUTO and not options.compensated
     return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items
 
 
 def takes_projection_options(documented: Documented) -> Documented:
-    """Insert the options into the signature and the docstring of a function or class that accepts them as keywords."""
+    """Return a function or class that accepts the options as keywords, with these in its signature and docstring."""
     function: Any = vars(documented)["__init__"] if isinstance(documented, type) else documented
     signature = inspect.signature(function)
     *own, rest = signature.parameters.values()

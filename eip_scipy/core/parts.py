@@ -43,7 +43,7 @@ class SolverOfParts(EIPSolver):
 
     @property
     def place(self) -> tuple[int, int]:
-        """Return the number of this process and the number of processes."""
+        """Return the number of this process, counted from 0, and the number of processes."""
         raise NotImplementedError
 
     def gathered(self, a: Any) -> np.ndarray:
@@ -79,8 +79,8 @@ class SolverOfParts(EIPSolver):
 class _Coordinates:
     """The projection in coordinates of the space that the gradients span; the origin is the unprojected state.
 
-    The engine calls `rhs`, `inv` and `grad` with coordinates of all processes: ``c[rank * l + i]`` belongs to row i of
-    the basis on process `rank`.
+    The engine calls `rhs`, `inv` and `grad` with the coordinates c of all processes: ``c[rank * l + i]`` multiplies row
+    i of the orthonormal basis on process number `rank`.
     """
 
     def __init__(self, solver: SolverOfParts) -> None:

@@ -96,12 +96,17 @@ class PointerFunction:
         self._function = PROTOTYPES[kind](self.address)
 
     def __call__(self, t: float, y: np.ndarray, *others: Any) -> Any:
-        """Call the function. Entries of the value that it does not fill are NaN; all are NaN if the status is above 0.
+        """Call the function; return its value if `shape` is given, else None.
+
+        Entries of a returned value that the function does not fill are NaN. All entries of the value are NaN if the
+        status is above 0.
 
         Raises
         ------
         RuntimeError
             If the function returns a status below 0.
+        TypeError
+            If the last arguments are neither numbers nor one array of floats.
         """
         rest = list(others)
         state = np.ascontiguousarray(y, complex if np.iscomplexobj(y) else float)
@@ -137,7 +142,7 @@ class PointerFunction:
         )
 
     def failure(self, t: float, status: int) -> RuntimeError:
-        """Return the error for a negative status."""
+        """Return the error for a call at `t` that returned the negative `status`."""
         return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; a status below 0 ends the run.")
 
 
@@ -154,7 +159,7 @@ def is_pointer(fun: Any) -> bool:
 
 
 def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
-    """Return a C function pointer as a `PointerFunction` with these keywords; return anything else unchanged.
+    """Return a C function pointer as a `PointerFunction` with the keywords `form`; return anything else unchanged.
 
     Raises
     ------
@@ -165,7 +170,7 @@ def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
 
 
 def address_hint(fun: Any) -> str:
-    """Return an additional hint for an integer given instead of a function."""
+    """Return the end of a message: a hint if `fun` is an integer, such as an address, otherwise ""."""
     if isinstance(fun, bool) or not isinstance(fun, (int, np.integer)):
         return ""
     return "; an address does not contain the signature: give a ctypes or cffi pointer, or a scipy.LowLevelCallable"

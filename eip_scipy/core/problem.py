@@ -30,7 +30,7 @@ SAME_S = 1e-4
 
 
 class Deferred:
-    """A function that is created when it is first needed.
+    """A function that is created when it is first called.
 
     Parameters
     ----------
@@ -42,12 +42,12 @@ class Deferred:
         self._make = make
 
     def __call__(self, *args: Any) -> Any:
-        """Call the function."""
+        """Return the value of the function, which is created in the first call."""
         return self.function(*args)
 
     @cached_property
     def function(self) -> Callable[..., Any]:
-        """Return the function itself."""
+        """Return the function, which is created when this attribute is first read."""
         return self._make()
 
 
@@ -168,7 +168,8 @@ class Problem:
             by `integrate`.
         method : type or str
             An EIP method, which receives the invariants, metric, blocks and frame, and the step `h` unless rtol, atol,
-            first_step, max_step or h is given; or a method of SciPy, which receives none of these.
+            first_step, max_step or h is given; or a method of SciPy, which receives none of these. Implicit EIP methods
+            receive `stiff_invariants` and no step. All methods receive the events.
         **options
             Options of `solve_ivp` and of the method; they take precedence.
 
@@ -213,7 +214,7 @@ class Problem:
 
     @property
     def unit_system(self) -> tuple[Unit, Unit] | None:
-        """Units of length and time, if `units` names both."""
+        """Units of length and time if `units` names both, else None."""
         return known_units(self.units)
 
     @property
@@ -223,15 +224,15 @@ class Problem:
 
     @property
     def stiff_invariants(self) -> tuple[Any, ...]:
-        """Invariants that implicit methods keep by default; balances are not included.
+        """Invariants that implicit methods keep by default: all except objects of the class `Balance`.
 
-        A problem that knows which of its invariants is an energy excludes it: implicit methods damp fast oscillations,
+        A subclass that knows which of the invariants is an energy excludes it: implicit methods damp fast oscillations,
         and a projection onto an energy that contains them would transfer the lost part to the slow motion.
         """
         return tuple(item for item in self.invariants if not item.is_balance)
 
     def observed(self, t: Any, y: Any, params: Any = None) -> dict[str, Any]:
-        """Return further fields of the result of a run, by name, computed from its states; none for this class.
+        """Return further fields of the result of a run, by name, computed from the states of a run; {} for this class.
 
         Parameters
         ----------
@@ -306,7 +307,7 @@ class Problem:
         return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
     def _plain_state(self, y0: Any) -> Any:
-        """Return the state from positions and velocities with units; anything else is returned unchanged."""
+        """Return the state (n,) from a pair (positions, velocities) with units; return any other `y0` unchanged."""
         names, known = self.component_names or (), self.unit_system
         half = len(names) // 2
         pair = isinstance(y0, tuple | list) and len(y0) == 2 and all(map(has_unit, y0))
@@ -320,7 +321,10 @@ class Problem:
         return np.concatenate([q, v])
 
     def _own_start(self, time: Any, t0: float) -> float:
-        """Return the starting time of the problem if it is the given date, else raise ValueError."""
+        """Return the starting time of the problem if `time`, the date of `t0`, is the date at which the problem starts.
+
+        Raise ValueError if it is another date. Return `t0` if the problem has no units, no epoch or no `t_span`.
+        """
         known = self.unit_system
         if known is None or self.epoch is None or self.t_span is None:
             return t0
@@ -394,16 +398,16 @@ def _derivative(rhs: Callable[..., None], extra: tuple[np.ndarray, ...], t: floa
 
 
 def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
-    """Return an invariant made from the function of `library` with that name and its gradient."""
+    """Return the invariant `name`, made from the functions `function` and ``{function}_gradient`` of `library`."""
     fun, grad = library[function], library[f"{function}_gradient"]
     return Invariant(fun, grad, args=(params,), in_place=True, uses_f=grad.takes_f, name=name)
 
 
 def library_variational(function: str, names: tuple[str, ...], parameters: tuple[int, ...]) -> Callable[..., None]:
-    """Return the function of `library` of that name for a state with columns of derivatives, see `Problem`.
+    """Return the function of `library` for a state with columns of derivatives: ``Problem.variational(parameters)``.
 
-    `names` contains the name of the first parameter if the library has derivatives with respect to it, else nothing.
-    The function for a state whose last column is this derivative is called ``{function}_by_parameter``.
+    It is called `function`, or ``{function}_by_parameter`` if the last column is the derivative by the first parameter.
+    `names` contains the name of this parameter if `library` has that derivative; otherwise it is empty.
     """
     if not parameters:
         return library[function]

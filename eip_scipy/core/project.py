@@ -59,7 +59,7 @@ def project(
         Derivative of the system at y_hat, or ``f(t, y)``, for invariants with ``uses_f=True``; it must be a callable if
         `iterations` is above 1.
     start : array_like, shape (n,), optional
-        State at which invariants without a `target` have their target values, at time `t`.
+        State at which invariants without a `target` have the values that y_hat is projected onto, at time `t`.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def project(
     ------
     ValueError
         If an invariant has no target, an argument has a wrong shape or value, or the projection fails: an invariant
-        error is not finite, or larger after the projection than before.
+        error is not finite, or is larger after the projection than before.
 
     Warns
     -----

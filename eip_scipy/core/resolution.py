@@ -74,7 +74,7 @@ def unresolved(
 def runge_kutta_step(
     A: Array, b: Array, c: Array, rhs: Callable[[float, Array], Array], t: float, h: float, y: Array
 ) -> Array:
-    """Return the state after a step of length h, which may be negative, by an explicit Runge-Kutta method."""
+    """Return the state (n,) after a step of length h, which may be negative, by the Runge-Kutta method (A, b, c)."""
     K = np.empty((b.size, y.size), y.dtype)
     for i in range(b.size):
         K[i] = rhs(t + c[i] * h, y + h * (A[i, :i] @ K[:i]))
@@ -91,13 +91,13 @@ def _nystrom_step(method: Method, rhs: Callable[[float, Array], Array], t: float
 
 
 def _norms(state: Array, groups: Grouping) -> Array:
-    """Return the 2-norm of each block of a state."""
+    """Return an array with the 2-norm of each block of a state."""
     squares = np.ascontiguousarray(state).view(float)[groups.member] ** 2
     return np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
 
 
 def _components(groups: Grouping, block: int) -> str:
-    """Return the components of a block as words behind "component"."""
+    """Return the text after "component" in a message that names the components of a block: " 3" or "s 0, 1, 2"."""
     floats = groups.member[groups.start[block] : groups.start[block + 1]].astype(int)
     places = np.unique(floats // groups.width).tolist()
     return f" {places[0]}" if len(places) == 1 else "s " + ", ".join(map(str, places[:6])) + ", ..." * (len(places) > 6)

@@ -84,7 +84,7 @@ class Diagnostics:
         moved: str = "",
         slow: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        """Attach the buffers of a run, so that reading them does not slow down the run."""
+        """Keep the buffers of a run, from which the attributes are computed when they are read."""
         self.names = trust.names
         self._trust = trust
         self.max_defect = max_defect
@@ -117,7 +117,7 @@ class Diagnostics:
 
     @property
     def n_softened(self) -> int:
-        """Number of projections with more equal weights than those of the error metric."""
+        """Number of projections with weights that are more equal than those of the error metric."""
         return int(self._counters[SOFTENED])
 
     @property
@@ -127,12 +127,12 @@ class Diagnostics:
 
     @property
     def max_correction(self) -> float:
-        """Largest correction in units of the local error."""
+        """Largest correction in units of the local error of the step; nan without an error estimate."""
         return float(self._max_correction[0]) if self._estimated else float("nan")
 
     @property
     def trusted(self) -> bool:
-        """True if the run is reliable."""
+        """True if no step failed and no check found an error; it says nothing about the accuracy of the trajectory."""
         return self._trust.trusted
 
     @property
@@ -142,17 +142,20 @@ class Diagnostics:
 
     @property
     def worst(self) -> tuple[str, float, float] | None:
-        """Invariant, time and size of the largest correction, in units of the local error."""
+        """Invariant, time and size of the largest correction, in units of the local error; None if not measured."""
         return self._trust.worst
 
     @property
     def corrections(self) -> np.ndarray:
-        """Largest correction of each invariant in units of the local error, (l,)."""
+        """Largest correction of each invariant in units of the local error, (l,); nan if none was measured."""
         return self._trust.corrections
 
     @property
     def slowness(self) -> np.ndarray:
-        """Mean rate of each balance in units of its terms, (l,): the larger of those over the run and over its end."""
+        """Mean rate of each balance, divided by the mean of the terms of ``grad @ f``, (l,); nan for invariants.
+
+        It is the larger of the ratios for the whole run and for about the last eighth of its samples.
+        """
         places, sums = self._slow
         found = np.full(len(self.names), np.nan)
         found[places] = slowness(sums)
@@ -179,10 +182,11 @@ class Diagnostics:
 
 
 def slowness(sums: np.ndarray) -> np.ndarray:
-    """Return the mean rates (b,) of balances in units of their terms, from the sums (N_SLOW, b) of both.
+    """Return `Diagnostics.slowness` (b,) of the balances, from the sums (N_SLOW, b) of rates and terms.
 
     A mean over the whole run does not detect a balance that is slow only while its terms are large, such as the energy
-    of an oscillator that is damped until its driving dominates. The larger of both means is returned.
+    of an oscillator that is damped until its driving dominates. Therefore the larger of two ratios is returned: those
+    of the sums over the whole run, and of the sums over its last part.
     """
     rates, terms = sums[[ALL_RATES, LATE_RATES]], sums[[ALL_TERMS, LATE_TERMS]]
     known = terms > 0
@@ -190,7 +194,7 @@ def slowness(sums: np.ndarray) -> np.ndarray:
 
 
 def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return the sums (N_SLOW, b) of a run and its continuation; the late sums decay as in a single run."""
+    """Return the sums (N_SLOW, b) of a run, `one`, and its continuation, `two`, as if they were a single run."""
     both = one + two
     late = [LATE_RATES, LATE_TERMS]
     kept = (one[SAMPLES] / np.maximum(both[SAMPLES], 1.0)) ** (1 / LATE_SHARE)
@@ -199,14 +203,15 @@ def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
 
 
 class Multipliers(NamedTuple):
-    """Lagrange's multipliers, by the names of the constraints on velocities.
+    """Lagrange multipliers of m constraints on velocities, at one state or at k states.
 
     Attributes
     ----------
     names : tuple of str
+        Names of the constraints.
     values : ndarray, shape (m,) or (m, k)
-        lambda of M u' + G^T lambda = F: the constraints exert the generalised forces -G^T lambda. The unit is that of
-        power divided by that of the constraint's time derivative.
+        lambda of M u' + G^T lambda = F: the constraints exert the generalised forces -G^T lambda. The unit of lambda is
+        that of power, divided by that of the constraint on velocities.
     rank : int or ndarray of int, shape (k,)
         Rank of the constraints. Where it is below m, forces are distributed over dependent constraints such that the
         sum of the squares of ``lambda_i |G_i|`` is least.
@@ -218,7 +223,7 @@ class Multipliers(NamedTuple):
 
     @property
     def unique(self) -> Any:
-        """True where the multipliers are the only solution."""
+        """True if the multipliers at a state are the only solution; for k states a mask (k,)."""
         return self.rank == len(self.names)
 
 

@@ -111,7 +111,7 @@ class RunSpec:
         return run
 
     def examined(self, y0: Array, f0: Array | None = None) -> tuple[AnyMethod, Array]:
-        """Return the method for these equations, and the derivative at the start."""
+        """Return the method after a check of the equations, see `steppers.checked`, and the derivative (n,) at y0."""
         t0 = self.stepping.span.t0
         guard: AbstractContextManager[None] = nullcontext()
         if self.fun is not None and self.method.of_second_order:
@@ -134,7 +134,11 @@ class RunSpec:
         run.method.begin(self.rhs, start, self.stepping, self.jacobian())
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
-        """Return the length of the first step, which columns of derivatives do not change."""
+        """Return the length of the first step.
+
+        It is chosen from the state alone, without the columns of derivatives with respect to the start and the
+        parameters that may follow it.
+        """
         columns = self.columns
         if columns is None:
             return self.stepping.first(self.rhs, y0, f0, method)
@@ -174,7 +178,13 @@ class RunSpec:
         )  # fmt: skip
 
     def _check(self, run: Run, invariants_too: bool) -> None:
-        """Project the start if that is requested, and raise an error if the start misses the targets."""
+        """Project the start if that is requested, and check the invariants there if `invariants_too`.
+
+        Raises
+        ------
+        ValueError
+            If the start misses a target, the projection fails, or the check finds an error.
+        """
         if run.options.frame.products.size:
             run.options = run.options._replace(scales=_scales(run))
         if self.projection.project_initial:
@@ -193,10 +203,12 @@ class RunSpec:
 
 
 def _scales(run: Run) -> Array:
-    """Return the scales of the invariants' dead bands, which are infinite for invariants that are functions of C y.
+    """Return the scales (l,) of the dead bands, within which errors of the invariants are not corrected.
 
-    Corrections do not change these, because the frame removes their gradients up to rounding. The gradients are
-    examined at two states, because a gradient may be a combination of rows of C by chance.
+    Invariants that are functions of C y alone, where C is the matrix of the linear constraints of the option `frame`,
+    get scales so large that their errors stay within the dead bands. Corrections, which leave C y unchanged, could not
+    reduce these errors. The gradients are examined at two states, because a gradient may be a combination of rows of C
+    by chance.
     """
     (t0, y0, f0, tau), frame, invariants, G = run.begin, run.options.frame, run.invariants, run.work.G
     held = spanned(frame, G.view(float))
@@ -208,7 +220,13 @@ def _scales(run: Run) -> Array:
 
 
 def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
-    """Return the start projected onto the targets, by full Newton steps in the euclidean metric."""
+    """Return the start projected onto the targets, by full Newton steps in the euclidean metric.
+
+    Raises
+    ------
+    ValueError
+        If the projection fails, or the projected state misses a target.
+    """
     t0, y0, f0, _ = run.begin
     options = run.options._replace(
         metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
@@ -222,7 +240,10 @@ def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
 
 
 def _moved(before: Array, after: Array, floors: Array) -> str:
-    """Return a sentence on how far the projection moved the start; "" if none moved by more than TARGET_TOLERANCE."""
+    """Return a sentence on how far the projection moved the components of the start.
+
+    It is "" if no component moved by more than TARGET_TOLERANCE of its size, which is at least `floors` (n,).
+    """
     share = np.abs(after - before) / np.maximum(np.abs(before), floors)
     count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0
     if not count:

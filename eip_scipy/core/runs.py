@@ -26,7 +26,7 @@ __all__ = ["Counted", "Run", "Start"]
 
 
 class Start(NamedTuple):
-    """Start of a run: time, state, derivative, and the scale of time, which is the fixed step or the first step."""
+    """Start of a run: time, state, derivative, and the length of the fixed or first step, which is a scale of time."""
 
     t: float
     y: np.ndarray
@@ -90,7 +90,7 @@ class Run:
     def engine(
         self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
     ) -> Engine:
-        """Return the engine of the run; work.K[0] must hold the derivative.
+        """Return the engine of the run; work.K[0] must hold the derivative at the state from which it steps.
 
         `begins` is False if the engine continues a run. `others` are further `Hooks`.
         """
@@ -143,10 +143,10 @@ class Run:
         return self.invariants.size > 0 and (self.options.every != 1 or self.tableau.has_history)
 
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
-        """Examine a run after `steps` steps, or at its end (`ended`). Return True if it must be reported now.
+        """Examine a run after `steps` steps, or at its end (`ended`), and return True if it must be reported as faulty.
 
-        Steps that the engine suspects are examined. The invariants are checked after 10, 100, 1000, ... steps, at the
-        end, and if the corrections are too large, to find the reason. `rhs` returns a new array.
+        Steps that the engine has marked as suspicious are examined. The invariants are checked after 10, 100, 1000, ...
+        steps, at the end, and if the corrections are too large, to find the reason. `rhs` returns a new array.
         """
         if not self.options.watched or self.trust.failed:
             return False  # a failure has its own message
@@ -186,12 +186,15 @@ class Run:
         )
 
     def _is_doubtful(self, ended: bool) -> bool:
-        """Return True if the run is unreliable because of its corrections, or certainly will be at its end."""
+        """Return True if corrections or errors show that the run is faulty.
+
+        Before the end of the run they do so only if later projections cannot make it reliable again.
+        """
         return self.trust.is_sick if ended else self.trust.beyond_doubt
 
     @cached_property
     def examiner(self) -> Examiner:
-        """Return the examiner of the run's states."""
+        """Return the `Examiner` of the run's steps and states."""
         resolution = partial(unresolved, self.method, self.options.groups)
         return Examiner(self.invariants, self.start.tau, self.work.trust, resolution)
 
@@ -206,7 +209,7 @@ class Counted:
         self.count = 0
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the derivative."""
+        """Return the derivative (n,) at (t, y) as a new array, and count the call."""
         self.count += 1
         return self._rhs(t, y).copy()
 

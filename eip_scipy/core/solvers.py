@@ -131,11 +131,12 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     Between two steps, ``fun``, ``t``, ``y``, ``f``, ``t_bound`` (with ``status = "running"`` after the end),
     ``direction``, ``max_step``, ``h_abs``, ``rtol``, ``atol`` and, with fixed steps, ``h`` may be set, and the next
     step uses the new values. Setting the state or the time is a new start: each invariant without a given target takes
-    its value there as target, given targets must be met, and the figures that judge the projection are reset, while
-    counts and the largest residuals continue. If ``y``, ``t`` or ``fun`` was set and ``f`` was not, the derivative is
-    evaluated again; only `EIPRK23`, `EIPRK45` and `EIPDOP853` without invariants keep the old one for the first stage,
-    as SciPy's methods do. A multistep method starts again after any change. A wrong value raises an error in the next
-    step. Copies made by `copy.deepcopy` or `pickle` continue to the same bits; pickling needs functions that pickle.
+    its value there as target, given targets must be met, and the record of corrections by which the run is judged is
+    reset, while counts and the largest residuals continue. If ``y``, ``t`` or ``fun`` was set and ``f`` was not, the
+    derivative is evaluated again; only `EIPRK23`, `EIPRK45` and `EIPDOP853` without invariants keep the old one for the
+    first stage, as SciPy's methods do. A multistep method starts again after any change. A wrong value raises an error
+    in the next step. Copies made by `copy.deepcopy` or `pickle` continue to the same bits; pickling needs functions
+    that pickle.
 
     With ``every=k`` the states between two projections are returned as projected copies, also by dense output; the
     steps continue from the unprojected states.
@@ -246,7 +247,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self.rtol, self.atol = _frozen(stepping.rtol), _frozen(stepping.atol)
 
     def _specified(self, stepping: Stepping, projection: ProjectionOptions) -> RunSpec:
-        """Return the `RunSpec` of the solver's present function."""
+        """Return a `RunSpec` of the solver's present right-hand side with these options."""
         moved = times(self._jacobian) if callable(self._jacobian) else self._jacobian
         return RunSpec(
             name=type(self).__name__,
@@ -453,7 +454,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         return {}
 
     def _count(self) -> int:
-        """Update nfev, njev and nlu, and return how many projections of the run were conspicuous."""
+        """Update nfev, njev and nlu, and return how many suspicious corrections and errors the engine has counted."""
         counters = self._work.counters.tolist()
         self.nfev, self.njev, self.nlu = counters[NFEV], counters[NJEV], counters[NLU]
         return int(counters[FOUND])
@@ -479,7 +480,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
             elif (unscaled := np.flatnonzero((self.atol == 0) & (solver.y == 0) & (solver.f == 0))).size:
                 message = (
-                    f"the error of component {unscaled[0]} has no scale at t={self.t:.10g}: y and `atol` are 0 there"
+                    f"the error of component {unscaled[0]} has no scale at t={self.t:.10g}: y and `atol` are 0 there; "
+                    "give atol > 0"
                 )
             return False, message
         # SciPy keeps the value itself, and a user's function may return the same buffer again.
@@ -600,7 +602,11 @@ def _frozen(a: np.ndarray) -> np.ndarray:
 
 
 def _jacobian(method: Any, options: dict[str, Any]) -> Any:
-    """Remove the Jacobian from `options` and return it in the form that the method needs; None if there is none."""
+    """Remove the options for the Jacobian from `options`, and return them in the form that the method needs.
+
+    This is a `Jacobian` for a method whose steps SciPy makes, the function ``jacobian`` or None for a multistep method,
+    and None for all others.
+    """
     if method.drives:
         return Jacobian(options.pop("jac", None), options.pop("jac_sparsity", None))
     jacobian = options.pop("jacobian", None) if method.has_history else None
@@ -610,7 +616,7 @@ def _jacobian(method: Any, options: dict[str, Any]) -> Any:
 
 
 def _never(value: Any, t: float) -> np.ndarray:
-    """Stand-in for the conversion of the value of an in-place function."""
+    """Stand-in for `convert` of a `Call` that fills an array, and so has no value to convert; it is never called."""
     raise AssertionError
 
 
@@ -625,9 +631,9 @@ def _without_effect(names: Iterable[str]) -> str:
 def _checked(
     fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
 ) -> tuple[Callable[[float, np.ndarray], np.ndarray], Call]:
-    """Return the user's right-hand side with checks of its values: as a function of (t, y), and for the engine.
+    """Return the user's right-hand side with checks of its values: as ``derivative(t, y) -> (n,)``, and as a `Call`.
 
-    The function counts its calls in ``calls[0]``, while the engine counts its own calls. Its value may be a buffer of
+    ``derivative`` counts its calls in ``calls[0]``, while the engine counts its own calls. Its value may be a buffer of
     the user. `fun` gets a copy of the state, because it may keep or overwrite its argument. The common case, an array
     of the right shape and type, is tested first.
     """
@@ -771,9 +777,10 @@ class EIPGJ12(EIPSolver):
     Notes
     -----
     The first states come from `EIPRKN12` (from DOP853 where accelerations depend on velocities), with the same step.
-    The corrections of the projection are added to the sums. `integrate` returns states in the middle of the history,
-    which runs ahead of them by half the order, up to the end of the interval. solve_ivp returns the newest state of
-    the history, whose rounding error is larger.
+    The corrections of the projection are added to the sums of accelerations that give positions and velocities.
+    `integrate` returns states in the middle of the history of accelerations, whose newest entry is half the order of
+    steps ahead, but not beyond the end of the interval. solve_ivp returns the newest state of the history, whose
+    rounding error is larger.
     """
 
     TABLEAU = GaussJackson(order=12)
@@ -839,7 +846,10 @@ class EIPBDF(EIPSolver):
 
 
 def class_named(method: Any) -> str | None:
-    """Return the name of the EIP class for `method`: the class's name, SciPy's name of the method or SciPy's class."""
+    """Return the name of the EIP class for `method`, an EIP class, a solver class of SciPy, or the name of either.
+
+    The function returns None if there is no such EIP class.
+    """
     name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
     return next((known for known in __all__ if known.upper() == name), None)
 
@@ -857,7 +867,8 @@ def eip_method(
         this package. SciPy's Radau and BDF give `EIPRadau` and `EIPBDF`.
         A one-step method is any object with ``one_step(t, y, h) -> y_hat`` and ``order``; see `OneStepMethod`. Its
         steps are projected like those of other methods. `fun` is called only for gradients that use f and for dense
-        output (a cubic through both ends), so that `nfev` does not count the evaluations of `one_step`.
+        output (the cubic through states and derivatives at both ends of a step), so that `nfev` does not count the
+        evaluations of `one_step`.
 
     Returns
     -------

@@ -36,7 +36,7 @@ def states(name: str, value: Any) -> np.ndarray:
     TypeError
         If the value does not consist of numbers, or has a unit.
     ValueError
-        If values are masked.
+        If values are masked, or rows have different lengths.
     """
     refuse_units(**{name: value})
     if np.ma.isMaskedArray(value) and np.ma.is_masked(value):

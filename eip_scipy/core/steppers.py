@@ -36,8 +36,14 @@ Derivative = Callable[[float, Array], Array]
 
 @singledispatch
 def arrays(method: Any) -> Method | OneStep | Stepper:
-    """Return a method in the form that the engine uses for its steps."""
-    raise TypeError(f"{type(method).__name__} is not a family of methods.")
+    """Return a method in the form that the engine uses for its steps: coefficients, or an object that makes steps.
+
+    For a `GaussJackson` method these are the coefficients of the method that makes its first states.
+    """
+    raise TypeError(
+        f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
+        "OneStep or Driven."
+    )
 
 
 @arrays.register
@@ -118,7 +124,7 @@ def _exponent(method: Tableau | NystromTableau) -> float:
 
 @singledispatch
 def rated(method: Any) -> Array:
-    """Return a mask (s,) of the stages of a method at which the rates of balances are needed.
+    """Return a mask (s,) of the stages of a method at which the rate of a `Balance` is needed.
 
     Raises
     ------
@@ -126,8 +132,9 @@ def rated(method: Any) -> Array:
         If the method does not support balances.
     """
     raise ValueError(
-        f"invariants: {method.name} does not carry a Balance, because it has no stages with velocities, at which rates "
-        "could be evaluated. Use EIPRK4, EIPDOP853, eip_method(tableau) or EIPGJ12, or omit the balances."
+        f"invariants: {method.name} does not carry a Balance, because it does not provide the whole state at its "
+        "stages, where rates would be evaluated. Use EIPRK4, EIPDOP853, eip_method(tableau) or EIPGJ12, or omit the "
+        "balances."
     )
 
 
@@ -150,11 +157,12 @@ def _(method: Tableau) -> Array:
 
 
 class Form(NamedTuple):
-    """Form of a run's interpolants, in the terms of the engine.
+    """Form of a run's interpolants, as the engine needs it; `kind` is one of the engine's codes.
 
-    An interpolant consists of the states at both ends of its step and of `rows` further arrays of this size, which are
-    computed with the `weights`, and at further stages with the coefficients `A` and `c`. With `own_slopes` the
-    derivatives at both ends are evaluated, because the steps do not provide them.
+    An interpolant consists of the states (n,) at both ends of its step and of `rows` further arrays (n,), which are
+    computed from derivatives in the step, with `weights` if the kind needs any. `A` and `c` are the coefficients of
+    further stages, if the kind has some. With `own_slopes` the derivatives at both ends are evaluated, because the
+    steps do not provide them.
     """
 
     kind: int
@@ -168,7 +176,10 @@ class Form(NamedTuple):
 @singledispatch
 def form(method: Any, brief: bool) -> Form:
     """Return the form of the interpolants of a method; `brief`: the run has too few steps for a history."""
-    raise TypeError(f"{type(method).__name__} is not a family of methods.")
+    raise TypeError(
+        f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
+        "OneStep or Driven."
+    )
 
 
 @form.register
@@ -210,11 +221,13 @@ def _(method: GaussJackson, brief: bool) -> Form:
 
 @singledispatch
 def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> Any:
-    """Return the method after a check of the equations, which are evaluated again if they must be of second order.
+    """Return the method after a check of the equations; a `GaussJackson` method gets the right `velocities`.
+
+    If the equations must be of second order, `rhs` is evaluated once more, with other velocities.
 
     Parameters
     ----------
-    method : Tableau, NystromTableau, GaussJackson or OneStep
+    method : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
     rhs : callable
         ``rhs(t, y) -> (n,)``.
     start : Start
@@ -247,11 +260,11 @@ def _(method: GaussJackson, rhs: Derivative, start: Any, name: str, hint: Callab
 
 
 def check_halves(n: int) -> None:
-    """Raise a ValueError if n components cannot be (q, v)."""
+    """Raise a ValueError if a state of n components cannot be (q, v), because n is odd."""
     if n % 2:
         raise ValueError(
-            f"a Nystrom method needs the state (q, v) with an even number of components, but y0 has {n}. Use a "
-            "Runge-Kutta method such as EIPDOP853."
+            "a Nystrom or Gauss-Jackson method needs the state (q, v) with an even number of components, but y0 has "
+            f"{n}. Use a Runge-Kutta method such as EIPDOP853."
         )
 
 
@@ -261,7 +274,7 @@ def depends_on_velocity(rhs: Derivative, start: Any, name: str, hint: Callable[[
     Raises
     ------
     ValueError
-        If the first half of the derivative is not v.
+        If the state has an odd number of components, or the first half of its derivative is not v.
     """
     t0, y0, f0, _ = start
     check_halves(y0.size)

@@ -65,7 +65,7 @@ class Stepping:
         f0: np.ndarray,
         tableau: AnyMethod,
     ) -> float:
-        """Return the length of the first step.
+        """Return the length of the first step: `h`, at most the length of the interval, `first_step` or an estimate.
 
         Raises
         ------
@@ -85,7 +85,8 @@ class Stepping:
     ) -> float:
         """Estimate the first step of an adaptive run (Hairer, Norsett & Wanner I, II.4) with one call of `rhs`.
 
-        The result is NaN if the derivative is NaN.
+        The result is NaN if the derivative `f0` is not finite, 0 for an interval of length 0, and infinite for a state
+        without components.
         """
         span = self.span
         if y0.size == 0:
@@ -140,8 +141,8 @@ class StepOptions:
         Raises
         ------
         ValueError
-            If an option has a wrong value, `h` is combined with options of adaptive steps, or `h` is missing and the
-            method `name` has no error estimate.
+            If an option has a wrong value, `h` is combined with options of adaptive steps or with a method whose steps
+            SciPy makes, or `h` is missing and the method `name` needs fixed steps.
         """
         h = self.h
         if h is None and method.fixed_steps_only:
@@ -278,7 +279,10 @@ def fixed_steps(h: float, t0: float, t_bound: float) -> int:
 
 
 def saved_steps(n_steps: int, save_every: int) -> np.ndarray:
-    """Return the numbers of the steps after which a state is saved: 0, each `save_every`-th (0: none) and the last."""
+    """Return the numbers of the steps after which a state is saved: 0 for the start, every `save_every`-th, the last.
+
+    If `save_every` is 0, only the start and the last step are saved.
+    """
     return np.append(np.arange(0, n_steps, save_every or max(n_steps, 1)), n_steps)
 
 

@@ -35,9 +35,9 @@ class Unit(NamedTuple):
     name : str
         Name of a unit of astropy.
     scale : float
-        Size in this unit of astropy.
+        Size of the unit, in units of `name`.
     si : float
-        Size in metres or seconds.
+        Size of the unit, in metres or seconds.
     """
 
     name: str
@@ -67,7 +67,8 @@ def _unit(text: str, known: dict[str, float]) -> Unit | None:
 def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, Unit] | None) -> Any:
     """Convert a value with a unit, or a list of such values, to plain numbers in the unit length**a time**b.
 
-    Plain numbers are returned unchanged.
+    Plain numbers are returned unchanged if `known` is None or the unit is that of time. Otherwise only zeros may have
+    no unit.
 
     Parameters
     ----------
@@ -82,8 +83,8 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
     Raises
     ------
     TypeError
-        If a value has a unit but `known` is None, or if it has a unit of another package than
-        astropy.
+        If a value has a unit but `known` is None, has a unit of another package than astropy, is a date, or lacks a
+        unit.
     TypeError and ValueError
         astropy's UnitConversionError, if the dimensions do not fit.
     """
@@ -176,7 +177,7 @@ def days_since(name: str, epoch: Epoch, time: Any) -> Any:
 
 
 def exact_sum(a: float, b: float) -> tuple[float, float]:
-    """Return the rounded sum and its rounding error."""
+    """Return the rounded sum of a and b, and the exact sum minus the rounded one."""
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)

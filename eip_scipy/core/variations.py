@@ -1,4 +1,4 @@
-"""Wide states, which are states followed by columns of derivatives: the option `variations`, and their functions."""
+"""Wide states (a state and columns of its derivatives) for the option `variations`, and functions of wide states."""
 
 from __future__ import annotations
 
@@ -45,10 +45,11 @@ LEAST = 1e-3  # size for differences of a parameter that is 0
 
 
 class OfState(NamedTuple):
-    """An invariant or event of a wide state as a function of the `n` components of the state, which the engine calls.
+    """An invariant or event that the engine evaluates at the state, which is `n` components of the wide state.
 
-    `parameters` is the number of parameters that follow the state in the wide state; if there are any, `by_parameters`
-    returns the derivatives of an invariant with respect to them.
+    `function` is the `Invariant` or the event of the state alone. `parameters` is the number of parameters that follow
+    the state in the wide state. If there are any, ``by_parameters(t, y, params)`` returns the derivatives of an
+    invariant with respect to them.
     """
 
     n: int
@@ -99,12 +100,15 @@ class Columns:
 
     @property
     def half(self) -> int:
-        """Return the number of positions of a Nystrom method, otherwise 0."""
+        """Return the number of positions in the state, n / 2, if the wide state is `in_halves`; otherwise 0."""
         return self.n // 2 if self.in_halves else 0
 
     @cached_property
     def order(self) -> Array:
-        """Return the places in the wide state of the state and the columns, (1 + k, n + p)."""
+        """Return indices (1 + k, n + p) of entries of the wide state.
+
+        Row 0 is for the state and the p parameters, and row j for column j.
+        """
         places = np.arange(self.size * (1 + self.count))
         if not self.in_halves:
             return places.reshape(1 + self.count, self.size)
@@ -112,11 +116,11 @@ class Columns:
 
     @cached_property
     def places(self) -> Array | slice:
-        """Return the places of the state in the wide state."""
+        """Return the indices, or the slice, of the n components of the state in the wide state."""
         return self.order[0] if self.in_halves else slice(self.n)
 
     def wide(self, y: Array, params: Array) -> Array:
-        """Return the wide state of `y`: y, the values in `params` of the parameters, and the columns."""
+        """Return the wide state made of `y`, the p entries of `params` that belong to `parameters`, and `values`."""
         out = np.empty(self.order.size)
         out[self.order[0]] = np.concatenate([y, params[list(self.parameters)]])
         out[self.order[1:]] = self.values.T
@@ -133,7 +137,7 @@ class Columns:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Return the settings for a checkpoint: the properties of the columns that determine the bits of a run."""
+        """Return by name the properties of the columns that a checkpoint stores, because results depend on them."""
         return {"variations": self.values, "derivatives by": self.parameters, "symplectic": self.symplectic}
 
     def after(self, wide: Array) -> Columns:
@@ -147,23 +151,25 @@ def require_tableau(method: Any) -> None:
     Raises
     ------
     ValueError
-        If the method is neither a Runge-Kutta nor a Nystrom method.
+        If the method is neither an explicit Runge-Kutta method nor a Nystrom method.
     """
     if method.TABLEAU.has_history or method.TABLEAU.in_python:
         raise ValueError(
             f"variations: {method.__name__} carries no derivatives, because its steps do not consist of stages of a "
-            "tableau. Use "
-            "EIPDOP853, EIPRKN12 or another Runge-Kutta or Nystrom method."
+            "tableau. Use EIPDOP853, EIPRKN12 or another explicit Runge-Kutta or Nystrom method."
         )
 
 
 def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in_halves: bool) -> Columns:
-    """Return the columns for the option `variations`.
+    """Return the columns for the option `variations`; columns of an earlier run keep their values.
+
+    `asked` is the option, or the `Columns` of an earlier run. `in_halves` is an attribute of the result.
 
     Raises
     ------
     TypeError, ValueError
-        If the option has a wrong value, the state is complex, or the option names a parameter that the run lacks.
+        If the option has a wrong value, the state is complex, the option names a parameter that the run lacks, or it
+        asks a Nystrom method for derivatives with respect to parameters.
     """
     if isinstance(asked, Columns):
         return replace(asked, in_halves=in_halves)
@@ -201,7 +207,10 @@ def _is_name(item: Any) -> bool:
 
 
 def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invariants: Sequence[Invariant]) -> Columns:
-    """Return the columns with `symplectic` set, to the option of the user or by default to `canonical` of the problem.
+    """Return the columns with `symplectic` set to the option of the user, `asked`, or by default to `canonical`.
+
+    `canonical` is the attribute of the problem. By default `symplectic` is False if the columns cannot be kept
+    symplectic.
 
     Raises
     ------
@@ -211,7 +220,7 @@ def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invar
     reasons = {
         'derivatives by parameters or along directions do not make a tangent map; ask for variations="state" alone':
             not columns.is_transition or bool(columns.parameters),
-        f"a state of {columns.n} components is not (q, p)": columns.n % 2 == 1,
+        f"a state of {columns.n} components is not (q, p); omit symplectic": columns.n % 2 == 1,
         "without invariants no step is projected; give the energy, at least": not invariants,
     }  # fmt: skip
     reason = next((words for words, holds in reasons.items() if holds), None)
@@ -227,12 +236,16 @@ def _parameter(item: Any, params: Array, names: Sequence[str]) -> int:
             raise ValueError(f"variations: the run has no parameter {item!r}{known}.")
         return list(names).index(item)
     if not 0 <= item < params.size:
-        raise ValueError(f"variations: there is no parameter {item}; the run has {params.size} in params.")
+        raise ValueError(f"variations: there is no parameter {item}; params has {params.size} entries, counted from 0.")
     return int(item)
 
 
 def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tuple[Any, Array]:
-    """Return options and weights for the wide state, from those of the state; `G` has the gradients at the start."""
+    """Return the options of the step and the weights (m,) of the error metric for wide states of m components.
+
+    They are made from `options` and `sigma`, which are for the state. `G` (l, m) contains the gradients of the
+    invariants at the start, with respect to the wide state.
+    """
     n, places = columns.n, columns.order[0]
 
     def spread(values: Array | float) -> Array:
@@ -267,7 +280,7 @@ class StateSolution(OdeSolution):
         self.columns = columns
 
     def __call__(self, t: Any) -> Array:
-        """Return the states (n,) or (n, m)."""
+        """Return the state (n,) at the time t, or the states (n, m) at m times."""
         return self.columns.own(super().__call__(t).T).T
 
 
@@ -306,9 +319,9 @@ class Variations:
         *,
         in_python: bool = False,
     ) -> Variations:
-        """Make the functions from `products`, the output of `right_hand_side`.
+        """Return the functions of a wide state, made from `products`, the output of `right_hand_side`.
 
-        `extra` contains the further arguments of the invariants. With `in_python` the functions are called from Python,
+        `extra` contains the run's further arguments. With `in_python` the functions are called from Python,
         and nothing is compiled.
 
         Raises
@@ -327,13 +340,13 @@ class Variations:
         return cls(columns, rhs, items, tuple(invariants), source)
 
     def derivative(self, t: float, Y: Array, *extra: Any) -> Array:
-        """Return the derivative of the wide state."""
+        """Return the derivative (m,) with respect to time of the wide state Y."""
         out = np.empty_like(Y)
         self.rhs(t, Y, out, *extra)
         return out
 
     def with_targets(self, wide: tuple[Invariant, ...]) -> tuple[Invariant, ...]:
-        """Return the invariants as functions of the state, with the targets of `wide`, those of the wide state."""
+        """Return copies of `given` with the targets of `wide`, the same invariants as functions of the wide state."""
         kept = []
         for item, known in zip(self.given, wide, strict=True):
             own = copy(item)
@@ -359,7 +372,7 @@ class Variations:
 
 
 def _has_address(fun: Any) -> bool:
-    """Return True if the engine can call a function by its address."""
+    """Return True if a function belongs to the library or is jitted, so that the engine calls it by its address."""
     return isinstance(fun, LibraryFunction) or (is_jitted(fun) and not jit_is_off())
 
 
@@ -376,7 +389,7 @@ def right_hand_side(
         If `jvp` is wrong, or no source of derivatives is available.
     """
     if columns.parameters and scalars(extra) != "":
-        raise ValueError("variations: derivatives by parameters need them as params=[...], one array of numbers.")
+        raise ValueError("variations: derivatives by parameters need params=[...], one array of numbers.")
     if own is not None and jvp is None:
         return _rearranged(own(columns.parameters), columns.order[:, : columns.n]), "problem"
     jvp = by_pointer(jvp, "jvp", GRADIENT, takes_f=True, shape=(columns.n,))
@@ -436,12 +449,15 @@ def _require_products(
         k = int(np.argmax(np.abs(found - right)))
         raise ValueError(
             f"jvp is not the Jacobian of the right-hand side times dy: at the start, along {shown(dy)}, component {k} "
-            f"is {found[k]:.6g} where differences of fun give {right[k]:.6g}."
+            f"is {found[k]:.6g} where differences of fun give {right[k]:.6g}. Correct jvp."
         )
 
 
 def _direction(y0: Array, parameters: int) -> tuple[Array, Array]:
-    """Return a direction (dy, dp) for a check, which changes all components, and none by much more than its size."""
+    """Return a random direction for a check: dy (n,) for the state, and dp (parameters,) for the parameters.
+
+    The components of dy have about the sizes of those of `y0`, and those of dp about the size 1.
+    """
     rng = np.random.default_rng(0)
     dy, dp = rng.standard_normal(y0.size), rng.standard_normal(parameters)
     sizes = np.abs(y0)
@@ -474,7 +490,7 @@ def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
 
 
 def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
-    """Return ``derivative(t, y, extra)``, which calls `fun` of this `form` with a real or complex state (n,)."""
+    """Return ``derivative(t, y, extra) -> (n,)`` for real or complex states; it calls `fun`, which has this `form`."""
     n = y0.size
     half = n // 2 if form.startswith("acceleration") else 0
 
@@ -538,7 +554,10 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
 def _difference(
     derivative: Callable[..., Array], t: float, y: Array, dy: Array, dp: Array, places: list[int], extra: tuple
 ) -> Array:
-    """Return the derivative along (dy, dp) by central differences of order 6."""
+    """Return the derivative (n,) of ``derivative(t, y, extra)`` along (dy, dp), by central differences of order 6.
+
+    `places` are the indices in the run's parameters to which the components of dp belong.
+    """
 
     def along(s: Array) -> Array:
         if not places:
@@ -553,9 +572,9 @@ def _difference(
 class _WideInvariant:
     """An invariant as a function of the wide state, with its gradient, for calls from Python.
 
-    `shape` is the shape of its value. `parameters` are the indices of the parameters that follow the state, if the
-    invariant depends on them. ``slopes(t, y, params)`` returns the derivatives with respect to these parameters; by
-    default they are computed by differences.
+    `shape` is the shape of the invariant's value. `parameters` are the indices of the parameters that follow the
+    state, if the invariant depends on them. ``slopes(t, y, params)`` returns the derivatives with respect to these
+    parameters; by default they are computed by differences.
     """
 
     def __init__(
@@ -581,11 +600,14 @@ class _WideInvariant:
         self.own_gradient: Callable[..., Any] = gradient
 
     def value(self, t: float, Y: Array, *extra: Any) -> Any:
-        """Return the value at the wide state Y, with the parameters that follow the state in Y."""
+        """Return the invariant's value at the wide state Y, with the parameters that follow the state in Y."""
         return self.item.function(t, self.columns.own(Y), *self.item.args, *self._arguments(Y, extra))
 
     def gradient(self, t: float, Y: Array, *rest: Any) -> Array:
-        """Return the gradient with respect to the wide state; `rest` begins with f if the gradient uses it."""
+        """Return the gradient (*shape, m) with respect to the wide state Y (m,).
+
+        `rest` begins with the derivative of Y if the gradient uses f.
+        """
         own, places, n = self.columns.own, self.columns.places, self.columns.n
         first: tuple[Any, ...] = (t, own(Y))
         if self.uses_f:
@@ -612,7 +634,7 @@ class _WideInvariant:
         return (params,)
 
     def _differences(self, t: float, y: Array, params: Array) -> Array:
-        """Return the derivatives by parameters, by differences of order 6."""
+        """Return the invariant's derivatives with respect to the parameters in Y, by differences of order 6."""
         slopes = difference_gradient(
             lambda p: np.asarray(self.item.function(t, y.copy(), p)), params, np.abs(params) + LEAST
         )
@@ -636,7 +658,7 @@ def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple,
 def _of_state(
     item: Invariant, n: int, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
 ) -> OfState | None:
-    """Return the invariant with a gradient as an `OfState`; None if a function has no address."""
+    """Return the invariant, with a gradient, as an `OfState`; None if the engine would have to call Python for it."""
     own, slopes = copy(item), None
     if not _has_address(own.function) or (parameters and not is_jitted(own.function)):
         return None

@@ -75,7 +75,7 @@ class Call(NamedTuple):
 
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: Any) -> Call:
-    """Return a `Call` of ``fun(t, y, ..., *args)``; more `args` than the engine accepts are bound in Python."""
+    """Return a `Call` of ``fun(t, y, ..., *args)``; if the engine does not accept as many `args`, Python adds them."""
     if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
     return Call(fun, args, shape, convert, **kind)
@@ -92,8 +92,8 @@ class Rates(NamedTuple):
         For each balance its rate, as a `Call` or as an address. If it is None, the rate is computed from the gradient
         along the flow and from the explicit dependence on time.
     low, high, shift : float
-        Start and end of the interval within which derivatives with respect to time are computed, and the shift of
-        their differences.
+        Start and end of the interval within which derivatives with respect to time are computed, and the shift of the
+        time in the finite differences that give them.
     """
 
     items: tuple[tuple[int, int], ...] = ()
@@ -185,7 +185,7 @@ def _build(name: str) -> Any:
 
 
 def _best() -> Any:
-    """Return the build that the environment variable names, or the best one for the processor."""
+    """Return the build that the environment variable `VARIABLE` names, or else the best one for the processor."""
     if name := os.environ.get(VARIABLE):
         return _build(name)
     plain = _build("_native")
@@ -217,7 +217,7 @@ if _is_worker() and "OMP_NUM_THREADS" not in os.environ:
 
 @contextmanager
 def working_alone() -> Iterator[None]:
-    """Keep the calling thread from sharing sums over many bodies with other threads."""
+    """Return a context in which the calling thread computes sums over many bodies alone, without other threads."""
     before = BUILD.gravity.work_alone(True)
     try:
         yield

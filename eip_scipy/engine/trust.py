@@ -61,10 +61,12 @@ PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
 
 class ProjectionWarning(RuntimeWarning):
-    """Warning that the projection hides a failure: the errors of the steps do not explain its corrections.
+    """Warning that a projection hides a failure, usually because errors of the steps do not explain its corrections.
 
-    It is issued once per run by `solve_ivp` with an EIP method, `integrate`, `ensemble` and `project`; ``message``
-    contains the same text, and ``trusted`` is False. The page "When a run is not trusted" explains what to do.
+    `solve_ivp` with an EIP method and `integrate` issue it for a run, and `ensemble` once for all members; ``trusted``
+    of the result or its diagnostics is then False, and ``message`` gives the reason. `project` issues it if a large
+    error remains, and `recommend` if it recommends a run without invariants. The page "When a run is not trusted"
+    explains what to do.
     """
 
 
@@ -135,13 +137,16 @@ class Trust:
 
     @property
     def reasons(self) -> list[str]:
-        """Return what makes the run unreliable: a sentence for each of the worst three invariants, and a count."""
+        """Return sentences on corrections and errors that make the run unreliable; an empty list if there are none.
+
+        There is one for each of the worst three invariants, and one that counts the other invariants.
+        """
         if not self.is_sick:
             return []
         found = np.flatnonzero(sick(self.figures))
         worst = found[np.argsort(-_severity(self.figures[found]), kind="stable")]
         more = (
-            [f"{found.size - MOST_REASONS} more invariants were corrected too much"]
+            [f"{found.size - MOST_REASONS} more invariants exceed the bounds of correct runs"]
             if found.size > MOST_REASONS
             else []
         )
@@ -169,12 +174,15 @@ def sick(figures: np.ndarray) -> np.ndarray:
 
 
 def are_calm(figures: np.ndarray) -> bool:
-    """Return True if all figures for the judgement are those of correct runs, which is the usual case."""
+    """Return True if no row of figures (..., N_FIGURES) can be that of a faulty run.
+
+    This quick test usually suffices; if it is False, `sick` decides.
+    """
     return BUILD.are_calm(np.ascontiguousarray(figures), BEYOND_DOUBT, TOGETHER)
 
 
 def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:
-    """Return a mask of the runs with a step that must be examined, from their figures (m, l, N_FIGURES).
+    """Return a mask of the runs with a step that must be examined, from the figures (m, l, N_FIGURES) of m runs.
 
     `suspect`, (m, ...), holds for each run the suspicious step that the engine has kept, and the reason for it.
     """
@@ -225,7 +233,8 @@ def _reason(name: str, row: np.ndarray) -> str:
     if row[RAW] > 0:
         parts.append(
             f"before projections the error of {name!r} was up to {row[RAW]:.2g} times the size of its terms, at "
-            f"t={row[RAW_AT]:.6g} (more than {row[FAR_FROM]:g} times in {row[RAW_MANY]:.0f} of {row[NOTED]:.0f})"
+            f"t={row[RAW_AT]:.6g} (more than {row[FAR_FROM]:g} times this size in {row[RAW_MANY]:.0f} of "
+            f"{row[NOTED]:.0f} projections)"
         )
     if row[SHARE] > 0:
         parts.append(

@@ -37,7 +37,7 @@ class Chunk(NamedTuple):
     own: OwnTimes = OwnTimes()
 
     def part(self, first: int, last: int) -> Chunk:
-        """Return some of the members, counted from the first member of the chunk."""
+        """Return members `first` to `last` - 1 as a chunk, where 0 is the first member of this chunk."""
         params = np.ascontiguousarray(self.params[first:last])
         return Chunk(self.first + first, self.y0s[first:last], params, self.own.part(first, last))
 
@@ -57,7 +57,7 @@ class Pool(Protocol):
         """Return how many chunks can run at the same time."""
 
     def submit(self, chunk: Chunk) -> Any:
-        """Start a chunk; return a ticket for `collect`."""
+        """Start a chunk, and return a ticket by which `collect` finds it."""
 
     def collect(self, chunk: Chunk, ticket: Any) -> Part:
         """Wait for a chunk and return its results."""
@@ -67,12 +67,12 @@ class Pool(Protocol):
 
 
 def run_chunk(plan: Plan, chunk: Chunk, *, stop: threading.Event | None = None) -> Part:
-    """Run the members of a chunk, and compute their statistics if requested."""
+    """Run the members of a chunk, and return their results, with statistics if the task requests them."""
     return finished(plan.task, plan, run_members(plan, chunk.y0s, chunk.params, stop, chunk.own))
 
 
 def finished(task: Task, plan: Plan, members: Members) -> Part:
-    """Return the members, without saved states unless the task keeps them, and their statistics if requested."""
+    """Return the results and, if requested, the statistics of `members`; saved states only if the task keeps them."""
     statistics = None
     if task.reduce is not None:
         statistics = statistics_of(task.reduce, *plan.states(members))
@@ -87,7 +87,10 @@ _making = threading.Lock()
 
 @working_alone()  # the other processors run other chunks
 def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
-    """Run a chunk in another process, which creates the plan once and stores it under `key`."""
+    """Run a chunk in a worker process and return its results.
+
+    The process creates the plan for its first chunk and keeps it under `key`, which identifies the ensemble.
+    """
     with _making:
         plan = _plans.get(key)
         if plan is None:
@@ -166,7 +169,7 @@ def cores() -> int:
 
 
 def in_order(pool: Pool, chunks: Iterable[Chunk]) -> Iterator[tuple[Chunk, Part]]:
-    """Run chunks and yield them in order; only a few per worker are submitted at the same time."""
+    """Run chunks and yield each with its results, in order; at most AHEAD per worker are submitted at a time."""
     waiting = iter(chunks)
     under_way: deque[tuple[Chunk, Any]] = deque()
     while True:

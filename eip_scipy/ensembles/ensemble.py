@@ -120,7 +120,7 @@ class EnsembleResult(WithColumns):
         Times of the saved states; empty if no states are saved. If members have different times, there is one row for
         each member, padded with nan.
     trajectories : ndarray or zarr.Array or None, shape (members, n, m)
-        Saved states; nan after the end of a member that ended early. None if they were reduced.
+        Saved states; nan after the end of a member that ended early. None if no states are saved or they were reduced.
     invariants : ndarray or zarr.Array, shape (members, l) or (members, l, m)
         Values of the invariants in the saved states if `trajectories` has them, else in the last states.
     target : ndarray, shape (members, l)
@@ -363,8 +363,8 @@ def ensemble(
         Invariants to keep: each member keeps the values at its own start. If `params` differ, the functions receive the
         parameters as the last argument and must have no args.
     executor : None, int, "dask", distributed.Client, DaskExecutor or concurrent.futures.Executor, optional
-        Where members run. None: threads on all cores (one thread if functions are not compiled). A number: this number
-        of threads. "dask": the configured Dask cluster (``DASK_SCHEDULER_ADDRESS``), or a local cluster with one
+        Where members run. None: threads on all cores. A number: this number of threads. If functions are not compiled:
+        one thread. "dask": the configured Dask cluster (``DASK_SCHEDULER_ADDRESS``), or a local cluster with one
         process for each core; see `eip_scipy.integrations.dask`.
     save_every : int, optional
         Save every `save_every`-th step of each member in ``.trajectories``; fixed steps only.
@@ -527,7 +527,7 @@ class _Gathered:
         self._begin = time.perf_counter()
 
     def run(self, pool: Callable[[], Pool], progress: bool) -> EnsembleResult:
-        """Run all chunks that are not stored yet."""
+        """Run all chunks that are not stored yet, and return the result."""
         from tqdm import tqdm
 
         done = self._stored()
@@ -557,7 +557,13 @@ class _Gathered:
             yield self.everyone.part(first, first + self.chunk)
 
     def _stored(self) -> int:
-        """Read the stored members; return their number."""
+        """Read the results of the stored members and return the number of these members.
+
+        Raises
+        ------
+        CheckpointError
+            If the functions of this ensemble have other values than those of the stored one.
+        """
         if self.store is None:
             return 0
         done, statistics = self.store.finished, self.store.statistics
@@ -739,14 +745,17 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
 
 
 def _bare(fun: Any) -> Any:
-    """Return a problem without the functions that members do not need and that may not be picklable."""
+    """Return `fun`; if it is a problem with `rhs`, without its `fun` and `reference`, which may not be picklable."""
     if not isinstance(fun, Problem) or fun.rhs is None:
         return fun
     return dataclasses.replace(fun, fun=_not_called, reference=None)
 
 
 def _not_called(t: float, y: np.ndarray) -> np.ndarray:
-    raise NotImplementedError("ensemble calls the compiled right-hand side of a problem, not this function")
+    raise NotImplementedError(
+        "ensemble leaves out `fun` of a problem that has `rhs`, so that fun cannot be called here; call rhs(t, y, out, "
+        "params) instead."
+    )
 
 
 def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str]]:
@@ -780,9 +789,9 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
-    """Return the size of a chunk: at most about one second of work, in a multiple of LANES.
+    """Return the number of members in a chunk: at most about one second of work, and a multiple of LANES.
 
-    The size depends on the problem and on the number of members, and not on the number of workers.
+    The number depends on the problem and on the number of members, and not on the number of workers.
     """
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
     native = is_compiled(rhs) or isinstance(rhs, PointerFunction)
@@ -799,7 +808,7 @@ def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) 
     each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) * (3 + rows) + N_COUNTERS + 4)
     bound = most_bytes(members * each, max_bytes)
     if members * each > bound:
-        many = f"{rows} states per member would be stored. Increase save_every, use reduce= or out="
+        many = f"{rows} states per member would be stored. Save fewer (save_every, t_eval), use reduce= or out="
         advice = many if rows else "The last state of each member would be stored. Run the members in parts"
         raise MemoryError(
             f"{members} members of {plan.size} components need {members * each / 1e9:.3g} GB, the bound is "

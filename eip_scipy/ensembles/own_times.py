@@ -33,7 +33,7 @@ class OwnTimes(NamedTuple):
 
     @property
     def members(self) -> int:
-        """Number of members that have rows."""
+        """Number of rows, one for each member; 0 if all members have the same interval and times."""
         return len(self.spans or self.times or ())
 
     @property
@@ -42,12 +42,12 @@ class OwnTimes(NamedTuple):
         return "t_eval" if self.spans is None else "t_span"
 
     def part(self, first: int, last: int) -> OwnTimes:
-        """Return the intervals and times of some members."""
+        """Return the intervals and times of members `first` to `last` - 1."""
         spans = None if self.spans is None else self.spans[first:last]
         return OwnTimes(spans, None if self.times is None else self.times[first:last])
 
     def of(self, k: int) -> dict[str, Any]:
-        """Return the arguments of `integrate` for member `k`."""
+        """Return the arguments `t_span` and `t_eval` of `integrate` for member `k`, if they differ between members."""
         found: dict[str, Any] = {}
         if self.spans is not None:
             found["t_span"] = self.spans[k]
@@ -57,7 +57,7 @@ class OwnTimes(NamedTuple):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Return the settings that are compared when an ensemble is resumed."""
+        """Return by name the intervals and times as arrays, which are compared when an ensemble is resumed."""
         found: dict[str, Any] = {}
         if self.spans is not None:
             found["t_span"] = np.array(self.spans)

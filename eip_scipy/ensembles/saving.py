@@ -62,5 +62,5 @@ def shortened(messages: Sequence[str]) -> dict[str, Any]:
 
 
 def expanded(found: dict[str, Any], first: int, last: int) -> list[str]:
-    """Return the messages of members `first` to `last` from the output of `shortened`."""
+    """Return the messages of members `first` to `last` - 1 from the output of `shortened`."""
     return [found["others"].get(str(k), found["usual"]) for k in range(first, last)]

@@ -21,7 +21,7 @@ NAMES = ("rhs", "inv", "grad", "jacobian")  # the functions of a run
 
 
 def why_one_by_one(history: Multistep | None, options: Options, schedule: Schedule, dtype: np.dtype) -> str:
-    """Return the reason why members with these options cannot be vectorised; "" if they have the same fixed steps."""
+    """Return the reason why members with these options cannot be vectorised; "" if they can."""
     reasons = {
         "steps are adaptive": options.adaptive,
         "the interval is infinite": schedule.span.n_steps >= UNBOUNDED,

@@ -15,7 +15,8 @@ __all__ = ["Statistics", "merge", "statistics_of"]
 class Statistics:
     """Mean, variance and extremes of k quantities over members, at each of m times.
 
-    Members that failed before a time are not included at that time; `count` is the number of the others.
+    Members without a state at a time, such as those that failed before, are not included at that time; `count` is the
+    number of the others.
 
     Attributes
     ----------
@@ -55,7 +56,7 @@ class Statistics:
 
 
 def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics | None:
-    """Compute the statistics of some members.
+    """Return the statistics over some members.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ class _Store:
             self._lock.close()
 
     def _require_same(self, there: dict[str, Any], here: dict[str, Any], missing: list[str]) -> None:
-        """Compare the identity of two ensembles; raise CheckpointError if they differ or an array is missing."""
+        """Raise CheckpointError if the stored identity `there` differs from `here`, or arrays are `missing`."""
         checkpoint.require_same(self.path, there.get("settings"), here["settings"])
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
@@ -96,12 +96,15 @@ class _Store:
 
 
 def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
-    """Compare the stored values of functions at the end of a member of the last finished chunk with the present ones.
+    """Compare the values of f and of the invariants at the end of a member of the last finished chunk.
+
+    `there` are the stored values, `here` those of the present functions, `sizes` the sizes of their terms, and `first`
+    is the number of the first member of the chunk.
 
     Raises
     ------
     CheckpointError
-        If the values differ by more than rounding errors on another machine.
+        If a value differs by more than SAME of its size, which allows for rounding errors on another machine.
     """
     if there.size and not (there.shape == here.shape and bool(np.all(np.abs(there - here) <= SAME * sizes))):
         raise _other_functions(path, f"at the end of a member from number {first} on")
@@ -264,7 +267,7 @@ class ZarrStore(_Store):
             )
 
     def _layout(self, times: np.ndarray) -> dict[str, dict[str, Any]]:
-        """Return by name the arguments with which the arrays of this ensemble are created."""
+        """Return for each array of the group, by name, the arguments with which it is created."""
         layout: dict[str, dict[str, Any]] = {}
 
         def array(name: str, dtype: Any, axes: tuple[str, ...], shape: tuple[int, ...], rows: int, chunk: int) -> None:
@@ -295,7 +298,7 @@ class ZarrStore(_Store):
         return layout
 
     def read(self, first: int, last: int) -> Members:
-        """Return the results of members `first` to `last`."""
+        """Return the results of members `first` to `last` - 1."""
         found = {field: self._arrays[name][first:last] for name, (field, _) in ARRAYS.items() if name in self._arrays}
         found = {field: _as_stored(value) for field, value in found.items()}
         found["message"] = [str(text) for text in found["message"]]
@@ -303,7 +306,7 @@ class ZarrStore(_Store):
         return none._replace(**found, happened=unflattened(self._flat(first, last)))
 
     def _flat(self, first: int, last: int) -> Flat:
-        """Return the events of members `first` to `last`, which are stored after those of the preceding members."""
+        """Return the events of members `first` to `last` - 1, which are stored after those of preceding members."""
         if not self._events:
             return Flat(np.zeros((last - first, 0), np.int64), np.zeros(0), np.zeros((0, 1)))
         counts = self._arrays["event_count"][:last]
@@ -322,14 +325,21 @@ class ZarrStore(_Store):
                 self._arrays[name][begin:end] = values
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return the values stored with the chunk that starts at number `first`, which identify its functions."""
+        """Return the values of f and of the invariants stored with the chunk that starts at member `first`.
+
+        A resumed call compares them with those of its own functions. The array may be empty.
+        """
         row = self._arrays["known_by"][first // self._chunk]
         return row[~np.isnan(row)]
 
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
-        """Write the results of a chunk that starts at number `first`; `known_by` identifies its functions."""
+        """Write the results of a chunk that starts at member `first`.
+
+        `known_by` are the values of f and of the invariants with which a resumed call compares those of its own
+        functions. `whole` and `statistics` are not used.
+        """
         self._require_own()
         with self._written():
             if self._events:
@@ -388,23 +398,26 @@ class CheckpointStore(_Store):
         self.statistics = Statistics(**found) if found else None
 
     def read(self, first: int, last: int) -> Members:
-        """Return the results of members `first` to `last`."""
+        """Return the results of members `first` to `last` - 1."""
         arrays = {name: self._arrays[f"members_{name}"][first:last] for name in Members._fields if name not in LISTS}
         flat = Flat(*(self._arrays[f"events_{name}"] for name in Flat._fields))
         message = expanded(self._header["messages"], first, last)
         return Members(**arrays, message=message, happened=unflattened(flat)[first:last])
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return the values stored with the last chunk, which identify its functions; the array may be empty."""
+        """Return the values of f and of the invariants stored with the last chunk; `first` is not used.
+
+        A resumed call compares them with those of its own functions. The array may be empty.
+        """
         return self._arrays["known_by"]
 
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
-        """Record that the chunk that starts at number `first` is finished; write the file if it is time to do so.
+        """Record that the chunk that starts at member `first` is finished; write the file if it is time to do so.
 
-        `whole` holds the results of all members, and `statistics` are those of the finished members. `known_by`
-        identifies the functions of the chunk.
+        `whole` holds the results of all members, and `statistics` are those of the finished members. `known_by` are the
+        values of f and of the invariants with which a resumed call compares those of its own functions.
         """
         self._waiting = first + len(members.t), known_by, whole, statistics
         since = time.perf_counter() - self._written
@@ -412,7 +425,7 @@ class CheckpointStore(_Store):
             self.flush()
 
     def flush(self) -> None:
-        """Write new results; a full disk only causes a warning, and the previous file is kept."""
+        """Write new results; an error, such as a full disk, only causes a warning, and the previous file is kept."""
         if self._waiting is None:
             return
         begin = time.perf_counter()
@@ -438,13 +451,17 @@ Store = ZarrStore | CheckpointStore
 
 
 def _as_stored(value: Any) -> np.ndarray:
-    """Convert a field of Members to an array with the order of axes of the group, or back."""
+    """Return a field of `Members` as an array with the axes of the group, or convert an array of the group back.
+
+    The last two axes of an array of three dimensions are exchanged: time is the last axis in the group, and the second
+    one in `Members`.
+    """
     array = np.array(value, dtype=object) if isinstance(value, list) else value
     return array.swapaxes(1, 2) if array.ndim == 3 else array
 
 
 def _name_of(times: np.ndarray) -> str:
-    """Return the name of the array of times, which are common to all members or different for each."""
+    """Return the name of the array of times: "time" if it is common to all members, "times" if members have rows."""
     return "time" if times.ndim == 1 else "times"
 
 

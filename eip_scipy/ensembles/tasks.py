@@ -79,7 +79,10 @@ class Task:
     def prepared(
         self, y0: np.ndarray, params: np.ndarray | None, own: Mapping[str, Any] = NOTHING, *, check_start: bool = False
     ) -> Prepared:
-        """Prepare the run of one member as `integrate` does; `own` contains its interval and times."""
+        """Return the run of one member, prepared as `integrate` does.
+
+        `own` contains the `t_span` and `t_eval` of the member, if they differ between members.
+        """
         return prepared(self.request._replace(y0=y0, params=params, **own), check_start=check_start)
 
 
@@ -188,7 +191,7 @@ class Plan:
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
-        """Create the plan; `ready` is the member of the task if it has been prepared already."""
+        """Create the plan; `ready` is the run of the member of `task`, if it has been prepared already."""
         self.task = task
         self._ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
         schedule, run = self._ready.schedule, self._ready.run
@@ -208,7 +211,10 @@ class Plan:
         self._together, self._idle = False, list[Sweeper]()
 
     def compile(self, *, progress: bool = False) -> Plan:
-        """Compile the functions and return the plan itself; done before threads start, which would all compile."""
+        """Compile the functions and return the plan itself.
+
+        This is done before threads start, because each thread would compile them otherwise.
+        """
         ready = self._ready
         loop = Loop(replace(ready, request=ready.request._replace(progress=progress)), Keeper())
         self.why_not = loop.why_not
@@ -243,23 +249,27 @@ class Plan:
         return np.array([self.t_bound]), last[:, None]
 
     def loop(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Loop:
-        """Return the run of a single member; `own` contains its interval and times."""
+        """Return the `Loop` that runs a single member; `own` is that of `Task.prepared`."""
         return Loop(self._prepared(y0, params, own), Keeper())
 
     def _prepared(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Prepared:
         return self.task.prepared(y0, None if self.task.request.params is None else params, own)
 
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
-        """Return the identity of an ensemble in a form for JSON: settings, and values of its functions at a start."""
+        """Return the identity of an ensemble in a form for JSON: settings, and values at a start.
+
+        These are the first COMPARED values of f and of the invariants, at the start of the member of the task.
+        """
         settings = self._ready.identity(starts, params) | {"chunk": chunk}
         settings |= {name: plain(value) for name, value in own.identity.items()}
         return {"settings": settings, "start": self._start_values}
 
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
-        """Return values of the functions at the end of the first member that has ended, and the sizes of their terms.
+        """Return values of f and of the invariants at the end of the first member that did not fail, and their sizes.
 
-        They identify the functions when an ensemble is resumed. Both arrays are empty if no member has ended or the
-        functions fail there.
+        There are at most COMPARED components of f, and all invariants; the sizes are those of the terms of each value.
+        A resumed ensemble compares its functions by these values. Both arrays are empty if all members failed, or a
+        value cannot be evaluated or is not finite.
         """
         nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
         if not ended.size:
@@ -279,7 +289,7 @@ class Plan:
 
     @contextmanager
     def driver(self) -> Iterator[Sweeper | None]:
-        """Yield a driver that no other thread is using; None if each member needs its own."""
+        """Yield a `Sweeper` that no other thread is using; None if each member needs its own run."""
         if not self._together:
             yield None
             return
@@ -298,7 +308,8 @@ def saved_times(schedule: Schedule) -> np.ndarray:
     Raises
     ------
     ValueError
-        If each member would save at different times.
+        If the steps to be saved are adaptive, so that each member would save at different times, or if the interval is
+        infinite.
     """
     if schedule.t_eval.size:
         return schedule.t_eval.copy()
@@ -321,7 +332,7 @@ def run_members(
     stop: threading.Event | None = None,
     own: OwnTimes = SHARED,
 ) -> Members:
-    """Run members.
+    """Run members and return their results.
 
     Parameters
     ----------
@@ -413,7 +424,9 @@ def _alone(
 
 
 def _cover(out: Members, those: slice, rows: np.ndarray, schedule: Schedule) -> None:
-    """Update the largest invariant errors of some members with the invariants at `rows` (m, rows, l) and at the end.
+    """Update the largest invariant errors of some members, `those`, with errors in saved states and at the end.
+
+    `rows` (m, k, l) are the values of the invariants in k saved states.
 
     The state at an event that ended a member is not included if `t_eval` was given, as in the result of a single run.
     """
@@ -574,11 +587,10 @@ class Sweeper:
                 self._adapt(time.perf_counter() - begin)
 
     def _examine(self, each: data.Members, out: Members) -> None:
-        """Examine the steps that the engine suspects, and check the invariants at the ends of members.
+        """Examine the steps that the engine has marked as suspicious, and check the invariants at the ends of members.
 
-            The invariants are checked at the ends of the members that arrived, in their order, up to the first member
-            at which
-        nothing is found.
+        The invariants are checked at the ends of the members that did not fail, in their order, up to the first member
+        at which nothing is found.
         """
         run = self.loop.driver.run
         arrived = np.flatnonzero(out.status >= 0)
@@ -598,7 +610,7 @@ class Sweeper:
             self._judge(k, each, out, [found] if found else [])
 
     def _judge(self, k: int, each: data.Members, out: Members, doubts: list[str]) -> None:
-        """Store whether a member that arrived is reliable, using its corrections and the findings `doubts`."""
+        """Store whether member `k`, which did not fail, is reliable, by its corrections and the findings `doubts`."""
         trust = Trust(self.loop.driver.run.invariants.names, each.figures[k])
         trust.doubts += doubts
         end = ENDS[out.status[k]]
@@ -626,13 +638,19 @@ class Sweeper:
         self._arrived(done, each, out)
 
     def _adapt(self, seconds: float) -> None:
-        """Set the number of steps of the next call, after a call that used all of its steps."""
+        """Choose the number of steps of the next call, so that it takes about SWEEP_SECONDS.
+
+        `seconds` is the time of the last call, which has made all of its steps.
+        """
         self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / max(seconds, 1e-9))))
 
     def _look_at(
         self, plan: Plan, k: int, code: int, reason: str | None, each: data.Members, out: Members, watch: _Watch
     ) -> None:
-        """Handle a member for which the engine returned early."""
+        """Run member `k` again as `integrate` does if the engine asks for that by its `code`; else store its failure.
+
+        `reason` is the text of an exception in the user's functions, or None.
+        """
         loop = self.loop
         driver = loop.driver
         if code in (DOUBTFUL, PAUSE):
@@ -654,7 +672,7 @@ class Sweeper:
             each.rows[k, driver.rows :] = np.nan
 
     def _first_steps(self, y0s: np.ndarray, params: np.ndarray) -> np.ndarray:
-        """Return the length of each member's first step; NaN if it cannot be estimated."""
+        """Return the length (m,) of each member's first step; NaN if it cannot be estimated."""
         t0, stepping = self.loop.driver.schedule.span.t0, self.loop.driver.run.stepping
         if stepping.h is not None or stepping.first_step is not None:
             return np.full(len(y0s), stepping.h or stepping.first_step, float)

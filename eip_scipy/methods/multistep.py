@@ -200,7 +200,10 @@ class Weights(NamedTuple):
 
 @cache
 def weights(order: int) -> Weights:
-    """Return the weights of the method of this order; the velocity's errors have the shape of one difference more."""
+    """Return the weights of the method of this order.
+
+    The difference that has the shape of the errors is one order higher for velocities than for positions.
+    """
     back = range(order)
     estimate = min(ESTIMATE, order - 2)
 

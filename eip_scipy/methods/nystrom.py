@@ -91,7 +91,9 @@ class Weights(NamedTuple):
 
 
 def nystrom_residuals(A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> Iterator[tuple[Weights, int, float]]:
-    """Yield the residuals of all conditions up to the order of each row, with the number of vertices of their trees.
+    """Yield (row, vertices, residual) for each order condition up to the order of each row of weights.
+
+    `vertices` is the number of vertices of the condition's tree.
 
     For a velocity the residuals are sum_i b'_i phi_i(tree) - 1 / density(tree), for trees of up to `order` vertices.
     For a position they are sum_i b_i phi_i(tree) - 1 / ((vertices + 1) density(tree)), for trees of up to one vertex
@@ -287,17 +289,17 @@ def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _velocity_moments(order: int) -> list[Fraction]:
-    """Return the exact sums of b'_i c_i^k for k = 0, 1, ..."""
+    """Return the exact sums of b'_i c_i^k for k = 0, 1, ...; there are `order` of them, at most MOMENTS."""
     return [Fraction(1, k + 1) for k in range(min(order, MOMENTS))]
 
 
 def _position_moments(order: int) -> list[Fraction]:
-    """Return the exact sums of b_i c_i^k for k = 0, 1, ..., one sum less than for b': positions gain an order."""
+    """Return the exact sums of b_i c_i^k for k = 0, 1, ...; there are `order` - 1 of them, at most MOMENTS."""
     return [Fraction(1, (k + 1) * (k + 2)) for k in range(min(order - 1, MOMENTS))]
 
 
 def _low_parts_of_used(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
-    """Return the low parts of the weights that are not zero; the others stay zero."""
+    """Return the output of `_low_parts` for the weights that are not zero, and 0 for the others."""
     used = np.array([x != 0 for x in b])
     low = np.zeros(len(b))
     low[used] = _low_parts(b[used], c[used], moments)

@@ -114,7 +114,11 @@ def _stages(A: Array, c: Array, nodes: Array, order: int) -> tuple[int, Array]:
 
 
 def _smallest(rows: Array, met: Array) -> Array:
-    """Return the solutions (nodes, stages) of smallest norm, for orthonormal `rows` and right sides `met`."""
+    """Return for each node the weights of smallest norm that meet linear conditions, (nodes, stages).
+
+    `rows` (stages, conditions) are the orthonormal coefficients of the conditions, `met` (conditions, nodes) their
+    right-hand sides.
+    """
     return np.array([(rows * column).sum(axis=1) for column in met.T])
 
 
@@ -127,7 +131,10 @@ def _stage_factors(A: Array, c: Array, tree: NystromTree) -> Array:
 
 
 def _lobatto_nodes(interior: int) -> Array:
-    """Return the Gauss-Lobatto nodes between 0 and 1, correctly rounded: the zeros of the derivative of P_(k + 1)."""
+    """Return the k = `interior` Gauss-Lobatto nodes inside the interval from 0 to 1, correctly rounded.
+
+    They are the zeros of the derivative of the Legendre polynomial P_(k + 1), moved from [-1, 1] to [0, 1].
+    """
     n = interior + 1
     nodes = []
     for i in range(n - 1, 0, -1):

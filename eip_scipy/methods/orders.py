@@ -40,7 +40,10 @@ class Ordered:
 
     @property
     def kappa(self) -> float:
-        """Exponent of the error metric, (p + 1) / (p_hat + 1) with the orders of step and estimate; else 1."""
+        """Exponent of the error metric, (p + 1) / (p_hat + 1), or 1 without an estimate.
+
+        p is the order of the step, and p_hat that of the estimate.
+        """
         if self.error_estimator_order is None:
             return 1.0
         return (self.order + 1) / (self.error_estimator_order + 1)

@@ -66,7 +66,7 @@ def _stage_weights(tree: Tree, A: np.ndarray) -> np.ndarray:
 
 
 def order_residuals(A: np.ndarray, b: np.ndarray, order: int) -> Iterator[tuple[Tree, Number]]:
-    """Yield the residual of every order condition up to `order`: sum_i b_i phi_i(tree) - 1 / density(tree)."""
+    """Yield (tree, residual) for every order condition up to `order`: sum_i b_i phi_i(tree) - 1 / density(tree)."""
     for vertices in range(1, order + 1):
         for tree in rooted_trees(vertices):
             yield tree, b.dot(_stage_weights(tree, A)) - Fraction(1, _density(tree))
@@ -205,7 +205,10 @@ class Tableau(Ordered):
     def _check_embedded(
         self, name: str, A: np.ndarray, b: np.ndarray, b_hat: Sequence[Number], order_hat: int | None, fewer: int
     ) -> np.ndarray:
-        """Return `b_hat` with s + 1 entries after a check of its order, with f at the new point as a stage (row b)."""
+        """Return `b_hat` with s + 1 entries after a check that it is of order `order_hat` - `fewer`.
+
+        The derivative f at the new point is the last stage, whose row of the stage matrix is `b`.
+        """
         s = len(b)
         if len(b_hat) not in (s, s + 1):
             raise ValueError(

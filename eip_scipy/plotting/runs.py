@@ -141,7 +141,10 @@ def _draw_lines(
 
 
 def _by_size(components: Mapping[str, Any]) -> list[list[str]]:
-    """Return the names in one group, or in two groups if the largest gap between their sizes is wide."""
+    """Return the names in two groups if the sizes of components have a gap of a factor WIDE, else in one group.
+
+    The size of a component is its largest magnitude; the largest gap separates the groups.
+    """
     sizes = {name: np.max(np.abs(values), initial=0.0) for name, values in components.items()}
     ordered = sorted((size, name) for name, size in sizes.items() if 0 < size < np.inf)
     gaps = [above / below for (below, _), (above, _) in itertools.pairwise(ordered)]

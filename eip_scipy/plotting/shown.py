@@ -104,7 +104,7 @@ def _is_open(figure: Figure) -> bool:
 
 
 def _close_oldest() -> None:
-    """Close the oldest of these figures in pyplot before it warns about too many; they can still be saved."""
+    """Close the oldest figures of this package in pyplot before it warns about too many; they can still be saved."""
     mine = [figure for figure in (window() for window in _windows) if figure is not None and _is_open(figure)]
     most = rcParams["figure.max_open_warning"]
     while mine and 0 < most <= len(pyplot.get_fignums()):

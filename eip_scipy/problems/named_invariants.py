@@ -23,12 +23,15 @@ def named_invariant(
     uses_f: bool = False,
     where: str = "",
 ) -> Invariant:
-    """Return the invariant `name`; `made` has its value ``value(y)`` and a gradient that fills an array, by name.
+    """Return the invariant with the name `name`.
+
+    `made` maps names to pairs of functions, ``value(y)`` and ``gradient(t, y, out)``, or ``gradient(t, y, f, out)`` if
+    `uses_f` is True; the gradient fills `out`.
 
     Raises
     ------
     ValueError
-        If the name is not in `made`; the message lists the `known` names, and ends with `where`.
+        If the name is not in `made`; the message has `where` after the name, and lists the `known` names.
     """
     if name not in made:
         raise ValueError(f"unknown invariant {name!r}{where}, expected {', '.join(known)}{nearest(name, known)}")

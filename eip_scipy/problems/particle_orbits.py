@@ -23,7 +23,7 @@ class Tips(NamedTuple):
     Attributes
     ----------
     t, R, z : ndarray, shape (k,)
-        Times, and the distance of the guiding centre from the z axis and its height.
+        Times, and the distances of the guiding centre from the z axis and its heights (coordinates z) at these times.
     """
 
     t: np.ndarray
@@ -116,7 +116,7 @@ class ParticleOrbit:
 
     @cached_property
     def gyrofrequency(self) -> np.ndarray:
-        """Frequency ``|q| B / m`` (m,)."""
+        """Angular frequency ``|q| B / m`` (m,)."""
         return abs(self.problem.charge) / self.problem.mass * self._strength
 
     @cached_property
@@ -126,7 +126,7 @@ class ParticleOrbit:
 
     @cached_property
     def _gyrating(self) -> np.ndarray:
-        """Velocity across B without the drift E x B / B^2."""
+        """Velocity across B without the drift E x B / B^2, (3, m)."""
         across = self.v - self.parallel_velocity / self._strength * self._magnetic
         E = self.problem.field.along("E", self.x, self.t)
         return across - np.cross(E, self._magnetic, axis=0) / self._strength**2
@@ -220,7 +220,7 @@ class ParticleOrbit:
         return Tips(*(values[k] + part * (values[k + 1] - values[k]) for values in found))
 
     def turns(self) -> np.ndarray:
-        """Return the revolutions of the guiding centre around the z axis since the first state (m,), all positive."""
+        """Return the net revolutions (m,) of the guiding centre around the z axis since the first state, all >= 0."""
         return np.abs(self.guiding_angle - self.guiding_angle[0]) / (2 * np.pi)
 
     def poloidal_turns(self) -> Iterator[slice]:
@@ -242,7 +242,9 @@ class ParticleOrbit:
 
 
 def radial_range(orbit: ParticleOrbit, turn: float) -> float:
-    """Return half of the range of R in one turn of the guiding centre around the z axis, the gyroradius in a picture.
+    """Return half of the range of the particle's R in one turn of the guiding centre around the z axis.
+
+    For a guiding centre at constant R this is the gyroradius, as it is read from a picture of the orbit.
 
     Parameters
     ----------

@@ -33,7 +33,10 @@ def centre_time(y, params):
 
 @compilable
 def pair_time(y, params):
-    """Return (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2), a smooth time scale of the closest pair of N bodies."""
+    """Return (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2), a smooth time scale of the closest pair of N bodies.
+
+    `y` begins with the N positions in space, and `params` holds the N values Gm_i.
+    """
     rate2 = 0.0
     for i in range(params.size):
         for j in range(i):
@@ -145,7 +148,10 @@ def _transformed_invariant(item: Invariant) -> Invariant:
 def _transformed_functions(
     fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return value and gradient of an invariant for the state (y, t); f = dy/dt is computed from dy/ds and dt/ds."""
+    """Return the functions for value and gradient of an invariant of y as functions of s and the state (y, t).
+
+    A gradient that uses f = dy/dt gets it from dy/ds and dt/ds.
+    """
 
     def value(s, y, params):
         return fun(y[-1], y[:-1], params)

@@ -86,7 +86,10 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
 
 
 def _observed(one: IntegrationResult, two: IntegrationResult, new: slice) -> dict[str, Any]:
-    """Return the combined outputs and multipliers, which are computed on demand."""
+    """Return the outputs and multipliers of two joined runs, as far as the first one has them, as fields of a result.
+
+    `new` selects the times of the second run that the first one does not have.
+    """
     two._observe()
     found: dict[str, Any] = {}
     if "outputs" in one:

@@ -59,7 +59,7 @@ class Driver:
             self._pieces = self._more_pieces(steps if keeps_steps else 0)
 
     def advance(self, k_end: int) -> int:
-        """Advance to step `k_end`, or until something stops the loop earlier; return the loop's code."""
+        """Advance to step `k_end`, or until something stops the loop earlier; return the loop's status code."""
         interpolants = self._interpolants
         if interpolants is not None:
             interpolants.record.left[:] = self._events.left
@@ -90,9 +90,9 @@ class Driver:
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:
-        """Replace the engine's `FailedCallError` by the exception of the Numba function that failed.
+        """Replace a `FailedCallError` raised inside the block by the exception of the Numba function that failed.
 
-        For a C function, raise an error that names the function and its status.
+        If a C function failed, replace it by an error that names the function and its status.
         """
         try:
             yield
@@ -107,7 +107,7 @@ class Driver:
             raise
 
     def place(self, error: ChangedShapeError) -> None:
-        """Add the step to the message of an error from compiled code, which cannot format numbers."""
+        """Add the time of the step to the message of an error from compiled code, which cannot format numbers."""
         error.args = (f"{error}, in the step from t={self.schedule.clock[TIME]:.10g}",)
 
     @property
@@ -117,7 +117,7 @@ class Driver:
 
     @property
     def suspects(self) -> bool:
-        """Return True if the engine suspects a step, which must be examined."""
+        """Return True if the engine has marked a step as suspect, so that `Run.look` must examine the run."""
         return bool(self.run.work.suspect[REASON] != NOTHING)
 
     @property
@@ -163,7 +163,8 @@ class Driver:
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return copies of the buffers of `parts` after the last accepted step.
 
-        If a step is pending, the copies are updated as the loop would update the buffers.
+        If this step is pending, which means that the loop has paused in it, the copies are updated as the loop would
+        update the buffers.
         """
         copies = {name: part.copy() for name, part in self.parts().items()}
         if self.schedule.place[PENDING] == 1:
@@ -178,13 +179,13 @@ class Driver:
         return copies
 
     def load(self, t: np.ndarray, y: np.ndarray) -> None:
-        """Store the rows of a run that is resumed."""
+        """Copy the saved times `t` (m,) and states `y` (m, n) of a run that is resumed to the buffers of rows."""
         while self.t.size <= t.size:
             self._more_rows()
         self.t[: t.size], self.y[: t.size] = t, y
 
     def save(self, t: float, y: np.ndarray) -> None:
-        """Append a row."""
+        """Append a time and a state to the saved rows."""
         self.t[self.rows], self.y[self.rows] = t, y
         self.schedule.place[ROW] += 1
 
@@ -194,18 +195,18 @@ class Driver:
             self.save(self.schedule.span.t0, self.state)
 
     def save_now(self) -> None:
-        """Save the last accepted state after an early end."""
+        """Save the last accepted state after an early end of the run, unless it is the last saved row already."""
         t, y = self.now
         if self.rows == 0 or self.t[self.rows - 1] != t:
             self.save(t, self.shown(t, y))
 
     def shown(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the last state `y` at `t` in the form of the saved rows."""
+        """Return the last state `y` at `t` in the form of the saved rows, which may be a projected copy."""
         interpolants = self._interpolants
         return interpolants.shown(t, y) if interpolants is not None and interpolants.record.shows else y
 
     def cut(self, t: float, y: np.ndarray) -> None:
-        """End the rows with the state at which an event ended the run inside the last step."""
+        """Remove the saved rows from `t` on, and append the state `y` at `t`, in which an event ended the run."""
         while self.rows and self.schedule.span.sign * (self.t[self.rows - 1] - t) >= 0:
             self.schedule.place[ROW] -= 1
         self.save(t, y)
@@ -216,7 +217,7 @@ class Driver:
         Raises
         ------
         MemoryError
-            If they would need more than `max_bytes` of the run.
+            If the larger buffers would need more memory than `max_bytes` allows.
         """
         if self._kept and self._kept == len(self._pieces):
             self._pieces = np.concatenate([self._pieces, self._more_pieces(self._kept)])
@@ -262,13 +263,16 @@ class Driver:
             self._interpolants.warn()
 
     def solution(self, t_end: float) -> OdeSolution | None:
-        """Return the dense output over the whole run, or None if its steps are not stored."""
+        """Return the dense output from the start of the run to `t_end`, or None if the run does not store its steps."""
         if self._interpolants is None or not self._pieces.size:
             return None
         return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
 
     def note(self, values: np.ndarray) -> None:
-        """Update the largest invariant errors with the `values` (l, m) at the saved states after the start."""
+        """Update the largest invariant errors (l,) with the `values` (l, m) of the invariants at the m saved states.
+
+        Values at the start do not count.
+        """
         largest, target = self.run.work.max_defect, self.run.invariants.fixed_target
         later = values[:, np.count_nonzero(self.t[: self.rows] == self.schedule.span.t0) :]
         np.fmax(largest, np.fmax.reduce(np.abs(later - target[:, None]), axis=1, initial=0.0), out=largest)
@@ -310,7 +314,7 @@ def expected_steps(schedule: Schedule) -> int:
 
 
 def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
-    """Raise MemoryError if the saved rows would need too much memory."""
+    """Raise MemoryError if `rows` saved states of the run would need more memory than `max_bytes` allows."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
     require_memory(
         needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "increase save_every or max_bytes"
@@ -318,7 +322,7 @@ def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
 
 
 def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:
-    """Raise MemoryError, with the number of bytes and advice, if `needed` exceeds the bound."""
+    """Raise MemoryError, with both sizes and `advice`, if `needed` bytes exceed the bound of `most_bytes`."""
     bound = most_bytes(needed, max_bytes)
     if needed > bound:
         raise MemoryError(f"{what} needs {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB; {advice}.")

@@ -18,7 +18,10 @@ __all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
 
 
 def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[..., Any]]) -> tuple[Any, ...]:
-    """Return `others`, functions that replace those of `events` one by one, with the times of these so far."""
+    """Return `others`, one function for each of `events`, as a tuple that replaces `events`.
+
+    If `events` is a `ContinuedEvents`, the result is one too, with the same times.
+    """
     return ContinuedEvents(others, events.happened) if isinstance(events, ContinuedEvents) else tuple(others)
 
 
@@ -43,7 +46,7 @@ class Events:
         ``event(t, y[, params]) -> float``, with the attributes ``terminal`` (bool, or the number of times after which
         the run ends) and ``direction`` of SciPy's `solve_ivp`.
     extra : tuple
-        ``(params,)``, args, or nothing.
+        Further arguments of the events: ``(params,)``, the `args` of `integrate`, or nothing.
 
     Raises
     ------
@@ -93,7 +96,7 @@ class Events:
 
     @property
     def left(self) -> list[float]:
-        """Return how often each event may still happen before it ends the run."""
+        """Return for each event after how many further times it ends the run; infinity if it never does."""
         return [allowed - count for allowed, count in zip(self._allowed, self._counts, strict=True)]
 
     def take(self, which: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
@@ -108,12 +111,12 @@ class Events:
         self.last = t, y
 
     def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
-        """Fill `values` with the values of all events."""
+        """Fill `values` with the values of all events at (t, y)."""
         for k in range(len(self.functions)):
             values[k] = self._value(k, t, y.copy())
 
     def leave(self, t: float, y: np.ndarray, f: np.ndarray, step: float, values: np.ndarray) -> None:
-        """Replace the values of events that happened at the start of a continued run by those slightly later.
+        """Replace the value of each event that happened at the start (t, y) of a continued run by a slightly later one.
 
         The value of such an event at the start is a rounding error, whose sign could make the event happen again.
         """
@@ -192,7 +195,7 @@ def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
 
 
 def _adapted(event: Any, k: int) -> Any:
-    """Wrap an event given as a C function pointer for Python, with its attributes."""
+    """Return an event; if it is a C function pointer, wrap it for Python, with its `terminal` and `direction`."""
     found = by_pointer(event, f"event {k}", shape=())
     if found is not event:
         found.terminal, found.direction = getattr(event, "terminal", None), getattr(event, "direction", 0)

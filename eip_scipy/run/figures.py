@@ -84,7 +84,10 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
 
 
 def planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    """Return the indices of the components x and y of each body, by the name of the body."""
+    """Return the indices of the components x and y of each body, by the name of the body.
+
+    The name is "0" for x_0 and y_0, and "orbit" for x and y.
+    """
     place = {name: k for k, name in enumerate(names)}
     bodies = [name[1:] for name in names if name[:1] == "x" and name[1:2] in ("", "_")]
     return {
@@ -95,7 +98,10 @@ def planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
 
 
 def described(result: Any) -> str:
-    """Return the method and the step of a run, with a remark if it is not to be trusted."""
+    """Return the method and the step of a run as text, with a remark if the run is not reliable.
+
+    The text is empty if the result does not name its method.
+    """
     if "method" not in result:
         return ""
     step = "adaptive steps" if result.h is None else f"h = {result.h:g}"

@@ -113,8 +113,8 @@ def integrate(
     args : tuple, optional
         As in `scipy.integrate.solve_ivp`: passed on as the last arguments, to `fun`, events, `jacobian` and `jac`, and
         to the invariants' functions behind their own. Numbers reach Numba functions as such (a float, an int, a bool)
-        and C functions as `params`; a single array of floats is the same as ``params``. With anything else Python calls
-        the functions.
+        and C functions as `params`; a single array of floats is the same as ``params``. With any other arguments the
+        functions are called from Python.
     params : array_like of float, optional
         Instead of `args`: one array of floats, passed on as the last argument. A problem that names its parameters
         (`hamiltonian`, `equations`) also accepts a mapping of the parameters that change.
@@ -142,8 +142,9 @@ def integrate(
     save_every : int, optional
         Save every `save_every`-th step, in addition to the first and the last state.
     t_eval : array_like, optional
-        Times to save at instead, inside `t_span`, in its direction. States between steps come from dense output and are
-        projected. Without `save_every` and `t_eval`, the first and the last state are saved.
+        Times at which states are saved, inside `t_span` and in its direction; not together with `save_every`. States
+        between steps come from dense output and are projected. Without `save_every` and `t_eval`, the first and the
+        last state are saved.
     events : callable or sequence of callable, optional
         ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`;
         Numba functions or C functions, or Python functions, which are called from Python even if `fun` is native.
@@ -167,7 +168,8 @@ def integrate(
         Seconds from one checkpoint to the next; longer if writing would take more than 5 % of the time.
     resume : bool, optional
         Continue from the checkpoint, with the same arguments: the result agrees bit by bit with that of an
-        uninterrupted run. If the file does not exist, the run starts at the beginning. `message` says which.
+        uninterrupted run. If the file does not exist, the run starts at the beginning. The `message` of
+        the result says which of the two happened.
     {names of ProjectionOptions}
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
         ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` is called with the `params` of
@@ -201,7 +203,7 @@ def integrate(
     (one row, the initial state, before the first step), and a note says where the checkpoint continues. If a later
     checkpoint cannot be written, a RuntimeWarning says so, `message` repeats it, and the previous checkpoint is kept.
 
-    The user's functions may store or overwrite the states that they receive: in that case they receive copies.
+    The user's functions may store or overwrite the states that they receive: functions that do so receive copies.
 
     Examples
     --------
@@ -229,10 +231,13 @@ def _check_names(projection: Iterable[str]) -> None:
 
 
 class Loop:
-    """A run in chunks of steps, with progress, samples, events, callbacks, and a partial result after an error."""
+    """A run in chunks of steps, with a progress bar, states at `t_eval`, events, callbacks, and checkpoints.
+
+    An error raised in it has a partial result.
+    """
 
     def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
-        """Prepare the run; `compiled` replaces the value of the request."""
+        """Prepare the run; `compiled` replaces the option `compiled` of the request, unless it is None."""
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
@@ -362,14 +367,17 @@ class Loop:
             )
 
     def _progress(self, shown: float, k: int) -> float:
-        """Return the progress since the last call: in steps if their number is known, else in time."""
+        """Return the progress beyond step `k` if the steps are fixed, else the elapsed time beyond `shown`."""
         schedule = self.driver.schedule
         if schedule.span.h != 0.0:
             return self.driver.step - k
         return abs(self.driver.now[0] - schedule.span.t0) - shown
 
     def _ended(self, code: int) -> bool:
-        """Return True if an event ends the run; after a pause, handle the samples and events of the pending step."""
+        """Return True if an event ends the run; `code` is the loop's status code.
+
+        If the loop has paused in a step, first save the states at `t_eval` in this step and record its events.
+        """
         driver, schedule = self.driver, self.driver.schedule
         self._event_ended = self._pause() if code == PAUSE else code == ENDED
         if self._event_ended and schedule.t_eval.size == 0:
@@ -377,7 +385,10 @@ class Loop:
         return self._event_ended
 
     def _pause(self) -> bool:
-        """Handle samples and events in the pending step; return True if an event ends the run."""
+        """Save the states at `t_eval` in the step in which the loop has paused, and record the events in this step.
+
+        Return True if an event ends the run.
+        """
         driver, schedule = self.driver, self.driver.schedule
         sol = driver.dense()
         end = self.events.handle(*driver.pending_events(), sol)
@@ -388,10 +399,10 @@ class Loop:
         return end is not None
 
     def _chunk(self, chunk: int) -> int:
-        """Return the number of steps to make next: at most `chunk`, and none beyond the next check.
+        """Return the number of steps to make next: at most `chunk`, and none beyond the next check of the run.
 
-        With a callback, none goes beyond the next state that is saved. At the end of a multistep run all remaining
-        steps are made, even if they are more than `chunk`.
+        With a callback, no step goes beyond the next state that is saved. At the end of a multistep run all remaining
+        steps, even if they are more than `chunk`, replace `chunk`.
         """
         driver, schedule = self.driver, self.driver.schedule
         history, left = driver.run.method.multistep, schedule.span.n_steps - driver.step
@@ -405,7 +416,7 @@ class Loop:
         return min(chunk, schedule.save_every - driver.step % schedule.save_every) if schedule.save_every else chunk
 
     def _steps_to_next_time(self) -> int:
-        """Return a number of steps that certainly ends before the next time in t_eval."""
+        """Return a number of fixed steps that does not go beyond the next time in `t_eval`; 1 for adaptive steps."""
         driver, schedule = self.driver, self.driver.schedule
         h = abs(schedule.span.h)
         if h == 0.0 or driver.rows == schedule.t_eval.size:
@@ -472,14 +483,17 @@ class Loop:
         return kept if self.prepared.variations is None else self.prepared.variations.with_targets(kept)
 
     def _solution(self) -> Any:
-        """Return the run as a function of time, or None."""
+        """Return the run as a function of time, or None if its steps are not stored."""
         found = self.driver.solution(self.events.last[0] if self._event_ended else self.driver.now[0])
         if found is None or self.prepared.variations is None:
             return found
         return StateSolution(found, self.prepared.variations.columns)
 
     def explained(self, message: str) -> str:
-        """Return the message with doubts about the run, notes on checkpoints, and why the run was not compiled."""
+        """Return the message with remarks: on a start that was moved and on doubts about the run.
+
+        Notes on checkpoints, functions that were not compiled and gradients by differences follow in parentheses.
+        """
         notes = [*self.keeper.notes, *([] if self.why_not is None else [self.why_not])]
         if labels := self.driver.run.invariants.by_differences:
             names = ", ".join(map(repr, labels))
@@ -491,7 +505,10 @@ class Loop:
         return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:
-        """Return the invariants of the saved states; NaN if an invariant that ended the run raises again."""
+        """Return the invariants (l, m) of the saved states.
+
+        If an error has ended the run (`broken`) and an invariant raises one again, all values are NaN.
+        """
         try:
             return self.driver.values()
         except BaseException:
@@ -514,7 +531,7 @@ def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
 
 
 def _compiling(shown: bool) -> Any:
-    """Show a line while functions are compiled, which can take some seconds."""
+    """Return a context manager that, if `shown`, shows a line while functions are compiled, which may take seconds."""
     if not shown:
         return nullcontext()
     from tqdm import tqdm
@@ -550,7 +567,7 @@ def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
 
 @contextmanager
 def _start_kept(request: Request) -> Iterator[None]:
-    """Attach the initial state as the partial result to an exception raised before the first step."""
+    """Attach a result with the initial state as `partial` to an exception raised in the block that has no `partial`."""
     begin = time.perf_counter()
     try:
         yield

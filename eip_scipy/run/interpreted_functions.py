@@ -60,7 +60,10 @@ def _interpreted_in_place(
 def _second_order(
     interpreted: Callable[..., Callable[..., None]], fun: Callable[..., Any], extra: tuple, y0: np.ndarray
 ) -> Callable[..., None]:
-    """Return the in-place right-hand side of y = (q, v) for the acceleration `fun`, checked by `interpreted`."""
+    """Return the in-place right-hand side of y = (q, v) for the acceleration `fun`.
+
+    `interpreted` is the function of this module that makes `fun` in-place and checks its values.
+    """
     check_halves(y0.size)
     half = y0.size // 2
     acc = interpreted(fun, extra, y0[:half], "acceleration")

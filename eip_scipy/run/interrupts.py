@@ -16,7 +16,7 @@ __all__ = ["TerminatedError", "ended_by_sigterm", "kept_ctrl_c", "look_for_signa
 
 
 class TerminatedError(KeyboardInterrupt):
-    """Exception raised by SIGTERM while a checkpoint must be written; it is handled like Ctrl-C."""
+    """Exception raised by SIGTERM in a run with a checkpoint, which is then written, as after Ctrl-C."""
 
 
 # A Ctrl-C that Python would drop is repeated after this number of seconds.
@@ -34,8 +34,8 @@ def kept_ctrl_c() -> Iterator[None]:
     """Make `look_for_signals` raise KeyboardInterrupt after a Ctrl-C that Python would drop.
 
     Python prints and drops exceptions raised inside a destructor or a callback from C, including KeyboardInterrupt.
-    Compilation creates and destroys LLVM objects all the time, so a Ctrl-C could do nothing. In these places it is
-    postponed until Python has left them. A user-defined handler stays in place.
+    Compilation creates and destroys LLVM objects all the time, so a Ctrl-C could do nothing. A Ctrl-C in a
+    destructor or a callback is postponed until Python has left it. A user-defined handler stays in place.
     """
     if not _is_ours(signal.SIGINT, signal.default_int_handler):
         yield
@@ -54,8 +54,8 @@ def kept_ctrl_c() -> Iterator[None]:
 def ended_by_sigterm(wanted: bool) -> Iterator[None]:
     """Let SIGTERM end the block by an exception, and then the process, as its sender expects.
 
-    Notes of exceptions are printed to the standard error stream. This applies only in the main thread and without a
-    user-defined handler, where SIGTERM would end the process at once. A second SIGTERM is ignored.
+    The notes of this exception are printed to the standard error stream. All of this applies only in the main thread
+    and without a user-defined handler, where SIGTERM would end the process at once. A second SIGTERM is ignored.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def ended_by_sigterm(wanted: bool) -> Iterator[None]:
 
 
 def look_for_signals() -> None:
-    """Raise the exception of a signal that was dropped.
+    """Raise the exception of a signal if it was dropped; otherwise do nothing.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def _note_ctrl_c(number: int, frame: FrameType | None) -> None:
 
 
 def _would_be_dropped(frame: FrameType | None) -> bool:
-    """Return True if Python is in a destructor, or in LLVM, which uses callbacks."""
+    """Return True if Python would drop an exception in `frame`: in a destructor, or in LLVM, which uses callbacks."""
     while frame is not None:
         if frame.f_code.co_name == "__del__" or frame.f_globals.get("__name__", "").startswith("llvmlite."):
             return True

@@ -13,21 +13,24 @@ SMALL = 2**22  # number of bytes up to which the free memory is not determined, 
 
 
 def check_bytes(max_bytes: Any) -> None:
-    """Raise ValueError unless the option ``max_bytes`` is None or a number."""
+    """Raise ValueError unless the option ``max_bytes`` is None or a number >= 0."""
     refuse_units(max_bytes=max_bytes)
     if max_bytes is not None and not (is_number(max_bytes) and max_bytes >= 0):
         raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
 
 
 def most_bytes(needed: float, max_bytes: float | None) -> float:
-    """Return the bound on the memory of a run that needs `needed` bytes: `max_bytes`, or half of the free memory."""
+    """Return the bound in bytes on the memory of a run that needs `needed` bytes.
+
+    It is `max_bytes` if this is given, else SMALL for a run that needs no more, else half of the free memory.
+    """
     if max_bytes is not None:
         return max_bytes
     return SMALL if needed <= SMALL else 0.5 * free_memory()
 
 
 def free_memory() -> float:
-    """Return the number of bytes that a process can still allocate."""
+    """Return an estimate of the number of bytes that a process can still allocate."""
     try:
         with open("/proc/meminfo") as lines:
             for line in lines:

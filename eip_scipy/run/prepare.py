@@ -114,13 +114,13 @@ class Request(NamedTuple):
 
     @property
     def adaptive(self) -> bool:
-        """Return True if an option of adaptive steps was given."""
+        """Return True if an option of adaptive steps was given: `rtol`, `atol`, `first_step` or `max_step`."""
         no_bound = isinstance(self.max_step, float) and self.max_step == np.inf
         return not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
 
     @property
     def steps(self) -> StepOptions:
-        """Return the options of the step size, with their defaults."""
+        """Return the options of the step size, with the defaults for those that were not given."""
         return StepOptions(
             h=None if self.h is DEFAULT else self.h,
             first_step=self.first_step,
@@ -161,11 +161,11 @@ class System:
     def left_out(self) -> str:
         """Return a possible cause of NaN in the value of the function, for messages; "" if none is known."""
         if isinstance(self.fun, PointerFunction):
-            return "a C function leaves NaN in components that it does not fill, and if it returns a status above 0"
+            return "components are NaN if the C function does not fill them, and all are if its status is above 0"
         return "with in_place=True it must fill all of out" if "in place" in self.form else ""
 
     def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the derivative as a new array; raise an error if the function has other arguments."""
+        """Return the derivative at (t, y) as a new array; raise TypeError if the function takes other arguments."""
         out = np.empty_like(y)
         try:
             self.rhs(t, y, out, self.parameters)
@@ -177,19 +177,23 @@ class System:
         return out
 
     def product(self) -> Callable[..., np.ndarray] | None:
-        """Return ``product(t, q, dq)``, the Jacobian times dq, or None; a `Deferred` Jacobian is made here."""
+        """Return the function ``product(t, q, dq)``, the Jacobian of the accelerations times dq.
+
+        A `Deferred` Jacobian is made here. Without the option `jacobian` the result is None.
+        """
         self.jacobian = made(self.jacobian)
         return None if self.jacobian is None else times(self.jacobian, *self.extra)
 
     def matrix(self) -> Jacobian:
-        """Return the Jacobian as SciPy's implicit solvers take it."""
+        """Return the option `jac`, with the arguments of `fun` bound, as SciPy's implicit solvers take it."""
         jac = self.jac
         return Jacobian((lambda t, y: jac(t, y, *self.extra)) if callable(jac) and self.extra else jac)
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
-        """Return the functions that the loop calls, and a sentence on those called from Python and why, or None.
+        """Return the functions that the loop calls, and None if all are called natively.
 
-        `wanted` is the option `compiled`: True raises NotCompilableError instead.
+        Otherwise the second item is a text that says which functions are called from Python, and why. `wanted` is the
+        option `compiled`; if it is True, NotCompilableError is raised instead.
         """
         numbers = scalars(self.extra)
         if wanted is False:
@@ -218,14 +222,14 @@ class System:
 
     @property
     def _native_form(self) -> tuple[Any, str]:
-        """Return `fun` and its form, or the acceleration if it comes from the same library and suffices."""
+        """Return the function to compile and its form: `acc` if it comes from the same library as `fun`, else `fun`."""
         own = isinstance(self.fun, LibraryFunction) and isinstance(self.acc, LibraryFunction)
         if own and self.fun.__name__.partition(".")[0] == self.acc.__name__.partition(".")[0]:
             return self.acc, "acceleration"
         return self.fun, self.form
 
     def calls(self, run: Run, functions: PythonFunctions | NativeFunctions) -> dict[str, str]:
-        """Return how each function is called; see `IntegrationResult`."""
+        """Return how each function is called, as the attribute `calls` of `IntegrationResult`."""
 
         def kind(fun: Any, in_python: bool) -> str:
             if in_python:
@@ -405,7 +409,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
 
 
 def _variations(given: Any, request: Request, form: str) -> Variations | None:
-    """Return the `Variations` for the option of this name, or None if it was not given."""
+    """Return the `Variations` for the option `variations` of the request, or None if it was not given."""
     if request.variations is None:
         if request.jvp is not None or request.symplectic is not None:
             raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
@@ -434,7 +438,10 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
 
 
 def _widened(request: Request, variations: Variations) -> Request:
-    """Return the request for the state extended by its columns."""
+    """Return the request for the state followed by its columns of derivatives.
+
+    It has the functions, events and invariants of `variations`, which take this longer state.
+    """
     extra = extra_arguments(request.args, request.params)
     return request._replace(
         fun=variations.rhs,
@@ -457,7 +464,10 @@ def started_at(request: Request) -> tuple[float, np.ndarray]:
 
 
 def _plain(request: Request) -> Request:
-    """Return the request in plain numbers; only a problem knows the units of a state and the names of parameters."""
+    """Return the request with durations, units and names of parameters replaced by plain numbers.
+
+    Only a `Problem` knows its units and parameters; with another function the request is returned unchanged.
+    """
     problem = request.fun
     if not isinstance(problem, Problem):
         return request
@@ -469,7 +479,10 @@ def _plain(request: Request) -> Request:
 
 
 def _second_order_hint(fun: Any) -> str:
-    """Return advice on how to write the problem in (q, v), or how to pass an acceleration."""
+    """Return advice on how to write the problem in (q, v) or how to pass an acceleration, for the end of a message.
+
+    The text is empty if the problem has no such form.
+    """
     if not isinstance(fun, Problem):
         return f". If fun is the acceleration a(t, q), {BY_NAME}"
     return (
@@ -517,7 +530,7 @@ def _given_or_brought(request: Request) -> tuple[Any, Any]:
 
 
 def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
-    """Return the function that the engine calls and its form: a right-hand side or an acceleration."""
+    """Return the function that the engine calls, and the name of its form in FORMS."""
     acceleration = isinstance(fun, AccelerationField)
     if acceleration:
         fun, in_place = fun.acceleration, fun.in_place
@@ -528,7 +541,10 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
 
 
 def _with_problem(request: Request) -> tuple[Request, str]:
-    """Return the request, completed by the attributes of a `Problem` if it has one, and the form of its function."""
+    """Return the request, completed by the attributes of its `Problem` if it has one, and the form of its function.
+
+    The form is a name in FORMS.
+    """
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
     problem, in_place = request.fun, flag("in_place", request.in_place)
@@ -564,7 +580,10 @@ def _with_problem(request: Request) -> tuple[Request, str]:
 
 
 def _without_own(projection: Mapping[str, Any], *extra: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the invariants without their args if these equal one of `extra`, which the run passes on itself."""
+    """Return the option `invariants`, in which an invariant whose args equal one of `extra` has no args.
+
+    The run passes these arguments on itself. The result is empty if the option was not given.
+    """
     if "invariants" not in projection:
         return {}
     items = as_invariants(projection["invariants"])

@@ -64,16 +64,16 @@ def recommend(
     acceleration : callable, optional
         Instead of `fun`, as for `integrate`: the a of q'' = a(t, q), with y = (q, v).
     error : float, optional
-        Wanted error of the state at the end: largest component of the difference to the exact one, relative to the
-        largest component.
+        Wanted error of the state at the end: largest component of the difference from the exact state, relative to the
+        largest component of the exact state.
     invariants : Invariant or sequence of Invariant, optional
         Invariants to keep; default: those of the problem; for a function, none.
     max_nfev : int, optional
         Approximate bound on the evaluations of one trial; default: 100 000, and 500 000 for compiled functions. A
         longer run is tried on the first part of its interval, and its error is extrapolated.
     t_eval : array_like, optional
-        Times at which the recommended run saves states, as for `integrate`. Methods are then compared with the
-        evaluations that states between their steps take.
+        Times at which the recommended run saves states, as for `integrate`. The comparison of methods then includes
+        the evaluations for states between steps.
     params, in_place, jacobian, metric, blocks, frame, compiled
         As for `integrate`, for all runs. With `jacobian`, or a problem that has one, `EIPGJ14` is tried.
 
@@ -100,8 +100,9 @@ def recommend(
     Notes
     -----
     Errors of trials are measured against a reference run, by `EIPDOP853` without projection if possible. Its tolerances
-    are reduced until two runs agree to 2 % of the wanted error. Of the trials with errors between 15 % and 100 % of the
-    wanted error, the one with the fewest evaluations is recommended; a cheaper trial may be more accurate.
+    are reduced until two runs agree to 2 % of the wanted error. With each method, up to 8 trials are made until one has
+    between 15 % and 100 % of the wanted error. Of all trials with at most the wanted error, the one with the fewest
+    evaluations is recommended, but a less usual method only if it needs less than 90 % of those of the others.
 
     Examples
     --------
@@ -120,7 +121,7 @@ def recommend(
 
 
 def _right_hand_side(fun: Any, acceleration: Any, options: dict[str, Any]) -> Any:
-    """Return the given right-hand side, or the acceleration together with `in_place`, which is removed from options."""
+    """Return `fun`, or the `AccelerationField` of `acceleration`, for which `in_place` is removed from `options`."""
     if acceleration is None:
         return fun
     if fun is not None:
@@ -170,7 +171,10 @@ def _problem(
 
 
 def _made(fun: Any, t_span: Any, y0: Any, common: dict[str, Any]) -> Problem:
-    """Return a problem made from a function; `in_place` and `params` move from the options to the problem."""
+    """Return a problem made from a function, with `in_place` removed from the options in `common`.
+
+    For an in-place function, `params` also moves from the options to the problem.
+    """
     if not callable(by_pointer(fun, "fun")):
         raise TypeError(f"recommend: fun must be callable or a Problem, got {shown(fun)}.")
     name = getattr(getattr(fun, "acceleration", fun), "__name__", "problem")

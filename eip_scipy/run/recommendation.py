@@ -36,10 +36,10 @@ class Recommendation:
     wanted : float
         The wanted error.
     error, nfev : float, int
-        Expected error at the end of the interval (largest component of the difference relative to the largest
-        component), and expected evaluations of the right-hand side.
+        Expected error at the end of the interval (largest component of the difference from the exact state, relative to
+        the largest component of the exact state), and expected number of evaluations of the right-hand side.
     share : float
-        Fraction of the interval that the trials cover; if it is below 1, both numbers are extrapolated.
+        Fraction of the interval that the trials cover; if it is below 1, `error` and `nfev` are extrapolated.
     trusted : bool
         True if the trial of the recommended run was reliable and kept all invariants that were asked for.
     message : str
@@ -69,12 +69,12 @@ class Recommendation:
 
     @property
     def error(self) -> float:
-        """Expected error at the end of the interval."""
+        """Expected error of the state at the end of the interval, relative to the largest component."""
         return self.trial.error
 
     @property
     def nfev(self) -> int:
-        """Expected evaluations of the right-hand side."""
+        """Expected number of evaluations of the right-hand side."""
         return self.trial.cost
 
     @property
@@ -143,13 +143,16 @@ def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
 
 
 def _telling(options: Mapping[str, Any]) -> str:
-    """Return the method and the options that do not follow from others, as text."""
+    """Return the method and its options as text, without `atol` and `compensated`, which follow from the others."""
     others = {name: value for name, value in options.items() if name not in ("method", "atol", "compensated")}
     return f"{options['method'].__name__}, {called(others)}"
 
 
 def _one_each(trials: tuple[Trial, ...], chosen: Trial) -> list[Trial]:
-    """Return one trial for each set of options without h, rtol and atol: the last good one, or the last one."""
+    """Return one trial for each set of options without h, rtol and atol.
+
+    It is `chosen` if this trial belongs to the set, else the last good trial, or the last trial if none is good.
+    """
     ways: dict[str, Trial] = {}
     for trial in trials:
         options = {name: value for name, value in trial.options.items() if name not in ("h", "rtol", "atol")}

@@ -57,7 +57,7 @@ UNSET = ("units", "epoch")  # fields that are printed only if they are set
 
 
 class WithColumns(Fields):
-    """A result whose runs may have carried derivatives."""
+    """Base class of results of runs that may have integrated derivatives of the state (``variations=``)."""
 
     variations: np.ndarray
     columns: dict[str, Any]
@@ -123,8 +123,10 @@ class IntegrationResult(WithColumns):
     sol : OdeSolution or None
         The run as a function of time, with ``dense_output=True``; as in `scipy.integrate.solve_ivp`.
     nfev, njev, nlu : int
-        Evaluations of the right-hand side and of the invariants' gradients, and factorisations. For a one-step method
-        of another kind (`Lawson`, `Splitting`), `nfev` also counts the evaluations that replace the right-hand side.
+        Numbers of evaluations of the right-hand side and of the invariants' gradients, and of factorisations in
+        projections. For `EIPRadau` and `EIPBDF`, `njev` and `nlu` also count the Jacobians of the right-hand side and
+        the factorisations in steps. For a one-step method of another kind (`Lawson`, `Splitting`), `nfev` also counts
+        the evaluations that replace the right-hand side.
     status : int
         0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
     message : str
@@ -141,7 +143,8 @@ class IntegrationResult(WithColumns):
         How each function was called: "python", "jitted" (a Numba function, as a C pointer), "native" (a function of the
         engine), "pointer" (a C function), or "differences" for the gradient of a C function without one. The keys are
         "fun" or "acceleration", the name of each invariant ("invariant 0" for the first one, if it has none),
-        "gradient of " followed by that name, "event 0", "event 1" and so on.
+        "gradient of " and, for a `Balance`, "rate of " followed by that name, "jacobian" for a method that uses it,
+        "event 0", "event 1" and so on.
     method : str
         Name of the method.
     h : float or None
@@ -150,10 +153,10 @@ class IntegrationResult(WithColumns):
         Columns of derivatives at the saved times, if they were requested. Between two steps they are interpolated
         and projected, as the states are. See `stm` and `sensitivities`.
     columns : dict
-        Description of these columns: "state", True if the state-transition matrix is included; "parameters", the number
-        of derivatives with respect to parameters, and their "names"; "symplectic", True if the matrix was kept
-        symplectic; "source", the origin of the products with the Jacobian: "problem", "jvp", "dual numbers" or "complex
-        steps".
+        Description of the columns of `variations`: "state", True if the state-transition matrix is included;
+        "parameters", the number of derivatives with respect to parameters, and "names", the names of these parameters;
+        "symplectic", True if the matrix was kept symplectic; "source", the origin of the products with the Jacobian:
+        "problem", "jvp", "dual numbers" or "complex steps".
     component_names : tuple of str
         Names of the components from the `Problem`, or "y0", "y1" and so on; other names can be assigned.
     units : str
@@ -169,8 +172,8 @@ class IntegrationResult(WithColumns):
     Notes
     -----
     The result can be pickled. A result that was pickled or loaded does not know the functions of its run: `continue_to`
-    raises an error, and ``sol`` holds a polynomial for each step, which agrees with the states at the steps exactly and
-    with those in between to 1e-12.
+    raises an error. In a pickled result ``sol`` holds a polynomial for each step, which agrees with the states at the
+    steps exactly and with those in between to 1e-12; in a loaded result it is None.
     """
 
     t: np.ndarray
@@ -232,7 +235,7 @@ class IntegrationResult(WithColumns):
         return self[name]
 
     def _observe(self) -> None:
-        """Compute outputs and multipliers, unless they have been computed."""
+        """Compute the fields for outputs and multipliers if the problem has them and they have not been computed."""
         origin = vars(self).get("_origin")
         if origin is None or any(name in self for name in OBSERVED) or not isinstance(origin.request.fun, Problem):
             return
@@ -314,7 +317,7 @@ class IntegrationResult(WithColumns):
         return continued(self, t, options)
 
     def __repr__(self) -> str:
-        """Return the fields as text, without those that are not set."""
+        """Return the fields as text, without `units` and `epoch` if they are not set."""
         return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
 
     def _packed(self) -> dict[str, Any]:
@@ -339,7 +342,7 @@ class IntegrationResult(WithColumns):
         return cls(found)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Compute outputs and multipliers first, because a pickle does not contain the functions."""
+        """Return the content of a pickle, with outputs and multipliers, because it does not contain the functions."""
         self._observe()
         return super().__reduce_ex__(protocol)
 
@@ -347,5 +350,5 @@ class IntegrationResult(WithColumns):
         return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray", "view"]
 
     def __getstate__(self) -> None:
-        """Exclude the attributes that are not fields: the origin, whose functions cannot be pickled."""
+        """Return None: a pickle excludes attributes that are not fields, such as the functions of the run."""
         return None

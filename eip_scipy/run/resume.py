@@ -58,10 +58,14 @@ class Keeper:
         y0: np.ndarray,
         f0: np.ndarray,
     ) -> None:
-        """Record the settings of the run and its derivative (`f0` at the start), before anything is compiled."""
+        """Record what identifies the run, before anything is compiled: its settings and functions.
+
+        `derivative` is the right-hand side, and `f0` its value at the start (t0, y0). A run that is resumed must agree
+        with its file, otherwise CheckpointError is raised.
+        """
 
     def begin(self, driver: Any, events: Events) -> None:
-        """Take over the driver, whose buffers hold the start; fill them if a run is resumed."""
+        """Store the driver, whose buffers hold the start, and the events; if a run is resumed, fill the buffers."""
 
     def keep(self) -> None:
         """Store a snapshot or write the file if it is due; called between two chunks of steps."""
@@ -82,7 +86,7 @@ def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[K
     TypeError
         If `path` is not a path.
     ValueError
-        If another value is wrong, or `resume` is given without a path.
+        If another value is wrong, `resume` is True without a path, or `dense_output` is True with one.
     CheckpointError
         If the file exists and `resume` is False, cannot be read, or is used by another run.
     """
@@ -163,7 +167,7 @@ def _digest(values: Iterable[Any]) -> str:
 
 
 class _Snapshot(NamedTuple):
-    """State of a run after an accepted step: its small arrays, the number of events so far, and the run time."""
+    """State of a run after an accepted step: its small arrays, how often each event has happened, and the run time."""
 
     arrays: dict[str, np.ndarray]
     happened: list[int]
@@ -213,7 +217,7 @@ class _FileKeeper(Keeper):
         checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
 
     def _known_by(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the values by which the functions are identified at a state of the run."""
+        """Return the values at (t, y) that identify the functions: the derivative, invariants and rates of balances."""
         f = self._derivative(t, y.copy())
         rates = run.invariants.balances.given(t, y, f)
         known_by = {"state_f": f, "state_values": run.invariants.values(t, y)}
@@ -325,7 +329,10 @@ class _FileKeeper(Keeper):
         )
 
     def _state(self) -> dict[str, np.ndarray]:
-        """Return the values that identify the functions at the snapshot; these evaluations are not counted."""
+        """Return the values that identify the functions at the snapshot, none if a function raises an error.
+
+        The evaluations are not counted.
+        """
         arrays = self._snapshot.arrays
         try:
             return self._known_by(self._driver.run, float(arrays["clock"][TIME]), arrays["y"])
@@ -344,7 +351,7 @@ class _FileKeeper(Keeper):
         return f"step {arrays['place'][STEP]}, t = {arrays['clock'][TIME]:.10g}"
 
     def _write_or_warn(self, status: int | None, message: str) -> None:
-        """Write the file; a full disk only causes a warning, and the run continues."""
+        """Write the file; if that fails, for example because the disk is full, warn and let the run continue."""
         self._failure = ""
         try:
             self._write(status, message)

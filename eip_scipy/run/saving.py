@@ -43,7 +43,7 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     TypeError
-        If a field is neither numeric nor representable in JSON.
+        If `result` is not such a result, or a field is neither numeric nor representable in JSON.
     CheckpointError
         If the file cannot be written.
 
@@ -134,7 +134,7 @@ def load(path: str | os.PathLike[str]) -> Any:
 
 
 def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Return the part of diagnostics that JSON can hold; the buffers are added to `arrays`."""
+    """Return the part of `diagnostics` that JSON can hold; the other part is added to `arrays`."""
     trust = diagnostics._trust
     buffers = (diagnostics.max_defect, diagnostics._defect, diagnostics._max_correction, diagnostics._counters)
     arrays |= zip(BUFFERS, (*buffers, trust.figures), strict=True)
@@ -167,7 +167,7 @@ def _numbers(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a value in a form that JSON can hold."""
+    """Return the value of a field in a form that JSON can hold; raise TypeError if it has none."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, dict):

@@ -68,10 +68,11 @@ LEAST_BOUND = 1000
 
 @dataclass(frozen=True)
 class Look:
-    """Results of a first run: the size of the state, the typical step, and the factor by which the steps vary.
+    """Results of a first run, by adaptive steps of `EIPDOP853`.
 
-    `velocities` says whether the accelerations of q'' = a(t, q, v) depend on v; it is None if the system is not of
-    that form.
+    `size` is the largest component of the state, but at most 1, `step` the median of the steps, and `variation` the
+    ratio of long to short steps (95th to 5th percentile). `velocities` says whether the accelerations of
+    q'' = a(t, q, v) depend on v; it is None if the system is not of that form.
     """
 
     size: float
@@ -81,7 +82,7 @@ class Look:
 
 
 class Search:
-    """The search for one problem: all trials, in the order in which they were run."""
+    """Search for the cheapest method for one problem; `trials` holds all trials in the order in which they were run."""
 
     def __init__(
         self, problem: Problem, common: Mapping[str, Any], wanted: float, max_nfev: int | None, output: Any = None
@@ -98,7 +99,7 @@ class Search:
         self.bench.most = LONGEST * self.longest
 
     def recommendation(self) -> Recommendation:
-        """Return the cheapest tuned method and options, with the reason."""
+        """Return the cheapest method with its options and the reason; raise ValueError if none has the wanted error."""
         chosen = self._cheapest()
         if chosen is None and self.keeps:
             self._leave_out_invariants()
@@ -132,7 +133,7 @@ class Search:
     # --- preparation: size, steps, a reference solution ---
 
     def _look(self, max_nfev: int | None) -> Look:
-        """Run once without projection, over as much of the interval as a trial may cover."""
+        """Run once without projection, over as much of the interval as a trial may cover; return the `Look`."""
         bench, problem = self.bench, self.bench.problem
         rtol = min(max(self.wanted, 1e-10), 1e-4)
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
@@ -160,7 +161,10 @@ class Search:
         return Look(size, float(np.median(lengths)), float(long / short), velocities)
 
     def _find_truth(self) -> None:
-        """Find reference states: those of the tighter of two runs that agree well enough."""
+        """Store in `bench` the reference states: those of the tighter of two runs that agree well enough.
+
+        Raise ValueError if no two runs agree well enough.
+        """
         size, plain = self.look.size, Kind(EIPDOP853, size=self.look.size, options=PLAIN)
         found, enough = [self._reference(plain, REFERENCE_START * self.wanted)], AGREEMENT * self.wanted
         method, options = (EIPRKN12, LONG) if self.look.velocities is False else (EIPDOP853, {})
@@ -185,7 +189,10 @@ class Search:
         self.bench.truth, self.bench.doubt = reference.y, agreement
 
     def _reference(self, kind: Kind, rtol: float) -> tuple[float, Outcome]:
-        """Reduce the tolerance from `rtol`; return how well the last two runs agree at the end, and the tighter one."""
+        """Reduce the tolerance from `rtol` until two runs agree or rounding errors remain.
+
+        Return the relative difference of the last two runs at the end of the interval, and the tighter of them.
+        """
         rtol, wider, agreement = max(rtol, FINE_START), None, math.inf
         while True:
             value = kind.near(rtol)
@@ -216,7 +223,10 @@ class Search:
         return chosen
 
     def _others(self, rtol: float) -> list[tuple[Kind, float]]:
-        """Return the other kinds, each with the step or tolerance at which its search starts."""
+        """Return each `Kind` to try after `EIPDOP853`, with the step or tolerance at which its search starts.
+
+        `rtol` is this tolerance for kinds with adaptive steps.
+        """
         look, found = self.look, []
         if look.velocities is False:
             found += [(self._kind(EIPRKN8, **LONG), rtol), (self._kind(EIPRKN12, **LONG), rtol)]
@@ -238,7 +248,11 @@ class Search:
         return Kind(method, fixed, self.look.size, length / LEAST_STEPS if fixed else COARSEST_RTOL, options)
 
     def _tuned(self, kind: Kind, value: float, bound: float = math.inf) -> Trial | None:
-        """Return the best trial of a kind, or None if no trial has the wanted error."""
+        """Return the cheapest trial of a kind, from `value` of its step or tolerance on.
+
+        The search ends if the kind costs much more than `bound` evaluations. Return None if no trial has the wanted
+        error.
+        """
         tried = tune(kind, value, self.wanted, self._trial, bound)
         for trial in tried:
             self.kinds[id(trial)] = kind
@@ -246,7 +260,7 @@ class Search:
         return None if chosen is None else self._with_output(chosen)
 
     def _with_output(self, chosen: Trial) -> Trial:
-        """Return the trial with the evaluations that states at the times of output take, and keep it in the table."""
+        """Replace `chosen` in `trials` by a trial with the evaluations for states at `bench.output`, and return it."""
         counted = self.bench.with_output(chosen)
         self.trials[[trial is chosen for trial in self.trials].index(True)] = counted
         self.kinds[id(counted)] = self.kinds.pop(id(chosen))  # an object that is gone may pass its id on
@@ -270,7 +284,7 @@ class Search:
         return chosen
 
     def _metrics(self) -> list[dict[str, Any]]:
-        """Return the options of the metric that neither the problem nor the user has set."""
+        """Return sets of options to try: other blocks and another metric, unless the problem or the user sets them."""
         problem, n = self.bench.problem, self.bench.problem.y0.size
         if problem.metric is not None or "metric" in self.bench.common:
             return []
@@ -284,7 +298,7 @@ class Search:
     # --- remarks ---
 
     def _leave_out_invariants(self) -> None:
-        """Continue the search without projection, and record the reason."""
+        """Let the further trials run without projection, and record the reason in `message`."""
         self.keeps = False
         good = [trial.error for trial in self.trials if trial.good]
         why = f"with the projection the error stays at {min(good):.1e}" if good else self.trials[-1].trouble
@@ -296,7 +310,7 @@ class Search:
             self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
 
     def _say_that_it_is_stiff(self, chosen: Trial) -> bool:
-        """Try an implicit method if the run is long, and say by how much it is cheaper if it is."""
+        """Return True if an implicit method needs at most 1 / STIFF of the evaluations of a long run; add a remark."""
         bench, share = self.bench, self.bench.share
         if chosen.nfev * share < LEAST_BOUND or np.iscomplexobj(bench.truth):
             return False

@@ -71,7 +71,7 @@ class OdeResult(Result):
     diagnostics : Diagnostics
         The record of the projections.
     variations : ndarray, shape (m, n, k)
-        The columns of derivatives, if they were requested.
+        The columns of derivatives of the state at the times `t`, if they were requested.
     """
 
     t: np.ndarray
@@ -154,7 +154,7 @@ def solve_ivp(
         with these initial values. The result has them as ``variations``. `integrate` also gives derivatives with
         respect to parameters.
     jvp : callable, optional
-        ``jvp(t, y, dy, *args) -> (n,)``, the Jacobian times dy.
+        For `variations`: ``jvp(t, y, dy, *args) -> (n,)``, the Jacobian of `fun` times dy.
     {names of ProjectionOptions}
         As for the methods, see `EIPSolver`.
     diagnostics : Diagnostics, optional
@@ -252,7 +252,10 @@ def _solve(
 def _variations(
     method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, asked: Any, extra: tuple, items: Any, jvp: Any
 ) -> Variations:
-    """Return the functions of the state with its columns; the invariants `items` have their arguments bound."""
+    """Return the `Variations` for the option `variations` (`asked`): functions of the state followed by its columns.
+
+    The invariants `items` have their arguments bound.
+    """
     require_tableau(method)
     start, t0 = initial_state(y0), interval(t_span)[0]
     columns = asked_columns(asked, start, NOTHING, (), method.TABLEAU.of_second_order)
@@ -261,12 +264,12 @@ def _variations(
 
 
 def _carrying(method: type[EIPSolver], wide: Variations) -> Any:
-    """Return the solver class for states that are followed by these columns."""
+    """Return a subclass of `method` for states that are followed by the columns of `wide`."""
     return SolverClass(method.__name__, (method,), {"_COLUMNS": wide.columns, "__doc__": method.__doc__})
 
 
 def _split(sol: Any, wide: Variations) -> None:
-    """Split the wide states of a result into states and columns."""
+    """Split the states followed by columns in a result `sol` into its states and its ``variations``, in place."""
     columns = wide.columns
     sol.y, sol.variations = columns.apart(sol.y.T)
     sol.y = sol.y.T
@@ -312,7 +315,7 @@ def _with_projection(method: Any, given: list[str]) -> Any:
 
 
 def _unpacked(args: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return `args` as SciPy gets them, and as a tuple; SciPy reports wrong ones."""
+    """Return `args` for SciPy, and as a tuple; SciPy raises the error for those that cannot become a tuple."""
     try:
         extra = () if args is None else tuple(args)
     except TypeError:

@@ -35,7 +35,7 @@ class _TooManyError(Exception):
 
 
 def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> ImplicitRun | None:
-    """Run a problem by `EIPRadau` to the end of the bench's trials.
+    """Run the problem of a `Bench` by `EIPRadau` over the interval of its trials, with smaller and smaller tolerances.
 
     Parameters
     ----------
@@ -51,7 +51,8 @@ def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> Implici
     Returns
     -------
     ImplicitRun or None
-        None if no run reaches the end with the wanted error.
+        The first run with the wanted error. None if no run has it, a run fails or needs more than `most` evaluations,
+        or the state has more than LARGEST components.
     """
     y0, times = bench.problem.y0, bench.times
     if y0.size > LARGEST:

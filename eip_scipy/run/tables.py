@@ -96,12 +96,13 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     Returns
     -------
     pandas.DataFrame
-        Table indexed by ``t``, with a column for each component, then for each invariant its value, "H", and its error,
-        "H error" (the value minus the target). If a component has the same name, the invariant is "invariant H". The
-        last columns are derivatives, such as "dx/dvy" of x with respect to the initial vy; see `to_xarray` for the
-        names. A mechanical system adds its outputs, "output x" if there is a column x, and its multipliers, such as
-        "multiplier g1'". The table of an ensemble is indexed by ``member``: a column for each component of the last
-        state, then "t_end", "status", "message", "trusted", and "H max_defect" for each invariant.
+        Table indexed by ``t``, with a column for each component, then two for each invariant: for one named H, its
+        value "H" and its error "H error" (the value minus the target). If a component is also named H, the columns are
+        "invariant H" and "invariant H error". Columns of derivatives follow, such as "dx/dvy" of x with respect to the
+        initial vy; see `to_xarray` for the names. A mechanical system adds its outputs, "output x" if there is a column
+        x, and its multipliers, such as "multiplier g1'". The table of an ensemble is indexed by ``member``: a column
+        for each component of the last state, then "t_end", "status", "message", "trusted", and "H max_defect" for each
+        invariant.
 
     Raises
     ------
@@ -171,7 +172,10 @@ def column_names(result: Any, components: Sequence[str]) -> list[str]:
 
 
 def component_names(result: Any, names: Any = None, n: int | None = None) -> tuple[str, ...]:
-    """Return `names`, by default those of the result, else "y0", "y1" and so on; `n` is len(result.y) by default."""
+    """Return the `n` names of components: `names`, by default those of the result, else "y0", "y1" and so on.
+
+    By default `n` is len(result.y). ValueError is raised if `names` are not `n` different names.
+    """
     n = len(result.y) if n is None else n
     if names is None:
         names = getattr(result, "component_names", None)
@@ -184,7 +188,7 @@ def default_names(n: int) -> tuple[str, ...]:
 
 
 def dataset(variables: dict[str, Any], coordinates: dict[str, Any], attributes: dict[str, Any]) -> Dataset:
-    """Return an `xarray.Dataset`; raise ImportError that names the extra if xarray is missing."""
+    """Return an `xarray.Dataset`; if xarray is missing, raise ImportError that says how to install it."""
     try:
         import xarray
     except ModuleNotFoundError as error:
@@ -193,7 +197,7 @@ def dataset(variables: dict[str, Any], coordinates: dict[str, Any], attributes: 
 
 
 def _attribute(value: Any) -> Any:
-    """Return an attribute in a form that NetCDF and Zarr can store: they have neither None nor booleans."""
+    """Return an attribute in a form that NetCDF and Zarr can store: NaN for None, and 1 or 0 for a boolean."""
     if value is None:
         return np.nan
     return int(value) if isinstance(value, (bool, np.bool_)) else value

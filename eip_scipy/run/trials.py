@@ -33,8 +33,9 @@ class Trial:
     options : dict
         Options of `integrate`, without those that all trials have in common.
     error : float
-        Error of the state at the end of the interval: largest component of the difference, relative to the largest
-        component. Extrapolated if the trial is shorter than the interval; nan if the run failed.
+        Error of the state at the end of the interval: largest component of the difference from the reference, relative
+        to the largest component of the reference. Extrapolated if the trial is shorter than the interval; nan if the
+        run failed.
     nfev : int
         Evaluations of the right-hand side for the whole interval.
     seconds : float
@@ -57,7 +58,7 @@ class Trial:
 
     @property
     def cost(self) -> int:
-        """All evaluations."""
+        """Number of all evaluations: the sum of `nfev` and `output`."""
         return self.nfev + self.output
 
     @property
@@ -67,7 +68,11 @@ class Trial:
 
 
 class Outcome(NamedTuple):
-    """States at the times of the bench, shape (n, k), evaluations, run time, and the reason if the run is not good."""
+    """Result of one run of a `Bench`.
+
+    `y` holds the states (n, k) at the times of the bench, `nfev` the number of evaluations, `seconds` the run time, and
+    `trouble` the reason if the run failed or is not reliable.
+    """
 
     y: np.ndarray
     nfev: int
@@ -139,7 +144,7 @@ class Bench:
         return _outcome(run, run.y[:, 1:])
 
     def trial(self, options: Mapping[str, Any]) -> Trial:
-        """Run once and compare with the reference; a run whose options or steps raise an error counts as failed."""
+        """Run once and compare with the reference; a ValueError or ArithmeticError makes it a failed trial."""
         try:
             done = self.run(options)
         except (ValueError, ArithmeticError) as error:
@@ -150,7 +155,7 @@ class Bench:
         )  # it may be the reference run
 
     def with_output(self, trial: Trial) -> Trial:
-        """Return the trial with the evaluations of a run that saves states at the times of output."""
+        """Return the trial with the further evaluations of a run that saves states at the times `self.output`."""
         if self.output is None:
             return trial
         end = self.times[-1]
@@ -167,7 +172,7 @@ class Bench:
         return replace(trial, output=round(run.nfev / self.share) - trial.nfev)
 
     def judged(self, options: Mapping[str, Any], done: Outcome, truth: np.ndarray) -> Trial:
-        """Return the trial of a run whose states are compared with `truth`."""
+        """Return the `Trial` of a run with `options` and the outcome `done`, whose states are compared with `truth`."""
         nfev = round(done.nfev / self.share)
         if done.y.shape != truth.shape or not np.isfinite(done.y).all():
             return Trial(options, math.nan, nfev, done.seconds, done.trouble or "it did not reach its end")
@@ -192,7 +197,7 @@ def _outcome(run: IntegrationResult, y: np.ndarray, stopped: str = "") -> Outcom
 
 
 def difference(y: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the largest difference relative to the largest component, for each column of two arrays (n, k)."""
+    """Return for each column of two arrays (n, k) the largest difference relative to the largest entry of `truth`."""
     sizes = np.abs(truth).max(axis=0)
     return np.abs(y - truth).max(axis=0) / np.where(sizes > 0, sizes, 1.0)
 

@@ -71,22 +71,22 @@ class Kind:
         }
 
     def near(self, value: float) -> float:
-        """Return the value within its bounds, rounded to few digits."""
+        """Return a step or tolerance, limited to its bounds and rounded to three digits (step) or two (tolerance)."""
         value = min(value, self.coarsest)
         return _short(value, 3) if self.fixed else _short(max(value, FINEST_RTOL), 2)
 
     def dearness(self, trial: Trial, wanted: float) -> float:
-        """Estimate the evaluations for the wanted error from one trial."""
+        """Return an estimate, from one trial, of the number of evaluations for the wanted error."""
         return trial.nfev * (trial.error / wanted) ** (1 / self.order)
 
 
 def tune(
     kind: Kind, value: float, wanted: float, run: Callable[[Mapping[str, Any]], Trial], bound: float
 ) -> list[Trial]:
-    """Run trials of a kind, starting from a value of its number, until one has the wanted error.
+    """Run trials of a kind, from `value` of its step or tolerance on, and return them in order.
 
-    The search ends early if the first trials fail, if no other value is left to try, or if the kind would cost much
-    more than `bound` evaluations.
+    The search ends if a trial has between WINDOW and 1 times the wanted error. It ends early if the first trials fail,
+    if no other value is left to try, or if the kind would cost much more than `bound` evaluations.
     """
     tried: dict[float, Trial] = {}
     fine: tuple[float, float] | None = None  # logarithms of number and error of an accurate enough trial
@@ -115,9 +115,9 @@ def tune(
 
 
 def _next(kind: Kind, fine: tuple[float, float] | None, coarse: tuple[float, float] | None, aim: float) -> float:
-    """Return the logarithm of the number at which the logarithm of the error is expected to be `aim`.
+    """Return the logarithm of the step or tolerance at which the logarithm of the error is expected to be `aim`.
 
-    `fine` and `coarse` are those of `tune`; one of them may be None.
+    `fine` and `coarse` are such pairs of logarithms of two trials, see `tune`; one of them may be None.
     """
     farthest = FARTHEST[kind.fixed]
     if fine and coarse:

@@ -98,18 +98,21 @@ def page(result: Any, *, names: Any = None, reference: Any = None) -> str:
 
 
 def _frames(rows: int, columns: int) -> np.ndarray:
-    """Return the rows that are shown, including the first and the last."""
+    """Return the indices of the saved states that the page shows, including the first and the last.
+
+    `rows` is the number of saved states, and `columns` that of the numbers shown for each.
+    """
     most = min(rows, FRAMES, max(100, NUMBERS // max(columns, 1)))
     return np.unique(np.linspace(0, rows - 1, most).round().astype(int))
 
 
 def _numbers(values: Any, digits: int = 5) -> list[float | None]:
-    """Return numbers for JSON, rounded to `digits` digits; NaN, which JSON lacks, becomes None."""
+    """Return numbers for JSON, rounded to `digits` digits; NaN and infinity, which JSON lacks, become None."""
     return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in np.asarray(values).tolist()]
 
 
 def _state(y: np.ndarray, labels: tuple[str, ...], bodies: dict[str, tuple[int, int]], frames: np.ndarray) -> Any:
-    """Return the animated part: bodies in the plane, two components, a few curves in time, or a profile."""
+    """Return the data of the animation: bodies in the plane, two components, curves in time, or a profile."""
     real = np.abs(y) if np.iscomplexobj(y) else y
     if not bodies and len(y) == 2 and not np.iscomplexobj(y):
         bodies = {f"{labels[1]} over {labels[0]}": (0, 1)}
@@ -148,7 +151,10 @@ def _largest(row: np.ndarray, frames: np.ndarray) -> list[float | None]:
 
 
 def _distances(difference: np.ndarray, labels: tuple[str, ...], bodies: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return the position error of each body, in space if z is named; without bodies, the largest component."""
+    """Return the position error (m,) of each body by name, from the differences (n, m) of states at the saved times.
+
+    The error includes z if the body has such a component. Without bodies it is the largest component of the difference.
+    """
     if not bodies:
         return {"largest component": np.abs(difference).max(axis=0)}
     place = {name: k for k, name in enumerate(labels)}
@@ -182,7 +188,7 @@ def _reference(result: Any, given: Any) -> np.ndarray | None:
 
 
 def _own_reference(result: Any) -> Any:
-    """Return the reference of the problem if the run has the problem's initial state and parameters."""
+    """Return the reference of the problem if the run has the problem's initial state and parameters, otherwise None."""
     origin = getattr(result, "_origin", None)
     request = None if origin is None else origin.request
     if request is None or not isinstance(request.fun, Problem) or request.y0 is not None or request.params is not None:
@@ -192,6 +198,6 @@ def _own_reference(result: Any) -> Any:
 
 
 def _time_unit(result: Any) -> str:
-    """Return the unit of time if the run names exactly two units, a length and a time."""
+    """Return the unit of time if the units of the run are a length and a time, otherwise an empty string."""
     parts = (result.get("units") or "").split(", ")
     return parts[1] if len(parts) == 2 and parts[1].replace(" ", "").isalpha() else ""

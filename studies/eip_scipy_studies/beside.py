@@ -39,15 +39,15 @@ class Beside:
         self._pipe.close()
 
     def start(self, call: Callable[[], Any]) -> None:
-        """Start `call` in the process; `result` of the previous call must have been read.
+        """Start ``call()`` in the process; `result` of the previous call must have been read.
 
-        The call and its result must pickle.
+        The function and its value must be picklable.
         """
         with contextlib.suppress(BrokenPipeError):  # `result` reports it
             self._pipe.send(call)
 
     def result(self) -> Any:
-        """Wait for the call of `start`, and return its value or raise its error.
+        """Wait for the call that `start` began, and return its value or raise its error.
 
         Raises
         ------
@@ -57,7 +57,10 @@ class Beside:
         try:
             value, error = self._pipe.recv()
         except (EOFError, ConnectionError):
-            raise UsageError("the second process of this command has died: it was killed, or memory ran out") from None
+            raise UsageError(
+                "the second process of this command has died: it was killed, or memory ran out. Free memory and repeat "
+                "the command."
+            ) from None
         if error is not None:
             raise error
         return value
@@ -75,7 +78,7 @@ def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
     ------
     callable
         ``start(function, *args)`` queues a call and returns a function that waits for its value, or raises
-        UsageError if a process has died. Function, arguments and value must pickle.
+        UsageError if a process has died. Function, arguments and value must be picklable.
     """
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn"))
@@ -88,7 +91,10 @@ def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
             try:
                 return future.result()
             except BrokenProcessPool:
-                raise UsageError("a process of this command has died: it was killed, or memory ran out") from None
+                raise UsageError(
+                    "a process of this command has died: it was killed, or memory ran out. Free memory and repeat the "
+                    "command."
+                ) from None
 
         return value
 

@@ -24,13 +24,13 @@ __all__ = ["HardCase", "hard_cases"]
 
 @dataclass(frozen=True, eq=False)
 class HardCase:
-    """One case.
+    """A hard case: a problem with its exact final state.
 
     Attributes
     ----------
     name, title : str
     problem : Problem
-        The problem. Its invariants are a single `Invariant` with values (l,), and ``problem.source`` is the citation.
+        The problem. It has one `Invariant` with values (l,), and ``problem.source`` is the citation.
     end : ndarray, shape (n,)
         The exact state at the end of ``problem.t_span``, up to about one rounding error.
     invariant_names : tuple of str, length l
@@ -52,11 +52,11 @@ class HardCase:
     note: str
 
     def error(self, y: np.ndarray) -> float:
-        """Return the error of a final state: largest component of the difference, relative to the largest component."""
+        """Return the error of a final state: largest component of `y` - `end`, relative to the largest one of `end`."""
         return float(np.max(np.abs(y - self.end)) / np.max(np.abs(self.end)))
 
     def drift(self, y: np.ndarray) -> float:
-        """Return the largest relative change of an invariant along states in columns, (n, m).
+        """Return the largest relative change of an invariant along the states `y` (n, m), since the first one.
 
         The change is relative to the invariant's first value, or to a thousandth of the largest of all invariants if
         that is larger (an invariant may be zero).
@@ -70,7 +70,8 @@ class HardCase:
 class CaseEquations(NamedTuple):
     """Equations of a case: right-hand side ``fun(t, y) -> (n,)``, and its invariants.
 
-    ``values(t, y) -> (l,)`` returns the invariants, and ``gradients(t, y) -> (l, n)`` their gradients.
+    ``values(t, y) -> (l,)`` returns the invariants, and ``gradients(t, y) -> (l, n)`` their gradients. The functions
+    below that return such equations name the invariants in the order of ``values``.
     """
 
     fun: Callable[..., np.ndarray]
@@ -79,7 +80,7 @@ class CaseEquations(NamedTuple):
 
 
 class _Function:
-    """One of the functions of a `CaseEquations`, which pickles by the names and parameters that make it."""
+    """One of the functions of a `CaseEquations`, which is pickled as the names and parameters that make it."""
 
     def __init__(self, equations: str, params: dict[str, Any], which: str) -> None:
         self._made = equations, params, which
@@ -167,7 +168,7 @@ def _state(record: dict[str, Any], key: str) -> np.ndarray:
 
 
 def kepler(mu: float) -> CaseEquations:
-    """Kepler problem; energy, angular momentum."""
+    """Return the Kepler problem with GM = `mu`; invariants: energy, angular momentum."""
 
     def fun(t, y):
         x, z, u, v = y
@@ -189,7 +190,7 @@ def kepler(mu: float) -> CaseEquations:
 
 
 def perturbed_kepler(delta: float) -> CaseEquations:
-    """Potential -1 / r - delta / (2 r^3); energy, angular momentum."""
+    """Return motion in the potential -1 / r - delta / (2 r^3); invariants: energy, angular momentum."""
 
     def attraction(r2):
         r = np.sqrt(r2)
@@ -215,7 +216,10 @@ def perturbed_kepler(delta: float) -> CaseEquations:
 
 
 def arenstorf(mu: float) -> CaseEquations:
-    """Restricted three-body problem in the rotating frame; Jacobi's integral."""
+    """Return the restricted three-body problem with masses 1 - mu and mu in the rotating frame.
+
+    The invariant is Jacobi's integral.
+    """
     rest = 1 - mu
 
     def attractions(x, z):
@@ -243,7 +247,7 @@ def arenstorf(mu: float) -> CaseEquations:
 
 
 def henon_heiles() -> CaseEquations:
-    """Hénon and Heiles; energy."""
+    """Return the system of Hénon and Heiles; invariant: energy."""
 
     def fun(t, y):
         x, z, u, v = y
@@ -261,7 +265,10 @@ def henon_heiles() -> CaseEquations:
 
 
 def boris_2d(charge: float) -> CaseEquations:
-    """Charged particle in B = r e_z and the potential charge / r; energy, canonical angular momentum."""
+    """Return a charged particle in B = r e_z and the potential charge / r.
+
+    Invariants: energy and canonical angular momentum.
+    """
 
     def fun(t, y):
         x, z, u, v = y
@@ -290,7 +297,7 @@ def boris_2d(charge: float) -> CaseEquations:
 
 
 def n_body(masses: list[float], G: float, dimension: int) -> CaseEquations:
-    """N bodies, y = (q, v) body by body; energy, momentum, angular momentum."""
+    """Return N bodies, y = (positions of all, velocities of all); invariants: energy, momentum, angular momentum."""
     m = np.array(masses)
     planes = [(0, 1)] if dimension == 2 else [(1, 2), (2, 0), (0, 1)]
     first, second = np.triu_indices(m.size, 1)
@@ -331,7 +338,7 @@ def n_body(masses: list[float], G: float, dimension: int) -> CaseEquations:
 
 
 def pendulum() -> CaseEquations:
-    """Mathematical pendulum; energy."""
+    """Return the mathematical pendulum, y = (angle, angular velocity); invariant: energy."""
     return CaseEquations(
         lambda t, y: np.array([y[1], -np.sin(y[0])]),
         lambda t, y: np.array([y[1] * y[1] / 2 - np.cos(y[0])]),
@@ -340,7 +347,7 @@ def pendulum() -> CaseEquations:
 
 
 def duffing() -> CaseEquations:
-    """Return the equation x'' = x - x^3; energy."""
+    """Return the equation x'' = x - x^3, y = (x, x'); invariant: energy."""
 
     def values(t, y):
         q, p = y
@@ -354,7 +361,7 @@ def duffing() -> CaseEquations:
 
 
 def oscillator() -> CaseEquations:
-    """Harmonic oscillator; energy."""
+    """Return the harmonic oscillator; invariant: energy."""
     return CaseEquations(
         lambda t, y: np.array([y[1], -y[0]]),
         lambda t, y: np.array([(y[1] * y[1] + y[0] * y[0]) / 2]),
@@ -363,7 +370,7 @@ def oscillator() -> CaseEquations:
 
 
 def double_pendulum(g: float) -> CaseEquations:
-    """Two equal pendulums, y = (angles, momenta); energy."""
+    """Return the double pendulum of equal masses and lengths, y = (angles, momenta); invariant: energy."""
 
     def fun(t, y):
         a, b, p, q = y
@@ -387,7 +394,10 @@ def double_pendulum(g: float) -> CaseEquations:
 
 
 def spherical_pendulum(g: float) -> CaseEquations:
-    """Pendulum in space in Cartesian coordinates; its constraints, energy, angular momentum."""
+    """Return a pendulum in space, y = (q, v) in Cartesian coordinates.
+
+    Invariants: the constraints (|q|^2 - 1) / 2 and q @ v, energy, and angular momentum about the vertical.
+    """
 
     def fun(t, y):
         q, v = y[:3], y[3:]
@@ -406,7 +416,7 @@ def spherical_pendulum(g: float) -> CaseEquations:
 
 
 def fput(omega: float) -> CaseEquations:
-    """Fermi, Pasta, Ulam and Tsingou with stiff springs; energy."""
+    """Return the chain of Fermi, Pasta, Ulam and Tsingou with stiff springs of frequency `omega`; invariant: energy."""
 
     def soft(y):
         x, z = y[:3], y[3:6]
@@ -428,7 +438,7 @@ def fput(omega: float) -> CaseEquations:
 
 
 def vortices(strengths: list[float]) -> CaseEquations:
-    """Point vortices, y = (x, y) vortex by vortex; energy, momenta, angular impulse."""
+    """Return point vortices, y = (x, y) vortex by vortex; invariants: energy, two momenta, angular impulse."""
     k = np.array(strengths)
     first, second = np.triu_indices(k.size, 1)
 
@@ -458,7 +468,7 @@ def vortices(strengths: list[float]) -> CaseEquations:
 
 
 def tokamak() -> CaseEquations:
-    """Charged particle in an axisymmetric field, R0 = B0 = 1, q = 2; energy, toroidal momentum."""
+    """Return a charged particle in an axisymmetric field, R0 = B0 = 1, q = 2; invariants: energy, toroidal momentum."""
 
     def fun(t, y):
         x, w, z, a, b, c = y
@@ -482,7 +492,10 @@ def tokamak() -> CaseEquations:
 
 
 def schwarzschild() -> CaseEquations:
-    """Geodesic, M = 1, y = (t, r, phi, E, p_r, L); mass shell, energy, angular momentum."""
+    """Return geodesics of Schwarzschild's metric, M = 1, y = (t, r, phi, E, p_r, L).
+
+    Invariants: the mass shell, energy and angular momentum.
+    """
 
     def fun(t, y):
         _, r, _, E, p, L = y
@@ -508,7 +521,7 @@ def schwarzschild() -> CaseEquations:
 
 
 def rigid_body(i1: float, i2: float, i3: float) -> CaseEquations:
-    """Euler's top, y = the angular momentum; Casimir, energy."""
+    """Return Euler's top, y = the angular momentum; invariants: Casimir function, energy."""
 
     def fun(t, y):
         a, b, c = y
@@ -526,7 +539,7 @@ def rigid_body(i1: float, i2: float, i3: float) -> CaseEquations:
 
 
 def euler_detest(k2: float) -> CaseEquations:
-    """Problem B5 of DETEST: Jacobi's elliptic functions; two quadratic invariants."""
+    """Return problem B5 of DETEST, whose solutions are Jacobi's elliptic functions; two quadratic invariants."""
 
     def fun(t, y):
         a, b, c = y
@@ -544,7 +557,7 @@ def euler_detest(k2: float) -> CaseEquations:
 
 
 def quaternion(w3: float) -> CaseEquations:
-    """Attitude under the angular velocity (sin t, cos 2t, w3); norm."""
+    """Return the attitude, a quaternion y, under the angular velocity (sin t, cos 2t, w3); invariant: |y|^2."""
 
     def fun(t, y):
         s, a, b, c = y
@@ -556,7 +569,7 @@ def quaternion(w3: float) -> CaseEquations:
 
 
 def heisenberg(anisotropy: float) -> CaseEquations:
-    """Ring of spins (Landau and Lifshitz); their lengths, energy, total spin along z."""
+    """Return a ring of spins (Landau and Lifshitz); invariants: squared length of each, energy, total spin along z."""
     axis = np.array([0.0, 0.0, anisotropy])
 
     def fun(t, y):
@@ -584,7 +597,7 @@ def heisenberg(anisotropy: float) -> CaseEquations:
 
 
 def lotka_volterra() -> CaseEquations:
-    """Predator and prey; ln u - u + 2 ln v - v."""
+    """Return predator and prey, y = (u, v); invariant: ln u - u + 2 ln v - v."""
     return CaseEquations(
         lambda t, y: np.array([y[0] * (y[1] - 2), y[1] * (1 - y[0])]),
         lambda t, y: np.array([np.log(y[0]) - y[0] + 2 * np.log(y[1]) - y[1]]),
@@ -593,7 +606,10 @@ def lotka_volterra() -> CaseEquations:
 
 
 def sir(infection: float, recovery: float) -> CaseEquations:
-    """Epidemic of Kermack and McKendrick, y = (S, I, R); S + I + R and I + S - (recovery / infection) ln S."""
+    """Return the epidemic of Kermack and McKendrick, y = (S, I, R).
+
+    Invariants: S + I + R and I + S - (recovery / infection) ln S.
+    """
     ratio = recovery / infection
 
     def fun(t, y):
@@ -608,7 +624,7 @@ def sir(infection: float, recovery: float) -> CaseEquations:
 
 
 def volterra_lattice() -> CaseEquations:
-    """Kac and van Moerbeke's lattice; sum, quadratic invariant, logarithm of the product."""
+    """Return Kac and van Moerbeke's lattice; invariants: sum, a quadratic one, logarithm of the product."""
 
     def values(t, y):
         return np.array([y.sum(), (y * y / 2 + y * np.roll(y, -1)).sum(), np.log(y).sum()])
@@ -621,7 +637,7 @@ def volterra_lattice() -> CaseEquations:
 
 
 def zabusky_kruskal(c1: float, c2: float) -> CaseEquations:
-    """Korteweg and de Vries's equation in Zabusky and Kruskal's scheme; sum of u, sum of u^2."""
+    """Return Korteweg and de Vries's equation in Zabusky and Kruskal's scheme; invariants: sum of u, sum of u^2."""
 
     def fun(t, y):
         a, b = np.roll(y, -1), np.roll(y, 1)
@@ -631,7 +647,7 @@ def zabusky_kruskal(c1: float, c2: float) -> CaseEquations:
 
 
 def sine_gordon(coupling: float) -> CaseEquations:
-    """Periodic chain of Frenkel and Kontorova, y = (u, v); energy."""
+    """Return the periodic chain of Frenkel and Kontorova, y = (u, v); invariant: energy."""
 
     def fun(t, y):
         u, v = np.split(y, 2)
@@ -650,7 +666,7 @@ def sine_gordon(coupling: float) -> CaseEquations:
 
 
 def three_wave() -> CaseEquations:
-    """Resonant interaction of three waves, complex; two of Manley and Rowe's relations, energy."""
+    """Return the resonant interaction of three complex waves; invariants: two Manley-Rowe relations, energy."""
 
     def fun(t, y):
         a, b, c = y
@@ -669,7 +685,10 @@ def three_wave() -> CaseEquations:
 
 
 def ablowitz_ladik() -> CaseEquations:
-    """Ablowitz and Ladik's periodic lattice, complex; mass, real and imaginary part of the correlation."""
+    """Return Ablowitz and Ladik's periodic complex lattice.
+
+    Invariants: mass, and the real and imaginary part of the correlation of neighbours.
+    """
 
     def square(y):
         return (y * np.conj(y)).real
@@ -689,7 +708,10 @@ def ablowitz_ladik() -> CaseEquations:
 
 
 def brockett() -> CaseEquations:
-    """Double-bracket flow L' = [L, [L, diag(1, 2, 3)]], y = (diagonal, off-diagonals); traces of L, L^2, L^3."""
+    """Return the double-bracket flow L' = [L, [L, diag(1, 2, 3)]], y = (diagonal, off-diagonals) of L.
+
+    Invariants: the traces of L, L^2 and L^3.
+    """
     where = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
     levels = np.diag([1.0, 2.0, 3.0])
 

@@ -39,6 +39,7 @@ class HeyokaRun:
     wall_time : float
         Seconds spent in the integration, without making and compiling the integrator.
     steps : int
+        Number of steps.
     """
 
     version: str
@@ -49,7 +50,7 @@ class HeyokaRun:
 
 
 def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> HeyokaRun:
-    """Integrate N bodies from t = 0 to `t_end`.
+    """Integrate N bodies under their mutual gravity from t = 0 to `t_end` by heyoka's Taylor integrator.
 
     Parameters
     ----------
@@ -104,6 +105,7 @@ def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_e
     Returns
     -------
     float
+        The exponent, per unit of time.
 
     Raises
     ------

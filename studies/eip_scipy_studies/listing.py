@@ -22,7 +22,7 @@ Found = dict[str, dict[str, str]]
 
 
 def fixed_step_methods() -> dict[str, type[EIPSolver]]:
-    """Return the solver classes of `eip_scipy` that have a tableau, by their names."""
+    """Return the solver classes of `eip_scipy` that have a tableau of coefficients, by their names."""
     found = {name: getattr(eip_scipy, name) for name in eip_scipy.__all__ if name.startswith("EIP")}
     return {name: value for name, value in found.items() if hasattr(value, "TABLEAU")}
 
@@ -34,7 +34,7 @@ class Listing(Study[Found]):
     writes_files = False
 
     def measure(self, session: Session) -> Found:
-        """Return, for each kind, the names with the first lines of their docstrings."""
+        """Return, for each kind of entry, the names with a line of description, most of them from docstrings."""
         sets = {name: solar_data.load(name) for name in solar_data.available()}
         others = {name: getattr(comparators, name) for name in comparators.__all__}
         functions = {name: make for name in problems.__all__ if _is_function(make := getattr(problems, name))}

@@ -1,4 +1,4 @@
-"""Checkpoints of commands that take minutes, and the option of a positive number."""
+"""Checkpoints of commands that take minutes, and options that are positive numbers."""
 
 from __future__ import annotations
 
@@ -27,14 +27,17 @@ class Checkpoints:
     resume: bool = option(False, "continue from the checkpoints in the folder of --checkpoint")
 
     def check_settings(self) -> None:
-        """Check that ``--resume`` comes with ``--checkpoint``, and that the folder can be written to."""
+        """Raise a UsageError if ``--resume`` comes without ``--checkpoint``, or the folder cannot be written to."""
         if self.resume and self.checkpoint is None:
             raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
         if self.checkpoint is not None:
             check_folder(self.checkpoint)
 
     def checkpoint_options(self, name: str) -> dict[str, Any]:
-        """Return the options with which `integrate` keeps checkpoints of the run `name`, in a file of its own."""
+        """Return the options with which `integrate` keeps checkpoints of the run `name` in a separate file.
+
+        Without a folder for checkpoints there are none.
+        """
         if self.checkpoint is None:
             return {}
         file = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
@@ -48,12 +51,12 @@ class Checkpoints:
 
 
 def positive(text: str) -> float:
-    """Return the finite positive number that `text` says.
+    """Return `text` as a finite positive number.
 
     Raises
     ------
     ArgumentTypeError
-        If it is not such a number.
+        If `text` is not such a number.
     """
     try:
         value = float(text)

@@ -436,7 +436,7 @@ class CostPanel(NamedTuple):
     cost : str
         Label of the cost, with its unit.
     curves : mapping of str to (array_like, array_like)
-        Costs and errors by method; values that are not numbers above 0 are left out.
+        Costs and errors by method; points whose error is not a number above 0 are left out.
     slopes : mapping of str to float, optional
         Slopes for some of the methods, each drawn as a dotted line a little below the method's curve.
     """
@@ -596,7 +596,7 @@ def linkages_figure(drawings: Mapping[str, Linkage], *, unit: str, time: str) ->
 
 
 def _draw_linkages(figure: Figure, above: Any, drawings: Mapping[str, Linkage], unit: str, time: str) -> None:
-    """Draw linkages in a row of axes, and a colour scale of the time."""
+    """Draw linkages in the row of axes `above`, with a colour scale of the time."""
     t = np.asarray(next(iter(drawings.values())).t, dtype=float)
     for axis, (name, linkage) in zip(above, drawings.items(), strict=True):
         links = LineCollection(
@@ -790,7 +790,10 @@ def _shaded(corners: np.ndarray, part: np.ndarray, view: tuple[float, float]) ->
 
 
 def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) -> Any:
-    """Draw one density; return the image, for a colour scale or to be changed in a movie."""
+    """Draw one density and its vortices, and return the image, for a colour scale.
+
+    `top` is the upper end of the colours; None stands for the largest density of the panel.
+    """
     density, ends, names, where, followed = panel
     image = axis.imshow(
         np.asarray(density).T, origin="lower", extent=ends, cmap="viridis", vmin=0.0, vmax=top, interpolation="bilinear"
@@ -823,7 +826,10 @@ def blank_figure(width: float, height: float, title: str = "") -> Figure:
 
 
 def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log: bool = False) -> None:
-    """Draw the largest magnitude in each of some hundred time intervals, because full noise would fill the area."""
+    """Draw the largest magnitude in each of `POINTS` intervals of time, because all values would fill the area.
+
+    The intervals are equal in time, or in its logarithm if `log` is true.
+    """
     t, magnitude = np.asarray(t, dtype=float), np.abs(np.asarray(values, dtype=float))
     n = min(t.size, magnitude.size)
     known = np.flatnonzero(np.isfinite(magnitude[:n]) & (t[:n] > 0))
@@ -839,7 +845,7 @@ def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log:
 
 
 def _marked(scale: np.ndarray, count: int = 6) -> list[int]:
-    """Return the indices of `count` points that are about equally spaced on this scale, for markers."""
+    """Return the indices of at most `count` of the ascending values `scale`, about equally spaced, for markers."""
     wanted = np.linspace(scale[0], scale[-1], 2 * count + 1)[1::2]
     return sorted({int(np.argmin(np.abs(scale - at))) for at in wanted})
 
@@ -905,7 +911,7 @@ def side_by_side_figure(
     title: str = "",
     footnote: str = "",
 ) -> Figure:
-    """Draw the trajectory's error against time and, below, the invariants' errors, a line for each package.
+    """Draw the trajectory's error against the run's wall time and, below, the invariants' errors, by package.
 
     Parameters
     ----------
@@ -917,7 +923,7 @@ def side_by_side_figure(
     levels : collection of float
         Errors of the trajectory at which the report compares packages, drawn as dotted lines.
     time : str, optional
-        Label of the time.
+        Label of the axis of the runs' times.
     title, footnote : str, optional
 
     Returns

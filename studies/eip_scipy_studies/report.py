@@ -100,6 +100,8 @@ def needed(module: str, install: str = "") -> Any:
     ------
     UsageError
         If the module is not installed; the message says how to install it.
+    ImportError
+        If a part of this package cannot be imported, which is a fault of the package.
     """
     try:
         return import_module(module)
@@ -151,7 +153,9 @@ def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict
 
 
 def compact(value: float | None, digits: int = 2) -> str:
-    """Format a number in at most ``digits + 6`` characters; "-" stands for None and for values that are not finite.
+    """Format a number with `digits` significant digits in at most ``digits + 6`` characters.
+
+    The result is "-" for None and for values that are not finite.
 
     Examples
     --------
@@ -330,10 +334,10 @@ def check_target(path: Path) -> None:
     Raises
     ------
     UsageError
-        If it cannot.
+        If the file cannot be written.
     """
     if path.is_dir():
-        raise UsageError(f"cannot write {str(path)!r}: it is a folder")
+        raise UsageError(f"cannot write {str(path)!r}: it is a folder; give the name of a file")
     try:
         _try_to_write(path.parent)
     except OSError as error:

@@ -77,7 +77,7 @@ def option(default: Any, text: str, **settings: Any) -> Any:
 
 
 def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
-    """Make the ``type`` of an option that accepts one of these names, and suggests the most similar one for others.
+    """Make the ``type`` of an option that accepts one of the `known` names, and suggests a similar one for others.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
 
 
 def some_of(what: str, known: Collection[str]) -> Any:
-    """Make a field of a command for an option that may be repeated, each time with one of these names.
+    """Make a field of a command for an option that may be repeated, each time with one of the `known` names.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class Check(NamedTuple):
 
 
 class PartlyDone(KeyboardInterrupt):
-    """Exception after an interrupt by the user in a measurement that has partial results."""
+    """Exception after an interrupt by the user in a measurement that has partial results (`found`)."""
 
     def __init__(self, found: Any) -> None:
         super().__init__()
@@ -278,11 +278,11 @@ class Study(Command, Generic[Found]):
         return ()
 
     def figures(self, found: Found) -> Figures:
-        """Yield names and figures one by one. An ImportError means that matplotlib is missing; it is then printed."""
+        """Yield pairs (file name, figure). If an ImportError shows that matplotlib is missing, it is printed."""
         return ()
 
     def refine(self, found: Found, session: Session) -> bool:
-        """Measure a long second part after text and tables are written; return True if these must be written again."""
+        """Measure a long second part after the files are written; return True if these must be written again."""
         return False
 
     def when_interrupted(self) -> str:
@@ -332,7 +332,7 @@ def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
     Returns
     -------
     int, dict
-        Exit status: 0 done, 1 a check failed, 130 interrupted; and the content of the JSON.
+        Exit status: 0 done, 1 a check failed, 130 interrupted; and the result of `study.numbers`.
     """
     with session.open:
         interrupted = ""

@@ -26,9 +26,9 @@ def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_coun
 
 
 def many_calls(call: Callable[[], Any]) -> Action:
-    """Make a function that returns the processor time of one call, as the mean of many.
+    """Make a function that returns the processor time of one call in seconds, as the mean of many calls.
 
-    The time of reading the clock is negligible in it. `call` is called once before, to compile and plan.
+    The time of reading the clock is negligible in it. `call` is called before, to compile and to choose their number.
     """
     call()
     calls = max(1, int(2e-3 / max(clocked(call)(), 1e-6)))
@@ -45,16 +45,16 @@ def many_calls(call: Callable[[], Any]) -> Action:
 
 
 def least(actions: Mapping[Name, Action], *, turns: int = 1, seconds: float = 0.0) -> dict[Name, float]:
-    """Return the least time of each action.
+    """Call all actions in turn several times, and return the least time of each; inf if there were no calls.
 
     Parameters
     ----------
     actions : mapping of hashable to callable
         Functions that return the time that they took, in seconds.
     turns : int, optional
-        Number of calls of each of them. All are called in turn, so that other load affects all equally.
+        Number of calls of each action. All are called in turn, so that other load affects all equally.
     seconds : float, optional
-        If it is not 0: take at least 3 turns, and continue until this number of seconds has passed.
+        If it is not 0: ignore `turns`, take at least 3 turns, and continue until this number of seconds has passed.
 
     Returns
     -------

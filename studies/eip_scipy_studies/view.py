@@ -39,7 +39,7 @@ class View(Study[Movie]):
     names: str | None = option(None, 'names of the components, such as "x y vx vy"', metavar="NAMES")
 
     def measure(self, session: Session) -> Movie:
-        """Read the run, and write its page."""
+        """Read the run and the reference; return the run with the HTML text of its page."""
         run = _loaded(self.result)
         reference = None if self.reference is None else _loaded(self.reference)
         try:

@@ -47,7 +47,7 @@ class WorkPrecision:
     points : tuple of WorkPoint
         Points in the order of the methods and of their steps.
     states : tuple of ndarray
-        Their final states.
+        Final state of the run at each point.
     machine : str
         Machine on which the times were measured.
     """
@@ -71,7 +71,7 @@ def work_precision(
     Parameters
     ----------
     methods : mapping of str to (callable, sequence of float)
-        For each method the function ``run(step) -> (wall_time, y)``, and the steps. It returns the seconds without
+        For each method the function ``run(step) -> (wall_time, y)``, and the steps. `run` returns the seconds without
         compilation and the final state, which is nan if the run failed.
     error : callable
         ``error(y) -> float``, the error of a final state.
@@ -136,13 +136,14 @@ def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
 
 
 def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -> dict[str, Curve]:
-    """Gather runs by their methods.
+    """Gather the costs and errors of runs by their methods, in the order of the runs.
 
     Parameters
     ----------
     runs : iterable
-        Runs with ``method`` and the two named attributes, such as `WorkPoint`.
+        Runs with ``method`` and the two named attributes, such as `WorkPoint`, each method's in ascending cost.
     cost, error : str, optional
+        Names of the attributes.
 
     Returns
     -------
@@ -157,7 +158,10 @@ def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -
 
 
 def costs_at(curve: Curve, levels: Iterable[float], factor: float = 1.0) -> list[str]:
-    """Return cells of a table: the cost of each level of error, "<" before a bound and "-" if no run is as accurate."""
+    """Return cells of a table: `factor` times the cost of reaching each of the errors `levels`.
+
+    A cell has "<" before the cost if the cheapest run is more accurate, and is "-" if no run is as accurate.
+    """
     return [("<" if curve[1][0] <= level else "") + compact(factor * cost_to_reach(*curve, level)) for level in levels]
 
 

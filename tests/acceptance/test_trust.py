@@ -768,7 +768,7 @@ def test_the_worst_invariants_come_first():
     worst = np.argsort(-run.diagnostics.corrections)[:3]
     assert [reason[:4] for reason in reasons[:3]] == [f"'E{k}'" for k in worst]
     assert worst.tolist() != sorted(worst)
-    assert reasons[3] == "2 more invariants were corrected too much"
+    assert reasons[3] == "2 more invariants exceed the bounds of correct runs"
 
 
 @both

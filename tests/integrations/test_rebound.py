@@ -264,7 +264,7 @@ def set_attribute(name, value):
         (add_variation, "variational particles"),
         (add_active_test_particles, "test particles with masses.*testparticle_type 1"),
         (add_force, "additional forces that are not REBOUNDx's.*forces='gr-potential'"),
-        (modify_steps, "additional forces or modifications"),
+        (modify_steps, "modifications before or after a step"),
         (lambda sim: sim.create_ode(1), "differential equations"),
         (set_attribute("softening", 0.1), "softened"),
         (set_attribute("gravity", "none"), "gravity 'none'"),

@@ -173,7 +173,7 @@ def test_starts_differ_and_repeat_with_their_seed():
 
 @pytest.mark.needs_jit
 def test_ring_search_wants_a_hole():
-    with pytest.raises(ValueError, match="has no hole; use lowest_state"):
+    with pytest.raises(ValueError, match="has no hole with a radius above 4 grid spacings; use lowest_state"):
         lowest_ring(trap(0.5))
 
 

@@ -474,7 +474,7 @@ def test_functions_that_are_defined_nowhere():
         ({"y0": []}, "y0 must be a real, finite state"),
         ({"y0": 1.0}, "y0 must be a real, finite state"),
         ({"degree": 0}, "degree"),
-        ({"degree": 200}, "2 components make 20300 monomials up to degree 200; at most 2000"),
+        ({"degree": 200}, "2 components make 20300 functions, monomials up to degree 200 and terms; at most 2000"),
         ({"rtol": 0.0}, "rtol must be a number between 0 and 1, got"),
         ({"rtol": "a"}, "rtol must be a number between 0 and 1, got"),
         ({"t": np.inf}, "t must be a finite number, got"),

@@ -260,7 +260,7 @@ GM, Y = system(5)
         ((GM * 1j, Y), "gm must be an array of numbers"),
         ((GM, ["x"] * 30), "y0 must be an array of numbers"),
         ((-GM, Y), "gm must hold finite numbers"),
-        ((0 * GM, Y), "and one > 0"),
+        ((0 * GM, Y), "and at least one > 0"),
         ((GM * np.nan, Y), "gm must hold finite numbers"),
         ((GM, Y * np.inf), "y0 must be finite"),
         ((GM, Y, "enrgy"), "unknown quantity 'enrgy'.*did you mean 'energy'"),

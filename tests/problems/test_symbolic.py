@@ -639,7 +639,7 @@ def test_states_and_parameters_of_another_length():
     """Compiled code would read memory behind them."""
     problem = hamiltonian(KEPLER, params={"eps": 0.005})
     for y0, params in (([1.0, 0.0, 0.0], None), (np.ones(6), None), (np.ones(4), [1.0, 2.0]), (np.ones(4), [])):
-        with pytest.raises(ValueError, match="must hold as many numbers as there are in"):
+        with pytest.raises(ValueError, match="must hold as many numbers as there are names in"):
             integrate(problem, (0, 1), y0, params=params, method=EIPRK4, h=0.1)
 
 

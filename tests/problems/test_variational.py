@@ -121,7 +121,7 @@ def test_expressions_that_have_no_derivative():
     problem = equations({"x": "y", "y": "sign(x)"}, params={"a": 1.0})
     with pytest.raises(ValueError, match=r"derivative of y contains sign\(x\), which jumps"):
         problem.variational(())
-    with pytest.raises(ValueError, match="no parameter 1; expected places in"):
+    with pytest.raises(ValueError, match="no parameter 1; expected indices of"):
         problem.variational((1,))
     with pytest.raises(ValueError, match="no parameter -1"):
         problem.variational((-1,))

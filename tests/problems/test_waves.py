@@ -344,7 +344,7 @@ def test_lawson_is_exact_for_linear_waves():
     [
         (lambda: KortewegDeVries(Grid((4, 4), 0, 1)), "needs a grid of one dimension"),
         (lambda: KortewegDeVries(Grid(8, 0, 1)).problem(np.zeros(9), 1.0), r"u0 has shape \(9,\), expected \(8,\)"),
-        (lambda: SineGordon(Grid(8, 0, 1)).problem(np.zeros(8), 0.0, 1.0), r"a field has shape \(\), expected \(8,\)"),
+        (lambda: SineGordon(Grid(8, 0, 1)).problem(np.zeros(8), 0.0, 1.0), r"q0 or p0 has shape \(\), expected \(8,\)"),
         (lambda: SineGordon(Grid(8, 0, 1)).invariants("momentum_y"), "expected energy, momentum_x"),
         (lambda: KortewegDeVries(Grid(8, 0, 1)).invariants("enrgy"), "did you mean 'energy'"),
         (lambda: soliton().equation.invariants("momentum_y"), "needs an axis that"),

@@ -293,7 +293,7 @@ def test_sav_reports_an_energy_that_falls_below_the_shift():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"gpe": plane_wave((8, 8))}, TypeError, "got FieldProblem; of a problem pass problem.equation"),
+        ({"gpe": plane_wave((8, 8))}, TypeError, "got FieldProblem; for a problem, pass problem.equation"),
         ({"y0": np.ones(7)}, ValueError, r"psi has shape \(7,\), expected \(8, 8\) or \(64,\)"),
         ({"y0": np.full(64, np.nan)}, ValueError, "must be finite"),
         ({"h": 0.0}, ValueError, "`h` must be positive. Got 0.0"),
@@ -313,7 +313,7 @@ def test_bad_input(scheme, change, error, message):
 @pytest.mark.parametrize("tol", [0.0, 1.0, True, "tight", np.nan])
 def test_bad_tolerance(scheme, tol):
     problem = plane_wave((8, 8))
-    with pytest.raises(ValueError, match=r"tol must be a number from 1e-15 to 1, got"):
+    with pytest.raises(ValueError, match=r"tol must be a number from 1e-15 to 1, exclusive of 1, got"):
         scheme(problem.equation, (0, 1), problem.y0, 0.1, tol=tol)
 
 

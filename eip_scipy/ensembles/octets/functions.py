@@ -9,7 +9,7 @@ __all__ = ["compiled_for_octets"]
 
 
 def compiled_for_octets(one: Compiled) -> Compiled:
-    """Compile a function of one member for eight members.
+    """Return a function of one member compiled for eight members, with its address.
 
     Raises
     ------

@@ -36,7 +36,7 @@ class Octet(types.Type):  # emits LLVM
         super().__init__(name="octet")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """Allow numbers, which have the same value in every lane."""
+        """Return the kind of conversion of a number, which has the same value in every lane; None for other types."""
         return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
 
 

@@ -57,7 +57,7 @@ def bodies_of(run: Any) -> Bodies:
     Raises
     ------
     TypeError
-        If `run` is another kind of problem or run, or a loaded result, which does not know its problem.
+        If `run` is another kind of problem or run, or a loaded result, which does not contain its problem.
     """
     origin = None if isinstance(run, Problem) else getattr(run, "__dict__", {}).get("_origin")
     problem = run if origin is None else origin.request.fun
@@ -92,8 +92,8 @@ def body_names(names: Sequence[str], n: int) -> tuple[str, ...]:
 def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
     """Return the units of length and time as text, such as "au, d".
 
-    The unit of time is that of t_span, or that of the velocities if t_span has no unit. The text is empty if `gm`,
-    `position` or `velocity` has no unit.
+    The unit of time is that of t_span (days for dates), or that of the velocities if t_span has no unit. The text
+    is empty if `gm`, `position` or `velocity` has no unit.
     """
     given = {name: _first(value) for name, value in (("gm", gm), ("position", position), ("velocity", velocity))}
     if not all(hasattr(value, "unit") and hasattr(value, "to_value") for value in given.values()):
@@ -107,6 +107,8 @@ def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
 
 def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | None) -> tuple[Any, Any, Any]:
     """Return G m, positions and velocities as plain numbers in the problem's units; masses become G m.
+
+    If none of the arguments has a unit, they are returned unchanged.
 
     Raises
     ------
@@ -162,7 +164,10 @@ def _time_unit(speed: Any) -> Any:
 
 
 def _named(unit: Any, base: str, place: int) -> str:
-    """Return a unit of astropy as text for `units`: its name, or a number of metres or seconds."""
+    """Return a unit of astropy as text for `units`: its name, or a number of units `base`, "m" or "s".
+
+    The text is `base` if the unit has another dimension. `place` is 0 for a length and 1 for a time.
+    """
     if not unit.is_equivalent(base):  # what is converted to it will say so
         return base
     pair = f"{unit}, s" if place == 0 else f"m, {unit}"

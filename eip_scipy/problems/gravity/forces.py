@@ -2,8 +2,9 @@
 
 All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination:
 first G m of each body, then the entries that `parameters` lists. The first body is the Sun; each force on another body
-has its reaction on the Sun, so that momentum and centre of mass are those of Newton. (The full post-Newtonian
-equations, which have their own, are in engine/cpp/problems/einstein.hpp, the others in forces.cpp there.)
+has its reaction on the Sun, so that momentum and centre of mass are those of Newton. The full post-Newtonian equations
+("eih") have another momentum and another centre of mass. They are in engine/cpp/problems/einstein.hpp, and the other
+forces in forces.cpp there.
 """
 
 from __future__ import annotations
@@ -162,12 +163,12 @@ def _check_constant(force: str, name: str, value: Any, n: int) -> None:
     if name == "pole":
         pole = np.asarray(value, dtype=float)
         if pole.shape != (3,) or not np.isfinite(pole).all() or not pole.any():
-            raise ValueError(f"ForceConstants: pole must be three numbers, not all 0; got {value!r}.")
+            raise ValueError(f"ForceConstants: pole must be three finite numbers, not all 0; got {value!r}.")
     elif name == "moon_body":
         if not (isinstance(value, int | np.integer) and 0 < value < n):
             raise ValueError(f"ForceConstants: moon_body must be an index from 1 to {n - 1}; got {value!r}.")
     elif not (isfinite(value) and value > 0):
-        raise ValueError(f"ForceConstants: {name} must be a positive number; got {value!r}.")
+        raise ValueError(f"ForceConstants: {name} must be a finite positive number; got {value!r}.")
 
 
 def equations(forces: tuple[str, ...]) -> tuple[Any, Any]:
@@ -176,7 +177,7 @@ def equations(forces: tuple[str, ...]) -> tuple[Any, Any]:
 
 
 def acceleration(y: np.ndarray, params: np.ndarray) -> np.ndarray:
-    """Return the accelerations (N, 3) of a state."""
+    """Return the accelerations (N, 3) of all bodies in the state `y`, by gravitation and the forces in `params`."""
     out = np.empty_like(y)
     library["forces.rhs"](0.0, y, out, params)
     return out[y.size // 2 :].reshape(-1, 3)

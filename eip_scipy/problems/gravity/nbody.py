@@ -58,7 +58,8 @@ def nbody(
     position, velocity : array_like, shape (N, 3)
         Plain numbers, or quantities of astropy. Either all or none of `gm`, `position` and `velocity` have units.
     t_span : (float, float)
-        Numbers; if the units are known, also durations or moments (Time of astropy, in any scale).
+        Start and end of the run: numbers; if the units are known, also durations or moments (Time of astropy, in any
+        scale).
     h : float, optional
         Step length, a number or a duration.
     forces : str or sequence of str, optional
@@ -79,14 +80,16 @@ def nbody(
         "drag"
             Drag on all other bodies in an atmosphere of the first one, see `satellite`.
 
-        At most one of the first three.
+        At most one of "1pn", "eih" and "gr-potential" can be given.
     constants : ForceConstants, optional
         The speed of light and the other constants of the forces, in the units of the state.
     name, source : str, optional
+        See `Problem`.
     units : str, optional
         Units of length and time, such as "AU, yr" (see `Problem`). Default for quantities: the unit of length is that
         of `position`; the unit of time is that of `t_span` (days for moments), or else that of `velocity`.
     reference : callable, optional
+        See `Problem`.
     bodies : sequence of str, optional
         Names of the bodies, which become part of the components' names: x_Sun, y_Sun, ... Default: x_0, y_0, ...
     epoch : Time or float or (float, float), optional
@@ -97,16 +100,16 @@ def nbody(
         ``nbody([1, 1e-6], ..., G=4 * np.pi**2)`` in AU, years and solar masses. `Problem.G` stores it, so that a
         simulation of REBOUND gets the same masses.
     balances : str or sequence of str, optional
-        Use the quantities that each orbit conserves without the pulls of other bodies, as balances, instead of the
-        totals: "kepler" or "energy", "momentum", "laplace", see `orbital_balances`. They are made for planetary systems
-        without close encounters over long times.
+        Keep quantities that each orbit would conserve without the pulls of other bodies, as `Balance` objects, instead
+        of the total energy and angular momentum: "kepler" or "energy", "momentum", "laplace", see `orbital_balances`.
+        They are made for planetary systems without close encounters over long times.
 
     Returns
     -------
     Problem
         State (q_1, ..., q_N, v_1, ..., v_N), each with 3 components. Invariants: "H", the energy times G, and "L", the
-        angular momentum times G. Momentum and centre of mass are linear constraints in `frame`; `blocks` are the
-        bodies' positions and velocities.
+        angular momentum times G (for `forces` see Notes; with `balances`, these replace "H" and "L"). Momentum and
+        centre of mass are linear constraints in `frame`; `blocks` are the bodies' positions and velocities.
 
     Raises
     ------
@@ -190,7 +193,10 @@ def nbody(
 
 
 def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:
-    """Return x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ..., with the bodies' names if they are given."""
+    """Return the names of the 6 n components: x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ...
+
+    If `bodies` is given, its names take the places of the numbers.
+    """
     names = tuple(map(str, range(n))) if bodies is None else body_names(bodies, n)
     return tuple(f"{axis}_{body}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for body in names for axis in axes)
 
@@ -201,7 +207,7 @@ def _epoch(t_span: Any) -> Epoch | None:
 
 
 def _gravitational(masses: Any, G: Any) -> Any:
-    """Return G times the masses if G is given, otherwise the first argument unchanged."""
+    """Return `G` times `masses`; if `G` is None, return `masses` unchanged."""
     if G is None:
         return masses
     refuse_units(G=G)
@@ -220,7 +226,10 @@ def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
 
 
 def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the three arguments as arrays; raise ValueError if shapes or values are wrong, and warn of wrong units."""
+    """Return gm, position and velocity as arrays of shapes (N,), (N, 3) and (N, 3).
+
+    A ValueError is raised if shapes or values are wrong, and a warning is given if the speeds suggest wrong units.
+    """
     masses, q, v = (np.array(x, dtype=float) for x in (gm, position, velocity))
     n = masses.size
     if masses.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
@@ -240,9 +249,10 @@ def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndar
 
 
 def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return each body's speed relative to the body that binds it most, in units of the escape speed.
+    """Return each body's speed relative to the body that binds it most, in units of the escape speed of this pair.
 
-    Bodies at rest relative to that body are left out. A ValueError is raised if two bodies are at the same place.
+    Bodies whose relative speed is 0, and pairs without mass, are left out. A ValueError is raised if two bodies are at
+    the same place.
     """
     found = []
     for i in range(gm.size):  # one row of distances at a time, because N^2 distances may not fit in memory
@@ -276,8 +286,10 @@ def _check_speeds(ratio: np.ndarray) -> None:
 def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the `frame` (C, S) of centre of mass and momentum, with shifts of bodies proportional to their masses.
 
-    With these shifts the recoil from the correction of a planet goes to its star. `common_shift` would move the outer
-    planets by the same distance as the star.
+    C, of shape (6, 6 N), maps a state to the position and velocity of the centre of mass. The columns of S, of shape
+    (6 N, 6), are the shifts of the state that restore C y after a correction. With shifts proportional to the masses,
+    the recoil from the correction of a planet goes to its star. `common_shift` would move the outer planets by the same
+    distance as the star.
     """
     axes = np.eye(3)
     share = gm / gm.sum()
@@ -287,6 +299,10 @@ def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the `frame` (C, S) of centre of mass and momentum, with common shifts of all bodies, which keep orbits."""
+    """Return the `frame` (C, S) of centre of mass and momentum, with common shifts of all bodies.
+
+    C is that of `recoil`. The columns of S, of shape (6 N, 6), move all bodies by the same distance, or change all
+    velocities by the same amount, so that positions and velocities relative to other bodies do not change.
+    """
     C, _ = recoil(gm)
     return C, np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), np.eye(3)))

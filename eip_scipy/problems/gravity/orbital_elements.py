@@ -29,7 +29,7 @@ class OrbitalElements:
     Attributes
     ----------
     bodies : tuple of str
-        Names of the bodies whose orbits these are.
+        Names of the bodies that move on the orbits, in the order of the arrays.
     t : ndarray, shape (m,), or None
         Times of the states; None if the states have no times.
     a : ndarray
@@ -54,9 +54,9 @@ class OrbitalElements:
     l : ndarray
         Mean longitude, Omega + omega + M; for a retrograde orbit Omega - omega - M.
     n : ndarray
-        Mean motion; negative for a hyperbola, as in REBOUND.
+        Mean motion in radians per unit of time; negative for a hyperbola, as in REBOUND.
     P : ndarray
-        Period, 2 pi / n.
+        Period, 2 pi / n; negative for a hyperbola.
     """
 
     bodies: tuple[str, ...]
@@ -75,7 +75,7 @@ class OrbitalElements:
     P: np.ndarray
 
     def __getitem__(self, body: str | int) -> OrbitalElements:
-        """Return the elements of one body, by its name or its index in `bodies`, as arrays (m,) or numbers."""
+        """Return the elements of one body, given by its name or its index in `bodies`, as numbers or arrays (m,)."""
         if isinstance(body, str) and body not in self.bodies:
             raise KeyError(f"there is no orbit of {body!r}; the bodies with orbits are {', '.join(self.bodies)}.")
         k = self.bodies.index(body) if isinstance(body, str) else body
@@ -114,7 +114,7 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
     TypeError
         If masses are missing.
     ValueError
-        If shapes do not fit, there is no such primary, or it has no mass.
+        If shapes do not fit, `primary` is unknown, or the primary has no mass.
 
     Notes
     -----
@@ -170,10 +170,15 @@ def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray,
 
 
 def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states relative to the centre of mass of all bodies before each, and G times the mass of all these."""
+    """Return the states of all bodies except the first in Jacobi's coordinates, and the gravitational parameters.
+
+    The states (2, N - 1, 3, ...) are relative to the centre of mass of all bodies before each body. The parameters
+    (N - 1,) are G times the mass of all bodies up to and including this one.
+    """
     if not gm[0] > 0:
         raise ValueError(
-            f"orbital_elements: primary='jacobi' needs a first body with a mass, but its G m is {gm[0]!r}."
+            f"orbital_elements: primary='jacobi' needs a first body with a mass, but its G m is {gm[0]!r}. "
+            "Put a body with a mass first, or give another primary."
         )
     total = np.cumsum(gm)
     weighted = gm.reshape(-1, 1, *[1] * (state.ndim - 3)) * state
@@ -184,7 +189,11 @@ def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _around(
     state: np.ndarray, gm: np.ndarray, primary: str | int, names: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return the states relative to one primary, the gravitational parameters, and the indices of the bodies."""
+    """Return the states relative to `primary`, the gravitational parameters, and the indices of the orbiting bodies.
+
+    The shapes are (2, bodies, 3, ...) and (bodies,). The orbiting bodies are all bodies except the primary, or all
+    bodies if the primary is the barycentre.
+    """
     every = list(range(gm.size))
     if primary == "barycentric":
         total = gm.sum()
@@ -202,12 +211,15 @@ def _around(
         )
     others = [i for i in every if i != k]
     if gm[k] == 0:
-        raise ValueError(f"orbital_elements: the primary {names[k]!r} has no mass, so nothing orbits it.")
+        raise ValueError(f"orbital_elements: the primary {names[k]!r} has no mass, so nothing orbits it. Give another.")
     return state[:, others] - state[:, [k]], gm[k] + gm[others], others
 
 
 def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the elements of relative states (2, bodies, 3, ...) with the gravitational parameters `mu` (bodies,)."""
+    """Return the elements of relative states (2, bodies, 3, ...) by name, as arrays (bodies, ...).
+
+    The names are those of `OrbitalElements`. The gravitational parameters `mu` have the shape (bodies,).
+    """
     (x, y, z), (vx, vy, vz) = np.moveaxis(state, 2, 1)
     mu = mu.reshape(-1, *[1] * (x.ndim - 1))
     # Adding 0 leaves no -0, whose arc tangent is pi.
@@ -252,7 +264,11 @@ def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return the angle in the plane of the orbit from the ascending node to q; 0 if the node or q is undefined."""
+    """Return the angle in the plane of the orbit from the ascending node to q; 0 if the node or q is undefined.
+
+    `momentum` is the angular momentum (hx, hy, hz) per unit of mass, `level` the length of (hx, hy), and `h` that of
+    all three.
+    """
     hx, hy, hz = momentum
     along = hx * q[1] - hy * q[0] + 0.0
     # Product of h x node, (-hx hz, -hy hz, hx^2 + hy^2), with q, divided by h.
@@ -262,7 +278,10 @@ def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.nda
 
 
 def _mean_anomaly(e: np.ndarray, f: np.ndarray, a: np.ndarray, r: np.ndarray, rv: np.ndarray) -> np.ndarray:
-    """Return the mean anomaly by Kepler's equation, between 0 and 2 pi for an ellipse; `rv` is q . v / sqrt(mu)."""
+    """Return the mean anomaly by Kepler's equation, between 0 and 2 pi for an ellipse, NaN for a parabola.
+
+    `rv` is q . v / sqrt(mu), and `f` the true anomaly.
+    """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         sine, cosine = rv / np.sqrt(np.abs(a)), 1 - r / a  # e times those of the eccentric anomaly
         nearly = 2 * np.arctan2(np.sqrt(np.abs(1 - e)) * np.sin(f / 2), np.sqrt(1 + e) * np.cos(f / 2))

@@ -1,4 +1,4 @@
-"""Balances of the orbits of N bodies: energies, angular momenta and Laplace vectors, and their rates."""
+"""Energies, angular momenta and Laplace vectors of the orbits of N bodies as balances, see `Balance`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,13 @@ ENERGY = 0
 
 
 class _Orbit(NamedTuple):
-    """Orbit of a body: its parameters for the engine, the components (6, k) that corrections move, and weights."""
+    """Orbit of the body with the index `body`, or of this body together with those that move about it.
+
+    `entries` are the parameters of the orbit for the functions of the library: the energy at the start (0 until it is
+    known), the number of bodies that take part, and for each of them its index and its weight in the relative position.
+    `components` (6, k) are the indices of the components of the state that a correction moves, and `weights` (6, k) the
+    sizes of their moves relative to each other.
+    """
 
     body: int
     entries: Array
@@ -53,7 +59,7 @@ def orbital_balances(
         Quantities of each orbit: "energy", "momentum" (angular momentum) and "laplace" (Laplace's vector), all per
         reduced mass. "kepler" is the energy alone, which is enough for eccentricities below 0.3.
     bodies : sequence of str, optional
-        Names of the bodies.
+        Names of the bodies, for the names of the values. Default: the numbers 0, 1, ...
     newton : bool, optional
         True if no forces act except Newton's gravitation. The rates are then sums of the perturbing attractions instead
         of differences of the accelerations, which reduces rounding errors about a hundredfold for orbits about the
@@ -62,7 +68,8 @@ def orbital_balances(
     Returns
     -------
     tuple of Balance
-        One balance for each quantity. The values of the energies are their differences from those at the start.
+        One balance for each quantity, in the order energy, momentum, laplace; its values are those of the N - 1 orbits.
+        The value for an energy is its difference from the energy at the start.
 
     Raises
     ------
@@ -90,10 +97,11 @@ def orbital_balances(
 def balances_beside_frame(
     gm: Array, y0: Array, quantities: str | Sequence[str], bodies: Sequence[str] | None, newton: bool
 ) -> tuple[Balance, ...]:
-    """Return `orbital_balances` for runs whose frame keeps the centre of mass by a shift of all bodies.
+    """Return the balances of `orbital_balances` for runs whose `frame` restores the centre of mass by a common shift.
 
-    The shift changes no orbit. Therefore the correction of an orbit about the heaviest body moves only the body on this
-    orbit, while `orbital_balances` also moves all other bodies in the opposite direction.
+    A common shift of all bodies changes no orbit. Therefore the correction of an orbit about the heaviest body moves
+    only the body on this orbit, while a balance of `orbital_balances` also moves all other bodies in the opposite
+    direction.
     """
     return _balances(gm, y0, quantities, bodies, newton, neutral=False)
 
@@ -101,7 +109,7 @@ def balances_beside_frame(
 def _balances(
     gm: Any, y0: Any, quantities: Any, bodies: Sequence[str] | None, newton: bool, *, neutral: bool
 ) -> tuple[Balance, ...]:
-    """Return the balances; if `neutral` is True, their corrections keep the centre of mass by themselves."""
+    """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged."""
     masses, state = real_array("gm", gm), real_array("y0", y0)
     newton = flag("newton", newton)
     if masses.ndim != 1 or masses.size < 2 or state.shape != (6 * masses.size,):
@@ -109,7 +117,7 @@ def _balances(
             f"orbital_balances: gm has shape {masses.shape} and y0 {state.shape}; expected (N,) and (6 N,), N >= 2."
         )
     if not (np.isfinite(masses).all() and masses.min() >= 0 and masses.max() > 0):
-        raise ValueError(f"gm must hold finite numbers >= 0, and one > 0, got {shown(gm)}.")
+        raise ValueError(f"gm must hold finite numbers >= 0, and at least one > 0, got {shown(gm)}.")
     if not np.isfinite(state).all():
         raise ValueError(f"y0 must be finite, got {shown(y0)}.")
     names = tuple(map(str, range(masses.size))) if bodies is None else tuple(bodies)
@@ -136,7 +144,9 @@ def _balances(
 
 
 def chosen_quantities(given: Any) -> tuple[str, ...]:
-    """Return the names of the quantities, without repetitions, in the order of `QUANTITIES`.
+    """Return the quantities that `given`, a name or several names, stands for, in the order of `QUANTITIES`.
+
+    The name "kepler" stands for "energy". Repetitions are left out.
 
     Raises
     ------
@@ -154,7 +164,7 @@ def chosen_quantities(given: Any) -> tuple[str, ...]:
 
 
 def centres(gm: Array, y0: Array) -> Array:
-    """Return the number of the body that each body moves about at the start, -1 for the heaviest body.
+    """Return the indices (N,) of the bodies that the bodies move about at the start, -1 for the heaviest body.
 
     Among the heavier bodies to which a body is bound and in whose Hill sphere it is, the one with the smallest sphere
     is chosen. If there is none, the heaviest body is chosen.
@@ -176,7 +186,7 @@ def centres(gm: Array, y0: Array) -> Array:
 
 
 def _is_below(about: Array, body: int, top: int) -> bool:
-    """Return True if `body` moves about `top`, directly or through a chain of centres."""
+    """Return True if `body` moves about `top`, directly or through other bodies; `about` is the array of `centres`."""
     while body >= 0:
         body = int(about[body])
         if body == top:
@@ -185,7 +195,7 @@ def _is_below(about: Array, body: int, top: int) -> bool:
 
 
 def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orbit:
-    """Return the orbit about its centre of a body together with all bodies that move about it."""
+    """Return the orbit of `body`, together with all bodies that move about it, about the body ``about[body]``."""
     centre = int(about[body])
     group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
     total = float(gm[group].sum())
@@ -206,7 +216,11 @@ def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orb
 def _balance(
     quantity: str, group: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str
 ) -> Balance:
-    """Return the balance of one quantity for all orbits, from the functions of a `group` of the library."""
+    """Return the balance of one quantity for all orbits.
+
+    Its functions are those of the `group` ("orbits" or "planets") of the library, with the parameters `entries`. `end`
+    is the end of the name of the rate's function.
+    """
     fun, grad, rate = (library[f"{group}.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
     each = 1 if quantity == "energy" else 3
     kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)

@@ -50,22 +50,22 @@ def satellite(
         G m and the equatorial radius of the planet. All arguments have the units of length and time of your choice.
     t_span : (float, float)
     h : float, optional
-        Step. Default: a sixteenth of the period of the Kepler orbit at the start, if that is bound.
+        Step. Default: 1/16 of the period of the Kepler orbit at the start; none if that orbit is unbound.
     j2 : float, optional
-        Oblateness.
+        Oblateness J2, a number without unit.
     drag : float, optional
         Half of the air's density at `height`, times c_D A / m of the satellite. Its unit is one over a length.
     height, scale_height : float, optional
-        Height above the equator at which `drag` holds, and the height over which the density falls by a factor of e,
-        which must be given with `drag`.
+        `drag` holds at the distance `radius` + `height` from the planet's centre. `scale_height`, which must be given
+        with `drag`, is the height over which the density falls by a factor of e.
     spin : float, optional
-        Angular velocity of the air about the pole.
+        Angular velocity of the air about the pole, in radians per unit of time.
     pole : sequence of 3 floats, optional
         Axis of the planet.
     balances : str or sequence of str, optional
         Quantities of Kepler's motion to keep, see `orbital_balances`. The default is all of them, which is most
         accurate for nearly circular orbits. "kepler", the energy alone, is more accurate from eccentricities of about
-        0.1. None keeps nothing.
+        0.1. If it is None, the problem has no invariants.
     name, units : str, optional
         See `Problem`.
 
@@ -78,7 +78,8 @@ def satellite(
     Raises
     ------
     ValueError
-        If a shape is wrong, the radius or scale height is not positive, or the oblateness or drag is negative.
+        If a shape is wrong, `mu`, `radius` or `scale_height` is not positive, `j2`, `drag` or `height` is negative, or
+        a quantity in `balances` is unknown.
 
     Examples
     --------

@@ -34,9 +34,9 @@ def pythagorean() -> Problem:
     Returns
     -------
     Problem
-        From t = 0 to 70, with G = 1. Near t = 15.83 the bodies of masses 4 and 5 pass within 4e-4 of each other; from
-        about t = 60 on they are a binary, and the body of mass 3 leaves. The invariants are those of `nbody`; the
-        angular momentum is zero. There are `reference` states at t = 10, 20, ..., 70.
+        A problem from t = 0 to 70, with G = 1. Near t = 15.83 the bodies of masses 4 and 5 pass within 4e-4 of each
+        other; from about t = 60 on they are a binary, and the body of mass 3 leaves. The invariants are those of
+        `nbody`; the angular momentum is zero. There are `reference` states at t = 10, 20, ..., 70.
 
     References
     ----------
@@ -109,8 +109,8 @@ def comet() -> Problem:
         from the DE440 data of `SolarSystemData` (2014-02-02). The comet is synthetic: a body of 1e13 kg, placed so that
         after 10 years it passes Jupiter's centre at 3.0 radii (0.0014 AU), about as near as Lexell's comet did in 1779.
         Before the passage its semi-major axis is 3.2 AU, with perihelia at 1.3 AU; afterwards it is 500 AU. An error
-        before the passage has grown 700-fold at the end. The invariants are those of `nbody`. The comet contributes
-        1e-17 to them, so that they do not show errors of its orbit. There is a `reference` state at 20 years.
+        before the passage has grown 700-fold at the end. The invariants are those of `nbody`. The comet's share in them
+        is 1e-17, so that they do not show errors of its orbit. There is a `reference` state at 20 years.
     """
     data = solar_data.load("de440")
     rows = [data.bodies.index(name) for name in ("Sun", "Jupiter", "Saturn")]
@@ -133,7 +133,7 @@ def comet() -> Problem:
 
 
 def _reference(name: str, t: float) -> np.ndarray | None:
-    """Return the stored reference state of a problem at a time; None if there is none."""
+    """Return the stored reference state (6 N,) of the problem `name` at the time `t`; None if there is none."""
     for time, state in _references()[name]:
         if abs(t - time) <= 1e-14 * abs(time):
             return np.array(state)

@@ -64,13 +64,13 @@ class SolarSystemData:
     epoch : str
         The epoch as a date of the (proleptic) Gregorian calendar.
     axes : str
-        "ICRF" or "ecliptic J2000".
+        Axes of the positions and velocities: "ICRF" or "ecliptic J2000".
     source : str
         Source of the numbers.
     units : str
-        "AU, day".
+        Units of length and time of the arrays: "AU, day".
     epoch_rest : float
-        Rounding error of `epoch_jd_tdb` in days.
+        The part of the exact epoch, in days, that rounding removes from `epoch_jd_tdb`.
     """
 
     name: str
@@ -200,6 +200,7 @@ def to_barycentre(gm: np.ndarray, position: np.ndarray, velocity: np.ndarray) ->
     Parameters
     ----------
     gm : ndarray, shape (N,)
+        Masses, in any unit.
     position, velocity : ndarray, shape (N, 3)
         Positions and velocities, in any units.
 
@@ -217,7 +218,7 @@ def _centre(gm: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _state(rows: np.ndarray) -> np.ndarray:
-    """Rearrange rows (q, v) of the bodies as the state (q of all bodies, v of all bodies)."""
+    """Return the state (q of all bodies, v of all bodies) from an array whose rows are (q, v) of one body."""
     return rows.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
 
 
@@ -230,7 +231,10 @@ def _arrays(entry: dict[str, Any]) -> _Arrays:
 
 
 def _with_sun(entry: dict[str, Any], as_printed: bool) -> _Arrays:
-    """Return the paper's table with the Sun, which it leaves out, in AU and days, relative to the barycentre."""
+    """Return G m, positions and velocities of the bodies of the paper's table, with the Sun added as the first body.
+
+    The units are AU and days, and the barycentre is at rest at the origin.
+    """
     gm, position, velocity = _arrays(entry)
     if not as_printed:
         misprint = entry["misprint"]

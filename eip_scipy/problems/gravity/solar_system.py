@@ -50,8 +50,8 @@ def solar_system(
     units : {"AU, yr", "SI"}
         Units of the state, of time and of G m: AU and Julian years, or metres and seconds.
     forces : str or sequence of str, optional
-        "1pn", "eih" or "gr-potential", "j2", "moon-quadrupole": see `nbody`. The page "Forces" of the documentation
-        shows what each of them contributes.
+        At most one of "1pn", "eih" and "gr-potential"; in addition "j2" and "moon-quadrupole", see `nbody`. The page
+        "Forces" of the documentation shows what each of them contributes.
     balances : str or sequence of str, optional
         "kepler" keeps each planet's energy about the Sun instead of the total energy and angular momentum, see `nbody`.
         With `EIPGJ14` or `EIPDOP853` this is the most accurate choice over thousands of years.
@@ -66,7 +66,8 @@ def solar_system(
     Raises
     ------
     ValueError
-        If data, units or forces are unknown, or "moon-quadrupole" is given for data without the Earth-Moon barycentre.
+        If data, units or forces are unknown, "drag" is given, or "moon-quadrupole" is given for data without the
+        Earth-Moon barycentre.
     """
     refuse_units(years=years, h=h)
     known = load(data) if isinstance(data, str) else data
@@ -103,18 +104,21 @@ def _reference(references: dict[float, np.ndarray], length: float, time: float, 
 
 
 def _starts_as_references(data: SolarSystemData) -> bool:
-    """Return True if the data are those from which the stored states start; a name does not determine the epoch."""
+    """Return True if masses and states are those of the set "de440", from which the stored reference states start.
+
+    The name of the data is not compared, because it does not determine the epoch.
+    """
     start = load("de440")
     return np.array_equal(data.gm, start.gm) and np.array_equal(data.y0, start.y0)
 
 
 def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, time: float) -> ForceConstants:
-    """Return the constants in units in which the AU is `length` and the day is `time`."""
+    """Return the constants of the forces in units in which the AU is `length` and the day is `time`."""
     km = length / AU_KM
     if "moon-quadrupole" in forces and "EMB" not in data.bodies:
         raise ValueError(
             f"the force 'moon-quadrupole' replaces the Moon in data that contain the Earth-Moon barycentre EMB; "
-            f"{data.name!r} does not. Omit this force, or use 'de440'."
+            f"{data.name!r} does not contain it. Omit this force, or use 'de440'."
         )
     return ForceConstants(
         c=C_KM_S * DAY_S * km / time,
@@ -126,7 +130,7 @@ def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, ti
 
 
 def _pole(axes: str) -> tuple[float, float, float]:
-    """Return the Sun's north pole on the axes of the data."""
+    """Return the unit vector to the Sun's north pole on the axes "ICRF" or "ecliptic J2000"."""
     ra, dec = math.radians(POLE_RA_DEG), math.radians(POLE_DEC_DEG)
     x, y, z = math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)
     if axes == "ICRF":
@@ -136,7 +140,7 @@ def _pole(axes: str) -> tuple[float, float, float]:
 
 
 def _units(units: str) -> tuple[float, float]:
-    """Return one AU and one day in the given units."""
+    """Return the length of one AU and of one day in the given units."""
     if units == "AU, yr":
         return 1.0, 1.0 / YEAR_D
     if units == "SI":

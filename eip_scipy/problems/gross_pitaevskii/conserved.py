@@ -19,23 +19,27 @@ JOINT = ("mass", "energy")
 
 
 class _Known:
-    """Energy of a state at which f is known, and by an expansion of states at a distance of about 1e-12 from it."""
+    """Energy of a state at which f = -i H psi is known, and of states near it.
+
+    At distances of about 1e-12 the energy follows from an expansion in the distance.
+    """
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
         self._gpe, self._norm = gpe, gpe.largest_frequency()
         self.energy, self._peak = 0.0, np.inf  # the latter a bound of |psi|^2
 
     def note(self, psi: np.ndarray, f: np.ndarray) -> Moments:
-        """Store the energy of a state, computed from f at this state."""
+        """Store the energy of a state, computed from f at this state, and return the sums from which it follows."""
         gpe = self._gpe
         found = gpe.moments(psi, f)
         self.energy, self._peak = gpe.grid.cell * found.energy(gpe.beta), found.quartic**0.5
         return found
 
     def beside(self, square: float, slope: float) -> float | None:
-        """Return the energy of psi + d, from the sums of ``|d|^2`` and Re(conj(H psi) d), for the noted state psi.
+        """Return the energy of psi + d for a small d, where psi is the state of the last `note`.
 
-        The result is None if the terms of second order and higher are not far below the rounding of the energy.
+        `square` is the sum of ``|d|^2`` over the grid, and `slope` that of Re(conj(H psi) d). The result is None if the
+        terms of second order and higher are not far below the rounding of the energy.
         """
         cell = self._gpe.grid.cell
         density = 3 * self._peak + 2 * (self._peak * square) ** 0.5 + 0.5 * square
@@ -44,7 +48,7 @@ class _Known:
 
 
 class Energy:
-    """The energy as an invariant: its value, and its gradient 2 w i f with the size w of a cell.
+    """The energy as an invariant: its value, and its gradient 2 w i f with f = -i H psi and the size w of a cell.
 
     A step needs the gradient and the energy at its unprojected result, and the energy of the projected state. None of
     these needs a transform.
@@ -59,7 +63,7 @@ class Energy:
         self._near: tuple[np.ndarray, np.ndarray] | None = None  # the state noted last and f there
 
     def value(self, y: np.ndarray) -> float:
-        """Return the energy of a state."""
+        """Return the energy of a state, without a transform if the state is very near that of the last `gradient`."""
         gpe = self._gpe
         energy = None
         if self._near is not None:
@@ -79,10 +83,10 @@ class Energy:
 
 
 class Joint:
-    """Functions of `JointInvariants` for mass and energy, or one of them; a projection takes two passes over the field.
+    """The functions `moments` and `shift` of `JointInvariants` for mass and energy, or one of them.
 
-    The gradients 2 w psi and 2 w H psi = 2 w i f are never stored: their products and the energy are computed as sums
-    over psi and f.
+    A projection takes two passes over the field. The gradients 2 w psi and 2 w H psi = 2 w i f, with the size w of a
+    cell, are never stored: their products and the energy are computed as sums over psi and f.
 
     Parameters
     ----------
@@ -104,13 +108,14 @@ class Joint:
         ----------
         t : float
         y, f : ndarray, shape (n,)
-            The state and the right-hand side there.
+            The state, and the right-hand side f = -i H psi at this state.
         values : ndarray, shape (l,)
             Filled with the values of the invariants.
         gram : ndarray, shape (l, l)
             Filled with the inner products of the gradients.
         terms : ndarray, shape (l,)
-            Filled with the sums of ``|G_k y_k|`` over the real components, for the dead bands.
+            Filled with the sums of ``|G_k y_k|`` over the real components of the state, to which the rounding errors of
+            the values are proportional.
         """
         found, w = self._known.note(y, f), self._gpe.grid.cell
         m, e = self._mass, self._energy
@@ -136,7 +141,8 @@ class Joint:
         out : ndarray, shape (n,)
             Filled with ``y + sum_i mu_i G_i(y)``.
         values : ndarray, shape (l,)
-            Filled with the invariants of `out`. The energy is computed with a transform only if the shift is large.
+            Filled with the values of the invariants at `out`. The energy is computed with a transform only if the shift
+            is large.
         """
         gpe, w = self._gpe, self._gpe.grid.cell
         a, b = (0.0 if k is None else 2 * w * mu[k] for k in (self._mass, self._energy))

@@ -24,7 +24,8 @@ class DampedGrossPitaevskii(GrossPitaevskii):
     grid, potential
         As for `GrossPitaevskii`.
     damping : float, optional
-        Pitaevskii's phenomenological damping, the strength of the exchange with a thermal cloud.
+        Pitaevskii's phenomenological damping, a number >= 0 without unit: the strength of the exchange with a thermal
+        cloud.
     chemical_potential : float, optional
         mu, the chemical potential of the thermal cloud. `damping` relaxes the field to a state of this chemical
         potential, which is at rest in these equations.
@@ -42,8 +43,8 @@ class DampedGrossPitaevskii(GrossPitaevskii):
     -----
     Mass, energy and momenta change at the rate Re <G, d>, with the gradient G and the terms d that damping and losses
     add to psi_t. The derivative at a stage contains H psi, so that the rates of mass and energy need no transform.
-    `invariants` returns these quantities as balances, and `problem` keeps them, with the Runge-Kutta methods that
-    support balances. `Splitting` solves the equation without damping and losses.
+    `invariants` returns these quantities as `Balance` objects, and `problem` keeps them, with the Runge-Kutta methods
+    that support balances. `Splitting` solves the equation without damping and losses.
 
     Examples
     --------
@@ -97,12 +98,15 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         return self.grid.cell * self.moments(psi, f).energy(self.beta)
 
     def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``-i H psi``, and the terms of damping and losses without i mu psi, from the derivative f of y."""
+        """Return two parts of the derivative `f` at the state `y`: -i H psi, and the terms that damping and losses add.
+
+        The term i mu psi is left out of both parts, because it changes no invariant.
+        """
         turning = (f - (self._growth + 1j * self.mu) * y) / (1 - 1j * self.damping)
         return turning, self._growth * y - 1j * self.damping * turning
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Balance, ...]:
-        """Return the invariants of `GrossPitaevskii` as balances.
+        """Return invariants of the undamped equation as balances, with their rates by damping and losses.
 
         Parameters
         ----------

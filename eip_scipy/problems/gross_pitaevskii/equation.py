@@ -73,8 +73,9 @@ class GrossPitaevskii:
     V : ndarray
         The potential on the grid.
     transforms : Transforms
+        The Fourier transforms of the library `fft`.
     fft : str
-        The library of the transforms.
+        Name of the library of the transforms.
 
     Raises
     ------
@@ -133,17 +134,19 @@ class GrossPitaevskii:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
 
     def changed(self, **options: Any) -> GrossPitaevskii:
-        """Return the equation with other values of `potential`, `Omega`, `beta` and so on, as after a quench."""
+        """Return the equation on the same grid with other values of `potential`, `Omega`, `beta` and other options."""
         options = {"potential": self.V, "Omega": self.Omega, "beta": self.beta, **self._options, **options}
         return type(self)(self.grid, **options)
 
     def kinetic_factor(self, axis: int) -> np.ndarray:
-        """Return the factor k^2 / 2 of the modes along one axis."""
+        """Return the factor k^2 / 2 of the modes along one axis, as an array that broadcasts to fields."""
         k = self.grid.wavenumbers(axis, odd=self.nyquist == "zero")
         return 0.5 * k * k
 
     def rotation_factors(self) -> list[np.ndarray]:
         """Return the factors of Lz = x q - y k: -y k of the modes along x, and x q of the modes along y.
+
+        Both are arrays that broadcast to fields.
 
         Raises
         ------
@@ -173,7 +176,7 @@ class GrossPitaevskii:
     # These four a field on several ranks does in another way (`eip_scipy.integrations.mpi_fields`).
 
     def _method(self) -> Splitting | None:
-        """Return the method that problems of the equation use by default; None for the default of runs."""
+        """Return the method that problems of the equation use by default; None for the default of `integrate`."""
         return Splitting(self)
 
     def _total(self, sums: Any) -> Any:
@@ -187,7 +190,7 @@ class GrossPitaevskii:
         return float(np.abs(a).max())
 
     def linear_terms(self) -> list[tuple[Axes, Any]]:
-        """Return the linear part, kinetic energy and rotation, as axes and the real factors of the modes along them.
+        """Return the linear part, kinetic energy and rotation, as pairs (axes, factor of the modes along them).
 
         The terms are chosen so that the number of transforms is smallest: without rotation one term of all axes,
         otherwise one term of x and one of y and z.
@@ -255,7 +258,10 @@ class GrossPitaevskii:
         return float(self.grid.cell * self._total(total_mass(self.as_field(psi))))
 
     def energy(self, psi: Any) -> float:
-        """Return the sum of kinetic, potential, rotational and interaction energy (beta / 2 sum of ``|psi|^4``)."""
+        """Return the sum of kinetic, potential, rotational and interaction energy.
+
+        The interaction energy is beta / 2 times the sum of ``|psi|^4`` over the grid, times the size of a cell.
+        """
         psi = self.as_field(psi)
         return self.grid.cell * self.moments(psi, self.fun(0.0, psi.reshape(-1))).energy(self.beta)
 
@@ -274,7 +280,7 @@ class GrossPitaevskii:
         return float(self.grid.cell * self._total(self._turning.expectation(self.as_field(psi))))
 
     def momentum(self, psi: Any) -> np.ndarray:
-        """Return the momenta along the axes of the grid, the means of -i times the derivatives, times the mass."""
+        """Return the momenta (d,) along the d axes: the means of -i times the derivatives, times the mass."""
         psi = self.as_field(psi)
         return self.grid.cell * np.array([self._total(along.expectation(psi)) for along in self._moving])
 
@@ -299,7 +305,7 @@ class GrossPitaevskii:
         out *= 2 * self.grid.cell
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Invariant, ...]:
-        """Return the invariants of the equation.
+        """Return those invariants of the equation that `names` lists.
 
         Parameters
         ----------
@@ -313,10 +319,10 @@ class GrossPitaevskii:
         -------
         tuple of Invariant
             The gradients of mass, energy, momentum and angular momentum are 2 w psi, 2 w H psi, -2 i w d psi and 2 w Lz
-            psi with the size w of a cell. The gradient of the energy is a multiple of the right-hand side, which the
-            step evaluates only once for this gradient and for the first stage of the next step (`reuse_f`). Mass and
-            energy are returned as `JointInvariants`. If this object is passed on unchanged, a projection takes two
-            passes over the field.
+            psi, with the size w of a cell and the derivative d along an axis. The gradient of the energy is a multiple
+            of the right-hand side, which the step evaluates only once for this gradient and for the first stage of the
+            next step (`reuse_f`). Mass and energy, or one of them without other invariants, are returned as
+            `JointInvariants`. If this object is passed on unchanged, a projection takes two passes over the field.
 
         Raises
         ------
@@ -365,17 +371,19 @@ class GrossPitaevskii:
         h : float, optional
             Length of the step. An explicit method needs one below `largest_step`.
         name : str, optional
+            See `Problem`.
         invariants : sequence of str, optional
-            See `invariants`.
+            Names of the invariants, see `invariants`.
         reference : callable, optional
             ``reference(t) -> y``, the exact solution as a flat array, or None where it is not known.
         source : str, optional
+            See `Problem`.
 
         Returns
         -------
         FieldProblem
             The problem. Its metric is "euclidean", because all points of the grid are equivalent. Its method is
-            `Splitting`, of order 4.
+            `Splitting`, of order 4; a `DampedGrossPitaevskii` has the default method of `integrate`.
         """
         return FieldProblem(
             name=name,
@@ -400,12 +408,12 @@ class GrossPitaevskii:
         return kinetic + abs(self.Omega) * turning + self._largest(self.V)
 
     def largest_step(self, psi: Any, limit: float = 2 * 2**0.5) -> float:
-        """Return the step above which an explicit method is unstable.
+        """Return a step up to which an explicit method is stable.
 
         Parameters
         ----------
         psi : array_like
-            A typical field.
+            A field whose largest density ``|psi|^2`` is typical of the run.
         limit : float, optional
             Largest stable value of h times the largest frequency for the method; default: that of RK4, 2 sqrt(2).
 
@@ -421,7 +429,7 @@ class GrossPitaevskii:
 
 
 def on_grid(potential: Any, grid: Grid, name: str = "potential") -> np.ndarray:
-    """Return the values (J[, K[, L]]) of a potential or another quantity on the grid; `name` is for messages."""
+    """Return the values (J[, K[, L]]) of a real quantity on the grid; `name` is its name in messages."""
     values = np.asarray(potential(*grid.mesh()) if callable(potential) else 0.0 if potential is None else potential)
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name} must be real, got values of type {values.dtype}.")

@@ -48,7 +48,8 @@ class LinearFlow:
         angle = gpe.Omega * time if angle is None else angle
         if abs(angle) > LARGEST_TURN * (1 + 1e-9):
             raise ValueError(
-                f"the angle of a flow, Omega times its time, is at most pi / 4, got {angle:.3g}; use shorter steps."
+                f"the absolute value of the angle, by default Omega times time, must be at most pi / 4, got "
+                f"{angle:.3g}; use shorter steps."
             )
         self._fft = gpe.transforms
         kinetic = [gpe.kinetic_factor(axis) for axis in range(gpe.grid.dim)]
@@ -64,13 +65,19 @@ class LinearFlow:
 
     @staticmethod
     def _factor(gpe: GrossPitaevskii, axes: Axes, phases: list[Any]) -> tuple[Axes, list[np.ndarray]]:
-        """Return `axes`, and factors exp(-i phase) of the modes; the first is divided by the number of points."""
+        """Return `axes`, and the factors exp(-i phase) of the modes along them, one for each of the `phases`.
+
+        The first factor is divided by the number of points along `axes`, because the transforms are not normalised.
+        """
         points = int(np.prod([gpe.grid.shape[axis] for axis in axes]))
         first, *rest = (np.exp(-1j * phase) for phase in phases)
         return axes, [first / points, *rest]
 
     def apply(self, psi: np.ndarray, work: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the image of `psi`, in one of the two arrays, and the other array; both arrays are overwritten."""
+        """Return the field after the flow, which starts at `psi`, in one of the two arrays, and the other array.
+
+        Both arrays are overwritten.
+        """
         for axes, factors in self._factors:
             self._fft.forward(psi, axes, work)
             for factor in factors:

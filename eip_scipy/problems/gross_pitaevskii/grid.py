@@ -19,14 +19,15 @@ SLAB = 2**19  # bytes of a field that stay in a processor's cache together with 
 
 
 class Grid:
-    """A uniform periodic grid in one, two or three dimensions; points at the upper ends are those at the lower ends.
+    """A uniform periodic grid in d = one, two or three dimensions.
 
     Parameters
     ----------
     shape : int or sequence of int
         Numbers of points along x, y and z, at least two each.
     lower, upper : float or sequence of float
-        Ends of the box; a single number applies to all axes.
+        Ends of the box; a single number applies to all axes. A field has the same values at both ends; only the lower
+        ends are points of the grid.
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ class Grid:
         return tuple(self._along(axis, self.points(axis)) for axis in range(self.dim))
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """Return the wavenumbers along one axis, with the shape as in `mesh`; if `odd`, that of the Nyquist mode is 0.
+        """Return the wavenumbers along one axis, with the shape as in `mesh`; if `odd`, it is 0 for the Nyquist mode.
 
         The Nyquist mode, the highest mode of an even number of points, has no sign: odd derivatives of it are 0 at the
         points, even derivatives are not.
@@ -174,7 +175,10 @@ class Multiplier:
 
 
 def _in_strips(factor: np.ndarray) -> list[tuple[slice, np.ndarray, np.ndarray]]:
-    """Return for each strip of columns its slice, its factor, and a buffer, which strips of the same width share."""
+    """Return the strips of columns into which a factor (J, K) is divided, each as its slice, its factor, and a buffer.
+
+    Strips of the same width share the buffer.
+    """
     strips = [slice(begin, begin + STRIP) for begin in range(0, factor.shape[1], STRIP)]
     factors = [np.ascontiguousarray(factor[:, columns]) for columns in strips]
     rooms = {part.shape: np.empty(part.shape, complex) for part in factors}
@@ -182,7 +186,7 @@ def _in_strips(factor: np.ndarray) -> list[tuple[slice, np.ndarray, np.ndarray]]
 
 
 class SpectralSum:
-    """A sum of multipliers, a linear operator that is Hermitian to round-off.
+    """A sum of objects of `Multiplier`, a linear operator that is Hermitian to round-off.
 
     Parameters
     ----------
@@ -205,7 +209,9 @@ class SpectralSum:
         self._slab = grid.shape[0] if whole else max(1, SLAB // max(1, 16 * int(np.prod(grid.shape[1:]))))
 
     def parts(self, psi: np.ndarray, out: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Fill `out` with all terms except the last of several; yield the last one by slabs, while these are in cache.
+        """Fill `out` with the sum of all terms except the last, applied to `psi`, and yield the last by slabs.
+
+        A slab is a range of indices along x. It is yielded while it is in the cache. A single term is written to `out`.
 
         Yields
         ------

@@ -38,7 +38,7 @@ class GroundState:
     iterations : int
         Number of iterations.
     converged : bool
-        True if the residual is at most `tol`.
+        True if the residual is at most `tol` of `ground_state`.
     message : str
         Why the iteration ended.
     """
@@ -124,7 +124,11 @@ class _Descent:
         add_potential(field, self.gpe.V, 0.0, out)
 
     def run(self, tol: float, max_iterations: int, progress: Progress | None) -> GroundState:
-        """Search until the residual is at most `tol`, or until another end, and return the result."""
+        """Iterate, and return the result.
+
+        The iteration ends if the residual is at most `tol`, after `max_iterations`, if `progress` returns True, or if
+        no direction descends.
+        """
         message, iteration = "", 0
         while not message:
             if iteration % REFRESH == 0:
@@ -208,7 +212,10 @@ def _least_energy(e: tuple[float, float, float, float, float]) -> float:
 
 
 class _Preconditioner:
-    """Operator D (a - Laplace / 2)^(-1) D with D = (a + V + beta |psi|^2)^(-1/2), for a typical energy a."""
+    """Operator D (a - Laplace / 2)^(-1) D with D = (a + W)^(-1/2), for a typical energy a.
+
+    W is V minus its minimum plus ``|beta| |psi|^2``, so that D is defined for every sign of V and beta.
+    """
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
         self._gpe = gpe
@@ -220,7 +227,7 @@ class _Preconditioner:
         self.zero = np.zeros(gpe.grid.size)
 
     def fit(self, psi: np.ndarray) -> None:
-        """Compute the constant a from a field: the sum of its kinetic, potential and interaction energy."""
+        """Compute a from a field: its kinetic energy plus the sum of W ``|psi|^2`` times the size of a cell."""
         gpe = self._gpe
         density = np.abs(psi) ** 2
         local = float(np.vdot(density, self._V + abs(gpe.beta) * density))

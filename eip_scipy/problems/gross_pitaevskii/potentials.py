@@ -61,5 +61,7 @@ def quartic_trap(alpha: float, kappa: float, *gamma: float) -> Potential:
 
 def _squares(gamma: tuple[float, ...], x: tuple[np.ndarray, ...]) -> Any:
     if len(gamma) != len(x):
-        raise ValueError(f"a trap of {len(gamma)} frequencies does not fit {len(x)} coordinates; give one for each.")
+        raise ValueError(
+            f"a trap of {len(gamma)} frequencies does not fit {len(x)} coordinates; give one frequency for each."
+        )
     return sum((g * a) ** 2 for g, a in zip(gamma, x, strict=True))

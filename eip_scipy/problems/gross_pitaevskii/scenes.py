@@ -36,15 +36,16 @@ def soliton(
     Parameters
     ----------
     points : int
+        Number of points of the grid.
     amplitude, velocity : float
         a and v.
     beta : float
         < 0.
     length : float
-        Length of the ring; exp(-a length / 2) is the error of the closed form there.
+        Length of the ring; on the ring the closed form has an error of exp(-a length / 2).
     t_end : float
     h : float, optional
-        Default: half of what RK4 allows.
+        Default: half of `GrossPitaevskii.largest_step`, which is that of RK4.
     **options
         Options of `GrossPitaevskii`.
 
@@ -85,12 +86,13 @@ def breather(
     Parameters
     ----------
     points : int
+        Number of points of the grid.
     amplitude, velocity : float
         a and v.
     beta : float
         < 0.
     length : float
-        Length of the ring; exp(-a length / 2) is the error of the closed form there.
+        Length of the ring; on the ring the closed form has an error of exp(-a length / 2).
     t_end : float
     h : float, optional
         Default: 0.005 / a^2, a step for `Splitting`. The step of other methods must be below
@@ -146,7 +148,7 @@ def plane_wave(
         k, a whole number along each axis.
     amplitude, beta, t_end : float
     h : float, optional
-        Default: half of what RK4 allows.
+        Default: half of `GrossPitaevskii.largest_step`, which is that of RK4.
     **options
         Options of `GrossPitaevskii`.
 
@@ -260,7 +262,7 @@ def _breather(x: np.ndarray, length: float, amplitude: float, velocity: float, b
 
 
 def _moving(x: np.ndarray, length: float, velocity: float, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances of points from a centre that moves around the ring, and the phase factor of the motion."""
+    """Return the distances of points from a centre that moves around the ring, and the factors of the moving phase."""
     # The phase follows the distance, so that nothing jumps where it turns.
     s = np.remainder(x - velocity * t + length / 2, length) - length / 2
     return s, np.exp(1j * (velocity * (s + velocity * t) - 0.5 * velocity**2 * t))

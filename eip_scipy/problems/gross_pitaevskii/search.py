@@ -55,7 +55,9 @@ def lowest_ring(
     progress: Progress | None = None,
     report: Callable[[int, int, float], Any] | None = None,
 ) -> GroundState:
-    """Search for the lowest state with one row of vortices in a ring, over their number and the winding number inside.
+    """Search for the lowest state of a condensate with a hole that has one row of vortices around the hole.
+
+    The search is over the number of vortices and the winding number of the phase around the hole.
 
     Parameters
     ----------
@@ -66,7 +68,7 @@ def lowest_ring(
     seed : int, optional
         Seed of the noise that breaks the symmetry of the best state before the last search.
     report : callable, optional
-        ``report(count, winding, energy)`` for each pair tried.
+        ``report(count, winding, energy)``, called for each pair of numbers that is tried.
 
     Returns
     -------
@@ -75,7 +77,7 @@ def lowest_ring(
     Raises
     ------
     ValueError
-        If the condensate has no hole.
+        If the condensate has no hole, or its hole is narrower than the grid resolves.
 
     Notes
     -----
@@ -87,7 +89,10 @@ def lowest_ring(
     x, y, *_ = gpe.grid.mesh()
     r2 = (x**2 + y**2)[density > 0] if gpe.grid.dim == 2 else (x**2 + y**2 + 0 * density)[density > 0]
     if not r2.min() > (4 * gpe.grid.spacing[:2].max()) ** 2:
-        raise ValueError("the condensate has no hole; use lowest_state.")
+        raise ValueError(
+            "the condensate has no hole with a radius above 4 grid spacings; use lowest_state, or a finer grid if "
+            "the hole is narrow."
+        )
     count = round(ROW * abs(gpe.Omega) * (r2.max() - r2.min()))
     here = count, round(abs(gpe.Omega) * mean_square_radius(gpe) - count / 2)
     found: dict[tuple[int, int], GroundState] = {}

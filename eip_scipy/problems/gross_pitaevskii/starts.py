@@ -82,13 +82,16 @@ def polygon(count: int, radius: float) -> np.ndarray:
 
 
 def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
-    """Return a ring with `count` vortices at equal distances in its middle and the winding number `winding` inside.
+    """Return the Thomas-Fermi amplitude of a ring with vortices at equal distances on its mean circle.
+
+    The radius of the circle is the root of `mean_square_radius`.
 
     Parameters
     ----------
     gpe : GrossPitaevskii
         An equation whose Thomas-Fermi density has a hole.
     count, winding : int
+        Number of vortices on the circle, and winding number of the phase inside the circle.
 
     Returns
     -------
@@ -107,7 +110,7 @@ def mean_square_radius(gpe: GrossPitaevskii) -> float:
 
 
 def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -> np.ndarray:
-    """Add complex noise of `size` times the modulus at each point, so that the field has no symmetry."""
+    """Return `psi` plus complex noise of `size` times the modulus at each point, so that the field has no symmetry."""
     noise = rng.standard_normal((2, *psi.shape))
     return psi + size * np.abs(psi) * (noise[0] + 1j * noise[1])
 
@@ -116,13 +119,15 @@ def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[n
     """Yield fields with triangular lattices of vortices, turned, shifted and stretched at random, with some noise.
 
     A condensate that turns as a rigid body has Omega / pi vortices per unit area; the lattices have 0.6 to 1.2 times
-    as many, over the whole condensate and any hole in it. Without rotation there are none.
+    as many, over the whole condensate and any hole in it. Without rotation (`Omega` = 0) the fields have no vortices.
 
     Parameters
     ----------
     gpe : GrossPitaevskii
     count : int
+        Number of fields.
     seed : int, optional
+        Seed of the random numbers.
 
     Yields
     ------
@@ -138,7 +143,7 @@ def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[n
 
 
 def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return points (k, 2) of a triangular lattice within the outer radius of the condensate."""
+    """Return the points (k, 2) of a triangular lattice within the outer radius of the condensate about the z axis."""
     x, y, *_ = gpe.grid.mesh()
     radius = sqrt(float(np.max((x**2 + y**2) * (amplitude > 0))))
     area = pi / abs(gpe.Omega) / rng.uniform(0.6, 1.2)

@@ -39,7 +39,7 @@ def vortices(
     plane: int | None = None,
     Omega: float | None = None,
 ) -> Vortices:
-    """Return the vortices of a field inside the condensate.
+    """Return the vortices of a field inside the condensate; in three dimensions those in one plane z = constant.
 
     Parameters
     ----------
@@ -48,13 +48,13 @@ def vortices(
     psi : array_like
         A field or flat state.
     threshold : float, optional
-        Fraction of the largest density. Where the density with filled vortex cores is below this value, phases are not
-        meaningful, and no vortices are counted.
+        Fraction of the largest density. Where the density with filled vortex cores is below this fraction, phases are
+        not meaningful, and no vortices are counted.
     core : float, optional
         Width of the minima of the density that are filled (by a grey closing). Default: four healing lengths at the
         largest density. The width is at least three points.
     plane : int, optional
-        Index of z in three dimensions; default: the middle.
+        Index along z of the plane, in three dimensions; default: the middle.
     Omega : float, optional
         Angular velocity of the rotating frame in which neighbouring phases are compared; default: that of the equation.
         Without it, phases that turn by more than pi between two points of the grid would be miscounted.
@@ -66,7 +66,7 @@ def vortices(
     Raises
     ------
     ValueError
-        If the grid has one dimension, or the field is zero.
+        If the grid has one dimension, or the field is zero or not finite.
 
     Notes
     -----
@@ -93,7 +93,10 @@ def vortices(
 
 
 def core_size(gpe: GrossPitaevskii, top: float, core: float | None = None) -> list[int]:
-    """Return the numbers of points across a vortex core along x and y, odd and at least 3, from the largest density."""
+    """Return the numbers of points across a vortex core along x and y, odd and at least 3.
+
+    The width of the core is `core`, or else four healing lengths at the largest density `top`.
+    """
     width = core if core is not None else CORE / sqrt(2 * gpe.beta * top) if gpe.beta > 0 else 0.0
     return [max(3, ceil(width / d) | 1) for d in gpe.grid.spacing[:2]]
 

@@ -64,14 +64,14 @@ def find_invariants(
     -------
     list of Invariant
         Functionally independent invariants, the simplest first, with readable names (``"y0*y3 - y1*y2"``) and
-        gradients. Coefficients are replaced by small fractions if these are conserved too. The functions are jitted if
-        `fun` is jitted. Polynomials and other functions of the returned invariants are left out. The list is empty if
-        no invariant is found.
+        gradients. Coefficients are replaced by small fractions if the combination with these fractions is conserved
+        too. The functions are jitted if `fun` and the `terms` that they contain are jitted. Polynomials and other
+        functions of the returned invariants are left out. The list is empty if no invariant is found.
 
     Raises
     ------
     ValueError
-        If an argument is wrong, or `fun` is finite at too few points.
+        If an argument is wrong, or `fun` or a term is finite at too few points.
 
     Notes
     -----
@@ -101,8 +101,9 @@ def find_invariants(
     size = math.comb(start.size + degree, degree) - 1 + len(terms)
     if size > LARGEST_BASIS:
         raise ValueError(
-            f"find_invariants: {start.size} components make {size} monomials up to degree {degree}; at most "
-            f"{LARGEST_BASIS} can be tried. Use a smaller degree, and give functions that may occur as terms."
+            f"find_invariants: {start.size} components make {size} functions, monomials up to degree {degree} and "
+            f"terms; at most {LARGEST_BASIS} can be tried. Use a smaller degree or fewer terms; functions of higher "
+            "degree can be given as terms."
         )
     given = terms.items() if isinstance(terms, Mapping) else [(None, item) for item in terms]
     further = [_term(item, k, name) for k, (name, item) in enumerate(given)]

@@ -19,11 +19,13 @@ STEPS = 200
 
 
 class Sample(NamedTuple):
-    """Values at random points, one row for each point.
+    """Values at m random points, one row for each point.
 
-    `points` are z = y / scale, `slopes` dz/dt divided by the sum of its absolute values, `rates` the rates of the
-    functions, one column for each function. `sizes` are the sums of the absolute values of the products in the rates,
-    ``dI/dz_i dz_i/dt``, where the derivative of a monomial is written as one product for each of its factors.
+    `points` (m, n) are z = y / scale, and `slopes` (m, n) are dz/dt divided by the sum of its absolute values. `rates`
+    (m, k) are the rates dI/dz . slopes of k functions I, one column for each: first the monomials of a basis, then the
+    given functions (`terms` of `Surroundings`). `sizes` (m, k) are the sums of the absolute values of the products in
+    the rates, ``dI/dz_i dz_i/dt``, where the derivative of a monomial is written as one product for each of its
+    factors.
     """
 
     points: Array
@@ -35,8 +37,9 @@ class Sample(NamedTuple):
 class Surroundings:
     """The region around a state in which invariants are searched, and random points in it.
 
-    `scale` holds the sizes of the components, `tau` is a time in which the state moves by its own size, and
-    `trajectory` holds states on the trajectory that starts at y0.
+    `terms` are the given functions, each a `Term`: invariants are searched among sums of multiples of monomials of the
+    state and of these functions. `scale` (n,) holds the sizes of the components of the state, `tau` is a time in which
+    the state moves by its own size, and `trajectory` (m, n) holds states on the trajectory that starts at y0.
     """
 
     def __init__(self, fun: Callable[..., Any], y0: Array, terms: Sequence[Term], t: float, seed: int) -> None:
@@ -47,7 +50,7 @@ class Surroundings:
         self.trajectory = self._follow()
 
     def _slope(self, t: float, y: Array) -> Array:
-        """Return the derivative f(t, y), or NaN if it cannot be computed."""
+        """Return the derivative f(t, y), shape (n,); all NaN if `fun` raises an ArithmeticError or ValueError."""
         try:
             found = np.asarray(self.fun(t, y.copy()), dtype=float)
         except (ArithmeticError, ValueError) as error:
@@ -58,7 +61,7 @@ class Surroundings:
         return found
 
     def term_gradients(self, y: Array) -> Array:
-        """Return the gradients of the terms, one row for each term; all NaN if one of them cannot be computed."""
+        """Return the gradients (k, n) of the given functions (`terms`); all NaN if one of them cannot be computed."""
         try:
             return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
         except (ArithmeticError, ValueError) as error:
@@ -66,7 +69,7 @@ class Surroundings:
             return np.full((len(self.terms), y.size), np.nan)
 
     def term_values(self, y: Array) -> Array:
-        """Return the values of the terms; all NaN if one of them cannot be computed."""
+        """Return the values (k,) of the given functions (`terms`); all NaN if one of them cannot be computed."""
         try:
             return np.array([item.fun(y.copy()) for item in self.terms], dtype=float)
         except (ArithmeticError, ValueError):
@@ -86,12 +89,14 @@ class Surroundings:
         self.scale[self.scale == 0.0] = np.max(self.scale) or 1.0
 
     def sample(self, wanted: int, basis: Sequence[Monomial]) -> Sample:
-        """Return `wanted` random points, and the rates of the monomials of a basis and of the terms there.
+        """Return `wanted` random points, with the rates of monomials and of the given functions (`terms`) there.
+
+        `basis` lists the monomials.
 
         Raises
         ------
         ValueError
-            If the vector field, or a term, is finite at too few points.
+            If the vector field, or the gradient of a given function, is finite at too few points.
         """
         for spread in SPREADS:
             points, slopes, gradients = [], [], []
@@ -112,7 +117,7 @@ class Surroundings:
         ) from self.failure
 
     def _follow(self) -> Array:
-        """Return the states along a trajectory from y0."""
+        """Return states (m, n) on the trajectory from y0: those of at most 200 steps, within the time 3 `tau`."""
         solver = DOP853(self._slope, self.t, self.y0, self.t + 3 * self.tau, rtol=1e-12, atol=1e-16 * self.scale)
         states = [self.y0]
         while solver.status == "running" and len(states) <= STEPS:

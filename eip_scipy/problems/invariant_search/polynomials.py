@@ -47,7 +47,11 @@ def product_of(a: Polynomial, b: Polynomial) -> Polynomial:
 def functions(
     polynomial: Polynomial, terms: Sequence[tuple[Term, float]], n: int, like: Callable[..., object]
 ) -> Functions:
-    """Return a polynomial of n variables plus multiples of terms, jitted if `like` and the terms are jitted."""
+    """Return value and gradient of a polynomial of n variables plus multiples of given functions.
+
+    `terms` are pairs of a given function and its coefficient. Value and gradient are jitted if `like` and the given
+    functions are jitted.
+    """
     found = _of_polynomial(polynomial, n)
     compiled = [like]
     for term, coefficient in terms:
@@ -98,7 +102,10 @@ def _with_term(others: Functions, term: Term, coefficient: float) -> Functions:
 
 
 def written(polynomial: Polynomial, terms: Sequence[tuple[Term, float]], names: Sequence[str]) -> str:
-    """Return a polynomial plus multiples of terms as text such as "y0*y3 - y1*y2"."""
+    """Return a polynomial plus multiples of given functions as text such as "y0*y3 - y1*y2".
+
+    `terms` are pairs of a given function and its coefficient, and `names` the names of the variables.
+    """
     factors = [(_product(item, names), c) for item, c in polynomial.items()] + [(term.name, c) for term, c in terms]
     text = ""
     for name, coefficient in factors:

@@ -31,8 +31,9 @@ APART = 1e3  # the least singular value that is not 0, in units of rounding
 class Search:
     """A search for invariants, which is made when the object is created; `found` has the result.
 
-    A function is represented by a row of coefficients: first those of the monomials of z = y / scale, then those of the
-    terms.
+    A candidate for an invariant is represented by a row of coefficients: first those of the monomials of z = y / scale,
+    then those of the given functions (`terms` of `Surroundings`). `columns` are indices in such a row: the monomials
+    and given functions that a candidate may contain.
     """
 
     def __init__(self, around: Surroundings, degree: int, rtol: float) -> None:
@@ -53,7 +54,7 @@ class Search:
 
     @property
     def found(self) -> list[tuple[Polynomial, list[tuple[Term, float]]]]:
-        """Return the invariants as pairs of a polynomial of y and a list of terms with their coefficients."""
+        """Return the invariants as pairs: a polynomial of y, and a list of given functions with their coefficients."""
         rows = [row * self.units for row in self.accepted]
         of_terms = [zip(self.terms, row[len(self.basis) :].tolist(), strict=True) for row in rows]
         return [
@@ -70,7 +71,7 @@ class Search:
         self._take(null, columns)
 
     def _take(self, null: Array, columns: list[int]) -> None:
-        """Accept those rows of a null space that are conserved and independent of the rows accepted before."""
+        """Accept simple forms of those rows of a null space that are conserved and independent of accepted rows."""
         known = np.array([self._row(item) for item in self._products(columns)]).reshape(-1, self._width)
         rows = self._reduced(known, null)
         for row in sorted(rows, key=self._simplicity):
@@ -83,7 +84,11 @@ class Search:
         return len(self.basis) + len(self.terms)
 
     def _null_space(self, columns: Any) -> Array:
-        """Return rows that span the null space: singular vectors, smallest values first, until one is not conserved."""
+        """Return rows that span the null space of the rates of the functions in `columns`.
+
+        The rows are the constant functions, and then singular vectors, those of the smallest singular values first,
+        until one is not conserved.
+        """
         # A component that does not move is conserved; relative to such columns no rounding error is small.
         still, _, rows = self._singular(columns)
         found = [self._spread(np.ones(1), [k]) for k in still]
@@ -94,7 +99,9 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _numerical_null_space(self, columns: Any) -> Array:
-        """Return the rows whose singular values are 0 up to rounding, if there is a gap to the others.
+        """Return the constant functions and the singular vectors of singular values that are 0 up to rounding, as rows.
+
+        There are none if the smallest other singular value is not far above rounding.
 
         These rows are not tested. Because of rounding such a row contains small multiples of all columns. Near points
         at which all terms of the invariant vanish, these multiples exceed the terms, so that the row would fail the
@@ -111,7 +118,11 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _singular(self, columns: Any) -> tuple[Array, Array, Array]:
-        """Return the columns of constant functions, the singular values of the others, largest first, and vectors."""
+        """Return the functions in `columns` that are constant, and a singular value decomposition for the others.
+
+        The constant functions are given by their indices. The decomposition is that of the rates of the others at the
+        random points: its singular values, largest first, and its right singular vectors as rows of coefficients.
+        """
         A, columns = self.sample.rates[:, columns], np.asarray(columns)
         weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
         still, moving = columns[weights == 0], columns[weights > 0]
@@ -121,7 +132,11 @@ class Search:
         return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
-        """Return True if the rate of a candidate vanishes at new points, relative to the terms of the rate."""
+        """Return True if the rate of a candidate vanishes at new points.
+
+        Its bounds are `rtol` times the sum of the absolute values of ``dI/dz_i dz_i/dt``, and 0.001 `rtol` times that
+        of all products in these terms.
+        """
         rate = np.abs(self.fresh.rates @ row)
         if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
             return False
@@ -129,7 +144,11 @@ class Search:
         return bool(np.all(rate <= self.rtol * np.abs(gradients * self.fresh.slopes).sum(axis=1)))
 
     def _gradients(self, row: Array, points: Array, part: Callable[[Array], Array] = np.positive) -> Array:
-        """Return dI/dz at points z (m, n); with ``part=np.abs`` the sums of the absolute values of its terms."""
+        """Return the gradients dI/dz (m, n) of a candidate I at the points z (m, n).
+
+        With ``part=np.abs`` the contributions of the monomials and given functions are replaced by their absolute
+        values.
+        """
         out = np.zeros_like(points)
         for k in np.flatnonzero(row[: len(self.basis)]):
             item = self.basis[k]
@@ -142,7 +161,10 @@ class Search:
         return out
 
     def _products(self, columns: list[int]) -> Iterator[Polynomial]:
-        """Yield products of the accepted polynomials, up to the largest degree in `columns`."""
+        """Yield the accepted polynomials and their products, up to the largest degree in `columns`.
+
+        Accepted invariants that contain given functions are left out.
+        """
         degree = max(len(self.basis[k]) for k in columns if k < len(self.basis))
         polynomials = [self._polynomial(row) for row in self.accepted if not row[len(self.basis) :].any()]
         stack: list[tuple[int, Polynomial]] = [(0, {(): 1.0})]
@@ -188,9 +210,11 @@ class Search:
         return [row / np.max(np.abs(row)) for row, _ in reduced[count_known:]]
 
     def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
-        """Return the key for sorting rows: numbers of terms, of differences (negated) and of mixed terms, and columns.
+        """Return the key that sorts rows by simplicity.
 
-        Angular momenta contain differences; a mixed term is a product of different variables.
+        The key consists of the number of coefficients that are not 0, the negated number of differences, the number of
+        products of different variables, and the indices of the coefficients. Differences are counted because angular
+        momenta contain them.
         """
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0]).tolist()
         negative = sum(row[k] < 0 for k in support)
@@ -203,7 +227,7 @@ class Search:
         return -len(set(self.basis[k])), -len(self.basis[k]), k
 
     def _nice(self, row: Array) -> Array | None:
-        """Return a conserved version of a row with few terms and, if possible, simple coefficients, or None."""
+        """Return a conserved version of a row with few, and if possible simple, coefficients; None if there is none."""
         for bound in NEGLIGIBLE:
             null = self._null_space(np.flatnonzero(np.abs(row) > bound * np.max(np.abs(row))))
             if not len(null):
@@ -220,7 +244,7 @@ class Search:
         return row
 
     def _rational(self, row: Array) -> Array:
-        """Return a scaled row whose coefficients for y are small fractions, if all are close to such fractions."""
+        """Return the scaled row; its coefficients for y become small fractions if all are close to such fractions."""
         raw = row * self.units
         raw = raw / raw[np.argmax(np.abs(row))]
         for unit in (1.0, np.min(np.abs(raw[raw != 0]))):

@@ -106,8 +106,8 @@ def mechanism(
     Raises
     ------
     ValueError
-        If shapes do not fit, the start does not meet the constraints, the mass matrix is singular for motions that the
-        constraints allow, or a given derivative is wrong.
+        If shapes do not fit, a function that must be linear in u is not, the start does not meet the constraints, the
+        mass matrix is singular for motions that the constraints allow, or a given derivative or power is wrong.
 
     Notes
     -----
@@ -150,7 +150,10 @@ def mechanism(
 
 
 def _as_functions(given: Given) -> Given:
-    """Replace arrays and lists by functions, and functions that return lists by functions that return arrays."""
+    """Return `given` with functions in place of arrays for mass and forces.
+
+    A TypeError is raised if another item is not a function.
+    """
     mass, forces = given.mass, given.forces
     if not callable(mass):
         M = real_array("mass", mass)
@@ -167,7 +170,7 @@ def _as_functions(given: Given) -> Given:
 
 
 def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> dict[str, Callable[..., Any]]:
-    """Return the functions of the outputs by name, checked at the start."""
+    """Return the functions of the outputs by name, after a check that they return numbers at the start."""
     found = required_outputs("mechanism", outputs, names.state)
     for name, item in found.items():
         if not callable(item):
@@ -185,7 +188,10 @@ def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
 
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
-    """Return the argument `what` as an array, for the first calls of the functions; numbers that are missing are 0."""
+    """Return `given`, the argument with the name `what`, as an array for the first calls of the functions.
+
+    Components that are missing from a mapping are 0.
+    """
     if isinstance(given, dict):
         if names is None:
             raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")
@@ -265,7 +271,7 @@ def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
 
 
 def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
-    """Return the parts, made from expressions if all functions can be converted to them, otherwise from functions."""
+    """Return the `Parts`, made from expressions if all functions can be converted to them, else from functions."""
     if find_spec("sympy") is None:
         return numerical_parts(given, names, t, q, u, "SymPy is not installed")
     from ..symbolic.traced import NotTraceableError
@@ -278,7 +284,7 @@ def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -
 
 
 def _require_derivatives(given: Given, parts: Parts, names: Names, t: float, y: np.ndarray) -> None:
-    """Raise ValueError if a given derivative differs from the one that is computed."""
+    """Raise ValueError if a given jacobian or gamma differs from the computed one at the start."""
     nq, n, m = len(names.coordinates), len(names.speeds), len(names.positions)
     q, u = y[:nq], y[nq:]
     rows = len(names.velocities)

@@ -29,18 +29,20 @@ def momenta_of(
     states: Sequence[tuple],
     params: np.ndarray | None,
 ) -> tuple[Invariant, ...]:
-    """Return the candidates that are constant and independent of the invariants in `kept`.
+    """Return the candidates that are constant and independent of the invariants in `kept` and of each other.
 
     Parameters
     ----------
     candidates : sequence of Energy
+        Names, values and gradients of the momenta.
     kept : sequence of Invariant
         Invariants whose functions are not compiled.
     derivative : callable
-        ``derivative(t, y)``.
+        ``derivative(t, y)`` returns y'.
     states : sequence of (float, ndarray)
-        Times and states that meet the constraints.
+        Times and states that meet the constraints. If there are fewer than 3, no momenta are returned.
     params : ndarray or None
+        Values of the parameters; None if the functions have no parameters.
     """
     args = () if params is None else (params,)
     found: list[Invariant] = []
@@ -81,7 +83,7 @@ def norms_of(
 
 
 def _rows(items: Sequence[Invariant], t: float, y: np.ndarray) -> np.ndarray:
-    """Return the gradients of invariants as rows."""
+    """Return the gradients of the values of all invariants at a state as rows (l, n)."""
     found = [np.zeros((0, y.size))]
     for item in items:
         out = np.empty((item.size, y.size) if item.size else y.size)
@@ -121,14 +123,14 @@ def _speeds_are_rates(parts: Parts, names: Names, t: float, y: np.ndarray, param
 
 
 def _products(parts: Parts, names: Names, t: float, y: np.ndarray, params: np.ndarray | None) -> list[np.ndarray]:
-    """Return q q' of each coordinate, at zero speed and with each speed alone."""
+    """Return the products q_i q_i' (nq,) of all coordinates: first at zero speeds, then with one speed equal to 1."""
     nq, n = len(names.coordinates), len(names.speeds)
     speeds = np.vstack([np.zeros(n), np.eye(n)])
     return [y[:nq] * _rates(parts, names, t, np.append(y[:nq], u), params) for u in speeds]
 
 
 def _sets(products: np.ndarray) -> list[tuple[int, ...]]:
-    """Return the sets of at least two columns whose sum is 0 in each row."""
+    """Return the sets of at least two columns of `products` whose sum is 0 in each row, as tuples of their indices."""
     if not np.isfinite(products).all():
         return []
     size = np.abs(products).max(initial=0.0)

@@ -28,7 +28,11 @@ RIGHT = 1e-6
 
 
 class Energy(NamedTuple):
-    """A quantity that may be constant: its name, functions, and optionally its rate ``power(t, y, *params)``."""
+    """A quantity that may be constant: its name, and its functions of (t, y).
+
+    The functions are ``value(t, y, *params)``, ``gradient(t, y, out, *params)``, which fills `out`, and optionally the
+    rate of change ``power(t, y, *params)``.
+    """
 
     description: str
     value: Callable[..., float]
@@ -42,10 +46,10 @@ def energy_of(
     states: Sequence[tuple],
     params: np.ndarray | None,
 ) -> tuple[Invariant | None, str]:
-    """Return the energy as an invariant or a balance, or None if it is not kept, and a description for the repr.
+    """Return the energy as an `Invariant` or `Balance`, or None if it is not kept, and a description for the repr.
 
-    The energy is the first candidate that is constant, otherwise the candidate that changes most slowly, if its rate is
-    small enough for a balance.
+    The energy is the first candidate without a given power that is constant, otherwise the candidate that changes most
+    slowly, if its rate is small enough for a balance. It is not kept if there are fewer than 3 states.
 
     Raises
     ------
@@ -56,10 +60,11 @@ def energy_of(
     ----------
     candidates : sequence of Energy
     derivative : callable
-        ``derivative(t, y)``.
+        ``derivative(t, y)`` returns y'.
     states : sequence of (float, ndarray)
         Times and states that meet the constraints.
     params : ndarray or None
+        Values of the parameters; None if the functions have no parameters.
     """
     args = () if params is None else (params,)
     if candidates and len(states) < FEWEST:
@@ -113,7 +118,8 @@ def states_near(
 ) -> list[tuple[float, np.ndarray]]:
     """Return times and states that meet the constraints: the start, and states near it at typical speeds.
 
-    The times lie between t and `t_end`, and within the time in which the coordinates change by half their size.
+    The times lie between t and `t_end`, and within the time in which the coordinates change by their size at a typical
+    speed. `derivative(t, y)` returns y', and `coordinates` is the number of coordinates in y.
     """
     rng = np.random.default_rng(20391)
     half = np.abs(y[:coordinates]).max(initial=0.0) or 1.0
@@ -147,7 +153,10 @@ def _nearest(y: np.ndarray, constraints: Sequence[Invariant], t: float, sizes: n
 
 
 def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> float:
-    """Return the larger of the largest speed and the speed reached from rest over a distance of the size of q."""
+    """Return the largest speed, or the square root of the largest acceleration times the size of q if that is larger.
+
+    The size of q is that of its largest component, or 1 if all are 0.
+    """
     size = np.abs(q).max(initial=0.0) or 1.0
     return float(max(np.abs(u).max(initial=0.0), np.sqrt(size * np.abs(accelerations).max(initial=0.0))))
 
@@ -159,7 +168,7 @@ def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
 def rates_of(
     item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates of an energy at all states, and the sums of the absolute values of their terms."""
+    """Return the rates (k,) of an energy at all states, and the sums (k,) of the absolute values of their terms."""
     rates, terms = np.zeros(len(states)), np.zeros(len(states))
     for k, (t, y) in enumerate(states):
         gradient = np.empty(y.size)

@@ -39,15 +39,16 @@ class Sizes(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The functions of a system's motion.
+    """The functions of the motion of a system with constraints, with the state y = (q, u).
 
     Attributes
     ----------
     rhs : callable
         ``rhs(t, y, out, *params)`` fills `out` with (q', u').
     solved : callable
-        ``solved(t, y, rates, accelerations, multipliers, *params)`` fills the arrays; the first entries of `rates` are
-        q'. It returns the rank of the constraints, or NOT_FINITE if a matrix is not finite.
+        ``solved(t, y, rates, accelerations, multipliers, *params)`` fills the arrays with q' (the first entries of
+        `rates`), u' and lambda. It returns the rank of the constraints, or NOT_FINITE if a matrix is not finite, and
+        raises ValueError if the mass matrix is singular.
     """
 
     rhs: Callable[..., None]
@@ -55,7 +56,10 @@ class Motion(NamedTuple):
 
 
 def plain(function: Any) -> Callable[..., Any]:
-    """Return the Python function of a jitted function, for a few calls before a run that are not worth compilation."""
+    """Return the Python function of a jitted function, for a few calls that are not worth compilation.
+
+    A function that is not jitted is returned unchanged.
+    """
     return function.py_func if is_jitted(function) else function
 
 

@@ -19,7 +19,11 @@ Array = np.ndarray
 
 
 def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
-    """Return the parts of a mechanism, see `mechanism`; `why` is the reason why there are no expressions."""
+    """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none.
+
+    t, q and u are the time, coordinates and speeds at the start. `why` is the reason why the functions are not
+    converted to expressions.
+    """
     found = _Constraints(given, names, t, q)
     nq = q.size
 
@@ -59,7 +63,7 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
 
 
 def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
-    """Return outputs that call the functions of the user."""
+    """Return `Outputs` that call the functions of the user; None if there are none."""
     functions = tuple(given.outputs.values())
 
     def fill(t: float, x: Array, out: Array) -> None:
@@ -76,7 +80,7 @@ def _energy(given: Given) -> Callable[..., Any] | None:
 
 
 def _sizes(y: Array) -> Array:
-    """Return the sizes of components, which are the units for steps of differences."""
+    """Return the sizes of components, the units for steps of differences; for a zero that of the largest one."""
     return np.where(y != 0, np.abs(y), np.abs(y).max(initial=0.0) or 1.0)
 
 
@@ -104,7 +108,7 @@ class _Constraints:
         return np.zeros(0) if self.given.constraints is None else np.asarray(self.given.constraints(t, q), float)
 
     def jacobian(self, t: float, q: Array) -> tuple[Array, Array]:
-        """Return the derivatives of the constraints on positions with respect to q and to t."""
+        """Return the derivatives of the constraints on positions with respect to q, (m, nq), and to t, (m,)."""
         if self._slopes is None:
             return np.zeros((0, q.size)), np.zeros(0)
         slopes = self._slopes(0.0, np.append(q, t))
@@ -112,14 +116,14 @@ class _Constraints:
         return own, slopes[:, -1]
 
     def velocities(self, t: float, q: Array, u: Array) -> Array:
-        """Return the values of the constraints on velocities."""
+        """Return the values of the constraints on velocities: first the derivatives of those on positions."""
         J, explicit = self.jacobian(t, q)
         others = self.given.velocity_constraints
         own = [] if others is None else [np.asarray(others(t, q, u), float)]
         return np.concatenate([J @ self.rates(t, q, u) + explicit, *own])
 
     def values(self, t: float, q: Array, u: Array) -> Array:
-        """Return the values of all constraints."""
+        """Return the values of the constraints on positions, and then of those on velocities."""
         return np.concatenate([self.positions(t, q), self.velocities(t, q, u)])
 
     def speed_gradient(self, t: float, q: Array, u: Array) -> Array:
@@ -149,7 +153,7 @@ class _Constraints:
         )[:, 0]
 
     def gradient(self, t: float, q: Array, u: Array, out: Array) -> None:
-        """Fill `out` with the derivatives of all constraints with respect to the state."""
+        """Fill `out` with the derivatives of all constraints (rows) with respect to the state (q, u)."""
         out[:] = 0.0
         m, nq = self._positions, q.size
         out[:m, :nq] = self.jacobian(t, q)[0]

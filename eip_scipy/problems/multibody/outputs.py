@@ -20,7 +20,7 @@ class Outputs(NamedTuple):
 
 
 def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times as an array and the states as columns; `what` names the caller in messages.
+    """Return the times as an array (k,) and the states as columns (n, k); `what` names the caller in messages.
 
     Raises
     ------

@@ -28,10 +28,12 @@ class Given(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """The functions of which a problem is made, see `motion` and `Energy`.
+    """The functions of which a problem is made.
 
-    ``values(t, y, out, *params)`` fills `out` with the constraints on positions and velocities, and ``gradient`` fills
-    it with their derivatives (m, n) with respect to the state.
+    ``fill`` is the argument of `motion`. ``values(t, y, out, *params)`` fills `out` with the constraints on positions
+    and then those on velocities, m in total, and ``gradient`` fills it with their derivatives (m, n) with respect to
+    the state. `energies` and `momenta` are quantities that may be constant, `note` is a line for the repr, `outputs`
+    are the quantities that the user defines, and `origin` is what the functions can be made from again.
     """
 
     fill: Callable[..., None]

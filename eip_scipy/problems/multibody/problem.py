@@ -284,7 +284,11 @@ def mechanics_problem(
     notes: tuple[str, ...] = (),
     **others: Any,
 ) -> MechanicsProblem:
-    """Return the problem with the functions `parts`, started at the coordinates and speeds `start` at time `t`."""
+    """Return the problem with the functions `parts`, started at the coordinates and speeds `start` at time `t`.
+
+    The components in `independent`, by default all, keep the values in `start`; the others are guesses. `tolerance` is
+    the `rank_tolerance` of the problem, and `others` are further attributes.
+    """
     sizes = Sizes(len(names.coordinates), len(names.speeds), len(names.velocities))
     functions = motion(parts.fill, sizes, tolerance)
     once = motion(plain(parts.fill), sizes, tolerance)
@@ -373,7 +377,11 @@ def _at_speed(
     sizes: Sizes,
     args: tuple[Any, ...],
 ) -> Any:
-    """Return the sizes of the terms of constraints or of a momentum at a typical speed; at rest the terms vanish."""
+    """Return the `scale` of constraints, an array (size,), or of a momentum, a number, if `size` is None.
+
+    The scale is 0.1 times the size of the terms that are proportional to the speeds, at a typical speed, because these
+    terms vanish at rest. It is None if it is not finite.
+    """
     nq = sizes.coordinates
     speed = typical_speed(y[:nq], y[nq:], derivative(t, y)[nq:])
     slopes = np.empty((size or 1, y.size))

@@ -87,7 +87,7 @@ def started(
 
 
 def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
-    """Return the names of the components whose given values are kept."""
+    """Return the names of the components whose given values are kept: all components if `independent` is None."""
     if independent is None:
         return set(names.state)
     found = {name_of(name) for name in ([independent] if isinstance(independent, str) else independent)}
@@ -100,7 +100,10 @@ def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
 
 
 def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.ndarray:
-    """Return the values in the order of the names, from a mapping or an array."""
+    """Return the values of `given`, a mapping or an array, in the order of `names`.
+
+    Names that are missing from a mapping have the value 0; a ValueError is raised if one of them is in `held`.
+    """
     if isinstance(given, Mapping):
         by_name = {name_of(name): value for name, value in given.items()}
         for name in by_name:
@@ -120,7 +123,11 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
 
 
 def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return the state that Newton's method finds from y, with components in units of `sigma`; y if it fails."""
+    """Return the state near `y` at which the residuals of `item` are 0, found by Newton's method; `y` if it fails.
+
+    Distances are measured in units of `sigma`; components with `sigma` 0 do not change. If Newton's method does not
+    converge, the returned state has residuals.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ProjectionWarning)  # the remaining residuals are examined by `_violation`
@@ -130,7 +137,10 @@ def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -
 
 
 def _downhill(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return the state with the smallest residuals, for guesses from which Newton's method fails."""
+    """Return the state with the smallest residuals, for guesses from which Newton's method fails.
+
+    Components with `sigma` 0 do not change. Newton's method is then applied to the state with the smallest residuals.
+    """
     free = sigma > 0
 
     def whole(x: np.ndarray) -> np.ndarray:
@@ -163,15 +173,15 @@ def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, fl
 
 
 def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> None:
-    """Raise ValueError if a constraint is violated."""
+    """Raise ValueError if a constraint is violated by more than MET times the size of its terms."""
     worst, residual, share = _violation(y, item, t)
     if share <= MET:
         return
     name = item.value_names[worst]
     if not sigma.any():
         raise ValueError(
-            f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. List the "
-            "components whose values are to be kept in independent=; the others are then computed."
+            f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. List "
+            "in independent= the components whose values are to be kept; the others are then computed."
         )
     raise ValueError(
         f"{what}: no start was found that meets the constraint {name!r}: it is {residual:.3g}, expected 0. "
@@ -180,7 +190,10 @@ def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.
 
 
 def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
-    """Return the reason why a constraint is not met; `gradient` holds the derivatives by the components to compute."""
+    """Return the reason why the constraint with the index `worst` is not met, and what to do.
+
+    `gradient` holds the derivatives of all constraints with respect to the components that are computed.
+    """
     sizes = np.linalg.norm(gradient, axis=1)
     if sizes[worst] <= DEPENDENT * sizes.max():
         return "It does not depend on any component that is computed; list fewer components in independent=."
@@ -190,7 +203,8 @@ def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: i
     others = [repr(item.value_names[k]) for k in np.flatnonzero(left > SEEN * left[worst]) if k != worst]
     if others and (found > DEPENDENT * found.max()).sum() < len(unit):
         return (
-            f"It contradicts {', '.join(others)}, because their gradients depend on each other there. Remove one of "
-            "them, list fewer components in independent=, or give a guess that is nearer to a solution."
+            f"It contradicts {', '.join(others)}, because the gradients of these constraints depend on each other "
+            "at the end of the search. Remove one of them, list fewer components in independent=, or give a guess that "
+            "is nearer to a solution."
         )
     return "List fewer components in independent=, or give a guess that is nearer to a solution."

@@ -23,7 +23,9 @@ def variational(
     start: tuple[float, ...],
     parameters: tuple[int, ...],
 ) -> Callable[..., None]:
-    """Return the right-hand side of a state followed by columns of derivatives, see `Problem`.
+    """Return the right-hand side of a state and of its derivatives with respect to initial values and parameters.
+
+    Each derivative is a column of 6 numbers after the state, see `variational` of `Problem`.
 
     Jitted functions of the field are differentiated by dual numbers. Others are differentiated by complex steps if
     these give correct derivatives at `start`, otherwise by differences of order 6, whose shifts are proportional to the
@@ -32,7 +34,7 @@ def variational(
     Parameters
     ----------
     rhs : callable
-        The right-hand side of the state without columns.
+        The right-hand side ``rhs(t, y, out, params)`` of the state alone.
     functions : FieldFunctions
     form : {"canonical", "velocity"}
     length : float
@@ -144,7 +146,8 @@ def _velocity(rhs, B, E, slopes, slopes_of_E, by_mass):
 def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[float, ...]) -> Callable[..., Any]:
     """Return ``slopes(t, y, y)``, the derivatives of a field's function with respect to the position y[:3].
 
-    `ndim` is 1 if the function returns a vector, and 2 if it returns three rows.
+    The second y is not used. `ndim` is 1 if the function returns a vector, and 2 if it returns three rows. The last
+    index of the derivatives is that of the position.
     """
     if is_jitted(fun) and not jit_is_off():
         try:
@@ -158,7 +161,7 @@ def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[floa
 
 
 def _by_duals(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
-    """Return the output of `_slopes`, compiled with dual numbers.
+    """Return the function that `_slopes` returns, compiled, with derivatives by dual numbers.
 
     Raises
     ------

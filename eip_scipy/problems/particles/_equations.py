@@ -32,7 +32,11 @@ class FieldFunctions(NamedTuple):
 
 
 class ParticleEquations(NamedTuple):
-    """Functions of the problem of a particle; those of an invariant are None if the field does not have it."""
+    """Functions of the problem of a particle.
+
+    `energy` is None if the potential is not known, `momentum` and its gradient are None if A is not known, and the last
+    three functions, which concern the kinetic energy, are None in the canonical form.
+    """
 
     rhs: Callable[..., None]
     energy: Callable[..., float] | None
@@ -45,7 +49,10 @@ class ParticleEquations(NamedTuple):
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
-    """Return `fun`, compiled with the functions of this module that it calls if all of `others` are compiled."""
+    """Return `fun`, compiled if all of `others` are compiled; the functions of this module that it calls are inlined.
+
+    Items of `others` that are None are ignored.
+    """
     if all(is_compiled(other) for other in others if other is not None):
         _register()
     return compiled_like(fun, *(other for other in others if other is not None))
@@ -292,7 +299,7 @@ def at_any_time(fun: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function B = curl A, from the function of the rows dA_i/dx_j."""
+    """Return the function B = curl A of (t, x, y, z), from the function of the rows dA_i/dx_j."""
 
     def magnetic(t, x, y, z):
         d = jacobian(t, x, y, z)

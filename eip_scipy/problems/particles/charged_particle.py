@@ -114,7 +114,9 @@ def charged_particle(
     form : {"canonical", "velocity"}, optional
         The state: (x, p) with p = m x' + q A(x), or (x, x'). A field that varies in time needs "velocity".
     name, units, source : str, optional
+        See `Problem`.
     reference : callable, optional
+        See `Problem`.
     balances : {"energy", "kinetic"}, optional
         Keep an energy as a `Balance` instead of the invariant "H"; this needs the form "velocity". "kinetic" keeps the
         kinetic energy "T", which changes at the rate q v . E. "energy" keeps the total energy "H", which changes at the
@@ -173,7 +175,9 @@ def charged_particle(
     x, v = _vector("position", position), _vector("velocity", velocity)
     params = np.array([mass, charge], dtype=float)
     if not (0 < params[MASS] < inf and params[CHARGE] != 0 and np.isfinite(params[CHARGE])):
-        raise ValueError(f"charged_particle: mass must be positive and charge not 0, got {mass!r} and {charge!r}.")
+        raise ValueError(
+            f"charged_particle: mass must be positive and charge not 0, both finite; got {mass!r} and {charge!r}."
+        )
     field.check(x, float(t_span[0]))
     equations = _equations(field, form)
     momentum = v if form == "velocity" else params[MASS] * v + params[CHARGE] * field.along("A", x[:, None])[:, 0]
@@ -210,7 +214,7 @@ def _variational(
 
 @lru_cache(maxsize=32)
 def _equations(field: ParticleField, form: str) -> ParticleEquations:
-    """Return the functions of a field, which are compiled once in a process."""
+    """Return the equations and invariants of a field in one form; they are compiled once in a process."""
     return compose(field.functions, form)
 
 
@@ -250,7 +254,9 @@ def _vector(name: str, value: Any) -> np.ndarray:
 
 
 def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STEP, h: float = STEP) -> ParticleProblem:
-    """Return a particle that gyrates and drifts around the z axis, in B = e_z and the electric potential 1e-2 / R.
+    """Return the problem of a particle that gyrates and drifts around the z axis, in a uniform B.
+
+    The fields are B = e_z and the electric potential 1e-2 / R, where R is the distance from the z axis.
 
     Parameters
     ----------
@@ -276,11 +282,12 @@ def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STE
 def tokamak(
     orbit: str = "banana", *, form: str = "canonical", t_end: float = TOKAMAK_STEPS * STEP, h: float = STEP
 ) -> ParticleProblem:
-    """Return a charged particle in an axisymmetric tokamak, on a trapped (banana) or a passing (transit) orbit.
+    """Return the problem of a charged particle in an axisymmetric tokamak, on a trapped or a passing orbit.
 
     Parameters
     ----------
     orbit : {"banana", "transit"}, optional
+        The trapped ("banana") or the passing ("transit") orbit.
     form : {"canonical", "velocity"}, optional
         The state: (x, p), as in the paper, or (x, v).
     t_end, h : float, optional
@@ -321,7 +328,7 @@ def _paper(
 
 
 def _reference(name: str, form: str, t: float) -> np.ndarray | None:
-    """Return the stored state at a time; None if there is none."""
+    """Return the stored state of the problem `name` at the time `t`, in the given form; None if there is none."""
     for row in _references()[name]:
         if abs(t - row["t"]) <= 1e-14 * row["t"]:
             return np.array(row["position"] + row["momentum" if form == "canonical" else "velocity"])

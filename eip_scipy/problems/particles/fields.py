@@ -41,9 +41,9 @@ NEAR = ((0.0, 0.0, 0.0), (2.9, -1.7, 1.3), (-2.3, 2.1, 2.7), (1.1, 3.1, -2.2))
 class ParticleField:
     """An electromagnetic field, defined by functions of ``(x, y, z)``, or of ``(t, x, y, z)`` if it varies in time.
 
-    Give A, with its derivatives if they are known, or B; and phi and E if there is an electric field. With Numba
-    functions (lazily jitted, with three floats as arguments and a float or a tuple of floats as value) the equations
-    of a particle are compiled; with other callables they are interpreted.
+    Give A, with its derivatives if they are known, or B, or both; and phi or E, or both, if there is an electric field.
+    With Numba functions (lazily jitted, with three floats as arguments and a float or a tuple of floats as value) the
+    equations of a particle are compiled; with other callables they are interpreted.
 
     Attributes
     ----------
@@ -52,7 +52,8 @@ class ParticleField:
     jacobian : callable, optional
         ``(x, y, z) -> 3 rows``, whose row i is (dA_i/dx, dA_i/dy, dA_i/dz). Default: differences of A.
     potential : callable, optional
-        ``phi(x, y, z) -> float``. Default: 0, if there is no electric field either.
+        ``phi(x, y, z) -> float``. Default: 0 if `electric` is not given either; otherwise phi is not known, and the
+        energy is not an invariant.
     electric : callable, optional
         ``E(x, y, z) -> (E_x, E_y, E_z)``, which is -grad phi. Default: differences of phi.
     magnetic : callable, optional
@@ -72,7 +73,8 @@ class ParticleField:
     TypeError
         If a function is not callable.
     ValueError
-        If neither A nor B is given, derivatives are given without their function, or the length is wrong.
+        If neither A nor B is given, `jacobian` is given without A, a field that varies has no `electric`, or the length
+        is not positive and finite.
 
     Notes
     -----
@@ -111,7 +113,10 @@ class ParticleField:
 
     @cached_property
     def functions(self) -> FieldFunctions:
-        """Return all functions of the field; functions that were not given are computed from the others."""
+        """Return all functions of the field; functions that were not given are computed from the others.
+
+        A and its jacobian are None if A was not given, and phi is None if E was given without phi.
+        """
         step = self._step
         given = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
         A, jacobian, phi, E, B = (fun if fun is None or self.varies else at_any_time(fun) for fun in map(jitted, given))
@@ -199,8 +204,8 @@ class ParticleField:
     def _divergence(self, point: np.ndarray, t: float) -> tuple[float, float, float]:
         """Return the divergence of B relative to the largest derivative of B, the divergence, and that derivative.
 
-        Several steps of the differences are tried, and the result with the smallest share is returned, because errors
-        of differences only increase it.
+        Several steps of the differences are tried, and the result with the smallest relative divergence is returned,
+        because errors of differences only increase it.
         """
         B = self._plain("magnetic")
         slack = ROUND_OFF * float(np.abs(B(t, *point)).max()) / self.length

@@ -36,7 +36,10 @@ class Rate(NamedTuple):
         return sympy.Add(*self.terms)
 
     def at(self, point: Mapping[Any, Any]) -> tuple[Any, Any] | None:
-        """Return the sum of the terms and of their absolute values at a point; None unless all are finite and real."""
+        """Return the sums of the terms and of their absolute values at a point.
+
+        The result is a pair of numbers, or None if a term is not finite or not real.
+        """
         known = {item: value.evalf(DIGITS) for item, value in point.items()}
         values = [_value(term, known) for term in self.terms]
         if any(value is None for value in values):
@@ -63,7 +66,8 @@ def how_kept(
     NotKeptError
         If the quantity is not conserved. The message names a point and the rate there.
     ValueError
-        If the rate is not finite at any point that was tried.
+        If the rate is not finite at any point that was tried, or cannot be examined in all branches of functions such
+        as max.
     """
     time = sympy.Symbol("t", real=True)
     terms = [sympy.diff(quantity, variable) * f for variable, f in zip(variables, rates, strict=True)]
@@ -83,7 +87,9 @@ def how_kept(
         ) from None
     if not points:
         raise ValueError(
-            f"invariant {name!r}: its rate {shortened(rate.total)} is not finite and real at any point that was tried."
+            f"invariant {name!r}: its rate {shortened(rate.total)} is not finite and real at any point that was tried. "
+            "The variables were between 0.3 and 1.7 in size; choose units in which the rate exists there, "
+            "or omit this invariant."
         )
     _require_kept(name, rate, points)
     return f"numerically, at {len(points)} points" + (" with the parameters given" if parameters else "")
@@ -137,7 +143,7 @@ def _simplifies_to_zero(expression: Any) -> bool:
 
 
 def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]) -> Iterator[tuple[Any, Any]]:
-    """Yield random points at which the rate is finite and real, with its value there.
+    """Yield random points at which the rate is finite and real, each with the result of ``rate.at``.
 
     If there are too few such points, for example because of roots or logarithms, points with positive values are drawn.
     """
@@ -157,7 +163,10 @@ def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float
 def _beside_switches(
     expressions: Sequence[Any], variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield points on both sides of each place at which max, min, abs or a similar function changes its branch."""
+    """Yield points on both sides of each place at which max, min, abs or a similar function changes its branch.
+
+    Points are yielded with the result of ``rate.at``, if the rate is finite and real there.
+    """
     switches = Switches(expressions, variables)
     draw = random.Random(20221)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}
@@ -176,6 +185,6 @@ def _drawn(draw: random.Random, variables: Sequence[Any], signs: Sequence[int]) 
 
 
 def shortened(expression: Any) -> str:
-    """Return the beginning of an expression as text."""
+    """Return an expression as text, of which at most 120 characters are kept."""
     text = str(expression)
     return text if len(text) <= 120 else f"{text[:120]}..."

@@ -60,7 +60,7 @@ class Constrained(NamedTuple):
 
     @property
     def arguments(self) -> Arguments:
-        """Return the arguments of the compiled functions."""
+        """Return the `Arguments` of the compiled functions: the components of the state and the parameters."""
         return Arguments((*self.coordinates, *self.speeds), self.parameters)
 
     @property
@@ -80,7 +80,10 @@ class Constrained(NamedTuple):
 
 
 def own_speed(system: Constrained, k: int) -> list[Any]:
-    """Return the derivatives of all speeds by q_k', the rate of coordinate k; [] unless it has a speed of its own."""
+    """Return the derivatives of all speeds with respect to q_k', the rate of coordinate k.
+
+    The result is [] unless exactly one speed occurs in q_k', and this speed occurs in no other rate.
+    """
     speeds = [symbol(name) for name in system.speeds]
     own = [u for u in speeds if u in system.rates[k].free_symbols]
     if len(own) != 1 or sum(own[0] in rate.free_symbols for rate in system.rates) != 1:
@@ -92,14 +95,15 @@ def own_speed(system: Constrained, k: int) -> list[Any]:
 def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) -> list[int]:
     """Return the indices of coordinates whose momenta may be constant, because masses and forces do not depend on them.
 
-    A coordinate is left out if a constraint acts on its speed alone, or if the force along it has branches or comes
-    from a function, because such a force may be 0 only near the start.
+    A coordinate is left out if exactly one speed depends on its rate and a constraint contains this speed, or if the
+    force along the coordinate has branches or comes from a function, because such a force may be 0 only near the start.
 
     Parameters
     ----------
     system : Constrained
     speeds_by_rate : callable
-        ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds by the rate of coordinate k, or [].
+        ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds with respect to the rate of coordinate k, or []
+        if they are not known.
     """
     known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
     inputs = {symbol(name) for name, _ in system.inputs}
@@ -145,7 +149,7 @@ def parts_of(
     momenta: Sequence[tuple[str, Any]] = (),
     outputs: Sequence[tuple[str, Any]] = (),
 ) -> Parts:
-    """Return the compiled functions of a system.
+    """Return the compiled functions of a system as `Parts`.
 
     Parameters
     ----------
@@ -183,7 +187,7 @@ def matrices(system: Constrained) -> Callable[..., None]:
 
 @lru_cache(maxsize=64)
 def output_functions(outputs: tuple[tuple[str, Any], ...], system: Constrained) -> Outputs:
-    """Return the functions of the outputs."""
+    """Return the `Outputs` with the compiled functions of the given pairs of name and expression."""
     accelerations = [acceleration(name).name for name in system.speeds]
     names, items = zip(*outputs, strict=True)
     return Outputs(names, _with_inputs(system, lambda given: filling("outputs", items, given), accelerations))
@@ -194,7 +198,8 @@ def _with_inputs(
 ) -> Callable[..., None]:
     """Return ``fill(t, y, out, *params)``, where y holds the state and further values that are named in `behind`.
 
-    `fill` calls the functions of the inputs and appends their values to y for the function that `made` returns.
+    `made` receives the names of all these values and returns a function of them. `fill` calls the functions of the
+    inputs, appends their values to y, and calls that function.
     """
     names = (*system.coordinates, *system.speeds, *behind, *(name for name, _ in system.inputs))
     fill = made(Arguments(names, system.parameters))
@@ -216,7 +221,7 @@ def _with_input(fill: Callable[..., None], function: Callable[..., float], n: in
 
 @lru_cache(maxsize=64)
 def values_and_gradient(system: Constrained) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Return two functions that fill an array: with all constraints, and with the gradients of the constraints."""
+    """Return two functions that fill an array: with all constraints (m,), and with their derivatives (m, n)."""
     items = (*system.positions, *system.velocities)
     found = {(i, k): slope for i, item in enumerate(items) for k, slope in _gradient(item, system).items()}
     rows = function("gradients", list(found.values()), system.arguments, in_place=True, places=list(found))
@@ -241,7 +246,7 @@ def rate_function(rate: Any, system: Constrained) -> Callable[..., float]:
 
 
 def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Callable[..., None]:
-    """Return a function that fills an array with the values of expressions, most of which may be 0."""
+    """Return ``fill(t, y, out, *params)``, which fills `out` with the values of expressions, most of which may be 0."""
     found = {k: item for k, item in enumerate(expressions) if item != 0}
     return function(what, list(found.values()), arguments, in_place=True, places=list(found))
 

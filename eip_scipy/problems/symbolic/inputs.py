@@ -24,7 +24,11 @@ AGREES = 1e-9
 
 
 class Inputs(NamedTuple):
-    """Inputs as expressions, by their functions of time; inputs as functions ``f(t, y)``, by name; and notes."""
+    """Values of functions of time.
+
+    `expressions` maps functions of time to expressions. `called` are pairs of a name and a function ``f(t, y)`` that
+    returns a number, for values that are not converted to expressions. `notes` are lines about these for the repr.
+    """
 
     expressions: dict[Any, Any]
     called: tuple[tuple[str, Callable[..., float]], ...]
@@ -84,7 +88,7 @@ def _function_of_time(key: Any, known: Mapping[str, Any], state: Mapping[Any, st
 
 
 def _as_expressions(keys: Sequence[Any], value: Any) -> dict[Any, Any]:
-    """Return the numbers or expressions in `value`, by their functions of time."""
+    """Return the numbers or expressions in `value` as a dictionary with the functions of time `keys`."""
     values = [value] if len(keys) == 1 and not isinstance(value, (tuple, list, np.ndarray)) else list(value)
     if len(values) != len(keys):
         raise ValueError(f"inputs: got {len(values)} values for {', '.join(map(str, keys))}; expected {len(keys)}.")
@@ -117,7 +121,7 @@ def _traced(
 
 
 def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
-    """Return a name and a function of one number for each key of an input that is called."""
+    """Return for each key of an input that is not an expression its name and a function ``f(t, y)`` of one number."""
     from .models import name_of
 
     if len(keys) == 1:

@@ -64,12 +64,12 @@ class Manifold:
             )
 
     def how_kept(self, name: str, quantity: Any) -> str:
-        """Return how a quantity was shown to be conserved if the constraints hold; `name` is its name in messages.
+        """Return how a quantity was shown to be conserved, as text such as "numerically, at 8 points ...".
 
         Raises
         ------
         ValueError
-            If the quantity is not conserved.
+            If the quantity is not conserved, or its rate is not finite at any of the points.
         """
         terms = [sympy.diff(quantity, y) * f for y, f in zip(self._variables, self._rates, strict=True)]
         terms = [item for item in [*terms, sympy.diff(quantity, sympy.Symbol("t", real=True))] if item != 0]
@@ -83,7 +83,10 @@ class Manifold:
             if abs(values.sum()) > CONSTANT * np.abs(values).sum():
                 raise self._not_kept(name, Rate(terms).total, t, y, values)
         if count == 0:
-            raise ValueError(f"{name!r}: its rate is not finite at any of the points that meet the constraints.")
+            raise ValueError(
+                f"{name!r}: its rate is not finite at any of the points that meet the constraints."
+                " Choose units in which it exists at values of about 1, or omit this quantity."
+            )
         return f"numerically, at {count} points that meet the constraints"
 
     def _not_kept(self, name: str, rate: Any, t: float, y: np.ndarray, values: np.ndarray) -> ValueError:

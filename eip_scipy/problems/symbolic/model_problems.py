@@ -93,7 +93,10 @@ def _swapped(function: Any) -> Any:
 
 
 def _by_name(given: Any, names: tuple[str, ...]) -> Any:
-    """Return a mapping with names as keys, restricted to `names` if it has any of them; return an array unchanged."""
+    """Return a mapping with the names of its keys as keys; return an array unchanged.
+
+    Keys that are not in `names` are left out, unless this would leave nothing.
+    """
     if not isinstance(given, Mapping):
         return given
     found = {name_of(key): value for key, value in given.items()}

@@ -213,7 +213,11 @@ def _functions_of_time(found: _Equations) -> dict[str, Any]:
 
 
 def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, float]) -> Constrained:
-    """Return the equations without values of parameters, whose names are known once all expressions are converted."""
+    """Return the equations as a `Constrained` without parameters.
+
+    The names of the parameters are known once all expressions, also those of outputs, are converted. A ValueError is
+    raised if a constraint or the kinematics depend on an input that is called as a function.
+    """
     names = converted.names
     system = Constrained(
         tuple(names[item] for item in found.coordinates),
@@ -239,7 +243,8 @@ def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, 
 def _energies(found: _Equations, energy: Any, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
     """Yield the quantities that may be the energy.
 
-    There are none if inputs are called, because such a force may begin to do work after the times that are examined.
+    If `energy` is None and inputs are called as functions, there are none, because such a force may begin to do work
+    after the times that are examined.
     """
     if energy is not None:
         if converted.depends_on_call(given := converted(energy)):
@@ -261,7 +266,7 @@ def _energies(found: _Equations, energy: Any, system: Constrained, converted: _C
 
 
 def _by_rate(found: _Equations, system: Constrained, converted: _Conversion, k: int) -> list[Any]:
-    """Return the derivatives of the speeds by the rate of the k-th coordinate; [] if they are unknown."""
+    """Return the derivatives of the speeds with respect to the rate of the k-th coordinate; [] if they are unknown."""
     return own_speed(system, k) or (_speeds_by_rate(found.method, k, converted) if found.method else [])
 
 
@@ -276,7 +281,10 @@ def _momenta(found: _Equations, system: Constrained, converted: _Conversion) -> 
 
 
 def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
-    """Return the derivatives of a KanesMethod's speeds by the rate of the k-th coordinate; [] if they are unknown."""
+    """Return the derivatives of a KanesMethod's speeds with respect to the rate of the k-th coordinate, or [].
+
+    The result is [] if the numbers of coordinates and speeds differ.
+    """
     by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
     if by_speeds.rows != by_speeds.cols:
         return []
@@ -389,7 +397,10 @@ def _is_constant(load: Any, frame: Any) -> bool:
 
 
 def _potential_of_loads(loads: Iterable[Any], frame: Any, state: set[Any]) -> Any:
-    """Return the potential of forces that are constant in the inertial frame; None if a position is unknown."""
+    """Return the potential of the forces that are constant in the inertial frame; None if a position is unknown.
+
+    Other loads are ignored.
+    """
     total = sympy.Integer(0)
     for place, vector in loads:
         if not _is_constant((place, vector), frame):
@@ -426,7 +437,10 @@ def _require_distinct(names: Mapping[Any, str]) -> None:
 
 
 def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the names of the parameters that occur in the equations, in the order of `values`."""
+    """Return the names of the parameters that occur in the equations, in the order of `values`.
+
+    A ValueError is raised if one of them has no value.
+    """
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
     known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
     known |= {symbol(name) for name, _ in system.inputs}
@@ -436,15 +450,17 @@ def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str,
     if missing:
         hint = nearest(missing[0], [name for name in values if name not in needed])
         raise ValueError(
-            f"params: the value of {missing[0]!r} is missing{hint}. The model has {', '.join(sorted(needed))}."
+            f"params: the value of {missing[0]!r} is missing{hint}. The parameters of the model are "
+            f"{', '.join(sorted(needed))}."
         )
     return tuple(name for name in values if name in needed)
 
 
 def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -> tuple[Constrained, list[str]]:
-    """Add the derivatives of constraints on positions that are missing from the constraints on velocities.
+    """Add the derivatives of constraints on positions that do not follow from the constraints on velocities.
 
-    KanesMethod ignores a configuration constraint without its velocity constraint.
+    KanesMethod ignores a configuration constraint without its velocity constraint. The result is the system, and the
+    names g1, g2, ... of the constraints on positions whose derivatives were added.
     """
     if not system.positions:
         return system, []

@@ -12,9 +12,11 @@ KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
 
 
 def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the coordinates and their momenta, in the same order, among `names`.
+    """Return the coordinates and, in the same order, the momenta for the names in a Hamiltonian.
 
-    Pairs are x and px, q1 and p1, theta and p_theta or ptheta; p belongs to the one remaining coordinate.
+    A coordinate on which the Hamiltonian does not depend may be missing from `names`.
+
+    Pairs are x and px, q1 and p1, theta and p_theta or ptheta; p belongs to the one remaining coordinate, or to q.
 
     Raises
     ------
@@ -53,7 +55,10 @@ def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
 
 
 def _coordinate(momentum: str, free: set[str]) -> str | None:
-    """Return the name in `free` of the coordinate to which `momentum` belongs, or None."""
+    """Return the name of the coordinate to which `momentum` belongs; None if it is not the name of a momentum.
+
+    The coordinate need not be one of the names in `free`, because H may not depend on it.
+    """
     if not momentum.startswith("p") or momentum == "p":
         return None
     rest = momentum[1:].removeprefix("_")
@@ -64,7 +69,11 @@ def _coordinate(momentum: str, free: set[str]) -> str | None:
 
 
 def _partner_of_p(others: list[str]) -> str | None:
-    """Return the partner of p among the remaining names: q, the only name of a coordinate, or the only name."""
+    """Return the coordinate of p among the remaining names `others`; None if it is not clear.
+
+    The coordinate is q if q is among the names or there are none, otherwise the only usual name of a coordinate, or the
+    only name.
+    """
     if "q" in others or not others:
         return "q"
     likely = [name for name in others if name in KNOWN] or others
@@ -72,5 +81,5 @@ def _partner_of_p(others: list[str]) -> str | None:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key that sorts q2 before q10."""
+    """Return a key for sorting that puts q2 before q10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -20,7 +20,7 @@ BASES = (0, 1)
 
 
 def at_rest(forces: Sequence[Any], speeds: Sequence[Any], others: set[Any]) -> list[Any]:
-    """Return the terms of the forces at zero speed, without terms that contain `others`, such as the time."""
+    """Return the forces at zero speeds as expressions, without their terms that contain a symbol of `others`."""
     still = [sympy.expand_mul(sympy.sympify(item).subs(dict.fromkeys(speeds, 0))) for item in forces]
     return [sympy.Add(*(term for term in sympy.Add.make_args(F) if not term.free_symbols & others)) for F in still]
 
@@ -28,7 +28,8 @@ def at_rest(forces: Sequence[Any], speeds: Sequence[Any], others: set[Any]) -> l
 def potential_of(forces: Sequence[Any], coordinates: Sequence[Any]) -> Any:
     """Return V with forces = -dV/dq if the forces are conservative, None if no such expression is found.
 
-    V may be wrong if the forces are not conservative. The check of the energy that contains V detects that.
+    V may be wrong if the forces are not conservative, so that the caller must check whether the energy that contains V
+    is conserved.
 
     Parameters
     ----------
@@ -48,10 +49,11 @@ def potential_of(forces: Sequence[Any], coordinates: Sequence[Any]) -> Any:
 
 
 def _of_lengths(forces: Sequence[Any], coordinates: Sequence[Any]) -> tuple[Any, list[Any]]:
-    """Return the potential of terms along the gradient of a length, and the other terms of the forces.
+    """Return the potential of the force terms along the gradient of a length, and the forces without these terms.
 
-    Springs and gravitation have such terms. With S, the square of the length, a term is c S^p with c = a dS/dq / 2 and
-    a constant, and its potential is -a S^(p + 1) / (2 p + 2).
+    Springs and gravitation have such terms. With S, the square of the length, such a term of the force of coordinate q
+    is c S^p with c = a dS/dq / 2, where a does not depend on the coordinates. Its potential is
+    -a S^(p + 1) / (2 p + 2).
     """
     potential, forces = sympy.Integer(0), list(forces)
     powers = set().union(*(item.atoms(sympy.Pow) for item in forces))
@@ -70,9 +72,11 @@ def _of_lengths(forces: Sequence[Any], coordinates: Sequence[Any]) -> tuple[Any,
 
 
 def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) -> Any:
-    """Return the integral of the forces along a path that starts at `base` and moves along one coordinate at a time.
+    """Return the potential: minus the integral of the forces along a path, or None if it is not found.
 
-    The path moves along the last coordinate first.
+    The path starts at the point whose coordinates are all `base` and moves along one coordinate at a time, along the
+    last one first. The result is None if SymPy cannot integrate a term quickly, or if the integral is not finite and
+    real.
     """
     potential = sympy.Integer(0)
     for k, (force, q) in enumerate(zip(forces, coordinates, strict=True)):
@@ -89,10 +93,10 @@ def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) ->
 
 
 def _is_simple(term: Any, q: Any) -> bool:
-    """Return True if SymPy integrates a term quickly; the integration of other terms may not end.
+    """Return True if SymPy can integrate a term over q quickly; the integration of other terms may not end.
 
-    Such a term is a product of powers of q or of one polynomial of degree 2, or of sines, cosines and exponentials of
-    linear functions.
+    Such a term has at most MOST_FACTORS factors that depend on q: powers of q and of one polynomial of degree at most 2
+    in q, or powers of q and of sines, cosines and exponentials of linear functions of q.
     """
     powers = [item.as_base_exp() for item in sympy.Mul.make_args(term) if item.has(q)]
     if len(powers) > MOST_FACTORS:

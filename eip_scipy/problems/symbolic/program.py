@@ -1,8 +1,9 @@
 """Functions from SymPy expressions: each statement has one operation, and common subexpressions are computed once.
 
 A function is compiled from a tree of `ast` nodes. No text is executed, unlike in SymPy's `lambdify`, which writes
-source that contains the user's names and calls `exec`. The nodes are assignments of sums, products, powers and calls
-from the list below; the names are those of the arguments and `v` with a number; everything else is a number.
+source that contains the user's names and calls `exec`. The nodes are assignments of sums, products, powers, choices and
+calls of functions in the lists below, checks of array sizes, and in `variational` a loop over the columns. The names
+are those of the arguments, `k`, and `v` and `d` with a number; everything else is a number.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Arguments:
 
     @property
     def places(self) -> dict[str, tuple[str, int | None]]:
-        """Return the array and the index of each name; the index of the time is None."""
+        """Return for each name the name of its array and its index in this array; for the time, ("t", None)."""
         places = {name: (array, k) for array, names in self.arrays.items() for k, name in enumerate(names)}
         return {**places, "t": ("t", None)}
 
@@ -104,10 +105,11 @@ def variational(
     by_parameters: Sequence[Mapping[int, Any]],
     arguments: Arguments,
 ) -> Callable[..., None]:
-    """Return a function of ``(t, Y, out[, params])``, where Y is the state followed by columns of derivatives.
+    """Return a function of ``(t, Y, out[, params])`` that fills `out` with dY/dt.
 
-    Its values for the state have the bits of ``function(what, rates, ...)``, because the statements of the rates come
-    first. The statements of the derivatives use their intermediate results.
+    Y is the state, n numbers, followed by columns of derivatives, n numbers each. The rates of the state agree bit by
+    bit with those of ``function(what, rates, ...)``, because their statements come first. The statements for the
+    columns use intermediate results of the rates.
 
     Parameters
     ----------
@@ -117,7 +119,8 @@ def variational(
     jacobian : mapping of (int, int) to sympy.Expr
         The nonzero derivatives of the rates by the components, by row and column.
     by_parameters : sequence of mappings of int to sympy.Expr
-        For each of the last columns the nonzero derivatives of the rates by the parameter of that column, by row.
+        One mapping for each of the last columns, which are derivatives with respect to a parameter: the nonzero
+        derivatives of the rates by this parameter, by row.
     arguments : Arguments
 
     Raises
@@ -189,7 +192,10 @@ def _statements(
 
 
 def _products(n: int, entries: Mapping[tuple[int, int], ast.expr]) -> list[ast.stmt]:
-    """Return the statements that fill the column of `out` that starts at k with the Jacobian times that of `y`."""
+    """Return statements that set the column of `out` from index k on to the Jacobian times the same column of `y`.
+
+    `entries` holds the nonzero entries of the Jacobian (n, n), by row and column.
+    """
     read = sorted({j for _, j in entries})
     # The column of y is read first, because compiled code would read it again after each number that it writes.
     body = [
@@ -235,12 +241,15 @@ def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
     """Yield statements that check the sizes of arrays, because compiled code does not check indices."""
     for array, names in arguments.arrays.items():
         if names:
-            text = f"{array} must hold as many numbers as there are in ({', '.join(names)}): {len(names)}"
+            text = f"{array} must hold as many numbers as there are names in ({', '.join(names)}): {len(names)}"
             yield _refused(_differ(_size(array), ast.Constant(value=len(names))), text)
 
 
 def _checks_of_columns(n: int, columns: int) -> Iterable[ast.stmt]:
-    """Yield statements that check that `y` holds the state and enough whole columns, and that `out` is as long."""
+    """Yield statements that check that `y` holds the state, n numbers, and at least `columns` columns of n numbers.
+
+    They also check that `out` is as long as `y`.
+    """
     rest = ast.BinOp(left=_size("y"), op=ast.Mod(), right=ast.Constant(value=n))
     few = ast.Compare(left=_size("y"), ops=[ast.Lt()], comparators=[ast.Constant(value=n * (columns + 1))])
     text = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {columns} columns"
@@ -271,14 +280,17 @@ class Writer:
         self._places = arguments.places
 
     def values(self, expressions: Sequence[Any]) -> list[ast.expr]:
-        """Return a name or a constant for each expression; common subexpressions are computed once."""
+        """Write statements that compute expressions; return for each the variable or constant that holds its value.
+
+        Common subexpressions are computed once.
+        """
         common, reduced = sympy.cse(expressions, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
         for name, expression in common:
             self.known[name] = self.value(expression)
         return [self.value(expression) for expression in reduced]
 
     def value(self, expression: Any) -> ast.expr:
-        """Return the name of the variable that holds an expression, or the constant that it is equal to."""
+        """Return the variable or constant that holds the value of an expression; write its statements if it is new."""
         if expression not in self.known:
             self.known[expression] = self._write(expression)
         return self.known[expression]
@@ -395,7 +407,10 @@ class Writer:
         raise self._unknown(expression)
 
     def _cases(self, expression: Any) -> ast.expr:
-        """Return the first value whose condition holds, NaN if none holds. All values are computed."""
+        """Write the statements of a Piecewise expression, and return the variable or constant that holds its value.
+
+        This is the first value whose condition holds, NaN if none holds. All values are computed.
+        """
         chosen: ast.expr = ast.Constant(value=math.nan)
         for value, condition in reversed(expression.args):
             found = self.value(value)
@@ -419,7 +434,10 @@ class Writer:
         raise self._unknown(condition)
 
     def _by_sign(self, value: ast.expr, below: float, at_zero: float) -> ast.expr:
-        """Return 1 for positive values, `below` for negative ones, and `at_zero` for 0."""
+        """Write a choice by the sign of a value, and return its variable.
+
+        The choice is 1 if the value is positive, `below` if it is negative, and `at_zero` if it is 0 or NaN.
+        """
 
         def choice(test: ast.cmpop, yes: float, no: ast.expr) -> ast.expr:
             compared = ast.Compare(left=value, ops=[test], comparators=[ast.Constant(value=0.0)])

@@ -42,7 +42,7 @@ class TooLargeError(ValueError):
 
 
 def require_sum(items: Iterable[Any]) -> None:
-    """Raise TooLargeError if a coefficient of the sum has too many digits."""
+    """Raise TooLargeError if a coefficient of the sum of `items` has too many digits."""
     coefficients: dict[Any, Any] = defaultdict(lambda: ZERO)
     for item in items:
         for term in sympy.Add.make_args(item):
@@ -52,7 +52,7 @@ def require_sum(items: Iterable[Any]) -> None:
 
 
 def require_product(items: Iterable[Any]) -> None:
-    """Raise TooLargeError if the coefficient of the product or an exponent in it has too many digits."""
+    """Raise TooLargeError if the product of `items` has too many factors, or a number in it has too many digits."""
     coefficient, roots = ONE, 0
     exponents: dict[Any, Any] = defaultdict(lambda: ZERO)
     for item in items:
@@ -83,7 +83,8 @@ def require_power(base: Any, exponent: Any) -> None:
 def require_function(name: str, arguments: Iterable[Any], compared: int) -> int:
     """Raise TooLargeError if SymPy would compare or expand too much to build the function.
 
-    `compared` is the number of values that max and min have compared so far; the function returns the new number.
+    `compared` is the number of values that the max and min before this function in the same text compare. Return the
+    number that includes those of this function.
     """
     if name in ("max", "min"):
         kind = sympy.Max if name == "max" else sympy.Min
@@ -97,12 +98,12 @@ def require_function(name: str, arguments: Iterable[Any], compared: int) -> int:
     if name == "abs":
         for item in arguments:
             if not item.is_extended_real and expanded_terms(item) > EXPANDED_TERMS:
-                raise TooLargeError(f"takes an argument of more than {EXPANDED_TERMS} terms, which may be complex")
+                raise TooLargeError(f"takes an argument that may be complex and has more than {EXPANDED_TERMS} terms")
     return compared
 
 
 def require_constant(number: Any) -> None:
-    """Raise TooLargeError if a constant that is not rational takes too many operations."""
+    """Raise TooLargeError if `number` is not rational and has more than LARGEST_CONSTANT operations."""
     if not number.is_Rational and number.count_ops() > LARGEST_CONSTANT:
         raise TooLargeError(
             f"is a constant of more than {LARGEST_CONSTANT} operations; write its value, or make it a parameter"
@@ -110,7 +111,7 @@ def require_constant(number: Any) -> None:
 
 
 def expanded_terms(expression: Any) -> int:
-    """Return an upper bound for the number of terms of the expanded expression, or a number above EXPANDED_TERMS."""
+    """Return an upper bound for the number of terms of the expanded expression, at most EXPANDED_TERMS + 1."""
     most = EXPANDED_TERMS + 1
     match expression:
         case sympy.Add():

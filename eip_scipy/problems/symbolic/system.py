@@ -36,8 +36,8 @@ LARGEST_JACOBIAN = 16  # number of coordinates; the Jacobian has its square of e
 class System(NamedTuple):
     """Equations and their invariants and balances as expressions. Equal systems share their compiled functions.
 
-    `rates` are the time derivatives of `components`. An invariant is a name with an expression, a balance a name with
-    an expression and its rate.
+    `rates` are the time derivatives of `components`. `invariants` holds pairs (name, expression). `balances` holds
+    triples (name, expression, rate) of quantities that are not conserved but change at a known rate.
     """
 
     components: tuple[str, ...]
@@ -64,7 +64,11 @@ class System(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Functions of a system: value and gradient (in place) of each invariant and balance; the rate of each balance."""
+    """Functions made from a `System`: its derivative (in place), and its accelerations and their Jacobian, or None.
+
+    They are followed by (value, gradient) for each invariant and (value, gradient, rate) for each balance. Gradients
+    are in place.
+    """
 
     rhs: Callable[..., None]
     acc: Callable[..., np.ndarray] | None
@@ -112,14 +116,15 @@ class SymbolicProblem(Problem):
         Raises
         ------
         ValueError
-            If q' is not a constant matrix W times p, or p' depends on p.
+            If q' is not a constant invertible matrix W times p, p' depends on p, or the state does not consist of pairs
+            of coordinates and momenta.
         """
         names, rates = self.system.components, self.system.rates
         half, W = len(self.pairs), self._kinetic()
         if W is None:
             raise ValueError(
-                f"{self.name}: second_order needs q' = W p, p' = a(t, q) with a constant matrix W, but the equations "
-                f"are {_cut(rates)}."
+                f"{self.name}: second_order needs q' = W p, p' = a(t, q) with an invertible constant matrix W, for a "
+                f"state of coordinates and momenta (q, p), but the equations are {_cut(rates)}."
             )
         q, p = names[:half], [symbol(item) for item in names[half:]]
         new = as_names("the state", (*q, *(f"v_{item}" for item in q)))
@@ -143,7 +148,7 @@ class SymbolicProblem(Problem):
         return self._kinetic() is not None
 
     def _kinetic(self) -> Any:
-        """Return the matrix W of q' = W p if W is constant and regular and p' does not depend on p; otherwise None."""
+        """Return the matrix W of q' = W p if it is constant and invertible and p' is free of p, otherwise None."""
         names, rates, half = self.system.components, self.system.rates, len(self.pairs)
         p = [symbol(item) for item in names[half:]]
         if half == 0 or len(names) != 2 * half or any(rate.has(*p) for rate in rates[half:]):
@@ -173,7 +178,7 @@ class SymbolicProblem(Problem):
         return "\n".join(lines)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the expressions only; the functions are made from them again."""
+        """Return the content of a pickle: the expressions, from which loading makes the functions again."""
         functions = _functions(self.system)
         own = [fun for fun, *_ in (*functions.invariants, *functions.balances)]
         kept = [own.index(item.function) if item.function in own else item for item in self.invariants]
@@ -208,8 +213,8 @@ def hamiltonian_problem(
     if perturbed.given:
         if extended:
             raise ValueError(
-                "hamiltonian: extended=True keeps H + p_t, which a perturbation or dissipation changes; omit one of "
-                "the two."
+                "hamiltonian: extended=True keeps H + p_t, which a perturbation or dissipation changes; omit "
+                "extended=True, or perturbation= and dissipation=."
             )
         rates, slow = _with_perturbation(energy, names, rates, values, declared, perturbed, flow)
         return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, Further(invariants), pairs, slow)
@@ -232,7 +237,10 @@ def hamiltonian_problem(
 
 
 class Further(NamedTuple):
-    """Expressions, by name, of further invariants and of constraints, which are 0."""
+    """Arguments of `hamiltonian` and `equations`: mappings of names to expressions, or None.
+
+    `invariants` are conserved, and `constraints` are 0.
+    """
 
     invariants: Any
     constraints: Any = None
@@ -267,7 +275,11 @@ def _with_perturbation(
     perturbed: Perturbed,
     flow: Callable[[Any], tuple[Any, ...]],
 ) -> tuple[tuple[Any, ...], tuple[tuple[str, Any, Any], ...]]:
-    """Return the derivatives of the perturbed system, and its balances: integrals of H, with their rates."""
+    """Return the derivatives of the perturbed system, and its balances (name, expression, rate).
+
+    Balances are quantities that the system of H alone conserves, with their rates of change due to the perturbation and
+    the dissipation.
+    """
     if energy.has(symbol("t")):
         raise ValueError(
             "hamiltonian: H depends on t, so that it is not an integral; move such terms to perturbation=."
@@ -318,14 +330,17 @@ def _timed(given: Any, timed: Timed) -> Any:
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
-    """Return the names, a function of H that returns q' = dH/dp and p' = -dH/dq, and the pairs of names."""
+    """Return the names of the components, a function that returns (dH/dp, -dH/dq) of H, and the pairs of names."""
     if q is None and p is None:
         q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
     elif q is None or p is None:
         raise TypeError("hamiltonian: give both q and p, or neither; with poisson=, give the whole state as q.")
     q, p = as_names("q", q), as_names("p", p)
     if len(q) != len(p) or not q:
-        raise ValueError(f"hamiltonian: {len(q)} coordinates ({', '.join(q)}) but {len(p)} momenta ({', '.join(p)}).")
+        raise ValueError(
+            f"hamiltonian: {len(q)} coordinates ({', '.join(q)}) but {len(p)} momenta ({', '.join(p)}); expected a "
+            "momentum for each coordinate, and at least one pair."
+        )
     names = as_names("q and p", (*q, *p))
 
     def flow(H: Any) -> tuple[Any, ...]:
@@ -336,7 +351,7 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
 
 
 def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
-    """Return the names, a function of H that returns y' = B(y) grad H, and an empty tuple of pairs, as `_canonical`."""
+    """Return the names of the components, a function that returns B(y) grad H of H, and no pairs, as `_canonical`."""
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= give the names of the whole state as q, and omit p.")
     names = as_names("q", y)
@@ -388,7 +403,7 @@ def _checked(
     quantities = {}
     for label, item in (*constraints.items(), *further.items()):
         if not isinstance(label, str):
-            raise TypeError(f"invariants: names must be strings, got {shown(label)}.")
+            raise TypeError(f"invariants and constraints: names must be strings, got {shown(label)}.")
         if label in kept:
             raise ValueError(f"invariants: {label} is already the name of an invariant; choose another or omit it.")
         kind = "constraint" if label in constraints else "invariant"
@@ -406,7 +421,13 @@ def _checked(
 
 
 def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> Any:
-    """Return the expression of an invariant or a constraint."""
+    """Return the SymPy expression of an invariant or a constraint after a check of its names.
+
+    Raises
+    ------
+    ValueError
+        If it contains an unknown name or does not depend on the state.
+    """
     quantity = as_expression(what, given, known)
     _require_known(what, quantity, known)
     if not quantity.has(*map(symbol, names)):
@@ -417,7 +438,11 @@ def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> A
 def _how_kept(
     label: str, quantity: Any, names: Sequence[str], rates: Any, parameters: Any, manifold: Manifold | None, hint: str
 ) -> str:
-    """Return how a quantity was shown to be conserved, at all states or at those that meet the constraints."""
+    """Return how a quantity was shown to be conserved, such as "symbolically", see `SymbolicProblem`.
+
+    If it is not conserved at all states, it must be conserved at those that meet the constraints, otherwise ValueError
+    is raised.
+    """
     try:
         return how_kept(label, quantity, [symbol(item) for item in names], rates, parameters)
     except NotKeptError as error:
@@ -499,7 +524,11 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
 
 
 def _deferred_jacobian(system: System) -> Deferred | None:
-    """Return the product of the accelerations' Jacobian and a vector, made on demand; None if it is not available."""
+    """Return the function for the Jacobian of the accelerations times a vector, as a `Deferred` made when it is called.
+
+    Return None if the system is not of the form q'' = a(t, q), has more than LARGEST_JACOBIAN accelerations, or has
+    accelerations that jump.
+    """
     found = system.accelerations
     if found is None or len(found) > LARGEST_JACOBIAN:
         return None
@@ -520,11 +549,14 @@ def _jacobian(system: System) -> Callable[..., None]:
 
 
 def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
-    """Return the right-hand side of a state followed by columns of derivatives, see `Problem`."""
+    """Return the right-hand side of a state followed by columns of derivatives, see `Problem`.
+
+    `parameters` are the indices of the parameters with respect to which the last columns are derivatives.
+    """
     for k in parameters:
         if not 0 <= k < len(system.parameters):
             raise ValueError(
-                f"variational: there is no parameter {k}; expected places in ({', '.join(system.parameters)})."
+                f"variational: there is no parameter {k}; expected indices of ({', '.join(system.parameters)})."
             )
     return _with_columns(system, tuple(map(int, parameters)))
 
@@ -535,7 +567,7 @@ def _with_columns(system: System, parameters: tuple[int, ...]) -> Callable[..., 
         if jumps := rate.atoms(sympy.sign, sympy.Heaviside):  # abs, max and min are continuous
             raise ValueError(
                 f"variational: the derivative of {name} contains {_cut(min(jumps, key=str))}, which jumps; at a jump "
-                "derivatives of the state do not follow from derivatives of the equations."
+                "derivatives of the state do not follow from derivatives of the equations. Use a smooth expression."
             )
 
     def nonzero(by: Any) -> dict[int, Any]:
@@ -550,7 +582,7 @@ def _with_columns(system: System, parameters: tuple[int, ...]) -> Callable[..., 
 
 
 def parameter_values(params: Any) -> dict[str, float]:
-    """Return the values of parameters by name after checks: they must be finite numbers."""
+    """Return the parameters as a mapping of names to floats; raise an error if one is not a finite number."""
     if params is None:
         return {}
     if not isinstance(params, Mapping):

@@ -14,17 +14,24 @@ __all__ = ["Timed"]
 
 
 class Timed:
-    """The components of a state and their derivatives; components may be functions of time.
+    """Names of the components of a state, and their time derivatives; components may be SymPy functions of time.
 
     A derivative that is a component itself, such as x' in the state (x, x'), is called ``v_x``. Any other derivative of
-    a component is replaced by its right-hand side.
+    a component is replaced by its right-hand side. A call with an expression makes these replacements in it.
 
     Parameters
     ----------
     f : sequence or mapping
         Derivatives, as `equations` takes them.
     y : sequence or str, optional
-        The components.
+        The components. Default: the keys of `f`.
+
+    Attributes
+    ----------
+    names : sequence of str
+        Names of the components.
+    values : list
+        Time derivatives of the components, in the order of `names`.
     """
 
     def __init__(self, f: Any, y: Any) -> None:
@@ -62,7 +69,7 @@ class Timed:
         self.values = [self(value) for value in values]
 
     def __call__(self, expression: Any) -> Any:
-        """Replace derivatives of components in an expression; return text and numbers unchanged."""
+        """Return an expression with the derivatives of components replaced; return text and numbers unchanged."""
         if not isinstance(expression, sympy.Expr):
             return expression
         expression = self._with_speeds(expression)
@@ -84,7 +91,7 @@ def _listed(given: Any) -> list[Any]:
 
 
 def _is_rate(key: Any) -> bool:
-    """Return True if a key is the derivative of a function of time."""
+    """Return True if a key is a first derivative with respect to time."""
     return isinstance(key, sympy.Derivative) and key.variables == (TIME,)
 
 

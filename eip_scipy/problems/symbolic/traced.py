@@ -151,7 +151,7 @@ def _array(items: Sequence[Any]) -> np.ndarray:
 
 
 class _NumPy(types.ModuleType):
-    """NumPy with functions whose new arrays hold objects, such as `Number`."""
+    """Module that replaces NumPy: its zeros, ones, eye and similar functions return arrays that can hold `Number`."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(np, name)
@@ -183,7 +183,11 @@ for _name in dir(math):
 
 
 def _replaced(item: Any, known: dict[int, Any]) -> Any:
-    """Return the replacement of a global or closure variable: NumPy, math, and functions that use them."""
+    """Return the replacement of a global or closure variable, or the variable itself if it needs none.
+
+    NumPy, math and their functions are replaced by those of NUMPY and MATH. A Python or Numba function is replaced by a
+    copy whose own variables are replaced. `known` holds the copies made so far, by the id of the function.
+    """
     if item is np:
         return NUMPY
     if item is math:

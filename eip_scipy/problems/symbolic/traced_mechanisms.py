@@ -23,12 +23,14 @@ AGREES = 1e-9
 
 
 def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
-    """Return the parts of a mechanism, see `mechanism`.
+    """Return the `Parts` of a mechanism, made from expressions for the functions that `mechanism` was given.
+
+    The expressions are compared with the functions at the start (t, q, u).
 
     Raises
     ------
     NotTraceableError
-        If a function cannot be converted to an expression.
+        If a function cannot be converted to an expression, or its expression has another value at the start.
     """
     by_name = {"t": ("t", t), "q": (names.coordinates, q), "u": (names.speeds, u)}
 
@@ -68,7 +70,7 @@ def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndar
 
 
 def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
-    """Yield the names and expressions of momenta of coordinates that may be cyclic."""
+    """Yield the name and the expression of the momentum of each coordinate that may be cyclic."""
     n = len(system.speeds)
     momenta = sympy.Matrix(n, n, system.mass) * sympy.Matrix([symbol(name) for name in system.speeds])
     for k in cyclic(system, partial(own_speed, system)):
@@ -76,7 +78,7 @@ def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
 
 
 def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
-    """Return the outputs as expressions; an empty list if one of them cannot be converted."""
+    """Return the name and the expression of each output; an empty list if one of them cannot be converted."""
     symbols, numbers = zip(*(by_name[letter] for letter in "tqu"), strict=True)
     names = Names(by_name["q"][0], by_name["u"][0], (), ())
     found = []

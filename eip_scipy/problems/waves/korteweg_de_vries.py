@@ -88,25 +88,28 @@ class KortewegDeVries:
     # In modes: what `Lawson` takes.
 
     def modes(self, u: np.ndarray) -> np.ndarray:
-        """Return the modes with k >= 0 that the equation keeps, the means of ``u_j exp(-i k x_j)``."""
+        """Return the modes with k >= 0 that the equation keeps, the means of ``u_j exp(-i k x_j)``.
+
+        Here x_j is the distance of the point j from the first point of the grid.
+        """
         return scipy.fft.rfft(u, norm="forward")[: self._kept]
 
     def field(self, modes: np.ndarray) -> np.ndarray:
-        """Return the field on the grid with these modes."""
+        """Return the field at the points of the grid, (n,), from its `modes` with k >= 0."""
         return scipy.fft.irfft(modes, self._n, norm="forward")
 
     def nonlinear(self, modes: np.ndarray) -> np.ndarray:
-        """Return the modes of ``-3 (u^2)_x``."""
+        """Return the modes of ``-3 (u^2)_x`` for the field u with the given `modes`."""
         return self._flux * self._square(modes)
 
     def _square(self, modes: np.ndarray) -> np.ndarray:
-        """Return the modes of u^2."""
+        """Return the modes of u^2 for the field u with the given `modes`."""
         u = self._finer(modes)
         u *= u
         return scipy.fft.rfft(u, norm="forward")[: self._kept]
 
     def _finer(self, modes: np.ndarray) -> np.ndarray:
-        """Return the field on the finer grid."""
+        """Return the field with the given `modes` at the points of the finer grid."""
         return scipy.fft.irfft(modes, self._fine, norm="forward")
 
     # In points.
@@ -155,8 +158,8 @@ class KortewegDeVries:
         Parameters
         ----------
         names : sequence of {"mass", "momentum", "energy"}, optional
-            Default: momentum and energy; with damping the momentum, divided by its decay. The mass is linear: every
-            method keeps it, and the `frame` of `problem` prevents corrections from changing it.
+            Default: momentum and energy; with damping the momentum divided by exp(-2 damping t). The mass is linear:
+            every method keeps it, and the `frame` of `problem` prevents corrections from changing it.
 
         Returns
         -------
@@ -165,7 +168,7 @@ class KortewegDeVries:
         Raises
         ------
         ValueError
-            If a name is unknown.
+            If a name is unknown, or is "energy" for an equation with damping.
         """
         if names is None:
             names = ("momentum",) if self.damping else ("momentum", "energy")
@@ -221,7 +224,7 @@ class KortewegDeVries:
         t_end : float
             End of the interval that starts at 0.
         h : float, optional
-            The step, which must be below `largest_step`.
+            The step, which must be below `largest_step`. Default: the problem has no step.
         name : str, optional
         invariants : sequence of str, optional
             See `invariants`.

@@ -23,7 +23,8 @@ class Lawson:
         The equation, or another object with the attribute `frequencies` (w) and the methods `modes`, `field` and
         `nonlinear`.
     tableau : Tableau, optional
-        Runge-Kutta method, by default that of `EIPDOP853`. If it has an error estimate, the step has this estimate.
+        Runge-Kutta method, by default that of `EIPDOP853`. If it has an error estimate, `one_step` returns the estimate
+        too.
 
     Attributes
     ----------
@@ -42,7 +43,7 @@ class Lawson:
     Notes
     -----
     The linear part, which is stiff, only multiplies each mode by a factor and does not limit the step; the nonlinear
-    term limits it. For the frequencies of the equation the change of variables has no growing factors.
+    term limits it. If the frequencies are real (without damping), the factors have the modulus 1.
 
     References
     ----------
@@ -75,7 +76,10 @@ class Lawson:
         return f"Lawson({self.equation!r}, {self.tableau!r})"
 
     def one_step(self, t: float, y: np.ndarray, h: float) -> Any:
-        """Make one step of length h; return the state, and the error estimate if the tableau has one."""
+        """Make one step of length h from the state y at t.
+
+        Return the new state, or the new state and its error estimate if the tableau has one.
+        """
         if h != self._h:
             nodes = (*self.tableau.c, 1.0)
             phases = [1j * h * c * self.equation.frequencies for c in nodes]

@@ -29,7 +29,10 @@ class RealModes:
         self.shape = (*grid.shape[:-1], grid.shape[-1] // 2 + 1)
 
     def forward(self, field: np.ndarray) -> np.ndarray:
-        """Return the modes sum_j field_j exp(-i k x_j) of a field, which may be flat."""
+        """Return the modes sum_j field_j exp(-i k x_j) of a field, which may be flat.
+
+        Here x_j is the position of the point j relative to the first point of the grid.
+        """
         return scipy.fft.rfftn(field.reshape(self.grid.shape))
 
     def backward(self, modes: np.ndarray) -> np.ndarray:
@@ -37,6 +40,9 @@ class RealModes:
         return scipy.fft.irfftn(modes, s=self.grid.shape, overwrite_x=True).ravel()
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """Return the wavenumbers along one axis, which broadcast to modes; if `odd`, that of the Nyquist mode is 0."""
+        """Return the wavenumbers along one axis, of a shape that broadcasts to `shape`.
+
+        If `odd`, for derivatives of odd order, the wavenumber of the Nyquist mode is 0.
+        """
         k = self.grid.wavenumbers(axis, odd=odd)
         return np.abs(k[..., : self.shape[-1]]) if axis == self.grid.dim - 1 else k

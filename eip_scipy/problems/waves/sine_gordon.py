@@ -43,8 +43,9 @@ class SineGordon:
     Notes
     -----
     The energy ``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``, with w the size of a cell, is an invariant of the equations
-    on the grid for every field. The momenta ``-w sum p dq`` are conserved to spectral accuracy only, because sin q has
-    modes that the grid does not have; their aliases do not vanish if the field is not resolved.
+    on the grid for every field. The momenta ``-w sum p dq``, with dq the derivative of q along an axis, are conserved
+    to spectral accuracy only, because sin q has modes that the grid does not have; their aliases do not vanish if the
+    field is not resolved.
 
     Examples
     --------
@@ -100,7 +101,10 @@ class SineGordon:
         return float(self.grid.cell * density)
 
     def momentum(self, y: np.ndarray) -> np.ndarray:
-        """Return the momenta ``-w sum p dq`` along the axes that the grid has."""
+        """Return the momenta ``-w sum p dq``, one for each axis of the grid.
+
+        Here w is the size of a cell, and dq the derivative of q along the axis.
+        """
         return np.array([self._momentum_along(axis, y) for axis in range(self.grid.dim)])
 
     def _momentum_along(self, axis: int, y: np.ndarray) -> float:
@@ -111,7 +115,7 @@ class SineGordon:
         return self._modes.backward(1j * self._modes.wavenumbers(axis, odd=True) * self._modes.forward(field))
 
     def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivative without damping, and the damping term."""
+        """Return the two parts of the derivative `f`: the derivative without damping, and the damping term."""
         lost = np.zeros_like(y)
         lost[self.grid.size :] = -self.damping * y[self.grid.size :]
         return f - lost, lost
@@ -138,13 +142,13 @@ class SineGordon:
         Returns
         -------
         tuple of Invariant
-            Invariants, or balances if there is damping. The gradient of the energy is computed from the right-hand
-            side, which the step has already evaluated.
+            Invariants, or with damping objects of the class `Balance`. The gradient of the energy is computed from the
+            right-hand side, which the step has already evaluated.
 
         Raises
         ------
         ValueError
-            If a name is unknown.
+            If a name is unknown, or the grid does not have the axis of a momentum.
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         return tuple(self._invariant(name) for name in names)
@@ -195,7 +199,7 @@ class SineGordon:
         t_end : float
             End of the interval that starts at 0.
         h : float, optional
-            The step, which must be below `largest_step`.
+            The step, which must be below `largest_step`. Default: the problem has no step.
         name : str, optional
         invariants : sequence of str, optional
             See `invariants`.
@@ -216,7 +220,7 @@ class SineGordon:
         grid, fields = self.grid, [np.asarray(a, dtype=float) for a in (q0, p0)]
         for a in fields:
             if a.shape not in (grid.shape, (grid.size,)):
-                raise ValueError(f"a field has shape {a.shape}, expected {grid.shape} or ({grid.size},).")
+                raise ValueError(f"q0 or p0 has shape {a.shape}, expected {grid.shape} or ({grid.size},).")
         return WaveProblem(
             name=name,
             fun=self.fun,

@@ -30,13 +30,17 @@ class Bench(Study[Found]):
     Attributes
     ----------
     repeats : int
-        Largest number of runs at each setting; the least time counts.
+        Largest number of timed runs at each setting; the least time counts.
     enough : float
-        Seconds of runs at one setting after which it is not run again.
+        Total seconds of the runs at one setting after which it is not run again.
     patience : float
         Seconds: after a longer run, finer settings of the same method and problem are left out.
     limit : float
         Seconds after which the process of a method is stopped.
+    suites : mapping of str to Suite
+        The suites by their names, from which ``suite`` chooses.
+    field_of_peers : mapping of str to Peer
+        All methods of all packages, from which ``peers`` chooses; those of this package are always run.
     """
 
     suite: Sequence[str] = option(
@@ -60,14 +64,17 @@ class Bench(Study[Found]):
     field_of_peers: Mapping[str, Peer] = field(default_factory=lambda: PEERS)
 
     def check_settings(self) -> None:
-        """Raise an error if a name of `peers` is neither a package nor the beginning of a method."""
+        """Raise a UsageError if an entry of `peers` is neither a package nor the beginning of the name of a method."""
         for name in self.peers or ():
             if not any(_is(peer, name) for peer in PEERS.values()):
                 known = sorted({peer.distribution for peer in PEERS.values() if not peer.ours})
-                raise UsageError(f"the package {name!r} is not known; expected some of {', '.join(known)}")
+                raise UsageError(
+                    f"the package {name!r} is not known; expected some of {', '.join(known)}, or beginnings of the "
+                    "names of methods"
+                )
 
     def measure(self, session: Session) -> Found:
-        """Run all methods of all packages, one after the other."""
+        """Run all chosen methods on the problems of all chosen suites, one after the other, each in its own process."""
         found = Found(describe_machine(), datetime.now(UTC).strftime("%Y-%m-%d"))
         found.versions["eip_scipy"] = __version__
         asked = [
@@ -115,11 +122,11 @@ class Bench(Study[Found]):
             found.rows.append(Row(suite, scenes[-1]["title"], peer.takes, peer.name, said=reply.failed))
 
     def text(self, found: Found) -> str:
-        """Return tables at equal error, and the failures."""
+        """Return the report for the terminal: the tables of all suites, and the failures."""
         return text(found)
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """Return the runs at all settings, and the comparison at equal error."""
+        """Return the rows of two CSV files: the runs at all settings, and the comparison at equal error."""
         compared = [
             {**each._asdict(), "ratio": each.ratio if math.isfinite(each.ratio) else None}
             for each in standings(found.rows)
@@ -127,7 +134,7 @@ class Bench(Study[Found]):
         return {"bench.csv": [row._asdict() for row in found.rows], "bench-equal-error.csv": compared}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """Return the runs at all settings, with the versions of the packages."""
+        """Return the runs at all settings, the versions of the packages, and the reasons why others did not run."""
         return {
             "rows": [row._asdict() for row in found.rows],
             "versions_of_peers": found.versions,

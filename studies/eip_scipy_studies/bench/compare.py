@@ -15,18 +15,21 @@ LEVELS = (1e-6, 1e-9)
 
 
 class Row(NamedTuple):
-    """Result of one run, or its failure; a line of the CSV file.
+    """Result of a method of one package on a problem at one setting, or its failure; a line of the CSV file.
 
     Attributes
     ----------
     suite, scene, takes, peer : str
-        `takes`: the kind of function.
+        Name of the suite, title of the problem, kind of function that the method takes (see `Peer`), its name.
     setting : float or None
-        Tolerance or number of steps.
-    seconds, error, drift : float or None
-        Time, error at the end, and largest relative change of an invariant.
+        Relative tolerance or number of steps.
+    seconds : float or None
+        Least time of a run; in the suite "overhead" the time that is added to each evaluation, in "first-use" the time
+        from the start of the process to its first answer.
+    error, drift : float or None
+        Error of the final state, see `Scene.error`, and largest relative change of an invariant, see `Scene.drift`.
     said : str
-        The first line of an error, or another remark.
+        The first line of an error, or another remark; empty if there is none.
     """
 
     suite: str
@@ -46,18 +49,19 @@ class Standing(NamedTuple):
     Attributes
     ----------
     suite, scene, takes, peer : str
+        As in `Row`; `peer` is the method of the other package.
     level : float
-        Error of the trajectory.
+        Error of the final state at which times are compared.
     seconds : float
-        Time of the package; nan if no run of it reached this error.
+        Time of the other package's method to reach this error; nan if none of its runs did.
     best : str
-        Name of our method.
+        Name of our method that is fastest at this error; "none of ours" if none of our runs reached it.
     ours : float
-        Time of our method; inf if none of our runs reached this error.
+        Time of our method in seconds; inf if none of our runs reached this error.
     tried : float
-        Seconds of the package's longest run.
+        Seconds of the longest run of the other package's method.
     bound : bool
-        True if `seconds` is a bound: the package's cheapest run is more accurate than `level`.
+        True if `seconds` is an upper bound, because the method's first run is at least as accurate as `level`.
     """
 
     suite: str
@@ -73,17 +77,20 @@ class Standing(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Return the package's time divided by ours: above 1 if ours is faster."""
+        """Return the other method's time divided by ours: above 1 if ours is faster."""
         return self.seconds / self.ours
 
     @property
     def lost(self) -> bool:
-        """Return True if the package is faster."""
+        """Return True if the other method is faster."""
         return self.ratio < 1
 
 
 def groups(rows: Iterable[Row]) -> dict[tuple[str, str, str], dict[str, list[Row]]]:
-    """Group the runs that have a time and an error by suite, problem and kind of function, and by package."""
+    """Group the runs that have a time and a finite error.
+
+    The keys are (suite, problem, kind of function); each value holds lists of runs by the name of the method.
+    """
     found: dict[tuple[str, str, str], dict[str, list[Row]]] = {}
     for row in rows:
         if row.seconds is not None and row.error is not None and math.isfinite(row.error):
@@ -92,9 +99,9 @@ def groups(rows: Iterable[Row]) -> dict[tuple[str, str, str], dict[str, list[Row
 
 
 def standings(rows: Iterable[Row], levels: Sequence[float] = LEVELS) -> list[Standing]:
-    """Compare each package in each group with our best method for the same kind of function.
+    """Compare each method of another package with our best method for the same kind of function, at each of `levels`.
 
-    If there is no method of ours for the kind, the best compiled one takes its place.
+    If none of our methods takes this kind of function, our best one that takes compiled functions is used.
     """
     known = groups(rows)
     found = []
@@ -152,7 +159,7 @@ REASONS: tuple[tuple[str, str, str, str, str], ...] = (
 
 
 def reason(standing: Standing) -> str:
-    """Return why the package is faster; empty if it is not, or if no reason is known."""
+    """Return why the other method is faster; empty if it is not, or if no reason is known."""
     if not standing.lost:
         return ""
     for suite, scene, takes, peer, why in REASONS:

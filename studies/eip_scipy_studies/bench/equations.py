@@ -19,9 +19,9 @@ __all__ = ["EQUATIONS", "Functions", "Scene", "scene_from"]
 
 
 class Functions(NamedTuple):
-    """Functions as a user writes them: ``fun(t, y)``, ``values(t, y)`` and ``gradients(t, y)`` of the invariants.
+    """Functions of a problem: right-hand side ``fun(t, y)``, invariants ``values(t, y)``, their ``gradients(t, y)``.
 
-    ``acc(t, q)`` is given if the equations are q'' = acc.
+    The acceleration ``acc(t, q)`` is given if the equations are q'' = acc.
     """
 
     fun: Callable[..., Any]
@@ -31,7 +31,7 @@ class Functions(NamedTuple):
 
 
 def kepler(sqrt: Any) -> Functions:
-    """Return Kepler's problem, with energy and angular momentum."""
+    """Return the functions of Kepler's problem in a plane; the invariants are energy and angular momentum."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         r2 = y[0] * y[0] + y[1] * y[1]
@@ -56,7 +56,7 @@ def kepler(sqrt: Any) -> Functions:
 
 
 def henon_heiles(sqrt: Any) -> Functions:
-    """Return the system of Hénon and Heiles, with its energy."""
+    """Return the functions of the system of Hénon and Heiles; the invariant is the energy."""
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         return y[2], y[3], -y[0] - 2.0 * y[0] * y[1], -y[1] - y[0] * y[0] + y[1] * y[1]
@@ -75,7 +75,10 @@ def henon_heiles(sqrt: Any) -> Functions:
 
 
 def rigid_body(sqrt: Any) -> Functions:
-    """Return a free top with moments of inertia 2, 1, 2/3, with its Casimir invariant and energy."""
+    """Return the functions of a free top with moments of inertia 2, 1, 2/3; y is its angular momentum L.
+
+    The invariants are |L|^2 / 2 and the energy.
+    """
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         return 0.5 * y[1] * y[2], -y[2] * y[0], 0.5 * y[0] * y[1]
@@ -91,7 +94,10 @@ def rigid_body(sqrt: Any) -> Functions:
 
 
 def particle(sqrt: Any) -> Functions:
-    """Return a charge in B = r e_z and the potential 0.01 / r, with energy and canonical angular momentum."""
+    """Return the functions of a charge in a plane, in the field B = r e_z and the potential 0.01 / r.
+
+    The invariants are the energy and the canonical angular momentum.
+    """
 
     def fun(t, y):  # type: ignore[no-untyped-def]
         r2 = y[0] * y[0] + y[1] * y[1]
@@ -127,10 +133,10 @@ class Scene:
     title, equations : str
         `equations` is a key of `EQUATIONS`, "members" (of Kepler's problem), "bodies", "nls" or "case" (a hard case).
     y0, end : ndarray, shape (n,)
-        Start, and the exact state at the end; (members, n) for "members".
+        State at t = 0, and the exact state at `t_end`; shape (members, n) for "members".
     t_end : float
     params : dict
-        "gm" for bodies, "name" for a case, "length" for the field.
+        "gm" (G times the masses) for "bodies", "name" for "case", "length" of the ring for "nls".
     """
 
     title: str
@@ -141,7 +147,7 @@ class Scene:
     params: dict[str, Any]
 
     def plain(self) -> Functions:
-        """Return plain Python functions that return arrays."""
+        """Return the functions of the problem as plain Python functions that return arrays."""
         if self.equations == "bodies":
             return _bodies(self.params["gm"])
         if self.equations == "nls":
@@ -153,13 +159,17 @@ class Scene:
         return Functions(*(_returning_array(function) for function in EQUATIONS[self.equations](math.sqrt)))
 
     def compiled(self) -> Functions:
-        """Return jitted functions: ``fun(t, y, out)`` and ``acc(t, q, out)`` in place, the others return arrays."""
+        """Return the functions of the problem jitted by Numba, for "members" those of one orbit.
+
+        ``fun(t, y, out)`` and ``acc(t, q, out)`` fill `out`. The invariants and gradients return arrays; for "bodies"
+        these two are not jitted.
+        """
         njit = import_module("numba").njit
         name = "kepler" if self.equations == "members" else self.equations
         if self.equations == "bodies":
             return _jitted_bodies(np.array(self.params["gm"]), njit)
         if name not in EQUATIONS:
-            raise NotImplementedError("the bench has this problem (a hard case) as plain Python functions only")
+            raise NotImplementedError("the bench has hard cases and fields as plain Python functions only")
         fun, values, gradients, acc = EQUATIONS[name](math.sqrt)
         return Functions(
             _filling(njit(fun), njit),
@@ -169,7 +179,7 @@ class Scene:
         )
 
     def error(self, y: np.ndarray) -> float:
-        """Return the largest error of a component of the final state `y`, relative to the largest component."""
+        """Return the largest component of the error of the final state `y`, relative to that of the exact state."""
         return float(np.max(np.abs(np.asarray(y) - self.end)) / np.max(np.abs(self.end)))
 
     def drift(self, y: np.ndarray) -> float | None:
@@ -213,7 +223,10 @@ def _jitted_array(function: Any, njit: Any) -> Any:
 
 
 def _bodies(gm: list[float]) -> Functions:
-    """Return N bodies by sums over arrays, G = 1, with energy, momentum and angular momentum."""
+    """Return the functions of N bodies with G times the masses `gm`, computed by sums over arrays.
+
+    The invariants are energy, momentum and angular momentum.
+    """
     case = import_module("eip_scipy_studies.hard_cases").n_body(gm, 1.0, 3)
     m, n = np.array(gm), len(gm)
 
@@ -228,7 +241,10 @@ def _bodies(gm: list[float]) -> Functions:
 
 
 def _jitted_bodies(gm: np.ndarray, njit: Any) -> Functions:
-    """Return N bodies by loops over pairs, with the compiled invariants of `nbody`."""
+    """Return the functions of N bodies with G times the masses `gm`; `fun` and `acc` are jitted loops over pairs.
+
+    The invariants and their gradients are the plain Python functions of `_bodies`.
+    """
 
     @njit
     def acc(t, q, out):  # type: ignore[no-untyped-def]
@@ -257,7 +273,10 @@ def _jitted_bodies(gm: np.ndarray, njit: Any) -> Functions:
 
 
 def _nls(points: int, length: float) -> Functions:
-    """Return i psi' = -psi'' / 2 - |psi|^2 psi on a ring, by FFT, with mass and energy."""
+    """Return the functions of i dpsi/dt = -(d/dx)^2 psi / 2 - |psi|^2 psi on a ring of this length, by FFT.
+
+    The invariants are mass and energy.
+    """
     k2 = (2 * np.pi * np.fft.fftfreq(points, length / points)) ** 2
     dx = length / points
 

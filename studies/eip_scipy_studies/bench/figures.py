@@ -19,7 +19,7 @@ SHORT = {PYTHON: "python", COMPILED: "compiled", OWN: "own"}
 
 
 def drawn(rows: list[Row], machine: str) -> Iterator[tuple[Where, str, Any]]:
-    """Yield the place of each figure, the name of its file, and the figure."""
+    """Yield (suite, problem, kind of function), file name and figure of each figure of error against time."""
     from ..plotting import side_by_side_figure
 
     known = groups(rows)

@@ -26,7 +26,9 @@ class Found:
     Attributes
     ----------
     machine, date : str
+        Description of the machine, and the day of the measurement as year-month-day.
     rows : list of Row
+        The runs and failures of all methods.
     versions : dict
         Versions of the packages, including ours, by their names with pip.
     absent : dict
@@ -45,7 +47,10 @@ class Found:
 
 @dataclass(frozen=True)
 class Table:
-    """Table of the report: a heading, the heads of its columns, rows of cells, and lines below."""
+    """Table of the report: a heading, the heads of its columns, rows of cells, and lines below.
+
+    `where` is the suite, problem and kind of function of a table at equal error, and None for other tables.
+    """
 
     title: str
     head: list[str]
@@ -75,7 +80,7 @@ def _times(value: float) -> str:
 
 
 def _equal_error(found: Found, suite: str) -> list[Table]:
-    """Make a table for each problem and kind of function: times at each level of error, and ratios to our best time."""
+    """Make a table for each problem and kind of function: times at each error of `LEVELS`, and ratios to our best."""
     known = [each for each in standings(found.rows) if each.suite == suite]
     tables = []
     for where in dict.fromkeys((each.suite, each.scene, each.takes) for each in known):
@@ -106,7 +111,7 @@ def _factor(value: float) -> str:
 
 
 def _losses(group: list[Standing]) -> list[str]:
-    """Make a line for each reason: the packages that are faster for this reason, with ratio and level of error."""
+    """Make a line for each reason: the methods that are faster for this reason, with ratio and error."""
     by_reason: dict[str, list[str]] = {}
     for each in group:
         if each.lost:
@@ -148,7 +153,7 @@ def _tables(found: Found, suite: str) -> list[Table]:
 
 
 def _failures(found: Found, suite: str) -> list[str]:
-    """Return the first error or warning of each package in each problem."""
+    """Return a line with the first error of each method on each problem of a suite; none for the suite "asked"."""
     if SUITES[suite].task == "asked":
         return []
     said: dict[str, str] = {}
@@ -159,7 +164,7 @@ def _failures(found: Found, suite: str) -> list[str]:
 
 
 def _field(found: Found) -> Table:
-    """List the packages, the functions they take, and those that did not run."""
+    """Make the table of the packages: version, and the functions they take or the reason why they did not run."""
     rows = []
     for name in dict.fromkeys(peer.distribution for peer in PEERS.values()):
         if name in found.versions or name in found.absent:
@@ -184,7 +189,7 @@ HOW = (
 
 
 def text(found: Found) -> str:
-    """Lay out all tables for a terminal."""
+    """Return all tables and failures as text for a terminal."""
     parts = [f"Side by side with the field, {found.date}", found.machine]
     for suite in _suites(found):
         parts += ["", f"=== {SUITES[suite].title} ===", SUITES[suite].note]
@@ -203,7 +208,7 @@ def text(found: Found) -> str:
 
 
 def markdown(found: Found, names: Mapping[Where, str]) -> str:
-    """Lay out all tables for the documentation, with the names of the figures next to them."""
+    """Return all tables and failures as Markdown, with links to the files `names` of the figures."""
 
     def cell(value: str) -> str:
         return value.replace("|", "\\|").replace("<", "&lt;").replace("__", "\\_\\_")

@@ -28,9 +28,9 @@ class Reply:
     answers : list of dict
         Answers that it gave until its end, or until it was stopped.
     version : str or None
-        Version of the package.
+        Version of the package; None if the worker did not report it.
     first : float or None
-        Seconds from the start of the process to its first answer.
+        Seconds from the start of the process to its first answer; None if there was none.
     failed : str
         Reason why the worker did not finish; empty if it did.
     """

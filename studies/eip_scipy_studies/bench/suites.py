@@ -1,4 +1,8 @@
-"""The suites: problems with their exact ends, and the settings at which each package is run."""
+"""The suites: problems with their exact final states, and the settings at which each package is run.
+
+A record is the description of a problem in a request to the module `worker`: a dict with the fields of `Scene`, the
+settings, and the kinds of functions with which the problem is run.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +36,10 @@ class Suite:
     task : str
         Task of the worker: "precision", "first", "asked" or "overhead".
     make : callable
-        ``make()(peer)`` returns the problems of a request to the worker, with the settings of this method; an empty
-        list if the method is not run.
+        ``make()(peer)`` returns the records that the method `peer` runs, with the settings of this method; an empty
+        list if it runs none.
     note : str
-        Explanation for the reader.
+        Explanation that the report prints.
     """
 
     name: str
@@ -64,7 +68,7 @@ def _record(
 
 
 def _for(peer: Peer, records: list[dict[str, Any]], tolerances: tuple[float, ...] = TOLERANCES) -> list[dict[str, Any]]:
-    """Return those of the problems (records of a request) that this method runs, with its settings."""
+    """Return those of the records that this method runs, with its settings: numbers of steps, or else `tolerances`."""
     if " LSODA" in peer.name.upper():
         tolerances = tuple(max(tolerance, TIGHTEST) for tolerance in tolerances)
     found = []
@@ -98,7 +102,10 @@ RIGID_BODY = {
 
 
 def kepler() -> list[dict[str, Any]]:
-    """Return three small systems; runs of compiled code are longer, because the checks of a call take milliseconds."""
+    """Return six records: three small systems over a short time, and for compiled code over a time 20 times as long.
+
+    Compiled code needs longer runs, because the checks of a call take milliseconds.
+    """
     orbit, regular, top = (case.problem for case in hard_cases(["kepler_e06", "henon_heiles_regular", "euler_top"]))
     compiled = COMPILED, OWN
 
@@ -125,7 +132,7 @@ def kepler() -> list[dict[str, Any]]:
 
 
 def solar() -> list[dict[str, Any]]:
-    """Return the outer and the full solar system."""
+    """Return three records: the outer solar system, and the full one over a year and, for compiled code, 100 years."""
     (outer,) = hard_cases(["outer_solar_system"])
     stored = stored_cases()[outer.name]["params"]
     gm = [stored["G"] * m for m in stored["masses"]]
@@ -155,24 +162,30 @@ def solar() -> list[dict[str, Any]]:
 
 
 def particle() -> list[dict[str, Any]]:
-    """Return a charge in a plane."""
+    """Return one record: a charge in a plane."""
     return [_case("boris_2d", "charged particle", "particle")]
 
 
 def field() -> list[dict[str, Any]]:
-    """Return a soliton on a ring, so wide and finely resolved that the closed form is that of the grid to 1e-10."""
+    """Return one record: a soliton on a ring.
+
+    The ring is so wide and so finely resolved that the closed form solves the discrete equations to 1e-10.
+    """
     problem = soliton(points=256, length=50.0, t_end=2.0)
     assert problem.reference is not None
     return [_record("NLS soliton", "nls", problem.y0, problem.reference(2.0), 2.0, length=50.0)]
 
 
 def hard() -> list[dict[str, Any]]:
-    """Return some of the hard cases, as plain functions."""
+    """Return the records of the hard cases `HARD`, which are run with plain Python functions only."""
     return [_case(name, name.replace("_", " "), "case", takes=(PYTHON,)) for name in HARD]
 
 
 def members() -> list[dict[str, Any]]:
-    """Return Kepler orbits of e = 0 ... 0.6 over whole revolutions, so that the end is the start."""
+    """Return one record: `MEMBERS` Kepler orbits of e = 0 ... 0.6 over whole revolutions, so that the end is the start.
+
+    There are `TURNS` revolutions.
+    """
     e = np.linspace(0.0, 0.6, MEMBERS)
     starts = np.array([1 - e, 0 * e, 0 * e, np.sqrt((1 + e) / (1 - e))]).T
     steps = {"EIPRKN12": _geometric(200, 1000, 5)}
@@ -181,7 +194,7 @@ def members() -> list[dict[str, Any]]:
 
 
 def first_use() -> list[dict[str, Any]]:
-    """Return one short problem, which each method solves in a new process."""
+    """Return one record: a short Kepler orbit, which each method solves in a new process."""
     (orbit,) = hard_cases(["kepler_e03"])
     steps = {"EIPRKN12": [250], "EIPGJ12": [4000], "heyoka": [1e-9]}
     t_end = orbit.problem.t_span[1]
@@ -190,7 +203,7 @@ def first_use() -> list[dict[str, Any]]:
 
 
 def asking() -> list[dict[str, Any]]:
-    """Return problems that ask for more than the solution of a real system: a complex state, invariants, events."""
+    """Return three records that ask for more than the solution of a real system: complex state, invariants, events."""
     (orbit,), (wave,) = hard_cases(["kepler_e03"]), hard_cases(["three_wave"])
     steps = {"EIPRKN12": [250], "EIPGJ12": [4000]}
     real = ("kepler", orbit.problem.y0, orbit.end, orbit.problem.t_span[1], steps, (PYTHON, COMPILED, OWN))
@@ -203,9 +216,10 @@ def asking() -> list[dict[str, Any]]:
 
 
 def _one_setting(records: list[dict[str, Any]]) -> Callable[[Peer], list[dict[str, Any]]]:
-    """Return a function that gives the records with one tolerance to a method, as a `make` of `Suite` returns it.
+    """Return a function of a method, as a `make` of `Suite` returns it, that gives the records with one tolerance.
 
-    Only the first method of each package for each kind of function gets any.
+    Methods with fixed steps get the numbers of steps in the records. Only the first method of each package for each
+    kind of function gets any records.
     """
     able = [peer for peer in PEERS.values() if _for(peer, records)]
     first = {(peer.distribution, peer.takes): peer.name for peer in reversed(able)}.values()
@@ -233,7 +247,7 @@ def _described() -> tuple[Suite, ...]:
 
 
 def cheap() -> list[dict[str, Any]]:
-    """Return a rigid body, whose right-hand side is cheap: three components of three products each."""
+    """Return one record: a rigid body, whose right-hand side is cheap, with three components that are products."""
     return [record for record in kepler() if record["title"] == "rigid body, t = 1000"]
 
 

@@ -30,7 +30,11 @@ Answers = Iterator[dict[str, Any]]
 
 
 def precision(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Yield time and errors of each problem at its settings, from the loosest on."""
+    """Yield time, error and drift of the method on each problem at each of its settings, in their order.
+
+    If a run fails, yield the first line of its error in their place. After a run that takes longer than the request's
+    `patience`, the further settings of the problem are left out.
+    """
     for record in request["scenes"]:
         try:
             scene = scene_from(record)
@@ -72,7 +76,7 @@ def _points(
 
 
 def _least(action: Callable[[], np.ndarray], enough: float, repeats: int) -> tuple[float, np.ndarray]:
-    """Return the least time of a call, and its result.
+    """Return the least time of a call in seconds, and the result of the last call.
 
     There are at most `repeats` calls, and none after `enough` seconds in all.
     """
@@ -95,7 +99,7 @@ def first(peer: Peer, request: Mapping[str, Any]) -> Answers:
 
 
 def asked(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Yield the response of the package to each request: the first line of its error or warning, or the accuracy."""
+    """Yield the response of the package to each problem: the first line of its error or warning, or the accuracy."""
     for record in request["scenes"]:
         scene, extra = scene_from(record), dict(record["extra"])
         functions = scene.plain()
@@ -121,7 +125,7 @@ def _crossing(t: float, y: np.ndarray) -> float:
 
 
 def overhead(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Yield the time that a package adds to each evaluation of the user's function in a run."""
+    """Yield the seconds that a package adds to each evaluation of the user's function in a run, and the run's error."""
     (record,) = request["scenes"]
     scene = scene_from(record)
     setting = record["settings"][0]
@@ -146,12 +150,12 @@ def _call(fun: Callable[..., Any], y: np.ndarray) -> Any:
 
 
 class _Counting(Scene):
-    """A problem whose function counts its calls."""
+    """A problem that counts the calls of its plain `fun` and `acc` in the class attribute ``calls``."""
 
     calls = 0
 
     def plain(self) -> Functions:
-        """Return the functions of the problem, wrapped to count their calls."""
+        """Return the functions of the problem; calls of `fun` and `acc` are counted."""
         functions = super().plain()
 
         def counted(fun: Callable[..., Any]) -> Callable[..., Any]:

@@ -56,10 +56,10 @@ class FieldScheme:
 
     Attributes
     ----------
-    psi : ndarray
+    psi : ndarray, shape (n,)
         The state, flat.
     nfev : int
-        Number of pairs of transforms so far.
+        Number of pairs of transforms since `start`.
     """
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
@@ -126,12 +126,12 @@ class FixedPoint:
         self._means: list[np.ndarray] = []
 
     def solve(self, rhs: Callable[[np.ndarray, np.ndarray], float], guess: np.ndarray) -> tuple[np.ndarray, str]:
-        """Find m. It is returned in an array that is used again after three further calls.
+        """Find m. The array that is returned is overwritten in the third call after this one.
 
         Parameters
         ----------
         rhs : callable
-            ``rhs(m, values)`` replaces `values` by the right-hand side at m, and returns the norm of their change.
+            ``rhs(m, values)`` replaces `values` (n,) by the right-hand side at m, and returns the norm of their change.
         guess : ndarray, shape (n,)
             First iterate, used until three solutions are known; then a parabola through these is extrapolated.
 
@@ -161,7 +161,9 @@ class FixedPoint:
         self._means.append(mean)
         if residual <= bound:
             return mean, ""
-        return mean, f"the iteration left a residual of {residual:.1e}, expected {bound:.1e}; take a smaller h"
+        return mean, (
+            f"the iteration left a residual of {residual:.1e}, expected {bound:.1e}; take a smaller h or a larger tol"
+        )
 
 
 class Implicit(FieldScheme):
@@ -174,7 +176,7 @@ class Implicit(FieldScheme):
     ----------
     gpe : GrossPitaevskii
     psi : ndarray, shape (n,)
-        A typical state.
+        A typical state, from which the constant w of `FixedPoint` is computed.
     tol : float
         See `FixedPoint`.
     """
@@ -191,14 +193,14 @@ class Implicit(FieldScheme):
         self._solver = None
 
     def solver(self, c: float) -> tuple[FixedPoint, bool]:
-        """Return the solver for `c`, and whether it has just been made, so that it has no earlier solutions."""
+        """Return the solver for `c`, and True if it has just been made and therefore has no earlier solutions."""
         new = self._solver is None or self._solver.c != c
         if self._solver is None or new:
             self._solver = FixedPoint(self, self._tol, c, self._w)
         return self._solver, new
 
     def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with the potential W for a step from `start` with this mean."""
+        """Fill `out` (n,) with the potential W for a step from `start` whose two states have the mean `mean`."""
         raise NotImplementedError
 
     def cross(self, solver: FixedPoint, start: np.ndarray) -> str:
@@ -219,10 +221,10 @@ def check_tol(tol: Any) -> float:
     Raises
     ------
     ValueError
-        If it does not lie between round-off and 1.
+        If it is not a number from 1e-15 to 1, exclusive of 1.
     """
     if isinstance(tol, bool) or not isinstance(tol, (int, float, np.integer, np.floating)) or not 1e-15 <= tol < 1:
-        raise ValueError(f"tol must be a number from 1e-15 to 1, got {tol!r}")
+        raise ValueError(f"tol must be a number from 1e-15 to 1, exclusive of 1, got {tol!r}")
     return float(tol)
 
 
@@ -235,7 +237,9 @@ def check_equation(gpe: Any) -> GrossPitaevskii:
         If it is not a `GrossPitaevskii`.
     """
     if not isinstance(gpe, GrossPitaevskii):
-        raise TypeError(f"gpe must be a GrossPitaevskii, got {type(gpe).__name__}; of a problem pass problem.equation")
+        raise TypeError(
+            f"gpe must be a GrossPitaevskii, got {type(gpe).__name__}; for a problem, pass problem.equation"
+        )
     return gpe
 
 
@@ -248,7 +252,10 @@ def march(
     save_every: int | None,
     observe: Callable[[Any], float] = lambda scheme: math.nan,
 ) -> tuple[FieldResult, np.ndarray]:
-    """Run a scheme over `t_span`; return its result, and the values of `observe(scheme)` at the saved states."""
+    """Run the scheme ``make(gpe, psi)`` from ``psi = y0`` over `t_span`.
+
+    Return its result, and the values (m,) of ``observe(scheme)`` at the saved states; they are nan after a failure.
+    """
     steps = FixedSteps.of(t_span, h, save_every)
     psi = check_equation(gpe).as_field(y0).reshape(-1)
     if not np.isfinite(psi).all():

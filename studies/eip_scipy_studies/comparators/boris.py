@@ -80,7 +80,7 @@ def boris(
         raise ValueError(f"y0 must hold position and velocity, 6 components, got {y.size}")
     refuse_units(mass=mass, charge=charge)
     if not (mass > 0 and np.isfinite(mass) and np.isfinite(charge)):
-        raise ValueError(f"mass must be positive and charge finite, got {mass!r} and {charge!r}")
+        raise ValueError(f"mass must be positive and finite, and charge finite, got {mass!r} and {charge!r}")
     steps = FixedSteps.of(t_span, h, save_every)
     ratio = charge / mass
     return run_in_place("boris", fields, steps, y, params, name="fields", takes=3, fills=6, constant=ratio)

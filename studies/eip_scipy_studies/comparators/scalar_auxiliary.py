@@ -120,7 +120,7 @@ def _shift(gpe: GrossPitaevskii, psi: np.ndarray, shift: Any) -> float:
 
 
 class _SAV(FieldScheme):
-    """The scheme of `sav_crank_nicolson`, with its scalar variable `r`."""
+    """The scheme of `sav_crank_nicolson`; the attributes `r` and `shift` are its r and C."""
 
     def __init__(self, gpe: GrossPitaevskii, shift: float) -> None:
         super().__init__(gpe)

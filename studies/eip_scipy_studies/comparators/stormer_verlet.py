@@ -15,7 +15,7 @@ FORMS = ("kick-drift-kick", "drift-kick-drift")
 
 
 class StormerVerletResult(FixedStepResult):
-    """Result of `stormer_verlet`: a `FixedStepResult` with states (q, v) and evaluations of the acceleration."""
+    """Result of `stormer_verlet`: a `FixedStepResult` with states (q, v), whose `nfev` counts calls of `acc`."""
 
 
 def stormer_verlet(

@@ -2,10 +2,10 @@
 
 Two problems on 64 x 64 points of [0, 2 pi)^2, beta = 1, to t = 1. The paper's plane wave is a stationary state: the
 gradients of mass and energy are parallel, so that a projection onto both has rank 1 (counted in the table), |psi|^2 is
-constant, so that the linear systems of LIC need no iteration, and splittings are exact. None of this holds for the
-modulated wave. Explicit steps are limited by the grid, the others are not. Times are processor seconds, the least of
-several runs taken in turn, minus the least time of a run of a single step, which removes the set-up of up to 20 ms.
-All methods use the same library of transforms.
+constant, so that the linear systems of LIC (`linearly_implicit`) need no iteration, and splittings are exact. None of
+this holds for the modulated wave. Explicit steps are limited by the grid, the others are not. Times are processor
+seconds, the least of several runs taken in turn, minus the least time of a run of a single step, which removes the
+set-up of up to 20 ms. All methods use the same library of transforms.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Contender(NamedTuple):
 
 
 def stable_steps(problem: FieldProblem) -> list[float]:
-    """Return lengths of steps below the stability limit of RK4, which divide the interval."""
+    """Return the lengths of the steps of RK4: `SHARES` of its stability limit, shortened to divide the interval."""
     assert problem.equation is not None
     limit = problem.equation.largest_step(problem.y0)
     return [T_END / ceil(T_END / (share * limit)) for share in SHARES]
@@ -75,12 +75,15 @@ def _own(problem: FieldProblem, h: float, t_end: float, base: Any, names: Sequen
 
 
 def runge_kutta(*names: str) -> Contender:
-    """Return EIP on RK4 with these invariants; plain RK4 without any."""
+    """Return RK4 with projection onto the invariants `names` ("mass", "energy"); without names plain RK4."""
     return Contender(lambda problem, h, t_end: _own(problem, h, t_end, lambda gpe: EIPRK4, names), stable_steps)
 
 
 def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Contender:
-    """Return EIP on the one-step method `base(gpe)` with the invariants `names`; without names the plain method."""
+    """Return the one-step method ``base(gpe)`` with projection onto the invariants `names`, run at these steps.
+
+    Without names it is the plain method.
+    """
 
     def run(problem: FieldProblem, h: float, t_end: float) -> Any:
         return _own(problem, h, t_end, lambda gpe: eip_method(base(gpe)), names)
@@ -89,7 +92,7 @@ def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Cont
 
 
 def implicit(scheme: Callable[..., Any]) -> Contender:
-    """Return one of the paper's implicit schemes."""
+    """Return one of the paper's implicit schemes, a function of `comparators`, as a method that is run at `LONG`."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> tuple[np.ndarray, int, str]:
         result = scheme(problem.equation, (0.0, t_end), problem.y0, h)
@@ -112,7 +115,10 @@ METHODS = {
 
 
 def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
-    """Return the problem of a modulated plane wave, and its final state by SciPy's DOP853 at its tightest tolerance."""
+    """Return the problem of a modulated plane wave, and its final state (n,) by SciPy's DOP853.
+
+    DOP853 runs at its tightest tolerance.
+    """
     gpe = plane_wave((points, points), fft=make_transforms().name).equation
     assert gpe is not None
     x, y = gpe.grid.mesh()
@@ -129,13 +135,14 @@ class Trial:
     Parameters
     ----------
     problem : FieldProblem
-    exact : ndarray
+    exact : ndarray, shape (n,)
         Exact state at the end.
 
     Attributes
     ----------
     rows : dict
-        Numbers of a run by (method, h).
+        For each (name of a method, h) the results of its run by their names: `errors`, "seconds", "pairs" of transforms
+        and "remark".
     """
 
     def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:
@@ -144,7 +151,7 @@ class Trial:
         self._single: dict[str, float] = {}  # seconds of a single step, including set-up
 
     def runner(self, name: str) -> Callable[[float], tuple[float, np.ndarray]]:
-        """Return ``run(h) -> (seconds, final state)`` of a method, for `work_precision`."""
+        """Return ``run(h) -> (seconds, final state)`` of a method, for `work_precision`; a run also fills `rows`."""
         method = METHODS[name]
 
         def run(h: float) -> tuple[float, np.ndarray]:
@@ -160,7 +167,10 @@ class Trial:
         return run
 
     def errors(self, y: np.ndarray) -> dict[str, float]:
-        """Return the errors of the final state, and the relative errors of mass and energy there."""
+        """Return the errors of the final state of `y` (n, 2): maximum, L2 norm, and relative errors of mass and energy.
+
+        `y` are the states at the start and at the end.
+        """
         gpe, (start, end) = self.problem.equation, y.T
         assert gpe is not None
         difference = end - self.exact
@@ -172,7 +182,7 @@ class Trial:
         }
 
     def methods(self) -> dict[str, tuple[Callable[[float], tuple[float, np.ndarray]], Sequence[float]]]:
-        """Return `runner` and the steps of each method."""
+        """Return, by the name of each method, its function `runner` and the lengths of its steps."""
         return {name: (self.runner(name), method.steps(self.problem)) for name, method in METHODS.items()}
 
     def measure(self, repeats: int, callback: Callable[[], Any]) -> None:
@@ -190,7 +200,7 @@ class Trial:
         return np.array([row[key] for (method, _), row in self.rows.items() if method == name])
 
     def slope(self, name: str) -> float:
-        """Return the fitted order of a method.
+        """Return the order of a method: the slope of a line fitted to the logarithms of error and h.
 
         It is nan if fewer than two errors lie between round-off and the largest that is fitted, for example for a
         splitting on the plane wave, which is exact.
@@ -229,9 +239,9 @@ class Efficiency(Study[Found]):
     repeats : int
         Number of runs of each method and step; the least time counts.
     orders : mapping of str to int
-        Expected slopes.
+        Expected slopes, the orders of the methods, by the methods' names.
     stem : str
-        Stem of the files' names.
+        Stem of the names of the files that the command writes.
     """
 
     points: int = 64
@@ -252,7 +262,10 @@ class Efficiency(Study[Found]):
         return trials
 
     def checks(self, found: Found) -> list[Slope]:
-        """Compare the slopes with the methods' orders, and the invariant errors of EIP-ME with round-off."""
+        """Compare slopes with the orders of the methods, and invariant errors of EIP-ME on the modulated wave with 0.
+
+        Slopes that are nan are not compared.
+        """
         slopes = [
             Slope(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
             for wave, trial in found.items()
@@ -331,7 +344,7 @@ def _number(value: float, form: str) -> str:
 
 
 def runs_text(trials: Found) -> str:
-    """Lay out a table of all runs."""
+    """Return a table of all runs of each wave as text."""
     parts = []
     for wave, trial in trials.items():
         body = []

@@ -67,7 +67,7 @@ class VortexLines(QuenchStudy):
         return {"h": self.step, "t_end": self.t_end}
 
     def measure(self, session: Session) -> QuenchRuns:
-        """Search the state, show that it is a saddle, and do all runs."""
+        """Find the stationary state, show that it is a saddle of the energy, and do all runs from it."""
         before, after = (line_condensate(Omega, self.points) for Omega in (OMEGA_BEFORE, OMEGA_AFTER))
         start = kept_state(self, session, before, lambda update: search_saddle(self.points, update))
         with searching(session) as update:
@@ -158,7 +158,10 @@ def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
 
 
 def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
-    """Return the surface of equal density, with the sector marked that contains the followed line."""
+    """Return the surface of equal density `LEVEL` in the k-th saved state.
+
+    The sector of the surface that contains the line `Motion.followed` is marked.
+    """
     from ..plotting import SurfacePanel
 
     surface = density_surface(made.quench.equation, _field(made, k), LEVEL)

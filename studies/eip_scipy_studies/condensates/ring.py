@@ -33,9 +33,9 @@ class Ring(QuenchStudy):
     Attributes
     ----------
     condensate : callable
-        ``condensate(kappa, points)`` returns the equation.
+        ``condensate(kappa, points)`` returns the equation, see `ring_condensate`.
     kappas : (float, float)
-        Values of kappa before and after the quench, the sudden change of the trap at t = 0.
+        Values of kappa, which determines the trap, before and after the quench, its sudden change at t = 0.
     saved : float
         Time between two saved states.
     """
@@ -92,7 +92,7 @@ class Ring(QuenchStudy):
         return self.do_runs(quench, session)
 
     def pictures(self, found: QuenchRuns) -> Figures:
-        """Draw density and vortices at some times, and if asked for as a movie."""
+        """Draw density and vortices at the times `snapshots` and, if `movie`, at all saved times as a movie."""
         from ..plotting import fields_figure, fields_movie
 
         quench, fields, moved = found.quench, found.fields, found.moved
@@ -114,7 +114,7 @@ class Ring(QuenchStudy):
 
 
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
-    """Return one panel for each saved state, all cropped as the first one, whose condensate is the largest."""
+    """Return one panel for each saved state, all cropped to the region that the condensate reaches in any of them."""
     from ..plotting import FieldPanel
 
     fields = np.abs(gpe.grid.field(y)) ** 2

@@ -46,7 +46,7 @@ class Quench:
     Attributes
     ----------
     name : str
-        Name in its files.
+        Stem of the names of the files.
     title : str
     problem : FieldProblem
         Problem after the quench, with the step of RK4. It starts from the stationary state before the quench.
@@ -100,10 +100,14 @@ class FieldRun:
     Attributes
     ----------
     t : ndarray, shape (m,)
+        Saved times.
     mass_error, energy_error, field_error : ndarray, shape (m,)
-        Absolute errors; the last is the norm of the difference from the reference.
+        Absolute errors: of mass and energy the change since the start, of the field the norm of the difference from
+        the reference.
     wall_time : float
+        Seconds spent in the run.
     nfev : int
+        Number of evaluations of the right-hand side.
     n_rank_reduced : int
         Number of projections in which the gradients were parallel, as at a stationary state.
     """
@@ -125,6 +129,7 @@ class QuenchRuns:
     ----------
     quench : Quench
     lines : dict of str to FieldRun
+        The runs by the names of their methods.
     reference, fields : ndarray, shape (n, m), or None
         States of the reference, and of the method `SHOWN`, whose fields are drawn.
     moved : Motion or None
@@ -154,7 +159,8 @@ class Motion:
     vortices : list of Vortices
         One entry for each time.
     angle : ndarray, shape (m,)
-        Mean angle by which they have turned about the centre, positive anticlockwise [rad].
+        Angle by which the vortices have turned about the centre since the start, positive anticlockwise [rad]: the sum
+        of the medians of their turns from one state to the next.
     """
 
     t: np.ndarray
@@ -164,7 +170,7 @@ class Motion:
     def off(self, k: int, x: Any, y: Any) -> Any:
         """Return polar angles of points (x, y) relative to that of a reference vortex in the k-th state, in (-pi, pi].
 
-        The reference is the vortex with the largest x at the start, turned by the mean angle of all vortices.
+        The reference is the vortex with the largest x at the start, turned by `angle`.
         """
         a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
         return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
@@ -211,8 +217,8 @@ def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
 def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
     """Find the vortices in all states, and the angle by which they have turned.
 
-    From one state to the next, each vortex is extrapolated and matched with the nearest one; the median of the turns
-    counts.
+    From one state to the next, the angle of each vortex is extrapolated and matched with the nearest one; the angle of
+    `Motion` increases by the median of the turns.
 
     Parameters
     ----------
@@ -236,7 +242,7 @@ def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
 def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
     """Return the median turn of vortices from angles `old` to `new`.
 
-    Each old angle plus `guess` is matched with the nearest new one.
+    Each old angle plus `guess` is matched with the nearest new one. Without vortices the turn is `guess`.
     """
     if not (old.size and new.size):
         return guess
@@ -265,7 +271,7 @@ def _checks(made: QuenchRuns) -> list[FieldCheck]:
 
 
 def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
-    """Lay out the errors, the vortices and the checks."""
+    """Return the errors, the vortices and the checks as text."""
     quench, moved = made.quench, made.moved
     head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
     head += [["error of", "psi"], ["rank", "reduced"]]
@@ -323,12 +329,14 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
     seed: int = option(0, "seed of the random starts (default: %(default)s)", type=int, metavar="N")
 
     def do_runs(self, quench: Quench, session: Session) -> QuenchRuns:
-        """Run the reference and each of `METHODS`; an interrupt by the user keeps the completed runs.
+        """Run the reference and each of `METHODS`, and follow the vortices in the run of `SHOWN`.
 
         Raises
         ------
         RuntimeError
             If a run fails.
+        PartlyDone
+            If the user interrupts the runs after at least one of `METHODS` is completed; the error holds these.
         """
         made = QuenchRuns(quench)
         run = partial(_run, quench, session.shown, self.checkpoint_options)
@@ -368,7 +376,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         return numbers
 
     def figures(self, found: QuenchRuns) -> Figures:
-        """Draw the errors in time, and the fields."""
+        """Draw the errors against time, and the fields (see `pictures`)."""
         from ..plotting import ErrorSeries, errors_figure
 
         quench = found.quench
@@ -386,7 +394,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
 
     @abstractmethod
     def pictures(self, found: QuenchRuns) -> Figures:
-        """Draw the fields."""
+        """Draw the fields at the times `snapshots`; yield the file names and figures."""
 
 
 def _moved(made: QuenchRuns) -> Motion | None:

@@ -69,7 +69,7 @@ class Found:
     Attributes
     ----------
     label : str
-        Property that distinguishes its start, for the table.
+        Property that distinguishes the start or, in the trap, the equation from the others; heads a row of the table.
     equation : GrossPitaevskii
     state : GroundState
     published : float or None
@@ -122,7 +122,10 @@ def search_ring(seed: int, update: Update) -> Found:
 
 
 def lines(settings: GroundStates, update: Update) -> list[Found]:
-    """Return states of the paper's 3D condensate from starts with 0 ... 4 lines, and the saddle with four."""
+    """Return states of the paper's 3D condensate found from noisy starts with 0 ... 4 vortex lines, and the saddle.
+
+    The saddle, the last one, is the state of `search_saddle`.
+    """
     gpe = line_condensate(points=LINE_POINTS)
     rng = np.random.default_rng(settings.seed)
     found = []
@@ -146,7 +149,7 @@ def search_saddle(points: int, update: Update) -> Found:
 
 
 def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
-    """Add a little noise to a saddle and continue the descent, which then leads to a lower state."""
+    """Return the lower state to which the descent of the energy leads from a saddle with a little noise."""
     update("lines, down from the saddle")
     start = with_noise(saddle, np.random.default_rng(seed))
     state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
@@ -257,7 +260,10 @@ class GroundStates(Study[Results]):
         return {"states": _rows(found), "checks": [check.record for check in self.checks(found)]}
 
     def figures(self, found: Results) -> Figures:
-        """Write the fields that `gpe ring` starts from, and draw densities and vortices."""
+        """Write the lowest states of the ring and of the lines as npz files, and draw densities and vortices.
+
+        ``gpe ring`` can start from ring.npz.
+        """
         for name, states in found.items():
             if name != "trap":
                 yield f"{name}.npz", partial(_save, min(states, key=lambda item: item.state.energy))
@@ -331,9 +337,10 @@ def _counted(count: int, kind: str) -> str:
 def cropped(
     density: np.ndarray, grid: Grid, axes: tuple[int, int], half: float | None = None
 ) -> tuple[np.ndarray, Ends]:
-    """Cut the middle out of a density in a plane; return it with its ends along both axes.
+    """Return the middle part of a density in a plane, and its ends: lower and upper along the first and second axis.
 
-    It reaches to `half` on all sides; by default it contains the condensate and a margin.
+    `axes` are the axes of `grid` in this plane. The part reaches from the centre to `half` on all sides; by default it
+    contains the condensate and a margin.
     """
     if half is None:
         seen = (np.any(density > VISIBLE * density.max(), axis=1 - k) for k in (0, 1))
@@ -348,7 +355,7 @@ def cropped(
 
 
 def save_state(path: Path, item: Found) -> Path:
-    """Write a state as an npz file without pickled objects."""
+    """Write a state and its equation as an npz file without pickled objects; return `path`."""
     return write_file(path, partial(_save, item))
 
 
@@ -414,7 +421,9 @@ def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {name: file[name] for name in ("psi", "V", "lower", "upper", "Omega", "beta")}
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UsageError(f"cannot read a state from {str(path)!r}: {error}") from error
+        raise UsageError(
+            f"cannot read a state from {str(path)!r}: {error}. Give another file, or leave out --resume or --start."
+        ) from error
     expected: dict[str, Any] = {
         "lower": gpe.grid.lower,
         "upper": gpe.grid.upper,
@@ -425,7 +434,8 @@ def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
     for name, value in expected.items():
         if np.shape(value) != content[name].shape or not np.allclose(value, content[name], rtol=1e-12):
             raise UsageError(
-                f"{str(path)!r} holds a state of another equation: its {name} differs from that of {gpe!r}"
+                f"{str(path)!r} holds a state of another equation: its {name} differs from that of {gpe!r}. "
+                "Give a state that was computed for this equation, or leave out --resume or --start."
             )
     psi = content["psi"]
     if psi.shape != gpe.grid.shape or psi.dtype.kind != "c" or not np.isfinite(psi).all():

@@ -55,19 +55,20 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """One run.
+    """Result of one run.
 
     Attributes
     ----------
     error : float
-        Relative error of the final state; nan for a run that did not reach the end.
+        Relative error of the final state, see `HardCase.error`; nan for a run that did not reach the end.
     drift : float
-        Largest relative change of an invariant.
+        Largest relative change of an invariant, see `HardCase.drift`; nan for a run that raised an error.
     steps, nfev : int
+        Numbers of steps and of evaluations of the right-hand side; 0 for a run that raised an error.
     failure : str
         Reason why the run did not reach its end; empty if it did.
     rank_reduced, rejected_projections : int
-        Steps with parallel gradients, and projections that failed.
+        Numbers of projections with linearly dependent gradients, and of projections that failed.
     """
 
     error: float
@@ -88,7 +89,8 @@ class Comparison:
     case : HardCase
     plain, projected : CaseOutcome
     nearby : tuple of float
-        For a case that gets worse: the gain at rtol times and divided by sqrt(10), and with the euclidean metric.
+        For a case that gets worse by projection, three values of `gain`: at rtol times sqrt(10), at rtol divided by
+        sqrt(10), and at rtol with the euclidean metric. Empty for other cases.
     """
 
     case: HardCase
@@ -98,7 +100,7 @@ class Comparison:
 
     @property
     def gain(self) -> float:
-        """Return the factor by which projection reduces the final error."""
+        """Return the final error without projection divided by that with projection."""
         return _ratio(self.plain.error, self.projected.error)
 
 
@@ -107,7 +109,7 @@ def _ratio(a: float, b: float) -> float:
 
 
 def adaptive_methods() -> dict[str, type[EIPSolver]]:
-    """Return the solver classes with adaptive steps for systems of the first order."""
+    """Return the solver classes with adaptive steps for systems of the first order, by their names."""
     return {
         name: method
         for name, method in fixed_step_methods().items()
@@ -126,7 +128,7 @@ def _tolerance(text: str) -> float:
 
 
 def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | None) -> CaseOutcome:
-    """Run one case.
+    """Run one case with one method.
 
     Parameters
     ----------
@@ -134,7 +136,7 @@ def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | No
     method : type
     rtol : float
     metric : str or None
-        None: no projection.
+        Metric of the projection; None: no projection.
 
     Returns
     -------
@@ -215,7 +217,7 @@ def geometric_mean(values: Iterable[float]) -> float:
 
 
 def summary(results: Sequence[Comparison]) -> dict[str, Any]:
-    """Compute the numbers that `bars` compares with bounds."""
+    """Return the numbers, by their names, that `bars` compares with bounds: of gain, drift and failures."""
     worst = min(results, key=lambda r: r.gain if r.gain == r.gain else -math.inf)
     drifts = [r.projected.drift for r in results]
     return {
@@ -230,7 +232,9 @@ def summary(results: Sequence[Comparison]) -> dict[str, Any]:
 
 
 def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -> list[Check]:
-    """Check the results; bars on drift and errors are set for EIPRK45 at 1e-6 and EIPDOP853 at 1e-9 only.
+    """Check the results against bars: bounds on the number of failures, the drift and the errors.
+
+    Bars on drift and errors are set for EIPRK45 at rtol = 1e-6 and EIPDOP853 at 1e-9 only.
 
     Parameters
     ----------
@@ -351,7 +355,10 @@ def _worse(results: Sequence[Comparison]) -> list[str]:
 
 
 def cause(result: Comparison) -> str:
-    """Return why a case gets worse, or at least whether it does at neighbouring tolerances."""
+    """Return why projection makes a case worse.
+
+    If this is not known, return whether projection also does so at neighbouring tolerances.
+    """
     if result.case.name in CAUSES:
         return CAUSES[result.case.name]
     if geometric_mean([result.gain, *result.nearby[:2]]) >= 1:

@@ -111,7 +111,10 @@ class HardScene:
         return float(np.linalg.norm((y - self.end)[:half].reshape(-1, self.dimensions), axis=1).max())
 
     def invariant_errors(self, y: np.ndarray) -> tuple[float, float]:
-        """Return the largest error of H and of L along states in columns: relative, or absolute if the value is 0."""
+        """Return the largest errors of H and of L in the states `y` (n, m).
+
+        They are relative to the first value, or absolute if this is 0.
+        """
         found = []
         for item in self.problem.invariants:
             values = np.array([np.atleast_1d(item.fun(0.0, state, *item.args)) for state in y.T])
@@ -121,7 +124,7 @@ class HardScene:
         return energy, momentum
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return G m and the initial state for REBOUND.
+        """Return G times the masses (N,) and the initial state (6 N,) of N bodies in space, for REBOUND.
 
         REBOUND has no fixed centre, so that Kepler's problem becomes one of two equal masses.
         """
@@ -133,7 +136,7 @@ class HardScene:
         return np.array([0.5, 0.5]), np.stack([relative / 2, -relative / 2], axis=1).ravel()
 
     def from_bodies(self, y: np.ndarray) -> np.ndarray:
-        """Return states of the bodies of `bodies`, in columns, as states of the problem."""
+        """Return states (6 N, m) of the bodies of `bodies` as states (n, m) of the problem."""
         if self.dimensions == 3:
             return y
         q1, q2, v1, v2 = y.reshape(4, 3, -1)
@@ -183,14 +186,16 @@ def scene(name: str) -> HardScene:
 
 
 class Outcome(NamedTuple):
-    """One run.
+    """Result of one run.
 
     Attributes
     ----------
     y : ndarray, shape (n, m)
         Saved states, the last at the end.
     nfev : int
+        Number of evaluations of the right-hand side; 0 for IAS15 unless `look` of `Contender.run` is true.
     wall_time : float
+        Seconds.
     failure : str
         Reason why the run did not reach its end; empty if it did.
     """
@@ -202,7 +207,7 @@ class Outcome(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """A way to run a problem.
+    """A method with its settings for one problem.
 
     Attributes
     ----------
@@ -221,14 +226,16 @@ class Contender(NamedTuple):
 
 
 class Point(NamedTuple):
-    """A method at one setting.
+    """Result of a method on a problem at one setting.
 
     Attributes
     ----------
     scene, method, setting : str
+        Names of the problem, of the method, and of the setting (see `Contender`).
     value : float
         Value of the setting.
     nfev : int
+        Number of evaluations of the right-hand side.
     wall_time : float
         Seconds, the least of several runs.
     error : float

@@ -38,7 +38,10 @@ LEVELS = (1e-2, 1e-4, 1e-6, 1e-8)
 
 
 class KeplerPoint(NamedTuple):
-    """One run: its step or relative tolerance, evaluations of f, seconds, and the final error of the position."""
+    """Result of a method at one `setting`, a step or a relative tolerance.
+
+    It has the number of evaluations of f, the least time in seconds, and the final error of the position.
+    """
 
     method: str
     setting: float
@@ -48,7 +51,7 @@ class KeplerPoint(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The runs, those of each method in ascending cost, and the machine."""
+    """The results of all runs, and the description of the machine."""
 
     points: list[KeplerPoint]
     machine: str

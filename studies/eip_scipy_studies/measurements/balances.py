@@ -54,11 +54,12 @@ MOST_TIMES, MOST_UNWARNED, LEAST_GAIN = 1.5, 3.0, 100.0
 
 
 class Case(NamedTuple):
-    """A system in one rotation of the axes: a function that runs it, its sets of balances, and its settings.
+    """A system in one rotation of the axes, or with one phase or start, and the settings of its runs.
 
-    `steps` are the options h, or rtol and atol. `finer` is the number of steps of the reference in one step, or the
-    ratio of the tolerances. The error is the largest length of an error vector; `places` are the parts of the state
-    that are these vectors.
+    ``run(**options)`` returns a run by `integrate`, and `sets` are the sets of balances by their names. `steps` are the
+    options h, or rtol and atol. `finer` is the number of steps of the reference in one step, or the tolerances divided
+    by those of the reference. `places` are the slices of the state that hold the vectors (such as positions of bodies)
+    whose errors count: the error of a state is the largest length of their differences from the reference.
     """
 
     run: Callable[..., Any]
@@ -71,10 +72,11 @@ class Case(NamedTuple):
 class System(NamedTuple):
     """A system, and the conditions (bars) that its results must fulfil.
 
-    ``make(rotation, number)`` returns a `Case`, and `unit` is the unit of the error. `helps`: balances must not
-    increase the error more than `MOST_TIMES`; otherwise a run with more than `MOST_UNWARNED` times the error must come
-    with a warning. `gains`: the error must be `LEAST_GAIN` times smaller. `drawn` is the label of the error in the
-    figure, if it is drawn. `times` converts errors to `unit`.
+    ``make(rotation, number)`` returns the `Case` for a rotation matrix (3, 3) and its number 0, 1, ..., from which
+    phases and starts are made. `unit` is the unit of the error. If `helps`, the error with balances must be at most
+    `MOST_TIMES` that without; otherwise a run with more than `MOST_UNWARNED` times the error must come with a warning.
+    If `gains`, the error must be `LEAST_GAIN` times smaller. `drawn` is the label of the error in the figure; a system
+    with "" is not drawn. `times` is the factor that converts errors to `unit`.
     """
 
     make: Callable[[np.ndarray, int], Case]
@@ -148,7 +150,11 @@ def laplace_loss(t, y, c):
 
 
 def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[str, Any] | None = None) -> Any:
-    """Return a function that makes the case of a planet with e = 0.2 and this drag."""
+    """Return a function that makes the case of a planet with e = 0.2 and the drag -`strength` times the velocity.
+
+    It has `steps` steps per revolution. `rates`, if given, are other rates of the energy by their names, wrong ones;
+    each is then a set.
+    """
     energy = Balance(kepler_energy, energy_loss, name="E")
     others = [Balance(spin, spin_loss, name="h"), Balance(laplace, laplace_loss, name="e")]
     sets = {"E": energy, "E, h, e": [energy, *others]}
@@ -167,7 +173,7 @@ def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[st
 
 
 def leo(days: float) -> Any:
-    """Return a function that makes the case of a satellite in a low orbit."""
+    """Return a function that makes the case of a satellite in a low orbit, over a number of days."""
     a, e, tilt = EARTH["radius"] + 420, 2e-3, math.radians(51.6)
     speed = math.sqrt(EARTH["mu"] / a * (1 + e) / (1 - e))
     start = np.array([[a * (1 - e), 0, 0], [0, speed * math.cos(tilt), speed * math.sin(tilt)]])
@@ -192,7 +198,10 @@ def bodies(
     names: tuple[str, ...], years: float, h: float, finer: int, data: str = "de440", relativity: bool = False,
     wrong: bool = False,
 ) -> Any:  # fmt: skip
-    """Return a function that makes the case of some bodies of DE440; the Sun's error does not count."""
+    """Return a function that makes the case of some bodies of a data set over `years`; the Sun's error does not count.
+
+    `h` is the step in years, and `finer` is that of `Case`. With `wrong` the balance is that of the Moon about the Sun.
+    """
     known = load(data)
     places = [list(known.bodies).index(name) for name in names]
     gm = known.gm[places] * YEAR_D**2
@@ -217,7 +226,7 @@ def bodies(
 
 
 def asteroid(turned: np.ndarray, turn: int) -> Case:
-    """Return an asteroid inside the orbit of Jupiter, a = 3.7 AU and e = 0.1, for 2000 years (281 revolutions)."""
+    """Return the case of an asteroid inside the orbit of Jupiter, with a = 3.7 AU and e = 0.1, for 2000 years."""
     sun, gm = 4 * math.pi**2, np.array([4 * math.pi**2, 4 * math.pi**2 / 1047.35, 0.0])
     q = np.array([[0, 0, 0], [0, 5.2 * 0.95, 0], [3.7 * 0.9, 0, 0]])
     speeds = math.sqrt((sun + gm[1]) / 5.2 * 1.05 / 0.95), math.sqrt(sun / 3.7 * 1.1 / 0.9)
@@ -238,7 +247,7 @@ def about_the_first(t, y, p):
 
 @njit
 def rate_about_the_first(t, y, p):
-    """Return the rate of `about_the_first`, from the pulls of the second body on the third and on the first."""
+    """Return the rate of change of `about_the_first`, from the pulls of the second body on the third and the first."""
     near = ((y[6] - y[3]) ** 2 + (y[7] - y[4]) ** 2 + (y[8] - y[5]) ** 2) ** 1.5
     far = ((y[0] - y[3]) ** 2 + (y[1] - y[4]) ** 2 + (y[2] - y[5]) ** 2) ** 1.5
     rate = 0.0
@@ -248,7 +257,10 @@ def rate_about_the_first(t, y, p):
 
 
 def encounter(turned: np.ndarray, turn: int) -> Case:
-    """Return an asteroid that passes the Earth at 5e-4 AU with 10 km/s after the first of two years; rtol 1e-9."""
+    """Return the case of an asteroid that passes the Earth at 5e-4 AU with 10 km/s after the first of two years.
+
+    The run is adaptive, with rtol = 1e-9.
+    """
     gm = 4 * math.pi**2 * np.array([1, 3.003e-6, 0])
     earth, speed = np.array([1.0, 0, 0]), math.sqrt(gm[0] + gm[1])
     q = np.array([[0, 0, 0], earth, earth + [5e-4, 0, 0]])
@@ -356,7 +368,7 @@ VARYING = ParticleField(
 
 
 def held(turned: np.ndarray, turn: int) -> Case:
-    """Return a charged particle over some 400 gyrations, which starts in several directions of the velocity."""
+    """Return the case of a charged particle over some 400 gyrations; `turn` gives the direction of its velocity."""
     start = [0.5, 0, 0], [0.3 * math.sin(turn), 0.3 * math.cos(turn), 0]
     made = {
         name: charged_particle(VARYING, *start, t_span=(0, 2000), form="velocity", balances=name)
@@ -370,7 +382,10 @@ def held(turned: np.ndarray, turn: int) -> Case:
 
 
 def condensate(turned: np.ndarray, turn: int) -> Case:
-    """Return a packet in a trap, with losses and Pitaevskii's damping, by RK4; it starts at several places."""
+    """Return the case of a packet in a trap, with losses and Pitaevskii's damping, by RK4.
+
+    The packet starts at 1 + 0.05 `turn`.
+    """
     grid = Grid(48, -8, 8)
     equation = DampedGrossPitaevskii(grid, harmonic_trap(1), beta=10.0, damping=1e-4, chemical_potential=3.0, loss=1e-4)
     packet = np.exp(-((grid.points(0) - 1 - 0.05 * turn) ** 2) / 4)
@@ -381,7 +396,7 @@ def condensate(turned: np.ndarray, turn: int) -> Case:
 
 
 def wave(turned: np.ndarray, turn: int) -> Case:
-    """Return the breather of the sine-Gordon equation, with damping 1e-4."""
+    """Return the case of the sine-Gordon breather of frequency 0.5 + 0.05 `turn`, with damping 1e-4."""
     scene = sine_gordon_breather(frequency=0.5 + 0.05 * turn)
     equation, n = SineGordon(Grid(512, -40, 40), damping=1e-4), scene.y0.size // 2
     problem = equation.problem(scene.y0[:n], scene.y0[n:], 200.0)
@@ -408,7 +423,10 @@ def swing_power(t, y, a, b, c, d, w, phase):
 
 
 def oscillator(a: float, b: float, c: float, d: float, w: float, end: float, h: float = 0.4) -> Any:
-    """Return a function that makes the case of an oscillator; the error is that of (x, v)."""
+    """Return a function that makes the case of x'' = -a x - b x^3 - c x' + d cos(w t + phase) to t = `end`.
+
+    The phase is `turn`, and the error is that of the vector (x, v).
+    """
 
     def make(turned: np.ndarray, turn: int) -> Case:
         run = runner(fun=swinging, t_span=(0, end), y0=[1.0, 0.3], args=(a, b, c, d, w, float(turn)))
@@ -446,7 +464,7 @@ def partial_power(t, y, c):
 
 
 def chaos(turned: np.ndarray, turn: int) -> Case:
-    """Return a chaotic orbit of Hénon and Heiles with the energy 1/7, from several starts."""
+    """Return the case of a chaotic orbit of Hénon and Heiles with energy 1/7 and y = 0.05 `turn` - 0.1 at the start."""
     y = 0.05 * turn - 0.1
     speed = math.sqrt(2 * (1 / 7 - 0.5 * y * y + y**3 / 3))
     run = runner(fun=henon, t_span=(0, 200), y0=[0, y, speed * 0.96, speed * 0.28], args=(1e-5,))
@@ -496,17 +514,23 @@ SYSTEMS = {
 
 
 def runner(**start: Any) -> Callable[..., Any]:
-    """Return ``run(**options)``, which calls `integrate` by EIPDOP853 with the arguments `start` and these options."""
+    """Return ``run(**options)``, which calls `integrate` with EIPDOP853, the arguments `start` and these options."""
     return lambda **options: integrate(method=EIPDOP853, **start, **options)
 
 
 def of(problem: Any, method: Any = EIPDOP853) -> Callable[..., Any]:
-    """Return ``run(**options)``, which calls `integrate` for a problem with these options."""
+    """Return ``run(**options)``, which calls `integrate` for a problem with this method and these options."""
     return lambda **options: integrate(problem, method=method, **options)
 
 
 class Row(NamedTuple):
-    """Errors without and with one set of balances (`kept`) in one rotation, and the warnings of the run."""
+    """Errors of a system without and with one set of balances (`kept`) in the rotation of number `turn`.
+
+    `calls` and `calls_with` are the numbers of calls of the right-hand side, `without` and `with_balances` the errors,
+    in the unit of the `System`. `slowness` is the largest `Diagnostics.slowness` of a balance, `warned` tells whether
+    the run with balances gave a warning or was not reliable, and `said` are these texts. `of_reference` is the error of
+    the reference.
+    """
 
     system: str
     kept: str
@@ -522,7 +546,7 @@ class Row(NamedTuple):
 
 
 class Found(NamedTuple):
-    """All rows, and for each system of the figure its times, errors without balances and errors with balances."""
+    """All rows, and for each system that is drawn its times, errors without balances and errors with balances (m,)."""
 
     rows: list[Row]
     curves: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -537,7 +561,7 @@ def finer_steps(case: Case, share: float = 1.0) -> dict[str, Any]:
 
 
 def distance(case: Case, a: np.ndarray, b: np.ndarray) -> Any:
-    """Return the largest distance between `a` and `b` among the vectors at `places` of the state."""
+    """Return the largest distance between states `a` and `b`, (n,) or (n, m), among the vectors at `places`."""
     return np.max([np.linalg.norm((a - b)[part], axis=0) for part in case.places], axis=0)
 
 
@@ -566,7 +590,7 @@ def measured(name: str, system: System, turned: np.ndarray, turn: int) -> list[R
 
 
 def curve(system: System, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times and errors without and with the first set of balances."""
+    """Return saved times (m,) of the run, and the errors (m,) there without and with the first set of balances."""
     case = system.make(turned, 0)
     every = 16 * max(1, round(case.run(**case.steps, invariants=()).nfev / 12 / 16 / SHOWN))
     right = case.run(**finer_steps(case), save_every=every * case.finer)
@@ -654,7 +678,11 @@ def grouped(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def summary(rows: list[Row]) -> dict[str, float]:
-    """Return medians of the errors and the gain, and the largest values of the other columns."""
+    """Return the medians of the errors and of the gain (error without over error with balances) over the rows.
+
+    The other numbers are the largest inverse gain ("worst"), the largest slowness and error of the reference, and the
+    number of rows with a warning ("warned").
+    """
     return {
         "without": float(np.median([row.without for row in rows])),
         "with": float(np.median([row.with_balances for row in rows])),
@@ -667,7 +695,7 @@ def summary(rows: list[Row]) -> dict[str, float]:
 
 
 def bars(groups: Mapping[tuple[str, str], list[Row]]) -> list[str]:
-    """Return a line for each condition that does not hold: too small a gain, a larger error, or no warning about it."""
+    """Return a line for each condition of `System` that does not hold, or the line "all bars hold"."""
     lines = []
     for (name, kept), rows in groups.items():
         system, one = SYSTEMS[name], summary(rows)

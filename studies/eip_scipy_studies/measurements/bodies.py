@@ -41,7 +41,10 @@ Found = dict[int, dict[str, Any]]
 
 @dataclass(frozen=True)
 class Row:
-    """Results of an integrator: steps per innermost period, milliseconds for a step and for a period, and its error."""
+    """Results of an integrator: steps per innermost period, milliseconds for a step and for a period, and the error.
+
+    The error is a distance, in units of the innermost semi-major axis.
+    """
 
     steps: float
     step: float
@@ -116,7 +119,7 @@ def _compare(n: int, periods: int, rebound: Any) -> dict[str, Any]:
 
 
 def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict[str, Row], dict[str, float]]:
-    """Return the rows of this package, and the shares of the time that the projection takes."""
+    """Return the rows of this package by the names of its runs, and what `_shares` returns."""
     coarse, h = f"EIPRKN12, {COARSE} steps", PERIOD / COARSE
     shared, alone = problem.y0.size >= 6 * SHARED, working_alone()
     actions = {"EIPRKN12": alone(partial(_seconds, problem))}
@@ -133,7 +136,7 @@ def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict
 
 
 def _shares(problem: Problem) -> dict[str, float]:
-    """Return the shares of the time that the projection takes.
+    """Return the shares of the time of a run that the projection takes, for ``every=10`` and ``every=1``.
 
     They are computed from processor times, which other programs hardly change.
     """

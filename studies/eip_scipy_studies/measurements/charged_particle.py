@@ -44,7 +44,10 @@ ROUNDS = 5
 
 
 def speed(turns: int, share: float) -> dict[str, float]:
-    """Return microseconds per step on the banana orbit, from `share` of the steps, for each method."""
+    """Return the microseconds per step of each method on the banana orbit, the least of `turns` measurements.
+
+    A run has `share` of `SPEED_STEPS`, or of `SOLVE_IVP_STEPS` in solve_ivp.
+    """
     problem, other = tokamak(), tokamak(form="velocity")
     h, rhs = problem.h, problem.rhs
     assert h is not None
@@ -94,7 +97,10 @@ def speed_text(best: dict[str, float]) -> str:
 
 
 class Point(NamedTuple):
-    """Result of one method at one setting: seconds, and errors of position and guiding centre at the end."""
+    """Result of a method on a problem at one setting: seconds, and errors of position and guiding centre at the end.
+
+    The setting is a step in units of the paper's step, or a tolerance.
+    """
 
     scene: str
     method: str
@@ -107,8 +113,8 @@ class Point(NamedTuple):
 class Case(NamedTuple):
     """One method at one setting.
 
-    ``seconds()`` times a run that saves no states; ``states()`` returns saved times and states, which include the last
-    gyrations.
+    ``seconds()`` runs it without saving states and returns the seconds that this took; ``states()`` returns saved times
+    (m,) and states (6, m), which include the last gyrations.
     """
 
     method: str
@@ -119,9 +125,9 @@ class Case(NamedTuple):
 
 
 def cases(problem: ParticleProblem, other: ParticleProblem, with_heyoka: bool) -> Iterator[Case]:
-    """Yield all methods and settings, which are steps in units of the paper's step, or tolerances.
+    """Yield all methods with their settings, which are steps in units of the paper's step, or tolerances.
 
-    `other` is the same problem with states (x, v).
+    `other` is the same problem as `problem`, but with states (x, v).
     """
     fine, wide, wider = (1.0, 0.5, 0.25, 0.125), (2.0, 1.0, 0.5, 0.25), (4.0, 2.0, 1.0, 0.5)
     for name, method, factors in (("RK4", EIPRK4, fine), ("RK45", EIPRK45, wide), ("DOP853", EIPDOP853, wider)):
@@ -143,7 +149,10 @@ def cases(problem: ParticleProblem, other: ParticleProblem, with_heyoka: bool) -
 
 
 def spacing(factor: float) -> int:
-    """Return the number of steps between two saved states, which are at multiples of the paper's step."""
+    """Return the number of steps between two saved states for steps of `factor` times the paper's.
+
+    The saved states are then at multiples of the paper's step.
+    """
     return max(round(1 / factor), 1)
 
 
@@ -199,7 +208,10 @@ def tail_times(problem: ParticleProblem) -> np.ndarray:
 
 
 def costs(name: str, repeats: int, share: float, with_heyoka: bool) -> list[Point]:
-    """Run all methods in turn on a share of one problem's interval; the least time of `repeats` turns counts."""
+    """Return the results of all methods on `share` of the interval of one problem.
+
+    The methods run in turn, and the least time of `repeats` turns counts.
+    """
     problem, other = (shortened(scene(name, form=form), share) for form in ("canonical", "velocity"))
     assert problem.h is not None
     # The reference has 1/4 of the paper's step, compensated: it is 1e-9 from the states stored with the problem.
@@ -224,7 +236,10 @@ def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
 
 
 def errors(orbit: ParticleOrbit, truth: ParticleOrbit) -> tuple[float, float]:
-    """Return errors of position and of the averaged guiding centre at the end."""
+    """Return the errors at the end of the position and of the guiding centre averaged over a gyration, as distances.
+
+    They are nan if the last states of `orbit` are not finite.
+    """
     step = round(float(np.median(np.diff(orbit.t))) / float(np.median(np.diff(truth.t))))
     count = TAIL // step + 1
     tail = ParticleOrbit(orbit.problem, orbit.t[-count:], np.ascontiguousarray(orbit.y[:, -count:]))
@@ -236,7 +251,7 @@ def errors(orbit: ParticleOrbit, truth: ParticleOrbit) -> tuple[float, float]:
 
 
 class Found(NamedTuple):
-    """Microseconds for a step, and the points of error against cost."""
+    """Microseconds for a step by the names of the methods, and the points of error against cost."""
 
     speed: dict[str, float]
     points: list[Point]

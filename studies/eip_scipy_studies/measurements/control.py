@@ -51,14 +51,15 @@ CHANGED = [*CONTROLS][1:]
 
 
 def floats(a: np.ndarray) -> np.ndarray:
-    """Return real or complex numbers as floats; real and imaginary parts become neighbours."""
+    """Return real or complex numbers as floats; the real and imaginary part of a number become neighbours."""
     return np.ascontiguousarray(a).view(float)
 
 
 def correction(change: np.ndarray, G: np.ndarray, weights: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """Return the shortest correction, in the metric of the weights, that changes the invariants by `change`.
+    """Return the shortest correction (n,) that changes the invariants by `change` (l,).
 
-    `G` are the gradients as rows of floats, and `like` is a state.
+    Its length is the norm of its components divided by `weights` (n,). `G` are the gradients as rows of floats, see
+    `floats`. The correction has the dtype of the state `like`.
     """
     sigma = np.repeat(weights / weights.max(), G.shape[1] // like.size)
     sizes = np.maximum(np.linalg.norm(G * sigma, axis=1), 1e-290)
@@ -69,7 +70,8 @@ def correction(change: np.ndarray, G: np.ndarray, weights: np.ndarray, like: np.
 class Projected:
     """The projected step of a method with another step control, in the form of a `OneStepMethod`.
 
-    It projects by itself, so that runs with it have no invariants.
+    `one_step` projects the state and returns an error estimate whose norm is the one that controls the step. Runs with
+    this method are therefore given no invariants.
     """
 
     def __init__(self, case: HardCase, method: type[EIPSolver], rtol: float, control: str) -> None:
@@ -104,7 +106,7 @@ class Projected:
         self.ends[y_new.tobytes()] = memory, K[-1]
 
         def norm(weights: Any) -> float:
-            """Return SciPy's norm of the estimate after a projection with these weights; None: without a projection."""
+            """Return SciPy's norm of the estimate after a projection with these weights, or of all of it for None."""
             left = [e if weights is None else e - correction(G @ floats(e), G, weights, y) for e in (err, low)]
             fine, coarse = (((abs(e) / scale) ** 2).sum() for e in left)
             return float(fine / np.sqrt((fine + 0.01 * coarse) * y.size or 1.0))
@@ -129,7 +131,11 @@ def run_one(case: HardCase, name: str, exponent: float, control: str) -> dict[st
 
 
 def relative_cost(found: Sequence[dict[str, Any]], control: str) -> float:
-    """Return the calls of f of a control relative to those of the package's control, as a mean over equal errors."""
+    """Return the calls of f of a control divided by those of the package's control ("before") at the same error.
+
+    It is the geometric mean over the errors that both reach; nan if one of them has no run with an error below
+    `LARGEST`.
+    """
     runs = [[row for row in found if row["control"] == x and row["error"] < LARGEST] for x in ("before", control)]
     curves = [([row["nfev"] for row in rows], [row["error"] for row in rows]) for rows in runs]
     if not all(runs):
@@ -139,7 +145,7 @@ def relative_cost(found: Sequence[dict[str, Any]], control: str) -> float:
 
 
 def lines(found: Sequence[dict[str, Any]], method: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the rows of a method: its cases, and the geometric means of the relative costs."""
+    """Yield the rows of the table for a method: one with the relative costs in each case, and their geometric means."""
     own, costs = [row for row in found if row["method"] == method], []
     yield method, []
     for case in dict.fromkeys(row["case"] for row in own):

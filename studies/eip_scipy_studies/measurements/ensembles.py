@@ -51,7 +51,7 @@ def starts(members: int) -> np.ndarray:
 
 
 def seconds(members: int, steps: int, executor: Any) -> float:
-    """Return the wall time of an ensemble, from call to result."""
+    """Return the wall time in seconds of an ensemble of Kepler orbits, from call to result."""
     y0s = starts(members)
     begin = time.perf_counter()
     run = ensemble(kepler(), (0.0, steps * H), y0s, h=H, executor=executor)
@@ -61,7 +61,7 @@ def seconds(members: int, steps: int, executor: Any) -> float:
 
 
 def single(members: int, steps: int) -> float:
-    """Return the total time of `members` single runs, without the time before their steps."""
+    """Return the total wall time in seconds of `members` single runs, without the time before their steps."""
     problem, y0s = kepler(), starts(members)
     return sum(integrate(problem, (0.0, steps * H), y0, method=EIPRK4, h=H, check=False).wall_time for y0 in y0s)
 
@@ -69,9 +69,10 @@ def single(members: int, steps: int) -> float:
 def in_turns(
     actions: Mapping[str, tuple[Callable[[], float], Callable[[], float]]], repeats: int
 ) -> dict[str, dict[str, float]]:
-    """Return the least wall and processor times of each action.
+    """Return the least wall and processor time in seconds of each action, by the name of the action.
 
     An action is a pair: a clock of the processor time of its workers, and a function that returns the seconds it took.
+    The actions take turns, `repeats` times.
     """
     found = {name: {"wall": np.inf, "processor": np.inf} for name in actions}
     for _ in range(repeats):
@@ -84,7 +85,7 @@ def in_turns(
 
 
 def threads(members: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Measure single runs, an ensemble on one thread, and one on two threads."""
+    """Return the times, as from `in_turns`, of single runs, an ensemble on one thread, and one on two threads."""
     ways = {
         "single runs, loop only": lambda: single(members, steps),
         "one thread": lambda: seconds(members, steps, 1),
@@ -94,7 +95,7 @@ def threads(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
 
 
 def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Measure an ensemble on one worker of Dask, and on two."""
+    """Return the times, as from `in_turns`, of an ensemble on one worker of Dask, and on two."""
     local_client = needed("eip_scipy.integrations.dask").local_client
     clients = {"one Dask worker": local_client(1), "two Dask workers": local_client(2)}
     try:
@@ -112,9 +113,10 @@ def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
 
 
 def memory(members: int) -> dict[str, float]:
-    """Return the memory of a process that runs an ensemble: megabytes of all states, of its peak, and of the run alone.
+    """Return the memory of a process that runs an ensemble, with the number of members.
 
-    The last number is the peak less the memory after the imports and the making of the starts.
+    It is given as the size of all states ("states", in units of 1e6 bytes), the peak of the process ("peak") and the
+    peak less the memory after the imports and the making of the starts ("above", both in units of 2^20 bytes).
     """
     code = MEMORY.format(members=members, h=H)
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

@@ -34,7 +34,11 @@ EARTH = 3.003e-6  # solar masses
 
 
 class System(NamedTuple):
-    """A problem, the period of its innermost planet, and the numbers of steps per period."""
+    """A system of planets and the steps with which it is run.
+
+    The fields are a problem, the period of its innermost planet [yr], whether it has relativity, and numbers of steps
+    per period for EIPGJ14 (`multistep`), EIPRKN12 (`nystrom`) and WHFast (`whfast`).
+    """
 
     problem: Problem
     period: float
@@ -47,7 +51,10 @@ class System(NamedTuple):
 def planets(
     star: float, elements: list[tuple[float, float, float, float, float, float]], years: float, relativity: bool = False
 ) -> Problem:
-    """Return bodies on ellipses about a star of the given mass [solar masses], in the frame of their barycentre.
+    """Return the problem of planets on ellipses about a star of mass `star` [solar masses], to t = `years`.
+
+    The units are AU and years, and the barycentre is at rest at the origin. With `relativity` the potential of the star
+    has a relativistic term in 1/r^2.
 
     `elements` of each planet: mass [solar masses], semi-major axis [AU], eccentricity, inclination, argument of the
     pericentre and mean anomaly [rad].
@@ -105,7 +112,7 @@ SYSTEMS = {"resonant chain": chain, "e = .6": eccentric, "hot Jupiter": hot_jupi
 
 
 def methods(system: System) -> Methods:
-    """Return a row for each method and each number of steps in the innermost period."""
+    """Return the runs of a system: of each method with each of its numbers of steps per period, and of IAS15."""
     problem, period, force = system.problem, system.period, {"prepare": potential} if system.relativity else {}
 
     def some(name: str, run: Any, counts: tuple[int, ...]) -> Methods:

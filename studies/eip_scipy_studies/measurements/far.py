@@ -30,7 +30,7 @@ DECADES = (100.0, 1000.0, 10_000.0, 100_000.0)
 
 
 def ways() -> dict[str, dict[str, Any]]:
-    """Return the options of each run of this package."""
+    """Return the options of `integrate` for each run of this package, by the name of the run."""
     return {
         FINEST: {"method": EIPGJ14, "h": 1 / 1024, **orbits_kept()},
         "EIPGJ14, balances, 1/512 yr": {"method": EIPGJ14, "h": 1 / 512, **orbits_kept()},
@@ -40,9 +40,10 @@ def ways() -> dict[str, dict[str, Any]]:
 
 
 class Found(NamedTuple):
-    """Times, and for each run its seconds and the distances (m, 10) of the bodies from the finest run [AU].
+    """Results: times (m,) in years, and wall times in seconds and errors of the runs by their names.
 
-    `known`: distances of the finest run from the reference, at its times.
+    `apart` are the distances [AU] (m, 10) of the bodies from their places in the finest run, for each other run.
+    `known` are the distances [AU] (10,) of the finest run from the packaged reference, at the times which this has.
     """
 
     times: np.ndarray

@@ -49,7 +49,10 @@ def equation(shape: Shape, fft: str) -> tuple[GrossPitaevskii, np.ndarray]:
 
 
 def right_hand_side(shape: Shape, seconds: float) -> Times:
-    """Return the least times [ms] of f and of its transforms alone, for each library of transforms."""
+    """Return the least times [ms] of the right-hand side f and of its transforms alone.
+
+    The keys are (library of transforms, "f" or "transforms"); `seconds` is the duration of the measurement.
+    """
     functions = {}
     for fft in (name for name in LIBRARIES if find_spec(name) is not None):
         gpe, psi = equation(shape, fft)
@@ -66,7 +69,10 @@ def right_hand_side(shape: Shape, seconds: float) -> Times:
 
 
 def steps(shape: Shape, seconds: float) -> Times:
-    """Return least times [ms] of a step of each variant by `integrate` and in `solve_ivp`, and of SciPy's RK45."""
+    """Return the least times [ms] of a step of each of `VARIANTS`, and of a step of SciPy's RK45 in `solve_ivp`.
+
+    The keys are (variant or "RK45", "integrate" or "solve_ivp"); `seconds` is the duration of the measurement.
+    """
     gpe, psi = equation(shape, "auto")
     h = 0.2 * gpe.largest_step(psi)
     functions: dict[Any, Any] = {}

@@ -35,17 +35,20 @@ SPLITTING_STEPS = (2.5e-3, 2e-3, 1.6e-3, 1.25e-3, 1e-3)
 
 
 def grid_error(gpe, turning, resting):
-    """Return the norm of the difference between the solutions in both frames, which the grid causes."""
+    """Return the norm of the difference between the final fields in the rotating frame and in the frame at rest.
+
+    `turning` and `resting` are pairs (problem, final state). The difference is caused by the grid.
+    """
     angle = gpe.Omega * turning[0].t_span[1]
     return float(np.sqrt(gpe.mass(rotated(gpe, resting[1], angle).ravel() - turning[1])))
 
 
 def runners(psi, t_end, points):
-    """Return the methods, and what is needed to judge their results.
+    """Return the methods to run from the field `psi` to the time `t_end`, and what is needed to judge the runs.
 
-    These are (run, steps) of each method; the invariant errors by (method, h), which runs fill in; the error of the
-    grid; and a function that returns the norm of a difference. ``run(h) -> (seconds, y)``, where y is the difference of
-    the final state from the reference in the same frame.
+    The four results are a dict of (run, steps) by method; a dict of (change of mass, change of energy) by (method, h),
+    which the runs fill in; the result of `grid_error`; and a function that returns the norm of a field.
+    ``run(h) -> (seconds, y)``, where y is the difference of the final state from the reference in the same frame.
     """
     gpe = ring_condensate(0.7, points=points)
     problem = gpe.problem(psi, t_end)
@@ -83,7 +86,7 @@ def runners(psi, t_end, points):
 
 
 class Found(NamedTuple):
-    """Results of all methods and steps, changes of mass and energy by (method, h), and the error of the grid."""
+    """Results of all methods and steps, changes of (mass, energy) by (method, h), and the result of `grid_error`."""
 
     points: tuple[WorkPoint, ...]
     defects: dict[tuple[str, float], tuple[float, float]]

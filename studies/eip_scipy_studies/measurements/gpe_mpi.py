@@ -41,14 +41,14 @@ def world() -> Any:
 
 
 def wait():
-    """Wait for all ranks, sleeping meanwhile."""
+    """Wait until all ranks have called this function, sleeping meanwhile."""
     request = world().Ibarrier()
     while not request.Test():
         time.sleep(1e-4)
 
 
 def timed(function, comm):
-    """Return the seconds of the slowest rank."""
+    """Call `function` on all ranks of `comm` at once, and return the wall time of the slowest rank in seconds."""
     comm.Barrier()
     begin = time.perf_counter()
     function()
@@ -62,9 +62,9 @@ def start(gpe):
 
 
 class Case:
-    """The equation on the first `ranks` ranks, or, if `ranks` is 0, on a single one without MPI.
+    """The Gross-Pitaevskii equation on the first `ranks` ranks, or, if `ranks` is 0, on a single one without MPI.
 
-    On the other ranks `here` is False, and there is nothing else.
+    On the other ranks the attribute `here` is False, and the object has no equation and no solvers.
     """
 
     def __init__(self, shape, ranks):
@@ -89,12 +89,12 @@ class Case:
         return method(self.gpe.fun, 0.0, self.psi, 1e3, h=h, invariants=invariants, metric="euclidean")
 
     def measure(self):
-        """Return the least seconds of f, of a step without invariants, and of one that keeps mass and energy."""
+        """Return the least seconds (3,) of a call of f, a step without invariants, and one keeping mass and energy."""
         functions = [lambda: self.gpe.rhs(0.0, self.psi, self.out), *(solver.step for solver in self.solvers)]
         return np.array([min(timed(function, self.comm) for _ in range(IN_A_ROW)) for function in functions])
 
     def results(self):
-        """Return whole fields on rank 0: f at the start, and the state after some steps with projection."""
+        """Return two fields, whole on rank 0: f at the start, and the state after `STEPS` steps with projection."""
         solver = self.solvers[1]
         for _ in range(STEPS):
             solver.step()
@@ -109,7 +109,11 @@ def counts():
 
 
 def compare(shape, seconds):
-    """Return rows {ranks: (f, step of RK4, step of EIP-ME in ms, relative errors of f and of the state)}, on rank 0."""
+    """Return, on rank 0, {ranks: [times of f, of RK4 and of EIP-ME in ms, relative errors of f and of the state]}.
+
+    The times are those of one call or one step; EIP-ME keeps mass and energy. Errors are differences from the run
+    without MPI. Other ranks return an empty dict. `seconds` is the time that is spent on measuring.
+    """
     cases = {ranks: Case(shape, ranks) for ranks in counts()}
     results = {}
     for ranks, case in cases.items():

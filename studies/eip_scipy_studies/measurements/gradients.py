@@ -1,8 +1,8 @@
 """``eip-scipy study gradients``: cost of a compiled gradient compared with one written by hand.
 
-Each system runs by `integrate` in turn with hand-written jitted gradients and without any, so that they are compiled
-from the invariants. The ratio is that of the least times. The hand-written gradients compute common terms once, as an
-author would write them.
+Each system runs by `integrate` in turn with hand-written jitted gradients and without any, so that the gradients are
+compiled from the invariants. The ratio is that of the least times. The hand-written gradients compute common terms
+once, as an author would write them.
 """
 
 from __future__ import annotations
@@ -161,7 +161,10 @@ SYSTEMS = {
 
 
 def seconds(name: str, written: bool) -> float:
-    """Return the seconds per step of one run, with gradients written by hand or compiled."""
+    """Return the seconds per step of a run of the system `name`.
+
+    Gradients are those written by hand if `written` is true, otherwise they are compiled from the invariants.
+    """
     fun, y0, pairs = SYSTEMS[name]
     kept = [Invariant(value, gradient if written else None, in_place=written) for value, gradient in pairs]
     options: dict[str, Any] = {"method": EIPRK4, "h": H, "in_place": True, "invariants": kept, "compiled": True}

@@ -1,12 +1,12 @@
 """``eip-scipy study growth``: growth of the position error over 10 000 years, compared with Brouwer's law.
 
-Ten bodies from DE440, Newtonian, by EIPGJ14, EIPRKN12, IAS15 and WHFast, against the packaged
-reference states. An error of longitude that comes from round-off alone grows as t^(3/2) (Brouwer 1937), one from a
-drift of the energy as t^2, one of a method that keeps the energy's error bounded as t.
+Ten bodies from DE440, Newtonian, by EIPGJ14, EIPRKN12, IAS15 and WHFast, against the packaged reference states. An
+error of longitude that comes from round-off alone grows as t^(3/2) (Brouwer 1937), one from a drift of the energy as
+t^2, one of a method that keeps the energy's error bounded as t.
 
-Each run is one sample of its rounding errors. EIPGJ14 with balances is therefore also run in all six orders of the
-coordinate axes, which change the rounding of the steps, but, unlike rotations, no bit of the start and of the
-references.
+Each run is one sample of its rounding errors. EIPGJ14 with balances (it keeps each planet's energy about the Sun
+instead of the totals) is therefore also run in all six orders of the coordinate axes, which change the rounding of the
+steps, but, unlike rotations, no bit of the start and of the references.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ORDER_STEPS = 512, 1024  # steps per year, in all orders of the axes
 
 
 def ways() -> dict[str, dict[str, Any]]:
-    """Return the options of each run of this package."""
+    """Return, by name, the options of `integrate` for each run of this package."""
     return {
         "EIPRKN12, every 10, compensated": {**NYSTROM, "every": 10, "compensated": True},
         "EIPRKN12, every 10": {**NYSTROM, "every": 10},
@@ -46,22 +46,25 @@ def ways() -> dict[str, dict[str, Any]]:
 
 
 def slope(times: np.ndarray, errors: np.ndarray) -> float:
-    """Return the exponent of the growth, ignoring errors that are 0 (their logarithm is infinite); nan for one time."""
+    """Return the exponent p of a fit of errors ~ times^p, both of shape (m,), without errors that are 0.
+
+    The result is nan if fewer than two errors are left.
+    """
     known = errors > 0
     return float(np.polyfit(np.log(times[known]), np.log(errors[known]), 1)[0]) if known.sum() > 1 else float("nan")
 
 
 def spread(values: np.ndarray) -> list[str]:
-    """Return the median and the range of values as cells of a table."""
+    """Return two cells of a table: the median of `values`, and their smallest and largest one."""
     digits = ".1e" if np.max(values) < 0.01 else ".2f"
     return [f"{np.median(values):{digits}}", f"{np.min(values):{digits}} ... {np.max(values):{digits}}"]
 
 
 class Found(NamedTuple):
-    """Times, and for each method the seconds of the run and the errors (m, 10) of the bodies [AU].
+    """Times (m,) in years, and for each method the seconds of the run and the position errors (m, 10) in AU.
 
-    `orders` has, for each number of steps per year, the errors (6, m, 10) of EIPGJ14 with balances in the six orders of
-    the axes.
+    `orders` has, for each number of steps per year, the position errors (6, m, 10) of EIPGJ14 with balances in the six
+    orders of the axes.
     """
 
     times: np.ndarray
@@ -71,12 +74,15 @@ class Found(NamedTuple):
 
 
 def distances(states: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the errors of position (m, 10) of states (60, m)."""
+    """Return the distances (m, 10) in AU between the positions of the ten bodies in two series of states (60, m)."""
     return np.linalg.norm((states - truth)[:30].reshape(10, 3, -1), axis=1).T
 
 
 def in_orders(problem: Problem, times: np.ndarray, truth: np.ndarray, steps: int) -> np.ndarray:
-    """Return the errors (6, m, 10) of EIPGJ14 with balances and `steps` steps per year, in all orders of the axes."""
+    """Return position errors (6, m, 10) in AU of EIPGJ14 with balances, in six orders of the axes.
+
+    `steps` is the number of steps per year, and `truth` (60, m) are the true states at `times` (m,).
+    """
     found = []
     for axes in ORDERS:
         start = replace(problem, y0=reordered(problem.y0, axes))

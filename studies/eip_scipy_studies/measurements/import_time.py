@@ -31,7 +31,7 @@ IMPORTS = (
 
 
 def seconds(code: str) -> float:
-    """Return the processor time of a fresh process that runs `code`."""
+    """Return the processor time in seconds of a fresh process that runs `code`."""
     writing = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     before = os.times()
     subprocess.run([sys.executable, "-c", code], check=True, env=writing)

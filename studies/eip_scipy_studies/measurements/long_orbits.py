@@ -1,7 +1,7 @@
 """``eip-scipy study long-orbits``: effect of projection, its spacing and compensation on EIPRKN12 over 1000 years.
 
 Ten bodies, DE440 system barycentres, Newtonian. Errors of position [AU] against the packaged reference states (80
-bits); wall times are the least of three, on one core. EIPGJ14 and, if REBOUND is installed, IAS15, SABA(10,6,4) and
+bits); wall times [s] are the least of three, on one core. EIPGJ14 and, if REBOUND is installed, IAS15, SABA(10,6,4) and
 WHFast with the corrector of order 17 run the same span.
 """
 
@@ -53,7 +53,9 @@ class LongOrbits(Measurement[list[TimedRun]]):
         assert problem.reference is not None
         truth = problem.reference(self.years)
         if truth is None:
-            raise UsageError(f"there is no stored reference state at {self.years:g} years; choose another --years")
+            raise UsageError(
+                f"there is no stored reference state at {self.years:g} years: --years must be 1, 2, 5, 10 ... 10000"
+            )
         methods: Methods = {
             f"h = {h:.5g} yr, {name}": (by_us(problem, EIPRKN12, **options), [h])
             for h in STEPS

@@ -1,14 +1,15 @@
 """``eip-scipy study multistep``: EIPGJ14 and EIPGJ12, one evaluation a step, against EIPRKN12 and other packages.
 
-1. Ten bodies, Newton, 1000 years: each method runs once in each of six rotations of the axes, in turns. Errors of
-   position [AU] against the packaged reference state: Mercury's, the least and the largest over the rotations, and the
-   largest of another planet. The ratios below the table are those of the least times.
+1. Ten bodies, Newton, 1000 years: each method runs once in each of six orientations of the axes (the original one and
+   five random ones), in turns. Errors of position [AU] against the packaged reference state: Mercury's, the least and
+   the largest over the orientations, and the largest of another planet. The ratios below the table are those of the
+   least times.
 2. The same over 10 000 years (IAS15 once), against the packaged states.
 3. Kepler's problem with e = 0.6 and the relativistic term to t = 600, compared with heyoka, without its compilation.
-4. EIPRKN12 over 100 years with steps of 0.02 yr, with and without projection, in the same rotations.
+4. EIPRKN12 over 100 years with steps of 0.02 yr, with and without projection, in the same orientations.
 
-All runs use one core, which must have no other load, since ratios of times are the result. Parts 1, 2 and 4 need
-REBOUND, part 3 heyoka.
+All runs use one core, which must have no other load, since ratios of times are the result. Parts 1 and 2 need REBOUND,
+part 3 heyoka.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def with_projection(quick: bool) -> Table:
 
 
 def known_end(problem: Problem) -> np.ndarray:
-    """Return the reference state at the end of the problem's interval."""
+    """Return the problem's reference state at the end of its interval, which must be stored."""
     assert problem.reference is not None
     truth = problem.reference(problem.t_span[1])
     assert truth is not None
@@ -128,7 +129,10 @@ def known_end(problem: Problem) -> np.ndarray:
 
 
 def against_heyoka(quick: bool) -> Table:
-    """Measure least times of whole calls in milliseconds and of the steps alone, and largest errors of a component."""
+    """Return a row for each method: least times in ms of the whole call and of its steps alone, and the final error.
+
+    The error is the largest component of the difference of the final state from that by heyoka with tolerance 1e-18.
+    """
     problem = kepler(0.6, 0.005, END)
     truth = taylor(problem, 1e-18)[0]()
     calls: dict[str, tuple[Callable[[], np.ndarray], Callable[[], float]]] = {
@@ -152,7 +156,7 @@ def against_heyoka(quick: bool) -> Table:
 
 
 def kepler_table(found: Table) -> str:
-    """Lay out the results of `against_heyoka`, and the cost of an error of given size compared with heyoka."""
+    """Lay out the results of `against_heyoka`, and the least times for an error of `WANTED` divided by heyoka's."""
     body = [(name, [f"{row['call']:.3f}", f"{row['steps']:.3f}", f"{row['error']:.1e}"]) for name, row in found.items()]
     lines = [table([["call [ms]"], ["steps [ms]"], ["error"]], body), ""]
     enough = {name: row for name, row in found.items() if row["error"] <= WANTED}
@@ -163,7 +167,10 @@ def kepler_table(found: Table) -> str:
 
 
 def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
-    """Return a function that runs the problem, and one that returns the seconds of the steps of its last run."""
+    """Return a function that runs the problem and returns its final state, and one for the seconds of the last run.
+
+    The seconds are those of the steps, without compilation and without the time before the steps.
+    """
     last = [0.0]
 
     def run() -> np.ndarray:
@@ -175,7 +182,10 @@ def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Cal
 
 
 def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
-    """Compile the problem for heyoka; return a function that runs it, and one for the seconds of the last run."""
+    """Compile the problem for heyoka.
+
+    Return a function that runs the problem and returns its final state, and one for the seconds of the last run.
+    """
     heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     assert problem.params is not None
     x, y, u, v = heyoka.make_vars("x", "y", "u", "v")
@@ -197,7 +207,10 @@ def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray]
 
 
 def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem, int], Methods], turns: int) -> Table:
-    """Run all methods in turn, in new random axes each time."""
+    """Run all methods `turns` times, first in the original axes and then in new random ones each time.
+
+    ``methods(problem, turn)`` returns the methods, and `truth` is the final state. Return the rows of `rows`.
+    """
     found = []
     for turn, rotation in enumerate([Rotation.identity(), *Rotation.random(turns - 1, np.random.default_rng(1))]):
         own = replace(problem, y0=rotation.apply(problem.y0.reshape(-1, 3)).ravel()) if turn else problem
@@ -207,7 +220,11 @@ def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem
 
 
 def compared(found: Table, mercury: float, others: float) -> list[str]:
-    """Compare the cheapest runs with errors of at most `mercury` and `others` with WHFast and IAS15, as text."""
+    """Return a line of text for each method of this package: the time of its cheapest run that is accurate enough.
+
+    Errors [AU] must be at most `mercury` and, of other planets, `others`. The time is compared with the one in which
+    WHFast reaches the error `mercury`, and with that of IAS15.
+    """
     whfast = [row for name, row in found.items() if name.startswith("WHFast")]
     there = cost_to_reach([row["least"] for row in whfast], [row["worst"] for row in whfast], mercury)
     good = {name: row for name, row in found.items() if row["worst"] <= mercury and row["others"] <= others}

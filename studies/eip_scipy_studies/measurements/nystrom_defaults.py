@@ -64,7 +64,10 @@ class System(NamedTuple):
 
 
 def by_reference(problem: Problem, size: float = 1.0) -> System:
-    """Make a system from a problem whose last state is known; errors of positions are in units of `size`."""
+    """Make a system from a problem whose last state is known.
+
+    The error is the largest one of a component of the position, divided by `size`.
+    """
 
     def error(y: np.ndarray) -> float:
         assert problem.reference is not None
@@ -98,7 +101,7 @@ def _scene(name: str) -> System:
 
 
 def exoplanets(name: str) -> System:
-    """Return a system of the study `exoplanets`."""
+    """Return the system `name` of the study `exoplanets`, over 0.2 of its time span; the truth is a run by heyoka."""
     from .exoplanets import SYSTEMS
     from .relativity import reference, speed_of_light
 
@@ -110,7 +113,7 @@ def exoplanets(name: str) -> System:
 
 
 def is_second_order(problem: Problem) -> bool:
-    """Return whether a hard case is q'' = a(t, q)."""
+    """Return whether a hard case has the form q'' = a(t, q), judged by its right-hand side at two velocities."""
     t, y = problem.t_span[0], np.asarray(problem.y0)
     n = y.size // 2
     if y.dtype.kind == "c" or y.size % 2:
@@ -124,7 +127,11 @@ def is_second_order(problem: Problem) -> bool:
 
 
 class Run(NamedTuple):
-    """Errors and costs of a run."""
+    """Results of a run.
+
+    They are the error of the last state, the largest relative change of an invariant (`drift`), the processor time in
+    seconds, the calls of the right-hand side, and whether the run is reliable.
+    """
 
     error: float
     drift: float
@@ -134,7 +141,11 @@ class Run(NamedTuple):
 
 
 def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], rows: bool = True) -> Run:
-    """Run a system; the time is the processor's for a run without the rows that show the drift."""
+    """Run a system, and return the results; if `rows` is true, the states that show the drift are saved.
+
+    The time is the least of `REPEATS` further runs without saved states; it is inf if `rows` is false or the run is not
+    compiled.
+    """
     steps = options.get("save_every", 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProjectionWarning)
@@ -150,7 +161,10 @@ def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], ro
 
 
 def steps(system: System) -> list[int]:
-    """Return the least numbers of steps at which the error of EIPRKN12 with projection is below each of `LEVELS`."""
+    """Return the first numbers of steps at which the error of EIPRKN12 with projection is below each of `LEVELS`.
+
+    Numbers grow by a factor of 1.3 from 8 on. Levels that are not reached with `MOST_STEPS` steps are left out.
+    """
     found, n, left = list[int](), 8, list(LEVELS)
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     while left and n < (MOST_STEPS if system.natively else MOST_STEPS // 8):
@@ -164,7 +178,7 @@ def steps(system: System) -> list[int]:
 
 
 def settings(system: System) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Yield the name of each setting, and the options of three runs with neighbouring steps or tolerances."""
+    """Yield, for each number of steps and each tolerance, its name and the options of three runs close to it."""
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     for n in steps(system):
         save = {"save_every": max(1, n // MOST_ROWS)}
@@ -174,12 +188,12 @@ def settings(system: System) -> Iterator[tuple[str, list[dict[str, Any]]]]:
 
 
 def mean(values: list[float]) -> float:
-    """Return the geometric mean; nan if a run has failed."""
+    """Return the geometric mean of `values`, each at least 1e-18; nan if one of them is nan, as for a failed run."""
     return float(np.exp(np.mean(np.log(np.maximum(values, 1e-18)))))
 
 
 def rows(name: str, make: Callable[[], System]) -> Iterator[dict[str, Any]]:
-    """Yield a row for each method, setting and way (a combination of both options)."""
+    """Yield a row of results for each setting, method and way (one of `WAYS`, a combination of both options)."""
     system = make()
     for setting, options in settings(system):
         for method in (EIPRKN8, EIPRKN12):
@@ -220,7 +234,10 @@ class NystromDefaults(Measurement[list[dict[str, Any]]]):
         return found
 
     def table(self, found: list[dict[str, Any]]) -> str:
-        """Lay out errors, changes of invariants, times relative to the first way, and unreliable runs of each way."""
+        """Lay out, for each of `WAYS`, the error, the change of invariants, the cost and the number of unreliable runs.
+
+        The cost is relative to the first way: processor time, or calls of the right-hand side for runs in Python.
+        """
         heads = [[way if what == "error" else "", what] for way in WAYS for what in ("error", "drift", "time", "bad")]
         body = []
         for k in range(0, len(found), len(WAYS)):

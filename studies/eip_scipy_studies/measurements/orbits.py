@@ -36,7 +36,10 @@ Row = dict[str, float]
 
 
 def by_rebound(problem: Problem, integrator: str, **options: Any) -> Runner:
-    """Return a function that runs an integrator of REBOUND, which must be installed; see `by_peer`."""
+    """Return ``run(step) -> (seconds, final state)`` by an integrator of REBOUND, which must be installed.
+
+    See `by_peer`.
+    """
     return by_peer(problem, needed("eip_scipy.integrations.rebound").run, integrator, **options)
 
 
@@ -44,7 +47,7 @@ def rebound_states(problem: Problem, integrator: str, times: np.ndarray) -> tupl
     """Run an integrator of REBOUND (WHFast with steps of a day) from the start to each of `times`.
 
     There is one run for each time, because a saved time would cut a step of IAS15. Return the seconds of the last run,
-    and the states (6 N, m).
+    and the states (6 N, m) at the m times.
     """
     run = needed("eip_scipy.integrations.rebound").run
     counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
@@ -53,27 +56,30 @@ def rebound_states(problem: Problem, integrator: str, times: np.ndarray) -> tupl
 
 
 def reordered(states: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
-    """Return states (6 N,) or (6 N, m) of N bodies with their coordinate axes in another order."""
+    """Return states (6 N,) or (6 N, m) of N bodies with the coordinate axes in the order `axes`."""
     return states.reshape(-1, 3, *states.shape[1:])[:, axes].reshape(states.shape)
 
 
 def one_each(label: Callable[[float], str], run: Runner, steps: Iterable[float]) -> Methods:
-    """Make a row of the table for each step, with the name ``label(step)``."""
+    """Return `Methods` with an entry for each step in years: the name ``label(step)``, and `run` with this step."""
     return {label(h): (run, [h]) for h in steps}
 
 
 def yearly(name: str, run: Runner, *counts: int) -> Methods:
-    """Make a row of the table for each number of steps per year."""
+    """Return `Methods` with an entry for each of `counts`, the numbers of steps per year."""
     return one_each(lambda h: f"{name}, 1/{round(1 / h)} yr", run, [1 / n for n in counts])
 
 
 def daily(name: str, run: Runner, *days: float) -> Methods:
-    """Make a row of the table for each length of a step in days."""
+    """Return `Methods` with an entry for each of `days`, the lengths of a step in days."""
     return one_each(lambda h: f"{name}, {h * YEAR_D:.3g} d", run, [d / YEAR_D for d in days])
 
 
 def rows(turns: Sequence[Sequence[TimedRun]]) -> dict[str, Row]:
-    """Return the least and the median time of each method, and the extremes of its errors, over all turns."""
+    """Return for each method the step, the least and median time [s], and errors of position [AU], over all turns.
+
+    "best" and "worst" are the least and the largest error of Mercury, "others" the largest of another planet.
+    """
     found = {}
     for name in dict.fromkeys(item.method for turn in turns for item in turn):
         own = [item for turn in turns for item in turn if item.method == name]
@@ -89,7 +95,7 @@ def rows(turns: Sequence[Sequence[TimedRun]]) -> dict[str, Row]:
 
 
 def orbit_table(found: Mapping[str, Row], first: str) -> str:
-    """Lay out `rows`; `first` is the name of the innermost planet."""
+    """Lay out the results of `rows` as a table; `first` is the name of the innermost planet."""
     head = [["median", "[s]"], ["least", "[s]"], [f"{first} [AU]", "least"], ["", "largest"], ["others", "[AU]"]]
     cells = {
         name: [

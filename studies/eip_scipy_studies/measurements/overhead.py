@@ -2,8 +2,7 @@
 
 Kepler's problem in plain NumPy, e = 0.6, two invariants (H, L) with analytic gradients. Numbers are medians of pairs of
 runs: each class runs in turn with SciPy's on the same right-hand side, so that a drifting speed of the machine affects
-both. Next to
-the median of the ratios is the ratio of the least times, which other load on the machine hardly affects.
+both. Next to the median of the ratios is the ratio of the least times, which other load on the machine hardly affects.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ PEERS = {EIPRK4: "RK45", EIPRK45: "RK45", EIPRK23: "RK23", EIPDOP853: "DOP853"}
 
 
 def per_step(options: dict[str, Any]) -> float:
-    """Return the seconds per step of a run of `solve_ivp` with these options."""
+    """Return the wall time in seconds per step of a run of `solve_ivp` with these options."""
     begin = time.perf_counter()
     solution = solve_ivp(fun, SPAN, Y0, **options)
     steps = STEPS if "t_eval" in options else solution.t.size - 1

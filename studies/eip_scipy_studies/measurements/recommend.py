@@ -1,8 +1,9 @@
 """``eip-scipy study recommend``: accuracy of `recommend` on the 35 hard cases.
 
 The table has the wanted, the expected and the true error of the recommended run; the true one is that of
-`recommendation.run()` against the exact final state. Below it are the numbers of true errors between 0.1 and 10 times
-the wanted error, and of those that are at most 10 times the wanted error. Times are those of the search and of the run.
+`recommendation.run()` against the exact final state. Below it are the numbers of cases whose true error is between 0.1
+and 10 times the wanted error, at most 10 times the wanted error, and between 0.1 and 10 times the expected error. Times
+are those of the search and of the run.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ class Recommended(Measurement[list[dict[str, Any]]]):
 
 
 def cells(row: dict[str, Any]) -> list[str]:
-    """Lay out the results of one case as cells of the table."""
+    """Return the cells of the table for the result of `recommended` in one case."""
     shown = {key: value for key, value in row["options"].items() if key not in ("atol", "compensated")}
     options = ", ".join(f"{k}={v:g}" if isinstance(v, float) else f"{k}={v}" for k, v in shown.items())
     return [

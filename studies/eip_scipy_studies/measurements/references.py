@@ -32,7 +32,7 @@ def _heyoka() -> Any:
 
 
 class Found(NamedTuple):
-    """Lines to print, a text about the origin of the states, and the states."""
+    """Lines to print, a text about the origin of the states, and the states by problem, as they are written as JSON."""
 
     lines: list[str]
     about: str
@@ -46,7 +46,7 @@ class Reference(Study[Found]):
 
     @abstractmethod
     def measure(self, session: Session) -> Found:
-        """Compute the states."""
+        """Compute the states, and return them with the lines to print."""
 
     def text(self, found: Found) -> str:
         return "\n".join(found.lines)
@@ -62,7 +62,10 @@ class Reference(Study[Found]):
 
 
 def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
-    """Return the equations of motion in (x, v), as expressions of heyoka."""
+    """Return pairs (variable, rate) of the equations of motion in (x, v), as expressions of heyoka.
+
+    `potential` is the factor of 1/r in the electric potential of the field "uniform"; other fields do not use it.
+    """
     heyoka = _heyoka()
     x, y, z, u, v, w = state = heyoka.make_vars("x", "y", "z", "u", "v", "w")
     r2 = x * x + y * y
@@ -104,7 +107,7 @@ def _log(r: Any, number: Any) -> Any:
 
 
 def particle_states(problem: ParticleProblem, times: np.ndarray, bits: int | None) -> np.ndarray:
-    """Return rows (x, v, p) at `times`, computed with `bits` bits; None: in double precision."""
+    """Return rows (x, v, p) at `times` (m,), an array (m, 9), computed with `bits` bits; None: in double precision."""
     heyoka = _heyoka()
 
     def number(value: float) -> Any:
@@ -129,7 +132,7 @@ def particle_states(problem: ParticleProblem, times: np.ndarray, bits: int | Non
 class ParticleReference(Reference):
     """Command ``eip-scipy study particle-reference``.
 
-    It computes position, velocity and canonical momentum at each hundredth of the paper's intervals.
+    It computes position, velocity and canonical momentum at each hundredth of the paper's time intervals.
     """
 
     file = "particle_references.json"
@@ -175,7 +178,7 @@ def scenes() -> list[tuple[Problem, list[float]]]:
 
 
 def scene_states(problem: Problem, times: Sequence[float], bits: int) -> np.ndarray:
-    """Return states (q, v) at `times` in rows, rounded from numbers of `bits` bits."""
+    """Return states (q, v) of N bodies at `times` (m,), shape (m, 6 N), rounded from numbers of `bits` bits."""
     heyoka = _heyoka()
 
     def real(x: float) -> Any:
@@ -195,7 +198,7 @@ def scene_states(problem: Problem, times: Sequence[float], bits: int) -> np.ndar
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the largest distance between a body's two positions, for rows of states."""
+    """Return, for each row of the states `a` and `b` (m, 6 N), the largest distance between the positions of a body."""
     positions = (a - b)[:, : a.shape[1] // 2].astype(float).reshape(len(a), -1, 3)
     return np.linalg.norm(positions, axis=2).max(axis=1)
 

@@ -2,8 +2,8 @@
 
 The force is the potential in 1/r^2 of Nobili & Roxburgh, the same in both packages: `forces="gr-potential"` here,
 `gr_potential` in REBOUNDx. Errors of position [AU] are those against heyoka in 80-bit arithmetic, which is run each
-time; wall times are the least of three, on one core. REBOUNDx (GPL) and heyoka are optional: ``pip install reboundx
-heyoka``.
+time; wall times are the least of three, on one core. The study needs REBOUND, REBOUNDx (GPL) and heyoka: ``pip install
+rebound reboundx heyoka``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ DAYS = {"whfast-c17": (5, 3, 2, 1, 0.5), "saba(10,6,4)": (10, 5, 3)}
 
 
 def reference(gm: np.ndarray, y0: np.ndarray, years: float, c: float | None = speed_of_light) -> np.ndarray:
-    """Return the positions (3 N,) at the end, by heyoka in 80 bits; c = None leaves out relativity."""
+    """Return the positions (3 N,) of N bodies after `years`, by heyoka in 80 bits.
+
+    `gm` (N,) are the masses times G, `y0` (6 N,) is the start, and `c` the speed of light; None leaves out relativity.
+    """
     heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     n = gm.size
     equations = list(heyoka.model.nbody(n, masses=list(gm.astype(FLOAT)), Gconst=FLOAT(1)))
@@ -65,7 +68,7 @@ def potential(sim: Any) -> Any:
 
 
 def methods(problem: Problem) -> Methods:
-    """Make a row for each method and step."""
+    """Return `Methods` with an entry for each method and step."""
     found = yearly("EIPGJ14", by_us(problem, EIPGJ14), *MULTISTEP)
     found |= yearly("EIPRKN12", by_us(problem, EIPRKN12, every=10, compensated=True), *NYSTROM)
     for name, days in DAYS.items():

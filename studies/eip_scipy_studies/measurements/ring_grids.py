@@ -40,7 +40,7 @@ def ground(file, points, tol):
 
 
 def on_grid(field, points):
-    """Return the field on another number of points along each axis, by its Fourier modes."""
+    """Return the square `field` on `points` points along each axis, by its Fourier modes."""
     return resample(resample(field, points, axis=0), points, axis=1)
 
 
@@ -52,7 +52,11 @@ def edge(field):
 
 
 class GridRun:
-    """A run: its fields at the snapshots in the frame at rest, and its vortices in the rotating frame."""
+    """A run on `points` x `points` points, by RK4 in the rotating frame if `turning`, otherwise by splitting at rest.
+
+    Attributes for each snapshot are the field in the frame at rest, the number of vortices (`counts`), and the angle in
+    rad by which the vortices have turned in the rotating frame (`turned`).
+    """
 
     def __init__(self, psi, points, t_end, *, shown, turning=False):
         gpe = ring_condensate(RING.kappas[1], points=points)

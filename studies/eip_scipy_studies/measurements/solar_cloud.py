@@ -38,7 +38,7 @@ SPREAD = 1e-6  # of each coordinate, relative
 
 
 def clones(problem: Problem, members: int) -> np.ndarray:
-    """Return perturbed starts, each in the frame of its own barycentre, which REBOUND's integrators use."""
+    """Return perturbed starts (members, 6 N), each in its barycentric frame, which REBOUND's integrators use."""
     assert problem.params is not None
     factors = 1 + SPREAD * np.random.default_rng(1).standard_normal((members, problem.y0.size))
     states = (problem.y0 * factors).reshape(members, 2, -1, 3)
@@ -77,7 +77,10 @@ class SolarCloud(Measurement[dict[str, Row]]):
         }
 
     def _runs(self, problem: Problem, starts: np.ndarray) -> dict[str, tuple[int, Callable[[], np.ndarray]]]:
-        """Return, for each row of the table, the number of members that it runs, and the run."""
+        """Return, for each row of the table, the number of members that it runs, and a function that runs them.
+
+        The function returns the final states in rows.
+        """
         few, span = starts[: self.sample], (0.0, self.years)
         found: dict[str, tuple[int, Callable[[], np.ndarray]]] = {}
 

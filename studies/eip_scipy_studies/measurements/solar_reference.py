@@ -46,13 +46,13 @@ class Gravity:
         self.pulls[self.second, pairs] = -gm[self.first]
 
     def __call__(self, q: Array) -> Array:
-        """Return the accelerations (N, 3)."""
+        """Return the accelerations (N, 3) at the positions `q` (N, 3)."""
         d = q[self.second] - q[self.first]
         r2 = (d * d).sum(axis=1)
         return self.pulls @ (d / (r2 * np.sqrt(r2))[:, None])
 
     def stepped(self, q: Array, v: Array, h: Any) -> tuple[Array, Array]:
-        """Return positions and velocities after a time `h`, by the Taylor series."""
+        """Return positions and velocities (N, 3) after a time `h`, by the Taylor series with `TERMS` terms."""
         qs, ds, r2, w = [q, v], [], [], []
         for k in range(TERMS):
             ds.append(qs[k][self.second] - qs[k][self.first])
@@ -132,7 +132,7 @@ def states(problem: Problem, years: Sequence[float], steps: int) -> Iterator[Arr
 
 
 def by_taylor(problem: Problem, years: Sequence[float]) -> Iterator[Array]:
-    """Yield the states at the times `years` by heyoka in 80 bits."""
+    """Yield the states (6 N,) at ascending times `years`, by heyoka in 80 bits."""
     heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     assert problem.params is not None
     gm, start = problem.params.astype(FLOAT), problem.y0.astype(FLOAT).reshape(2, -1, 3)
@@ -146,12 +146,12 @@ def by_taylor(problem: Problem, years: Sequence[float]) -> Iterator[Array]:
 
 
 def apart(a: Array, b: Array) -> Array:
-    """Return the distance between both positions of each body."""
+    """Return, for each of N bodies, the distance between its positions in the states `a` and `b` (6 N,)."""
     return np.linalg.norm((a - b)[: a.size // 2].astype(float).reshape(-1, 3), axis=1)
 
 
 class Found(NamedTuple):
-    """Times, the states, and the distances of other runs from them, by kind."""
+    """Times in years, the states at these times, and, for each other run, distances (N,) in AU from these states."""
 
     years: list[float]
     states: list[Array]
@@ -193,7 +193,7 @@ class SolarReference(Study[Found]):
         return "\n".join(lines)
 
     def figures(self, found: Found) -> Figures:
-        """Yield the file of the states. It is written with the figures, because tables are CSV files."""
+        """Yield the JSON file of the states. It is written with the figures, because tables are CSV files."""
         about = (
             "Newtonian ten-body solar system from the state of problems.solar_system() in AU and Julian years: all "
             "positions [AU], then all velocities [AU/yr], by time in Julian years; Gauss-Jackson of order 14 in 80 "

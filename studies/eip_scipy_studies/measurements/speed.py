@@ -1,12 +1,13 @@
 """``eip-scipy study speed``: speed of the step, as ratios measured in one run on one core.
 
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
-   hand for this one problem. Its time per step, and that of EIP-RK45 with adaptive steps, are also compared with that
-   of solve_ivp with SciPy's RK45.
+   hand for this one problem. The times per step of EIP-RK4, and of EIP-RK45 with adaptive steps, are also compared with
+   that of solve_ivp with SciPy's RK45.
 2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
 3. Compiled Kepler to t = 300 with 3001 times in t_eval, compared with saving each step; a Poincaré section of 1600
    crossings, compared with the run without it. These are times of whole calls.
-4. A process: from its start to its first compiled step, with user functions that are not in any cache.
+4. A process: from the start of its program to the end of its first compiled run, with user functions that are not in
+   any cache.
 """
 
 from __future__ import annotations
@@ -98,7 +99,10 @@ def _weight(err, old, new, rtol, atol):
 
 @njit
 def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
-    """Run EIP-RK4 on Kepler's problem, written out by hand: stages, metric, normal equations, check of the result."""
+    """Run EIP-RK4 on Kepler's problem, written out by hand: stages, metric, normal equations, residuals.
+
+    Return the four components of the final state, and the largest residual of an invariant.
+    """
     rtol, atol = 1e-3, 1e-6
     worst = 0.0
     w = _pull(a, b)
@@ -154,9 +158,9 @@ def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
 
 
 def per_step(seconds: Callable[[int], float], runs: int, steps: int = STEPS) -> float:
-    """Return the seconds of one step, without the start of a run: from the least times of runs of two lengths.
+    """Return the seconds of one step, without the start of a run, from the least times of `runs` runs of two lengths.
 
-    ``seconds(n)`` is the time of a run of n steps.
+    ``seconds(n)`` is the time of a run of n steps; the lengths are `steps` and 0.2 of it.
     """
     few = steps // 5
     best = least({n: partial(seconds, n) for n in (few, steps)}, turns=runs)
@@ -164,13 +168,13 @@ def per_step(seconds: Callable[[int], float], runs: int, steps: int = STEPS) -> 
 
 
 def call_time(action: Callable[[], Any], calls: int) -> float:
-    """Return the least wall time of several calls, after one that is not counted."""
+    """Return the least wall time of `action` in seconds over several calls, after one that is not counted."""
     action()
     return least({"": clocked(action)}, turns=calls)[""]
 
 
 def of_integrate(h: float, **arguments: Any) -> Callable[[int], float]:
-    """Return a function of n: the time of a run of n steps by `integrate`, without the time before the steps."""
+    """Return a function of n: the seconds of a run of n steps by `integrate`, without the time before the steps."""
     return lambda n: integrate(t_span=(0.0, n * h), h=h, **arguments).wall_time
 
 

@@ -1,12 +1,14 @@
-"""``eip-scipy study tangent-maps``: effect of projection on derivatives by the start and by parameters.
+"""``eip-scipy study tangent-maps``: effect of projection on derivatives of the state by the start.
 
 The state-transition matrix of Kepler's problem against its closed form; periodic orbits of the restricted three-body
 problem; Lyapunov exponents compared with heyoka's variational equations, from one start and as means over a chaotic
 sea; MEGNO compared with REBOUND's variational particles, and with relativity, which these lack, compared with
-differences of orbits; the cost of columns of derivatives, for each source of the products with the Jacobian, and what
-they save in a fit. The figure is a map of MEGNO over the semi-major axis and the eccentricity of the second of two
-planets, by this package and by REBOUND.
-``pip install "eip_scipy[heyoka,rebound,sympy]"``.
+differences of orbits; the cost of columns of the state-transition matrix, for each way to compute products with the
+Jacobian, and the time that these columns save in a fit. The figure is a map of MEGNO over the
+semi-major axis and the eccentricity of the second of two planets, by this package and by REBOUND.
+
+The study needs Numba and SymPy; heyoka and REBOUND are optional:
+``pip install "eip_scipy[heyoka,numba,rebound,sympy]"``.
 """
 
 from __future__ import annotations
@@ -58,12 +60,12 @@ CALM, WILD = 2.2, 4.0  # MEGNO below and above which an orbit counts as regular 
 
 
 def henon_heiles(heyoka: Any, x: Any, y: Any, u: Any, v: Any) -> Any:
-    """Return its Hamiltonian as an expression of heyoka."""
+    """Return the Hamiltonian of Hénon and Heiles, with momenta u and v, as an expression of heyoka."""
     return (u * u + v * v + x * x + y * y) / 2.0 + x * x * y - y * y * y / 3.0
 
 
 def double_pendulum(heyoka: Any, a: Any, b: Any, p: Any, r: Any) -> Any:
-    """Return its Hamiltonian as an expression of heyoka."""
+    """Return the Hamiltonian of a double pendulum, with angles a, b and momenta p, r, as an expression of heyoka."""
     kinetic = (p * p + 2.0 * r * r - 2.0 * p * r * heyoka.cos(a - b)) / (2.0 * (1.0 + heyoka.sin(a - b) ** 2.0))
     return kinetic - 2.0 * heyoka.cos(a) - heyoka.cos(b)
 
@@ -71,7 +73,7 @@ def double_pendulum(heyoka: Any, a: Any, b: Any, p: Any, r: Any) -> Any:
 class Chaotic(NamedTuple):
     """A Hamiltonian system in the forms of this package and of heyoka, with start, step and length of the run.
 
-    The length is a factor, by which the setting `time` of the study is multiplied.
+    `share` is the length of the run divided by the setting `time` of the study.
     """
 
     text: str
@@ -81,7 +83,7 @@ class Chaotic(NamedTuple):
     share: float
 
     def problem(self) -> Any:
-        """Return the system as a problem."""
+        """Return the system as a problem of this package, made by `hamiltonian`."""
         pair = (None, None) if "px" in self.text else ("a b", "p r")
         return hamiltonian(self.text, *pair)
 
@@ -99,14 +101,17 @@ SYSTEMS = {
 
 
 def after_revolutions(n: int) -> np.ndarray:
-    """Return the state-transition matrix after n periods in closed form, I - 3 n T f (dH/dy)."""
+    """Return the state-transition matrix (4, 4) of Kepler's orbit from `PERICENTRE` after n periods, in closed form.
+
+    It is I - 3 n T f (dH/dy), where T is the period, f the right-hand side and H the Hamiltonian.
+    """
     x, _, _, vy = PERICENTRE
     f, by_energy = np.array([0.0, vy, -1 / x**2, 0.0]), np.array([1 / x**2, 0.0, 0.0, vy])
     return np.eye(4) - 3 * PERIOD * n * np.outer(f, by_energy)
 
 
 def planets(numba: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return the right-hand side of gravitating bodies and their energy, jitted."""
+    """Return two jitted functions of gravitating bodies in space: the right-hand side and the energy."""
 
     @numba.njit
     def rates(t, y, out, m):
@@ -137,7 +142,11 @@ def planets(numba: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def two_planets(axis: float, e: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return masses and the state (q, v) in the plane, both planets at their pericentres, on opposite sides."""
+    """Return masses (3,) and the state (q, v) (18,) of a star and two planets at their pericentres on opposite sides.
+
+    `axis` and `e` are semi-major axis and eccentricity of the second planet; the first has 1 and 0.02. All bodies move
+    in one plane.
+    """
     m = np.array([1.0, MASS, MASS])
     q, v = np.zeros((3, 3)), np.zeros((3, 3))
     for k, (a, ecc, side) in enumerate(((1.0, 0.02, 1), (axis, e, -1)), 1):
@@ -148,7 +157,11 @@ def two_planets(axis: float, e: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Found(NamedTuple):
-    """The measurements, in the order of the tables that are printed."""
+    """The results of `_kepler`, `_orbits` and so on by their names, and the map of MEGNO.
+
+    `map` and `rates` are MEGNO and the exponents of this package at `eccentricities` (rows) and `axes` (columns);
+    `rebound` has the same of REBOUND, and is empty without it.
+    """
 
     kepler: list[tuple[str, dict[str, float]]]
     orbits: dict[str, list[float]]
@@ -192,9 +205,9 @@ class TangentMaps(Measurement[Found]):
             return Found(**parts, axes=axes, eccentricities=eccentricities, **maps)
 
     def _maps(self, axes: np.ndarray, eccentricities: np.ndarray, numba: Any, session: Session) -> dict[str, Any]:
-        """Compute MEGNO and the exponents over the grid.
+        """Return the fields `map`, `rates` and `rebound` of `Found`: MEGNO and Lyapunov exponents at each point.
 
-        REBOUND, if it is installed, does the same from the same tangent vectors.
+        REBOUND, if it is installed, computes both as well, from the same tangent vectors.
         """
         peer = session.peer("rebound", "REBOUND's map of MEGNO")
         rates, energy = planets(numba)
@@ -268,7 +281,10 @@ class TangentMaps(Measurement[Found]):
         return "\n\n".join(blocks)
 
     def _compared(self, found: Found) -> str:
-        """Return a text that compares both maps: points that are regular in both, and exponents of chaotic ones."""
+        """Return a text that compares the maps of this package and of REBOUND.
+
+        It has the numbers of regular and chaotic points, MEGNO at the regular ones, and exponents of the chaotic ones.
+        """
         ours, theirs = found.map, found.rebound["megno"]
         regular, chaotic = (ours < CALM) & (theirs < CALM), (ours > WILD) & (theirs > WILD)
         opposite = (ours < CALM) & (theirs > WILD) | (ours > WILD) & (theirs < CALM)
@@ -376,7 +392,9 @@ def _exponents(study: TangentMaps, session: Session, numba: Any) -> dict[str, li
 
 
 def _sea(study: TangentMaps, session: Session, numba: Any) -> dict[str, Any]:
-    """Average the largest exponent over starts in the chaotic sea: equally spaced states of one chaotic orbit.
+    """Return means and standard errors of the largest Lyapunov exponent over starts in the chaotic sea.
+
+    The starts are states of one chaotic orbit at equally spaced times.
 
     Only the means of this package and of heyoka can agree: rounding separates two integrations of a chaotic orbit, and
     each of them stays near regular islands for long times now and then.
@@ -403,9 +421,10 @@ def _sea(study: TangentMaps, session: Session, numba: Any) -> dict[str, Any]:
 
 
 def _followed(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float | None]]:
-    """Compare exponents along one orbit with heyoka.
+    """Return, for each of `SYSTEMS`, the largest Lyapunov exponent by this package, by heyoka, and the difference in %.
 
-    The orbit is cut into pieces, so short that rounding does not separate the two; heyoka starts each at our state.
+    The orbit is cut into pieces, so short that rounding does not separate the two runs; heyoka starts each piece at the
+    state of this package.
     """
     heyoka = session.peer("heyoka", "heyoka's variational equations")
     found: dict[str, list[float | None]] = {}
@@ -429,9 +448,10 @@ def _standard_error(values: np.ndarray) -> float:
 
 
 def _relativity(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float]]:
-    """Compare the growth of tangent vectors with that of the distance of two orbits, under relativity.
+    """Compare the growth of a tangent vector with that of the distance of two orbits, under relativity.
 
-    REBOUND's variational particles lack this force.
+    Return, for each force and start, the logarithm of the growth by columns, by differences of orbits and without
+    relativity, and MEGNO. REBOUND's variational particles lack these forces.
     """
     found, t_end, eps = {}, 50 * PERIOD, 1e-6
     direction = np.random.default_rng(0).standard_normal(18)
@@ -475,9 +495,10 @@ def _planets(study: TangentMaps, session: Session, numba: Any) -> dict[str, list
 
 
 def _costs(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
-    """Measure the cost of all columns of Kepler's problem, without invariants and with both.
+    """Return times of runs with columns of the state-transition matrix, relative to plain runs.
 
-    There is one result for each source of the products of the Jacobian and a vector.
+    For Kepler's problem, the time with all four columns is divided by that of five plain runs, for each way to compute
+    products of the Jacobian and a vector. The results of `_costs_of_ready_problems` are added.
     """
 
     def rates(t, y):
@@ -515,7 +536,7 @@ def _costs(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]
 
 
 def _costs_of_ready_problems() -> dict[str, float]:
-    """Measure the cost of k columns of ready-made problems, relative to k + 1 plain runs, with all invariants."""
+    """Return times of ready-made problems with k columns, relative to k + 1 runs without; all keep their invariants."""
     bodies = solar_system()
     n = bodies.y0.size
     cases: dict[str, tuple[Any, float, Any, int]] = {
@@ -539,7 +560,10 @@ def _seconds(fun: Any, n: int, **options: Any) -> float:
 
 
 def _fit(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
-    """Fit an orbit to observed directions, with the Jacobian from columns and from differences of plain runs."""
+    """Fit an orbit to observed positions, with the Jacobian from columns and from differences of plain runs.
+
+    Return the seconds, numbers of runs and errors of the fitted start for both, and the ratio of the times.
+    """
     problem = hamiltonian(KEPLER, invariants={"L": "x*py - y*px"})
     options: dict[str, Any] = {"method": EIPDOP853, "h": PERIOD / 80}
     t = np.linspace(0.0, 20 * PERIOD, 200)

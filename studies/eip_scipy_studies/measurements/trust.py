@@ -5,10 +5,11 @@ one), leaks of an invariant, leaks that start late or act only in some places, w
 bodies, and passages that blow up; some are members of ensembles. They use all methods, fixed and adaptive steps,
 solve_ivp and integrate, compiled and interpreted functions, real and complex states. A run is reported by ValueError or
 UserWarning at the start, by ProjectionWarning, status -1, or `trusted` false. Its error is that of the last state,
-relative to its largest component.
+relative to the largest component of the true state.
 
-Each correct run is compared with the same run without invariants, to make sure that it is one: its error must not be
-over ten times the other one and above the tolerance. Any report about a correct run is a false alarm.
+Each correct run is compared with the same run without invariants, to make sure that it is one: its error must not
+exceed ten times the other one plus 1000 times the relative tolerance (1e-12 for fixed steps). Any report about a
+correct run is a false alarm.
 
 The exit status is 1 if less than 95 % of the faulty runs are reported, or more than 1 % of the correct ones.
 """
@@ -38,7 +39,7 @@ CHUNK = 8
 
 
 def carried_out(numbers: list[int]) -> list[dict[str, Any]]:
-    """Carry out the runs of these numbers, and return them as plain data."""
+    """Carry out the runs with these indices in `all_runs`, and return the results of `record`."""
     every = all_runs()
     return [record(every[number]) for number in numbers]
 
@@ -49,7 +50,7 @@ def all_runs() -> list[Run]:
 
 
 def record(run: Run) -> dict[str, Any]:
-    """Carry out one run, and return its properties and results as plain data."""
+    """Carry out one run, and return its properties and results as a dict without arrays."""
     begin = time.perf_counter()
     outcome = carry_out(run)
     if (run.sick is False or run.group == LATE) and outcome.y is not None:
@@ -63,13 +64,16 @@ def record(run: Run) -> dict[str, Any]:
 
 
 def spoilt(run: Run, outcome: Outcome) -> bool:
-    """Return whether the projection made a run that should be correct much less accurate."""
+    """Return whether the error with projection exceeds `SPOILT` times the one without, plus `TOLERANCE` times rtol.
+
+    For fixed steps rtol is 1e-12.
+    """
     allowed = SPOILT * outcome.plain_error + TOLERANCE * run.options.get("rtol", 1e-12)
     return bool(outcome.error > allowed)
 
 
 def listing(rows: Iterable[dict[str, Any]]) -> str:
-    """Lay out a line for each run."""
+    """Lay out a line for each run, below the names of their groups."""
     lines, group = [], None
     for row in rows:
         if row["group"] != group:
@@ -82,12 +86,12 @@ def listing(rows: Iterable[dict[str, Any]]) -> str:
 
 
 def harmful(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the late leaks that make a run much less accurate than the same run without projection."""
+    """Return the rows of late leaks whose error is more than `SPOILT` times that of the run without projection."""
     return [row for row in rows if row["group"] == LATE and row["error"] > SPOILT * row["plain_error"]]
 
 
 def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return rows by group, in their order."""
+    """Return rows by group, in the order in which they come."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         found.setdefault(row["group"], []).append(row)
@@ -95,7 +99,10 @@ def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 
 def sick_table(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Count, in each group, how faulty runs were reported; of several ways the first one in `CHANNELS` counts."""
+    """Return a table of the numbers of faulty runs, by group and by the way in which they were reported.
+
+    If a run was reported in several ways, the first one in `CHANNELS` counts.
+    """
     table = [["what is wrong", "runs", *CHANNELS, "not reported"]]
     for group, own in {**groups(rows), "all": rows}.items():
         counts = [sum(row["first"] == channel for row in own) for channel in (*CHANNELS, SILENT)]
@@ -104,7 +111,7 @@ def sick_table(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def healthy_table(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Count the false alarms, group by group."""
+    """Return a table of the numbers of correct runs and of false alarms, by group."""
     table = [["correct runs", "runs", "false alarms"]]
     for group, own in {**groups(rows), "all": rows}.items():
         table.append([group, str(len(own)), str(sum(bool(row["told"]) for row in own))])
@@ -171,15 +178,15 @@ class Trust(Measurement[list[dict[str, Any]]]):
         return {"trust.csv": [{**row, "told": ", ".join(row["told"])} for row in found]}
 
     def figures(self, found: list[dict[str, Any]]) -> Figures:
-        """Yield the tables for the page on trust, as Markdown files."""
+        """Yield one Markdown file with the tables for the page on trust."""
         yield "trust.md", lambda path: path.write_text("\n\n".join(tables(found)) + "\n", encoding="utf-8")
 
 
 def split(found: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the faulty runs and the correct ones."""
+    """Return the rows of faulty runs and those of correct runs."""
     return [row for row in found if row["sick"]], [row for row in found if not row["sick"]]
 
 
 def tables(found: list[dict[str, Any]]) -> list[str]:
-    """Return the tables of faulty and of correct runs, each only if there are such runs."""
+    """Return the tables of faulty and of correct runs as Markdown texts, each only if there are such runs."""
     return [markdown(make(own)) for make, own in zip((sick_table, healthy_table), split(found), strict=True) if own]

@@ -1,4 +1,4 @@
-"""``eip-scipy study waves``: waves by lines, errors against processor time compared with SciPy's DOP853.
+"""``eip-scipy study waves``: error against processor time for waves by the method of lines, also by SciPy's DOP853.
 
 Three waves with closed forms: the breather of the nonlinear Schroedinger equation, a kink and an antikink of the
 sine-Gordon equation that meet, two solitons of the Korteweg-de Vries equation that overtake each other. Each by
@@ -63,7 +63,10 @@ def by_scipy(problem: Any, t: Any, tolerance: float) -> tuple[np.ndarray, int | 
 
 
 def methods(problem: Any, steps: Any, tolerances: Any) -> dict[tuple[str, float], Any]:
-    """Return the runs, by (method, step or tolerance): functions of the times at which states are wanted."""
+    """Return the runs by (method, step or tolerance), each a function of the times at which states are wanted.
+
+    The function returns the states at these times in columns, and the calls of f (None for the problem's own method).
+    """
     runs: dict[tuple[str, float], Any] = {}
     for h in steps:
         runs[OWN, h] = lambda t, h=h: by_own(problem, t, h)
@@ -75,13 +78,16 @@ def methods(problem: Any, steps: Any, tolerances: Any) -> dict[tuple[str, float]
 
 
 def errors(problem: Any, t: float, y: np.ndarray) -> tuple[float, float]:
-    """Return the largest error of the field, and the largest relative error of an invariant."""
+    """Return the largest error of the field in the state `y` at `t`, and the largest relative error of an invariant."""
     start, end = (np.array([item.fun(0.0, state) for item in problem.invariants]) for state in (problem.y0, y))
     return float(np.abs(y - problem.reference(t)).max()), float(np.abs(end / start - 1).max())
 
 
 def costs(problem: Any, steps: Any, tolerances: Any, times: Any, repeats: int) -> list[dict[str, Any]]:
-    """Return a row for each run: its processor time, calls of f, and errors at `times`."""
+    """Return a row for each run: its least processor time in seconds, calls of f, and errors of the field at `times`.
+
+    "field" and "invariants" are the largest errors at the last of these times.
+    """
     runs = methods(problem, steps, tolerances)
     rows: dict[tuple[str, float], dict[str, Any]] = {}
     for _ in range(repeats):
@@ -101,7 +107,7 @@ def costs(problem: Any, steps: Any, tolerances: Any, times: Any, repeats: int) -
 
 
 def rows_table(rows: list[dict[str, Any]], times: Any) -> str:
-    """Lay out the rows of `costs`, with the errors of the field at `times`."""
+    """Lay out the rows of `costs` as a table, with the errors of the field at `times`."""
     body = []
     for row in rows:
         fields = [f"{error:.1e}" for error in row["fields"]]

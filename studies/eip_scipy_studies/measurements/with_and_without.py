@@ -47,7 +47,10 @@ def momentum(t, y):
 
 
 class Errors(NamedTuple):
-    """Times of a run of the comet, its errors of the energy and of the position, and its calls of `fun`."""
+    """Times (m,) of a run of the comet, relative errors of the energy, errors of the position, and calls of `fun`.
+
+    Errors of the position are in units of the semi-major axis.
+    """
 
     t: np.ndarray
     energy: np.ndarray
@@ -55,7 +58,7 @@ class Errors(NamedTuple):
     nfev: int
 
     def largest(self) -> dict[str, float]:
-        """Return the largest errors of the first and of the last period."""
+        """Return, by name, the largest errors of the energy and of the position in the first and in the last period."""
         ends = {"first": self.t <= PERIOD, "last": self.t >= T_END - PERIOD}
         return {
             f"{what}, {when} period": float(getattr(self, what)[where].max())
@@ -88,7 +91,7 @@ def low_orbit() -> Problem:
 
 
 def flights() -> dict[str, Flight]:
-    """Run the satellite without and with its balances."""
+    """Run the satellite without and with its balances kept, and return the runs by the names of their methods."""
     problem = low_orbit()
     times = np.linspace(0, DAYS * DAY, 721)
     common: dict[str, Any] = {"fun": problem.fun, "t_span": problem.t_span, "y0": problem.y0, "t_eval": times}
@@ -174,7 +177,7 @@ def satellite_figure(found: dict[str, Flight]) -> Any:
 
 
 def two_panels(time: str, end: float, energy: str) -> tuple[Any, Any, Any, tuple[str, str]]:
-    """Return a figure, its panels for energies and positions, and the colours of runs without and with invariants.
+    """Return a figure, its panels for energies and positions, and the colours of runs without and with invariants kept.
 
     The panels go from time 0 to `end`; `time` and `energy` are labels.
     """

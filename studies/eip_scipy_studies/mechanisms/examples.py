@@ -75,7 +75,7 @@ def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
 
 
 def _crank(n: int, t: float) -> np.ndarray:
-    """Return the angle of the cranks from the vertical, which is the same for all, and its rate, at time `t`."""
+    """Return the angle [rad] from the vertical at time `t`, which is the same for all cranks, and its rate."""
     factor = G * ((n + 1) / 2 + n) / ((n + 1) / 3 + n)
     return solve_ivp(lambda t, y: [y[1], factor * np.sin(y[0])], (0, t), [0.0, 1.0], **FINEST).y[:, -1]
 
@@ -134,7 +134,7 @@ def _andrews_mass(q: Any) -> np.ndarray:
 
 
 def _spring(q: Any) -> tuple[Any, Any, Any]:
-    """Return the spring's length, and the vector along it."""
+    """Return the spring's length, and the components x and y of the vector along it."""
     x = SD * np.cos(q[2]) + SC * np.sin(q[2]) + XB - XC
     y = SD * np.sin(q[2]) - SC * np.cos(q[2]) + YB - YC
     return np.sqrt(x**2 + y**2), x, y
@@ -212,7 +212,10 @@ def _car_forces(t: Any, q: Any, u: Any) -> np.ndarray:
 
 
 def _car_constraints(t: Any, q: Any) -> np.ndarray:
-    """Return the residuals of the constraints: the left spring is perpendicular to the axis, which has the length 1."""
+    """Return the residuals of the constraints.
+
+    The left spring is perpendicular to the line between the wheels, and the axis has the length 1.
+    """
     axis = q[:2] - q[2:]
     return np.array([q[:2] @ _right_wheel(t), axis @ axis - 1])
 
@@ -226,7 +229,7 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1
 
 
 def bricard(section: float = 0.1, axes: bool = True, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
-    """Return Bricard's mechanism of five rods of 1 kg with a square section of this side, with gravity along -y.
+    """Return Bricard's mechanism of five rods of 1 kg with a square section of side `section` [m], gravity along -y.
 
     Its coordinates are those of the corners P2 to P5 and, if `axes` is true, of the axes of the joints there: 24
     constraints of rank 23. Otherwise the axes follow from the rods, which are then slender: 12 constraints of rank 11.
@@ -303,7 +306,7 @@ def knife_edge(t_end: float = 10.0) -> MechanicsProblem:
 
 @cache
 def four_bar_model() -> tuple[Any, dict[Any, float]]:
-    """Return a four-bar linkage with particles at the joints' ends as a KanesMethod, and values of its constants."""
+    """Return a four-bar linkage with particles at the ends of its links as a KanesMethod, and the constants' values."""
     import sympy
     import sympy.physics.mechanics as me
 
@@ -346,7 +349,7 @@ def four_bar(t_end: float = 30.0) -> MechanicsProblem:
 
 @cache
 def _disc_model() -> tuple[Any, dict[Any, float]]:
-    """Return a thin disc that rolls on a plane."""
+    """Return a thin disc that rolls on a plane as a KanesMethod, and the constants' values."""
     import sympy
     import sympy.physics.mechanics as me
 
@@ -384,7 +387,7 @@ def _disc_model() -> tuple[Any, dict[Any, float]]:
 
 
 def disc(wobbling: bool, t_end: float = 5.0) -> MechanicsProblem:
-    """Return a rolling disc that leans by 0.3: in steady motion on a circle, or wobbling."""
+    """Return a rolling disc that leans by 0.3 rad: wobbling, or else in steady motion on a circle."""
     lean, turning = 0.3, 1.0
     spinning = (turning**2 * np.tan(lean) - 4 * G * np.sin(lean)) / (6 * turning)  # of steady motion
     if wobbling:
@@ -402,7 +405,11 @@ def disc(wobbling: bool, t_end: float = 5.0) -> MechanicsProblem:
 
 
 def _rolled(start: np.ndarray, t: float) -> np.ndarray:
-    """Return (yaw, lean, spin, x, y, z, rates) from the equations of a thin disc of radius 1 without constraints."""
+    """Return the state at time `t` of a thin rolling disc of radius 1, from equations that need no constraints.
+
+    `start` is (yaw, lean, spin, x, y, u1, u2, u3) with the angular velocity u1 to u3; the result has z after y, and the
+    velocity of the centre at the end.
+    """
 
     def fun(t: float, s: np.ndarray) -> list[float]:
         yaw, lean, _, _, _, u1, u2, u3 = s

@@ -1,4 +1,4 @@
-"""The speed of the four-bar linkage's right-hand side, and of the way from a model to its first result."""
+"""Processor time of the four-bar linkage's right-hand side, and from a SymPy model to its first result."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Speed(NamedTuple):
 
 
 def speed() -> Speed:
-    """Measure these times."""
+    """Measure the three times of `Speed`, and return them."""
     problem = four_bar()
     kept(problem, (), TOLERANCE)  # compiles
     state, plain = problem.y0, lambdified(problem, 0.0)
@@ -52,9 +52,9 @@ def speed() -> Speed:
 
 
 def first_result() -> float:
-    """Return the processor time from the derived model to the first result.
+    """Return the processor time in seconds from a SymPy model whose equations are derived to the first result.
 
-    It is measured in a new process, in which nothing is compiled or imported before.
+    Call this function in a new process, in which nothing was compiled or imported before.
     """
     four_bar_model()
     began = time.process_time()

@@ -49,7 +49,11 @@ class Line(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Everything that was measured; `published` has the largest relative distances from published states."""
+    """Everything that was measured.
+
+    `published` has, for each mechanism with a published last state, the largest relative difference of a component from
+    it, in a run at the tolerance `FINEST`.
+    """
 
     lines: list[Line]
     published: dict[str, float]
@@ -58,7 +62,7 @@ class Found(NamedTuple):
 
     @property
     def by_mechanism(self) -> dict[str, list[Line]]:
-        """The results (`Line`) of each mechanism."""
+        """Return the results (`Line`) by the name of their mechanism."""
         names = dict.fromkeys(line.mechanism for line in self.lines)
         return {name: [line for line in self.lines if line.mechanism == name] for name in names}
 
@@ -159,7 +163,10 @@ class Mechanisms(Study[Found]):
 
 
 def _costs(lines: Sequence[Line]) -> str:
-    """Lay out the cost of each method at each error; runs that did not reach their end are left out."""
+    """Lay out the calls and milliseconds with which each method reaches each error of `LEVELS`.
+
+    Runs that did not reach their end are left out.
+    """
     done = [line for line in lines if np.isfinite(line.error)]
     by_calls, by_time = curves(done, "calls"), curves(done, "seconds")
     heads = [[f"{level:g}", what] for what in ("calls", "ms") for level in LEVELS]
@@ -202,7 +209,10 @@ def _published_checks(found: Found) -> Iterable[Check]:
 
 
 def _weights_checks(lines: Sequence[Line]) -> Iterable[Check]:
-    """Yield checks that projection does not increase the errors, as it would with wrong weights of the corrections."""
+    """Yield checks that errors with projection are hardly larger than without.
+
+    They would be larger if the weights of the corrections were wrong.
+    """
     by = {(line.mechanism, line.method, line.tolerance): line.error for line in lines}
     for name in dict.fromkeys(line.mechanism for line in lines if line.mechanism in WEIGHED):
         for what in (CONSTRAINTS, BOTH):

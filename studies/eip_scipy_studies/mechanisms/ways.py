@@ -29,7 +29,10 @@ FREE = 1e10  # absolute tolerance of IDA's multipliers, which are not part of th
 
 
 class Outcome(NamedTuple):
-    """A run: processor time in seconds, the last state (NaN if it was not reached), calls of the right-hand side."""
+    """A run: processor time in seconds, last state, calls of the right-hand side, and whether the run is reliable.
+
+    The last state is NaN if the run did not reach its end.
+    """
 
     seconds: float
     y: np.ndarray
@@ -41,7 +44,7 @@ Way = Callable[[float], Outcome]
 
 
 class _TooManyCallsError(Exception):
-    """Error that ends a run which takes too long."""
+    """Error that ends a run after more than `MOST_CALLS` calls of the right-hand side."""
 
 
 def ways(problem: MechanicsProblem, session: Session) -> dict[str, Way]:
@@ -68,7 +71,10 @@ def ways(problem: MechanicsProblem, session: Session) -> dict[str, Way]:
 
 
 def kept(problem: MechanicsProblem, invariants: Any, tolerance: float, **options: Any) -> Any:
-    """Run by EIPDOP853 with these invariants."""
+    """Run a mechanism by `integrate` with EIPDOP853, these invariants and rtol = atol = `tolerance`; return its result.
+
+    Warnings are suppressed; the result's `trusted` tells whether the run is reliable.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a run that is not reliable is marked
         return integrate(problem, invariants=invariants, method=EIPDOP853, rtol=tolerance, atol=tolerance, **options)
@@ -88,7 +94,7 @@ def _projected(problem: MechanicsProblem, invariants: Any, tolerance: float) -> 
 
 
 class _Calls:
-    """Counter of calls that ends a run with too many of them."""
+    """Counter of calls; `add` raises an error after more than `MOST_CALLS` of them, to end the run."""
 
     number = 0
 
@@ -117,7 +123,7 @@ def _by_scipy(problem: MechanicsProblem, fun: Any, method: str, tolerance: float
 
 
 def _by_ida(problem: MechanicsProblem, ida: Any, tolerance: float) -> Outcome:
-    """Run by IDA, with the constraints on positions and velocities as equations, and a multiplier for each.
+    """Run `problem` by IDA, with the constraints on positions and velocities as equations, and a multiplier for each.
 
     The multipliers move q' and u' along the gradients of the constraints (Gear, Gupta and Leimkuhler 1985). They are 0
     in the exact motion, since the accelerations satisfy the constraints already.

@@ -46,9 +46,9 @@ class Reproduce(Command):
     studies: Mapping[str, Make] = field(default_factory=lambda: STUDIES)
 
     def run(self, session: Session) -> int:
-        """Run the studies of the chosen tables and figures in turn, and write one JSON file of all.
+        """Run the studies of the chosen tables and figures in turn, and return the exit status.
 
-        The lists `cells` and `orders` in it hold the numbers of all tables.
+        If a JSON file is wanted, it is one for all; its lists `cells` and `orders` hold the numbers of all tables.
         """
         check_outputs(session.out, session.json)
         wanted = list(dict.fromkeys(self.studies if "all" in self.table else self.table))

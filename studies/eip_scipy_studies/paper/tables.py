@@ -41,7 +41,7 @@ WIDE, NARROW, DIGITS = 12, 9, 8  # columns of the printed tables
 
 @dataclass(frozen=True)
 class Value:
-    """One number of the paper and ours.
+    """A number of the paper, and the same number computed by this package.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Value:
 
     @property
     def digits(self) -> int:
-        """Return the number of significant digits to which both numbers agree when rounded."""
+        """Return the number of significant digits to which `paper` and `ours` agree when rounded."""
         paper, ours = Decimal(self.paper), Decimal(self.ours)
         for count in range(self.paper_digits, 0, -1):
             place = Decimal(1).scaleb(paper.adjusted() - count + 1)
@@ -78,7 +78,7 @@ class Value:
 
     @property
     def matched(self) -> bool:
-        """Return whether every printed digit agrees."""
+        """Return whether every digit printed in the paper agrees with our number."""
         return self.digits == self.paper_digits
 
     @property
@@ -106,7 +106,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of one of the paper's tables: an error, and its order unless it is the first of its series."""
+    """A cell of one of the paper's tables: an error and its order of convergence, None for the first of a series."""
 
     table: int
     row: str
@@ -159,7 +159,7 @@ class PaperTable(Study[list[Cell]]):
     processes: int = field(default_factory=cores)
 
     def measure(self, session: Session) -> list[Cell]:
-        """Compute all numbers, method by method, from the longest step to the shortest."""
+        """Compute all numbers of the table, method by method, from the longest step to the shortest."""
         number = TABLES.index(self.name) + 1
         stored = [Series(**s) for s in _data()["series"] if s["table"] == number]
         cells = []
@@ -193,7 +193,7 @@ class PaperTable(Study[list[Cell]]):
 
 
 def _cells(series: Series, errors: list[float]) -> list[Cell]:
-    """Return the cells of one series."""
+    """Return the cells of one series, whose errors computed by this package are `errors`."""
     about = _data()["tables"][str(series.table)]
     exact = [math.nan] * len(errors) if series.mpmath is None else [float(x) for x in series.mpmath]
     orders = _orders(series, errors, exact, about["roundoff"])
@@ -209,7 +209,10 @@ def _cells(series: Series, errors: list[float]) -> list[Cell]:
 
 
 def _orders(series: Series, errors: list[float], exact: list[float], roundoff: float) -> list[Value | None]:
-    """Return the order at each step except the first, and how much round-off in the two errors may change it."""
+    """Return None for the first step, and for each other one the order of convergence from the step before.
+
+    The `roundoff` of an order is how much round-off in its two errors may change it.
+    """
     refinement = -np.diff(np.log(series.steps))
     observed, expected = (-np.diff(np.log(np.abs(values))) / refinement for values in (errors, exact))
     relative = roundoff / np.where(np.isnan(exact), errors, exact)
@@ -261,7 +264,7 @@ def _raw_step(solver: type[EIPSolver], problem: Problem, y: np.ndarray, h: float
 
 
 def _last_defects(series: Series) -> list[float]:
-    """Return the errors in tables 2 and 4: the last residual of the first preserved invariant."""
+    """Return the errors in tables 2 and 4: the change of the first kept invariant from start to end, for each step."""
     problem = harmonic(OMEGA) if series.table == 2 else kepler(eccentricity=0.6, relativistic=0.005)
     return [_last_defect(problem, series, h) for h in series.steps]
 
@@ -285,9 +288,10 @@ def _field_differences(series: Series) -> list[float]:
 
 
 def _shared(stored: list[Series], start: Callable[..., Callable[[], Any]]) -> Callable[[Series], list[float]]:
-    """Queue the runs of all series, and return a function that does what `_field_differences` does with their results.
+    """Queue the runs of all series in other processes, and return a function that replaces `_field_differences`.
 
-    Runs with most steps come first. `start` is what `workers` yields.
+    The returned function waits for the runs of a series, and returns the errors. Runs with most steps come first.
+    `start` is the function that `workers` yields.
     """
     runs = [(series, h) for series in stored for h in _field_steps(series)]
     waiting = {(series.name, h): start(_field_end, series, h) for series, h in sorted(runs, key=lambda run: run[1])}
@@ -309,7 +313,7 @@ def _field_changes(ends: list[np.ndarray]) -> list[float]:
 
 
 def _run(problem: Problem, series: Series, h: float, t_end: float = 1.0) -> Any:
-    """Take round(t_end/h) steps of length h: the paper's last steps do not all end on t = 1."""
+    """Take round(t_end/h) steps of length h, and return the result: the paper's last steps do not all end on t = 1."""
     kept = [item for item in problem.invariants if item.name[0].upper() in series.invariants]
     return integrate(
         problem,

@@ -31,13 +31,13 @@ class ChargedParticle(Study[Found]):
     stem: str = "charged-particle"
 
     def chosen(self) -> Sequence[str]:
-        """Return the problems that run."""
+        """Return the names of the problems to run, some of `SCENES`."""
         return self.scenes
 
     def measure(self, session: Session) -> Found:
         if find_spec("numba") is None:
             warn(
-                "without Numba the fields run in Python, which takes hours; a minute is enough after "
+                "Numba is not installed, so the runs take hours in Python; they take about a minute after "
                 'pip install "eip_scipy[numba]"'
             )
         runs = len(self.chosen()) * (1 + (len(PAPER_METHODS) if self.paper_only else len(METHODS) + 1))
@@ -62,7 +62,7 @@ class ChargedParticle(Study[Found]):
         return {f"{self.stem}.csv": [row for scene in found.values() for row in report.rows(scene)]}
 
     def figures(self, found: Found) -> Figures:
-        """Draw one figure for each field, as in the paper."""
+        """Yield a file name and a figure for each field (uniform, tokamak), as in the paper."""
         for name, figure in report.figures(found, paper_only=self.paper_only):
             yield f"{self.stem}.png" if self.paper_only else f"{self.stem}-{name}.png", figure
 
@@ -82,5 +82,5 @@ class Tokamak(ChargedParticle):
     orbit: str | None = option(None, "run only this orbit; default: both", choices=tuple(ORBITS))
 
     def chosen(self) -> Sequence[str]:
-        """Return the problems of the orbit."""
+        """Return the names of the tokamak problems to run: that of `orbit`, or both if it is None."""
         return [name for name in self.scenes if self.orbit in (None, name.removeprefix("tokamak-"))]

@@ -69,7 +69,7 @@ def checks(found: ParticleStudy) -> list[RangeCheck]:
 
 
 def _keepers(found: ParticleStudy) -> list[str]:
-    """Return the methods that keep both invariants."""
+    """Return the names of the methods that keep both invariants, H and L."""
     return [name for name in found.lines if name.startswith("EIP-HL")]
 
 
@@ -267,7 +267,7 @@ def _tokamak_row(orbits: Mapping[str, ParticleStudy], name: str) -> Any:
 
 
 def _thin(orbit: ParticleOrbit) -> np.ndarray:
-    """Return points of a long orbit in (R, z): a few of each gyration are enough for the eye."""
+    """Return some points (R, z) of a long orbit, shape (2, m): a few of each gyration are enough for the eye."""
     every = max(orbit.t.size // CURVE_POINTS, 1)
     return np.stack([orbit.R[::every], orbit.z[::every]])
 

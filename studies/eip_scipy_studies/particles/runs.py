@@ -38,7 +38,9 @@ class ParticleRun:
     energy_error, momentum_error : ndarray, shape (m,)
         Relative errors of H and L.
     nfev : int
+        Calls of the right-hand side.
     wall_time : float
+        Seconds.
     """
 
     orbit: ParticleOrbit
@@ -80,8 +82,8 @@ class ParticleStudy:
         and ``gyroradius_last`` (half the range of R in the first and the 100th turn, or the last where there are
         fewer), and ``angle_error`` (of the guiding centre, averaged over a gyration; largest). Tokamak: ``tips``,
         ``tip_nearest`` and ``tip_farthest`` (guiding centre's R), ``extrema_error`` (largest error of the extrema of R
-        and z in a poloidal turn of the reference) and ``moment_change`` (of the magnetic moment, averaged over the
-        first and the last of these turns).
+        and z in a poloidal turn of the reference) and ``moment_change`` (relative, of the magnetic moment averaged over
+        a turn, from the first to the last of these turns).
         """
         special = _uniform_numbers if self.scene == "uniform" else _tokamak_numbers
         return {

@@ -71,19 +71,19 @@ class TimedRun:
 
     @property
     def mercury(self) -> float:
-        """Return the error of Mercury's position."""
+        """Return the error of Mercury's position in AU."""
         return float(self.errors[MERCURY])
 
     @property
     def others(self) -> float:
-        """Return the largest error of the other planets' positions."""
+        """Return the largest error of the position of another planet than Mercury in AU."""
         return float(np.delete(self.errors, MERCURY).max())
 
 
 def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
     """Return ``run(step)``, which runs the problem by `integrate` with this step in years.
 
-    It returns the seconds and the final state, which is nan if the run failed.
+    ``run(step)`` returns the seconds and the final state, which is nan if the run failed.
     """
 
     def run(step: float) -> tuple[float, np.ndarray]:
@@ -172,7 +172,9 @@ def cost(
     repeats: int,
     callback: Callable[[], Any] | None = None,
 ) -> list[TimedRun]:
-    """Return final position errors against the time of the run, for several methods and steps.
+    """Time several methods and steps, and return the times and the errors of the final positions.
+
+    The errors are relative to the stored state or, if there is none, to IAS15 or else to `tight_run`.
 
     Parameters
     ----------
@@ -209,9 +211,10 @@ def cost_methods(
     scene : SolarScene
     method : type
         The method asked for. It is timed with and without its projection; EIPRK5 (or EIPRK4 if `method` is EIPRK5),
-        EIPRKN12 and EIPGJ14 are timed as well.
+        Stoermer-Verlet, EIPRKN12, EIPGJ14 and, if there is a `peer`, REBOUND's methods are timed as well.
     metric : {"error", "euclidean"}
     peer : callable or None
+        REBOUND, if it is installed.
 
     Returns
     -------
@@ -240,5 +243,8 @@ def cost_methods(
 
 
 def _steps(scene: SolarScene, wanted: Sequence[float]) -> list[float]:
-    """Shorten steps to divide the time span, because a shortened last step would spoil a symplectic method."""
+    """Return the wanted steps, shortened to divide the time span, in descending order.
+
+    A shortened last step would spoil a symplectic method.
+    """
     return sorted({scene.years / whole_number(scene.years / h) for h in wanted}, reverse=True)

@@ -26,7 +26,7 @@ _ORDINAL_ZERO_JD = Fraction(3442849, 2)  # of date.toordinal(), at midnight
 
 
 class Epoch(NamedTuple):
-    """A Julian date, TDB, in two parts: the last midnight and the rest of the day."""
+    """A Julian date, TDB, in two parts: the last midnight, and the time since then in days."""
 
     midnight: float
     rest: float
@@ -68,7 +68,7 @@ def parse_epoch(text: str) -> Epoch:
 def _from_date(day: str, hour: str, minute: str, second: str) -> Epoch:
     time = Fraction(int(hour) * 60 + int(minute)) * 60 + Fraction(second)
     if int(hour) > 23 or int(minute) > 59 or Fraction(second) >= 60:
-        raise ValueError("a time is between 00:00 and 24:00, and TDB has no leap seconds")
+        raise ValueError("hours are 00 to 23, minutes 00 to 59, seconds below 60; TDB has no leap seconds")
     return _two_parts(date.fromisoformat(day).toordinal() + _ORDINAL_ZERO_JD + time / 86400)
 
 

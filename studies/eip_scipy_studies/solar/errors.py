@@ -24,7 +24,7 @@ TIGHT_POSITION = {"IAS15": 1e-8, TIGHT: 1e-7}  # AU, after 2000 years
 
 
 class PointErrors(NamedTuple):
-    """Errors of one run at one time, and the reference to which they are relative.
+    """Errors (9,) of the planets in one run at one time, and the name of the reference to which they are relative.
 
     Errors of longitude are signed, in rad, and nan if whole turns cannot be counted. Errors of position are distances
     in AU.
@@ -52,7 +52,7 @@ class SolarRuns:
     """Name of the run that another core did in parallel; empty if all runs were done one after the other."""
 
     def errors(self, year: float) -> dict[str, PointErrors]:
-        """Return, by name, the errors of those runs whose errors at this time are known."""
+        """Return, by name, the errors of those runs whose errors at the time `year` are known."""
         found = {run.name: errors_at(self.scene, run, year, self.tight) for run in self.runs}
         return {name: errors for name, errors in found.items() if errors is not None}
 
@@ -162,7 +162,9 @@ def _state_at(run: MethodRun, year: float) -> np.ndarray | None:
 
 
 def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | None) -> list[Check]:
-    """Check conditions that hold for any sensible settings; if one fails, the results are not reliable.
+    """Return checks that hold for any sensible settings; if one fails, the results are not reliable.
+
+    They are that the runs reached the end, that `main` keeps H and L, and that `tight` agrees with stored states.
 
     Parameters
     ----------
@@ -172,7 +174,7 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
     main : MethodRun
         The run of this method.
     tight : MethodRun or None
-        The tightest run.
+        The most accurate run, with which the others are compared.
 
     Returns
     -------
@@ -191,7 +193,7 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
 
 
 def _reference_checks(scene: SolarScene, tight: MethodRun) -> list[Check]:
-    """Check that the tightest run, along which turns are counted, agrees with the last stored state in its span."""
+    """Return a check that the run along which turns are counted agrees with the last stored state in its span."""
     stored = [year for year in report_times(scene) if stored_state(scene, year) is not None]
     at_end = errors_at(scene, tight, stored[-1], tight) if stored else None
     if at_end is None:

@@ -44,7 +44,7 @@ def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, 
 
 
 def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities of the planets relative to the centre of mass of all inner bodies.
+    """Return positions and velocities of each planet relative to the centre of mass of all bodies before it.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def osculating_orbits(scene: SolarScene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
-    """Compute the osculating ellipses: the planets' orbits if all bodies inside each were a single one.
+    """Compute the osculating ellipses: the orbit of each planet if all bodies before it were a single one.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _span(study: SolarRuns) -> str:
 
 
 def _longitudes(study: SolarRuns) -> dict[str, np.ndarray]:
-    """Return the errors of longitude along each run except the reference, by name."""
+    """Return the errors of longitude (9, m) in rad along each run except the reference, by name."""
     tight = study.tight
     if tight is None:
         return {}
@@ -138,7 +138,7 @@ def _longitude_figure(study: SolarRuns, styles: Any) -> Any:
 
 
 def _shown(study: SolarRuns) -> dict[str, MethodRun]:
-    """Return the runs that the figures of orbits show: Stoermer-Verlet and the method asked for, and the reference."""
+    """Return, by title, the runs that the figures of orbits show: Stoermer-Verlet, the chosen method, the reference."""
     verlet = next(run for run in study.runs if run.name == "SV")
     shown = {"Störmer-Verlet": verlet, study.runs[0].name: study.runs[0]}
     if study.tight:

@@ -28,7 +28,7 @@ LEVELS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 
 def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | None) -> dict[str, Any]:
-    """List the timed methods, with steps in years or tolerances.
+    """Return the methods to time, with steps in years or tolerances.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def _rows(runs: Sequence[TimedRun]) -> Rows:
 
 
 class Found(NamedTuple):
-    """The runs, and the machine."""
+    """The timed runs, and a description of the machine in one line."""
 
     runs: list[TimedRun]
     machine: str
@@ -119,7 +119,7 @@ class Frontier(Study[Found]):
     repeats: int = 3
 
     def check_settings(self) -> None:
-        """Raise an error if no reference state is stored for this length."""
+        """Raise a UsageError if no reference state is stored for the time `years`."""
         if self.years not in reference_states():
             known = ", ".join(f"{t:g}" for t in reference_states())
             raise UsageError(f"there is no stored reference state: --years must be one of {known}, got {self.years:g}")
@@ -166,7 +166,7 @@ class Frontier(Study[Found]):
         return {"runs": _rows(found.runs)}
 
     def figures(self, found: Found) -> Figures:
-        """Draw Mercury's error and that of the others, against time."""
+        """Yield a figure of position errors against wall time: of Mercury, and the largest of another planet."""
         from ..plotting import cost_figure
 
         yield (

@@ -108,7 +108,7 @@ def _check_lines(study: SolarRuns) -> list[str]:
 
 
 def cost_rows(study: SolarRuns) -> list[dict[str, Any]]:
-    """Make a row for each method and step that was timed."""
+    """Return a row for each method and step that was timed."""
     if study.cost_scene is None:
         return []
     return [
@@ -125,7 +125,7 @@ def cost_rows(study: SolarRuns) -> list[dict[str, Any]]:
 
 
 def csv_rows(study: SolarRuns) -> list[dict[str, Any]]:
-    """Make a row for each method and each time with a reference; it has columns for all planets."""
+    """Return a row for each method and each of the `report_times`, with columns for all planets."""
     rows = []
     planets = study.scene.planets
     for year in report_times(study.scene):
@@ -151,7 +151,7 @@ def csv_rows(study: SolarRuns) -> list[dict[str, Any]]:
 
 
 def json_content(study: SolarRuns) -> dict[str, Any]:
-    """Collect all numbers for the JSON file."""
+    """Return all numbers for the JSON file."""
     scene = study.scene
     times = {year: study.errors(year) for year in report_times(scene)}
     methods = [

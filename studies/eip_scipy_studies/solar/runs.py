@@ -69,6 +69,7 @@ class SolarScene:
         Problem in AU and Julian years; its `h` divides the time between saves.
     data : SolarSystemData
     years, h : float
+        Length and step of the runs in Julian years.
     n_saves : int
         Number of equally spaced states that are saved after the start.
     every : int
@@ -107,7 +108,9 @@ class MethodRun:
     wall_time : float
         Seconds of the run, without compilation and without reading states.
     t : ndarray, shape (m,)
+        Times in Julian years.
     y : ndarray, shape (60, m)
+        States in AU and AU/yr.
     energy_error, momentum_error : ndarray, shape (m,)
         |H - H(0)| / |H(0)| and |L - L(0)| / |L(0)|.
     failure : str
@@ -178,7 +181,7 @@ def _save_interval(years: float) -> float:
 
 
 def whole_number(ratio: float) -> int:
-    """Round the ratio up, unless it is a whole number up to rounding errors."""
+    """Return the ratio rounded up, or to the nearest integer if it differs only by rounding errors; at least 1."""
     nearest = round(ratio)
     return max(1, nearest if abs(ratio - nearest) <= 1e-9 * ratio else math.ceil(ratio))
 
@@ -190,7 +193,7 @@ def plan(
     peer: Peer | None,
     checkpoint_of: Callable[[str], dict[str, Any]] = lambda name: {},
 ) -> list[PendingRun]:
-    """List the runs of the comparison: first that of `method`, last the most accurate one, which serves as reference.
+    """Return the runs of the comparison: first that of `method`, last the most accurate one, which is the reference.
 
     Parameters
     ----------
@@ -240,7 +243,7 @@ def metric_of(method: type[EIPSolver], metric: str) -> str:
 
 
 def eip_name(method: type[EIPSolver], metric: str) -> str:
-    """Return the name of a method with its metric."""
+    """Return the name of a method with its metric, such as "EIPRK4 (error)"."""
     return f"{method.__name__} ({metric})"
 
 
@@ -317,13 +320,13 @@ def _verlet(scene: SolarScene) -> MethodRun:
 
 
 def leapfrog(problem: Problem, step: float, save_every: int | None) -> StormerVerletResult:
-    """Run Stoermer-Verlet in its kick-drift-kick form."""
+    """Run Stoermer-Verlet in its kick-drift-kick form with this step, and return the result of `stormer_verlet`."""
     assert problem.acc is not None  # N bodies have accelerations
     return stormer_verlet(problem.acc, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
 
 
 def rebound_run(scene: SolarScene, peer: Peer, name: str, integrator: str, per_save: int, progress: bool) -> MethodRun:
-    """Run an integrator of REBOUND.
+    """Run an integrator of REBOUND with `per_save` steps between two saved states.
 
     Integrators with fixed steps are timed in a second run without saves, because each save costs a synchronisation.
     """
@@ -365,13 +368,13 @@ def _finished(
 
 
 def stored_state(scene: SolarScene, year: float) -> np.ndarray | None:
-    """Return the reference state that the package carries for a time, if there is one."""
+    """Return the reference state (60,) that the package carries for the time `year`, or None if there is none."""
     known = scene.problem.reference
     return None if known is None else known(round(float(year), 9))
 
 
 def report_times(scene: SolarScene) -> list[float]:
-    """Return the years at which errors are reported: saved powers of ten with a stored reference state, and the end."""
+    """Return the years at which errors are reported: the end, and powers of ten with a saved and a stored state."""
     times = [t for t in np.linspace(0.0, scene.years, scene.n_saves + 1)[1:] if round(t, 9) in POWERS]
     stored = [round(float(t), 9) for t in times if stored_state(scene, t) is not None]
     return sorted({*stored, float(scene.years)})

@@ -133,7 +133,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return report.text(found.runs, self)
 
     def checks(self, found: Found) -> list[Check]:
-        """Return checks of the method, and of the reference run."""
+        """Return checks of the run of the chosen method, and of the reference run."""
         return found.runs.checks()
 
     def tables(self, found: Found) -> dict[str, Rows]:
@@ -144,7 +144,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return report.json_content(found.runs)
 
     def figures(self, found: Found) -> Figures:
-        """Yield the figures that the second process has drawn, and draw the others."""
+        """Yield figures as PNG files: those that the second process has drawn, and the others."""
         drawn = images(found.runs, slice(None) if found.beside is None else OWN_FIGURES)
         if found.beside is not None:
             drawn = found.beside.result() | drawn
@@ -153,7 +153,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
 
 
 def images(runs: SolarRuns, part: slice) -> dict[str, bytes]:
-    """Return some of the figures as PNG files, by their names."""
+    """Return the contents of PNG files by their names, for the figures in the slice `part` of `FIGURES`."""
     from .figures import figures
 
     found = {}

@@ -71,9 +71,10 @@ def models(forces: Sequence[str] | None) -> list[Model]:
 
 
 def save_times(years: float, h: float) -> tuple[np.ndarray, int, float]:
-    """Return times of saved states in years, the steps between them, and the step in years.
+    """Return the times of saved states in years, the number of steps between two of them, and the step in years.
 
-    1, 10, 100 and the end are among them; the time between them is a whole number of steps.
+    The times have the sign of `years`; 1, 10, 100 and the end are among them if they are in the span. The step is at
+    most `h`, and the interval before the end may be shorter than the others.
 
     Raises
     ------
@@ -83,7 +84,7 @@ def save_times(years: float, h: float) -> tuple[np.ndarray, int, float]:
     span = abs(years)
     interval = span / 100 if span < 1 else 0.1 if span <= 200 else 1.0
     if not h <= span:
-        raise ValueError(f"--h: a step of {h:g} yr does not fit into {years:g} yr")
+        raise ValueError(f"--h: a step of {h:g} yr does not fit into {years:g} yr; reduce --h or lengthen --years")
     every = whole_number(interval / h)
     times = interval * np.arange(whole_number(span / interval) + 1)
     times[-1] = span
@@ -127,7 +128,10 @@ def run_model(
 def _positions(
     model: Model, data: SolarSystemData, times: np.ndarray, every: int, step: float, progress: bool
 ) -> dict[str, np.ndarray]:
-    """Return heliocentric positions in km, as the ephemeris gives them."""
+    """Return the heliocentric positions (m, 3) in km of each body but the Sun at `times`.
+
+    If the Moon is a separate body, "EMB" is the centre of mass of Earth and Moon.
+    """
     problem = solar_system(data, years=float(times[-1]), h=step, forces=model.forces)
     method = named(EIPDOP853, model.name)
     result = integrate(problem, method=method, save_every=every, every="auto", compensated=True, progress=progress)
@@ -181,7 +185,7 @@ class Truth(AnyEpoch, Study[Found]):
     )
 
     def arguments(self) -> dict[str, Any]:
-        """Return the settings of the runs, except the epoch."""
+        """Return the user's settings for the JSON file, except the epoch and the kernel."""
         return {"years": self.years, "h": self.h, "forces": self.forces}
 
     def measure(self, session: Session) -> Found:
@@ -263,14 +267,14 @@ class Truth(AnyEpoch, Study[Found]):
 
 
 def reported(years: np.ndarray) -> list[int]:
-    """Return the indices of 1, 10 and 100 years and of the end among the times."""
+    """Return the indices in `years` of the end, and of those of 1, 10 and 100 years that are before it."""
     span = np.abs(years)
     inside = [int(np.argmin(np.abs(span - year))) for year in REPORTED if year < span[-1] * (1 - 1e-9)]
     return [*inside, years.size - 1]
 
 
 def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
-    """Return the rows of the table as numbers."""
+    """Return a row of errors for each model, each of the `reported` times and each body."""
     return [
         _row(run, place, body) | {"step_km": run.step_km[body] if place == run.years.size - 1 else None}
         for run in runs
@@ -280,7 +284,7 @@ def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
 
 
 def csv_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
-    """Return rows for all saved times except the start, at which there is no error."""
+    """Return a row for each model, body and saved time except the start, at which there is no error."""
     return [_row(run, k, body) for run in runs for k in range(1, run.years.size) for body in run.km]
 
 

@@ -56,7 +56,7 @@ class Case:
 
     @cached_property
     def reference(self) -> Array:
-        """Return the true value of `view` at the end."""
+        """Return the true value of `view` at the end of the interval."""
         if self.truth is not None:
             return np.asarray(self.truth())
         atol = 1e-2 * TIGHT * self.size
@@ -66,7 +66,9 @@ class Case:
         return y / self.size if self.view is None else self.view(y)
 
     def error(self, method: Any, rtol: float, share: float = 1e-2, **options: Any) -> tuple[float, int]:
-        """Run the problem; return the error of the last state, and the number of calls, including those for Jacobians.
+        """Run the problem; return the error of the last state, and the calls of `fun`, including those for Jacobians.
+
+        The error is the largest difference of a value of `view` from the reference.
 
         Parameters
         ----------
@@ -161,7 +163,10 @@ def ozone() -> Case:
 
 
 def magnet() -> Case:
-    """Return a magnetic moment in a rotating field, with strong Landau-Lifshitz damping; its length is invariant."""
+    """Return a magnetic moment in a rotating field, with strong Landau-Lifshitz damping.
+
+    The invariant is the squared length of the moment.
+    """
 
     def fun(t: float, m: Array) -> Array:
         field_ = 1e3 * np.array([np.cos(t), np.sin(t), 0.5]) + 1e3 * np.array([0.0, 0.0, m[2]])
@@ -230,7 +235,7 @@ def separation() -> Case:
 def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> Case:
     """Return the chain with dampers, with its constraints as invariants.
 
-    Its reference is the same chain in angles.
+    Its reference is a run of the same chain with the angles of the links as coordinates.
     """
     made, (fun, start, state) = chain(angles), chain_by_angles(angles)
 
@@ -243,7 +248,7 @@ def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> C
 def governor_case(end: float = 5.0) -> Case:
     """Return the flyball governor, with its constraints and L_z as invariants.
 
-    The height of the slider is compared with that of the same governor in angles.
+    The height of the slider is compared with that in a run of `governor_by_angles`.
     """
     made, (fun, start, height) = governor(), governor_by_angles()
 

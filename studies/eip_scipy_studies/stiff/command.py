@@ -39,7 +39,7 @@ Found = dict[str, list[dict[str, Any]]]
 
 
 def compared(name: str, case: Case, rtol: float, share: float) -> Iterable[dict[str, Any]]:
-    """Return a row for each method: errors and calls without and with projection."""
+    """Yield a row for each method: errors and calls without and with projection; `share` is that of `Case.error`."""
     for base, own in METHODS.items():
         error, calls = case.error(base, rtol, share)
         kept_error, kept_calls = case.error(own, rtol, share, invariants=case.invariants)
@@ -50,14 +50,14 @@ def compared(name: str, case: Case, rtol: float, share: float) -> Iterable[dict[
 
 
 def mean(rows: Sequence[dict[str, Any]], *names: str) -> float:
-    """Return the geometric mean of a column, or of the ratio of the first of two to the second."""
+    """Return the geometric mean of one named column, or of the ratio of the first of two named ones to the second."""
     values = np.array([[row[name] for name in names] for row in rows], float)
     logs = np.log(np.maximum(values, 1e-16))
     return float(np.exp(np.mean(logs[:, 0] - (logs[:, 1] if len(names) > 1 else 0.0))))
 
 
 def of(rows: Sequence[dict[str, Any]], **wanted: Any) -> list[dict[str, Any]]:
-    """Return the rows that have these values."""
+    """Return the rows that have these values in the columns of these names."""
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
@@ -142,6 +142,9 @@ class Stiff(Study[Found]):
 
 
 def _ratios(rows: Sequence[dict[str, Any]], calls: float | None = None) -> list[str]:
-    """Return the mean ratio of the errors and of the calls, with the calls without projection between them."""
+    """Return cells of a table: the mean ratio of errors, `calls` if it is given, and the mean ratio of calls.
+
+    The ratios are those with projection to without.
+    """
     shown = [] if calls is None else [f"{calls:.0f}"]
     return [f"{mean(rows, 'projected', 'error'):.2g}", *shown, f"{mean(rows, 'projected calls', 'calls'):.2f}"]

@@ -48,7 +48,7 @@ class Natural:
     turn: Array | None = None
 
     def fun(self, t: float, y: Array) -> Array:
-        """Evaluate the right-hand side, with the multipliers eliminated."""
+        """Return the right-hand side (v, dv/dt), with the multipliers eliminated."""
         q, v = np.split(y, 2)
         G = self.forms @ q
         free = np.linalg.solve(self.mass, np.column_stack([self.forces(q, v), G.T]))
@@ -57,7 +57,7 @@ class Natural:
 
     @property
     def invariants(self) -> list[Invariant]:
-        """Return the constraints on positions and velocities, and the angular momentum."""
+        """Return the constraints on positions and velocities, and the angular momentum if `turn` is given."""
         k, H = len(self.values), self.forms
 
         def places(t: float, y: Array) -> Array:
@@ -123,9 +123,9 @@ def chain(angles: Sequence[float], damping: float = 1e4) -> Natural:
 
 
 def chain_by_angles(angles: Sequence[float], damping: float = 1e4) -> tuple[Any, Array, Any]:
-    """Make the same chain in angles.
+    """Make the chain of `chain` with the angles of the links as coordinates.
 
-    Return the right-hand side, the start, and a function that converts a state to the coordinates of `chain`.
+    Return the right-hand side, the start (angles, rates), and a function that converts a state to that of `chain`.
     """
     n = len(angles)
     places = np.arange(n)
@@ -196,10 +196,11 @@ def governor() -> Natural:
 
 
 def governor_by_angles() -> tuple[Any, Array, Any]:
-    """Make the same governor by the rods' angle below the level, and the height of the slider above the ground.
+    """Make the governor of `governor` with two coordinates: the rods' angle below the level, and the slider's height.
 
-    The shaft's speed comes from the angular momentum. Returns the right-hand side, the start (angle, height, their
-    rates), and a function that returns the height.
+    The height is measured from the ground, 1 m below the rods' joints. The shaft's speed comes from the angular
+    momentum. Return the right-hand side, the start (angle, height and their rates), and a function of a state that
+    returns the height.
     """
     swing = 2 * (ROD_MASS / 3 + BALL) * ROD**2  # of both rods
 

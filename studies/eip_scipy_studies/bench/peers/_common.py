@@ -22,22 +22,23 @@ Solve = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Peer:
-    """One way to solve a problem.
+    """A method of a package with the kind of function that it takes.
 
     Attributes
     ----------
     name : str
+        Name of the method in tables.
     distribution : str
         Name of the package with pip.
     takes : str
         `PYTHON`, `COMPILED` or `OWN`.
     prepare : callable
         ``prepare(scene, **extra) -> solve`` imports the package and does the work that is needed once.
-        ``solve(setting)`` returns the state at the end. `extra` are further arguments of the package's own call.
+        ``solve(setting)`` returns the state at the end (n,). `extra` are further arguments of the package's own call.
     steps : bool
         True if the setting is a number of steps, not a tolerance.
     scenes : tuple of str
-        Keys of the equations for which the method is run; empty: all.
+        Values of `Scene.equations` for which the method is run; empty: all except "members".
     warm : bool
         True if each setting compiles its own code, so that an uncounted run comes first.
     projects : bool
@@ -65,10 +66,10 @@ class Peer:
 
 
 def package(name: str) -> Any:
-    """Import another package; this function is called only in the process that runs the package."""
+    """Import and return the module `name`; this function is called only in the process that runs the package."""
     return import_module(name)
 
 
 def plain_fun(scene: Scene) -> Any:
-    """Return the user's function for all methods that take plain Python."""
+    """Return the right-hand side ``fun(t, y)`` of a problem as a plain Python function, as a user writes it."""
     return scene.plain().fun

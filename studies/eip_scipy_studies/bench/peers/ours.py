@@ -42,7 +42,10 @@ def _run(method: str, arguments: dict[str, Any], t_end: float, options: dict[str
 
 
 def _right_hand_side(method: str, functions: Functions) -> dict[str, Any]:
-    """Return the right-hand side as an argument of `integrate`: the accelerations if the method needs only these."""
+    """Return the keyword argument of `integrate` that gives the equations: `acceleration` or `fun`.
+
+    It is `acceleration` for the methods that need only the accelerations.
+    """
     if method in ("EIPRKN12", "EIPGJ12", "EIPGJ14"):
         return {"acceleration": functions.acc}
     return {"fun": functions.fun}
@@ -78,7 +81,7 @@ def _compiled(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
 
 
 def _with_own_function(scene: Scene, functions: Functions) -> Any:
-    """Return the package's problem, whose invariants are compiled, with the user's jitted function."""
+    """Return the problem that `nbody` makes, with its compiled invariants and the jitted equations of `functions`."""
     njit, right = package("numba").njit, functions.fun
     filling: Any = functions.acc
 
@@ -100,7 +103,7 @@ def _native(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
 
 
 def _each(takes: str, make: Any, scenes: tuple[str, ...]) -> list[Peer]:
-    """Return one method of each kind: adaptive of the first order, Nystrom and multistep for q'' = a(q)."""
+    """Return three methods that take one kind of function: EIPDOP853, and EIPRKN12 and EIPGJ12 for q'' = a(q)."""
     label = {PYTHON: "", COMPILED: " (jitted)", OWN: " (problem)"}[takes]
     second = scenes or SECOND_ORDER
     return [

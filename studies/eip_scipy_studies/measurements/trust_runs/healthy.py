@@ -55,7 +55,7 @@ def hard_case(name: str) -> Problem:
 
 
 def short(make: Callable[[], Problem], end: float) -> Problem:
-    """Return a problem with an earlier end."""
+    """Return the problem that `make` makes, with its interval ending at `end`."""
     problem = make()
     return replace(problem, t_span=(problem.t_span[0], end))
 
@@ -73,7 +73,7 @@ def two_pendulums() -> Problem:
 
 
 def each(before: str, options: Iterable[str], after: str = "") -> str:
-    """Return settings as text for `runs`, one for each of the options, with `before` and `after` around it."""
+    """Return the text `ways` for `runs`: a part for each of the options, with `before` and `after` around it."""
     return ", ".join(f"{before} {option} {after}" for option in options)
 
 
@@ -199,7 +199,7 @@ def one_coordinate(
 
 
 def huber(width: float) -> Problem:
-    """Return a spring whose force does not grow beyond a distance."""
+    """Return a body on a spring whose force is constant beyond the elongation `width`."""
     return one_coordinate(
         "Huber's spring",
         lambda q: min(max(q, -width), width),
@@ -210,7 +210,7 @@ def huber(width: float) -> Problem:
 
 
 def contact(stiffness: float) -> Problem:
-    """Return a ball that falls onto a spring."""
+    """Return a ball that falls onto a spring of this stiffness."""
     return one_coordinate(
         "contact",
         lambda q: 1 + stiffness * min(q, 0.0),
@@ -221,7 +221,7 @@ def contact(stiffness: float) -> Problem:
 
 
 def hertz(stiffness: float) -> Problem:
-    """Return a ball that falls onto another ball."""
+    """Return a ball that falls onto a fixed ball, with Hertz's contact force."""
     return one_coordinate(
         "Hertz's contact",
         lambda q: 1 - stiffness * max(-q, 0.0) ** 1.5,
@@ -232,7 +232,7 @@ def hertz(stiffness: float) -> Problem:
 
 
 def dead_zone(width: float) -> Problem:
-    """Return a spring with backlash."""
+    """Return a body on a spring without force within the distance `width` of the origin (backlash)."""
     return one_coordinate(
         "backlash",
         lambda q: np.sign(q) * max(abs(q) - width, 0.0),

@@ -54,7 +54,7 @@ def inelastic_bumper(strength: float) -> Problem:
 
 
 def kicks(strength: float) -> Problem:
-    """Return a pendulum that is pushed three times for a short time."""
+    """Return a pendulum that is pushed three times for a short time, with the claimed energy of a free one."""
 
     def push(t):
         return 10 * strength * sum(np.exp(-(((t - at) / 0.2) ** 2)) for at in (6.1, 11.7, 17.3))
@@ -70,14 +70,14 @@ def one_bead(strength: float) -> Problem:
 
 
 def light_planet(mass: float) -> Problem:
-    """Return a star, a giant planet at 5.2, and a planet at 0.2, whose period is 0.56."""
+    """Return a star, a giant planet at 5.2, and a planet of this mass at 0.2, whose period is 0.56."""
     q = [[0.0, 0.0, 0.0], [5.2, 0.0, 0.0], [0.2, 0.0, 0.0]]
     v = [[0.0, 0.0, 0.0], [0.0, 5.2**-0.5, 0.0], [0.0, 0.2**-0.5, 0.0]]
     return nbody([1.0, 1e-3, mass], q, v, t_span=(0.0, 200.0))
 
 
 def two_oscillators() -> Problem:
-    """Return two oscillators of periods 0.25 and 6.3; the claimed energy contains the second one only."""
+    """Return two oscillators of periods 0.25 and 6.3; the claimed energy is that of the slow one only."""
     slow = Invariant(
         lambda t, y: 0.5 * (y[0] ** 2 + y[1] ** 2), lambda t, y: np.array([y[0], y[1], 0.0, 0.0]), name="energy"
     )
@@ -102,7 +102,7 @@ def late_leaks() -> Iterator[Run]:
 
 
 def light_bodies() -> Iterator[Run]:
-    """Yield faulty runs with bodies whose period is two or five steps."""
+    """Yield faulty runs with a light body whose period is at most six steps."""
     light = partial(runs, LIGHT)
     for mass in (1e-9, 0.0):
         yield from light(

@@ -94,7 +94,10 @@ def _option(item: str) -> dict[str, Any]:
 
 @dataclass
 class Outcome:
-    """Result of a run: how it was reported (`told`), its last state, and its error with and without projection."""
+    """Result of a run: how it was reported (`told`), its last state, and its error with and without projection.
+
+    For an ensemble, `flagged` has the indices of the members that are not reliable.
+    """
 
     told: list[str]
     status: int | None = None
@@ -126,7 +129,7 @@ def carry_out(run: Run) -> Outcome:
 
 
 def carry_out_plain(run: Run, t: float) -> Outcome:
-    """Carry out the same run without invariants, to the time `t` that it reached."""
+    """Carry out `run` without invariants, to the time `t` that it reached with invariants, and return the result."""
     problem = run.problem()
     options = {key: value for key, value in run.options.items() if key not in ("metric", "every")}
     options |= {"invariants": ()}

@@ -199,7 +199,7 @@ def other_trap() -> Problem:
 
 
 def wrong_joint() -> Problem:
-    """Return a condensate that is shaken from t = 0 on, with the joint invariants of a condensate that is not."""
+    """Return a condensate that is shaken from t = 0 on, with the mass and energy of one that is not shaken."""
     grid = Grid((16, 16), -4.0, 4.0)
     x, y = grid.mesh()
     psi = np.exp(-((x - 0.5) ** 2 + y**2) / 2)
@@ -211,7 +211,10 @@ FALLING = np.array([[1.0, 3.0], [-2.0, -1.0], [1.0, -1.0]])
 
 
 def falling_bodies(third: float = 5.0, softening: float = 0.0) -> Problem:
-    """Return three bodies that fall from rest, with an energy that has a wrong mass of the third body."""
+    """Return three bodies that fall from rest, with the energy for the mass `third` of the third one and no softening.
+
+    In the equations of motion this mass is 5, and `softening` is added to squared distances.
+    """
     masses = np.array([3.0, 4.0, 5.0])
     other = n_body([3.0, 4.0, third], 1.0, 2)
 
@@ -280,7 +283,7 @@ def spin_sum() -> Problem:
 
 
 def dragged(drag: float) -> Problem:
-    """Return a satellite that starts at rest against the air, above a rotating planet: the drag's power is 0 there."""
+    """Return a satellite that starts at rest relative to the air of a rotating planet: the drag is 0 at first."""
 
     def extra(t, y):
         return -drag * (y[2:] - 1.2 * np.array([-y[1], y[0]]))
@@ -401,7 +404,7 @@ def other_inertia() -> Problem:
 def other_coefficient() -> Problem:
     """Return predators and prey that start at u = 1, where the rate of the predators is 0, with a wrong invariant.
 
-    It has the coefficient 3 in place of 2.
+    The invariant has the coefficient 3 in place of 2.
     """
     return s.claimed(
         "Lotka-Volterra",
@@ -417,7 +420,10 @@ def other_coefficient() -> Problem:
 
 
 def falling_probe() -> Problem:
-    """Return a geodesic that starts at a turning point, with a mass shell that has a wrong mass."""
+    """Return a geodesic in Schwarzschild's metric that starts at a turning point, with a wrong mass shell.
+
+    The mass shell is that at 1.1 times the radius.
+    """
     shell, scale = schwarzschild(), np.array([1, 1.1, 1, 1, 1, 1])
 
     def value(t, y):

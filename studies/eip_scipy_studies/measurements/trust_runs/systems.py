@@ -20,7 +20,7 @@ Array = np.ndarray
 
 
 def claimed(name: str, fun: Callable[..., Any], y0: Any, end: float, *kept: Invariant, start: float = 0.0) -> Problem:
-    """Return a problem from a system and the quantities that are claimed to be invariants."""
+    """Return a problem from a right-hand side and the quantities `kept` that are claimed to be invariants."""
     y0 = np.array(y0)
     return Problem(
         name=name, fun=fun, y0=y0 + (0j if y0.dtype.kind == "c" else 0.0), t_span=(start, end), invariants=kept
@@ -68,14 +68,14 @@ def mechanics(
 
 
 def turning() -> Invariant:
-    """Return the angular momentum of motion in the plane, y = (x, z, u, v)."""
+    """Return the angular momentum of motion in the plane, y = (x, z, u, v) with velocities u and v, as an invariant."""
     return Invariant(
         lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"
     )
 
 
 def norm() -> Invariant:
-    """Return the sum of squares as an invariant."""
+    """Return the sum of the squared moduli of all components as an invariant."""
     return Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="norm")
 
 
@@ -134,7 +134,7 @@ def duffing(cubic: float = 1.0, q0: float = 0.5, end: float = 20.0) -> Problem:
 
 
 def falling(drag: float, v0: float = 0.0, end: float = 10.0) -> Problem:
-    """Return a stone that falls from rest, with the air's resistance."""
+    """Return a stone that falls with the air's resistance, with the claimed energy of one that falls without."""
     return mechanics(
         f"fall with drag {drag:g}",
         lambda t, q, v: -1 - drag * v * np.abs(v),
@@ -171,7 +171,7 @@ def central(
 
 
 def kepler_energy() -> Invariant:
-    """Return the energy of motion around a centre with G M = 1."""
+    """Return the energy of motion around a centre with G M = 1 in the plane as an invariant."""
     return Invariant(
         lambda t, y: (y[2] ** 2 + y[3] ** 2) / 2 - 1 / np.hypot(y[0], y[1]),
         lambda t, y: np.concatenate([y[:2] / np.hypot(y[0], y[1]) ** 3, y[2:]]),
@@ -180,7 +180,7 @@ def kepler_energy() -> Invariant:
 
 
 def laplace_x() -> Invariant:
-    """Return the component of Laplace's vector towards the pericentre."""
+    """Return the x component of Laplace's vector of motion around a centre with G M = 1 as an invariant."""
 
     def value(t, y):
         x, z, u, v = y
@@ -244,7 +244,10 @@ def chain(
 
 
 def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bool = False) -> Problem:
-    """Return Toda's lattice with one mass displaced; the claimed energy may be that of harmonic springs."""
+    """Return Toda's lattice with one mass displaced.
+
+    The claimed energy is the true one or, if `claim_harmonic` is true, that of harmonic springs.
+    """
     q0 = np.where(np.arange(n) == n // 2, 0.8, 0.0)
     v0 = np.where(np.arange(n) == n // 2, 0.5, 0.0) if moving else None
     if claim_harmonic:
@@ -255,7 +258,10 @@ def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bo
 def fput(
     alpha: float = 0.25, claimed_alpha: float | None = None, n: int = 16, end: float = 50.0, **more: Any
 ) -> Problem:
-    """Return the chain of Fermi, Pasta, Ulam and Tsingou, which starts in the first mode."""
+    """Return the chain of Fermi, Pasta, Ulam and Tsingou, which starts in the first mode.
+
+    `claimed_alpha` is the coefficient `alpha` in the claimed energy; default: the true one.
+    """
     own = alpha if claimed_alpha is None else claimed_alpha
     q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
     return chain(
@@ -272,7 +278,10 @@ def fput(
 def sine_gordon(
     claimed_coupling: float | None = None, n: int = 64, end: float = 20.0, friction: float = 0.0
 ) -> Problem:
-    """Return the sine-Gordon equation by the method of lines: a kink and an antikink at rest."""
+    """Return the sine-Gordon equation by the method of lines: a kink and an antikink at rest.
+
+    `claimed_coupling` is a factor of the gradient term in the claimed energy; default: 1, the true one.
+    """
     x = np.linspace(-10, 10, n, endpoint=False)
     h = x[1] - x[0]
     c = 1 / h**2
@@ -307,7 +316,10 @@ def waves(
     start: Callable[[Array], Array] = lambda x: np.exp(-((x - 1) ** 2) / 2),
     keep: Sequence[str] = ("mass", "energy"),
 ) -> Problem:
-    """Return i psi' = -psi''/2 + V psi + beta |psi|^2 psi on a line, with claimed mass and energy."""
+    """Return i psi' = -psi''/2 + V psi + beta |psi|^2 psi on a periodic line, with claimed mass and energy.
+
+    `claimed_beta` and `claimed_potential` are beta and V in the claimed energy; default: the true ones at t = 0.
+    """
     x = np.linspace(-8, 8, n, endpoint=False)
     dx = x[1] - x[0]
     k2 = (2 * np.pi * np.fft.fftfreq(n, dx)) ** 2
