@@ -153,6 +153,19 @@ inline Float load_alone(const double *a) {
         return load_as<Float>(a);
 }
 
+// Keep the compiler from packing floats into a vector, which takes longer than to compute with each: the next stage waits for
+// all of them.
+template <typename Float>
+[[gnu::always_inline]] inline void stay_alone(Float &value) {
+    if constexpr (sizeof(Float) == sizeof(double)) {
+#if defined(__x86_64__)
+        asm("" : "+x"(value));
+#elif defined(__aarch64__)
+        asm("" : "+w"(value));
+#endif
+    }
+}
+
 // COUNT vectors, or floats, from i on of out = y + scale sum, or of scale sum where there is no y.
 template <typename Float, int COUNT, bool ADD>
 inline void combine_part(const double *y, double scale, const Rows &rows, double *out, int64_t i) {
@@ -162,11 +175,15 @@ inline void combine_part(const double *y, double scale, const Rows &rows, double
         const double weight = rows.weights[j];
         if (weight == 0.0) continue;
         const double *row = rows.first + j * rows.stride + i;
-        for (int k = 0; k < COUNT; ++k) total[k] += weight * load_alone<Float>(row + k * LENGTH);
+        for (int k = 0; k < COUNT; ++k) {
+            total[k] += weight * load_alone<Float>(row + k * LENGTH);
+            stay_alone(total[k]);
+        }
     }
     for (int k = 0; k < COUNT; ++k) {
         Float value = scale * total[k];
         if constexpr (ADD) value = load_as<Float>(y + i + k * LENGTH) + value;
+        stay_alone(value);
         store_as(value, out + i + k * LENGTH);
     }
 }
