@@ -639,7 +639,10 @@ def test_missing_arguments():
 
 WRONG_OF_RUNS = [
     *(("in_place", v, ValueError, "in_place must be True or False, got") for v in (1, "yes", None)),
-    *(("compiled", v, ValueError, "compiled must be True, False or None .compile if possible., got") for v in ("a", 1, 0)),
+    *(
+        ("compiled", v, ValueError, "compiled must be True, False or None .compile if possible., got")
+        for v in ("a", 1, 0)
+    ),
     *(("progress", v, ValueError, "progress must be True or False, got") for v in (1, "yes", None)),
     *(("compensated", v, ValueError, "compensated must be True or False, got") for v in (1, "no")),
     *(("resume", v, ValueError, "resume must be True or False, got") for v in (1, "yes", None)),

@@ -141,7 +141,7 @@ def test_sizes_that_do_not_fit_are_refused(name):
         return function(*first, *([np.zeros(n * (n // 6 - 1))] if function.in_place else []), np.ones(p))
 
     for n, p in [(6, 1), (11, 3), (12, 2), (12, 4), (60, 10), (0, 0)]:
-        with pytest.raises(ValueError, match="takes positions and velocities"):
+        with pytest.raises(ValueError, match="expects positions and velocities"):
             call(n, p)
 
 

@@ -205,7 +205,9 @@ def test_what_is_refused():
     with pytest.raises(TypeError, match=r"fun is called with \(t, y, args\[0\]\): missing a required argument: 'm'"):
         integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K,))
     deaf = Invariant(lambda t, y: y @ y, name="S")
-    with pytest.raises(TypeError, match=r"'S' is called with \(t, y, args\[0\], args\[1\]\).* then the args of the run"):
+    with pytest.raises(
+        TypeError, match=r"'S' is called with \(t, y, args\[0\], args\[1\]\).* then the args of the run"
+    ):
         integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K, M), invariants=deaf)
     with pytest.raises(TypeError, match=r"event 0 is called with \(t, y, args\[0\], args\[1\]\)"):
         integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K, M), events=lambda t, y: y[0])
