@@ -119,7 +119,7 @@ def test_drag_on_a_body_with_mass_moves_no_centre_of_mass():
         (lambda: orbit(j2=-1.0), "j2 must be a finite number >= 0"),
         (lambda: orbit(scale_height=None), "drag needs scale_height"),
         (lambda: orbit(spin=np.inf), "spin must be a finite number"),
-        (lambda: orbit(pole=(0, 0, 0)), "pole must be three numbers"),
+        (lambda: orbit(pole=(0, 0, 0)), "pole must be three finite numbers"),
         (lambda: orbit(balances="total"), "unknown quantity 'total'"),
         (lambda: satellite([1, 2], [3, 4], mu=1, radius=1, t_span=(0, 1)), "position has shape"),
         (lambda: solar_system(forces="drag"), "needs an atmosphere"),

@@ -339,7 +339,7 @@ def test_no_value(c, k, status, compiled):
     assert 0.9 < run.t[-1] < 1.2
     assert np.isfinite(run.y).all()
     assert "t=1" in run.message
-    assert ("if it returns a status above 0" in run.message) == (k == 0)
+    assert ("if its status is above 0" in run.message) == (k == 0)
     with_python = ending(c, k, status, compiled=not compiled)
     assert with_python.message.partition(" (")[0] == run.message.partition(" (")[0]
 
