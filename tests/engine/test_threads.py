@@ -112,3 +112,19 @@ print(sys._is_gil_enabled())
     command = [sys.executable, "-W", "error", "-c", code]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (run.stdout, run.stderr) == ("False\n", "")
+
+
+@pytest.mark.needs_jit
+def test_a_daemon_thread_does_not_abort_the_process_at_its_end():
+    code = """
+import threading, time
+from eip_scipy import EIPRK4, integrate
+from eip_scipy.problems import kepler
+
+problem = kepler()
+integrate(problem, (0, 1), method=EIPRK4, h=0.01)
+threading.Thread(target=integrate, args=(problem, (0, 1e7)), kwargs={"method": EIPRK4, "h": 0.01}, daemon=True).start()
+time.sleep(0.3)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stderr) == (0, "")

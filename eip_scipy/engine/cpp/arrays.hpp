@@ -14,8 +14,11 @@
 #include <numpy/arrayobject.h>
 
 #include <algorithm>
+#include <atomic>
+#include <chrono>
 #include <initializer_list>
 #include <optional>
+#include <thread>
 #include <type_traits>
 
 namespace eip {
@@ -153,6 +156,35 @@ void require_one_length(const First &first, const Others &...others) {
     require(((first.points == others.points) && ...), "expected arrays with the same number of points");
 }
 
+// The end of the process: which thread ends it. A daemon thread that then asks for the lock of Python would be ended inside
+// a destructor, which aborts the process, so that it sleeps instead until the process has ended.
+struct Ending {
+    inline static std::atomic<bool> begun = false;
+    inline static std::thread::id by;
+
+    static void begin() {
+        by = std::this_thread::get_id();
+        begun = true;
+    }
+    static void sleep_if_begun() {
+        while (begun && by != std::this_thread::get_id()) std::this_thread::sleep_for(std::chrono::hours(1));
+    }
+};
+
+// Lets other threads run, without the lock of Python, during the life of the object.
+class [[maybe_unused]] Unlocked {
+  public:
+    Unlocked() = default;
+    Unlocked(const Unlocked &) = delete;
+    ~Unlocked() {
+        Ending::sleep_if_begun();
+        PyEval_RestoreThread(state_);
+    }
+
+  private:
+    PyThreadState *state_ = PyEval_SaveThread();
+};
+
 // Lets other threads run while a large array is worked on.
 class [[maybe_unused]] Released {
   public:
@@ -162,7 +194,7 @@ class [[maybe_unused]] Released {
 
   private:
     static constexpr npy_intp LARGE = 1 << 14;
-    std::optional<nb::gil_scoped_release> released_;
+    std::optional<Unlocked> released_;
 };
 
 }  // namespace eip

@@ -322,7 +322,7 @@ class Engine {
             refuse(PyExc_RuntimeError, "engine: this engine has been cleared or was never set up; make a new one");
         const FloatingPoint mode;
         try {
-            std::optional<nb::gil_scoped_release> released;
+            std::optional<Unlocked> released;
             if (!data_.system.python && !hooks_) released.emplace();
             return call(Run{data_.method, data_.options, data_.work, data_.system, hooks_.get()});
         } catch (const Broken &) {  // the GIL is taken again
@@ -426,6 +426,7 @@ NB_MODULE(EIP_MODULE, m) {
         PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError",
                                   "Error for a user's function, called by its address, that failed.", nullptr, nullptr);
     m.attr("FailedCallError") = eip::owned(eip::failed_call_error);
+    nanobind::module_::import_("atexit").attr("register")(nanobind::cpp_function(eip::Ending::begin));
     eip::add_constants(m);
     eip::add_records(m);
     eip::add_engine(m);
