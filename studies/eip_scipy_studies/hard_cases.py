@@ -396,7 +396,7 @@ def double_pendulum(g: float) -> CaseEquations:
 def spherical_pendulum(g: float) -> CaseEquations:
     """Return a pendulum in space, y = (q, v) in Cartesian coordinates.
 
-    Invariants: the constraints (|q|^2 - 1) / 2 and q @ v, energy, and angular momentum about the vertical.
+    Invariants: the constraints ``(|q|^2 - 1) / 2`` and q @ v, energy, and angular momentum about the vertical.
     """
 
     def fun(t, y):
@@ -557,7 +557,7 @@ def euler_detest(k2: float) -> CaseEquations:
 
 
 def quaternion(w3: float) -> CaseEquations:
-    """Return the attitude, a quaternion y, under the angular velocity (sin t, cos 2t, w3); invariant: |y|^2."""
+    """Return the attitude, a quaternion y, under the angular velocity (sin t, cos 2t, w3); invariant: ``y @ y``."""
 
     def fun(t, y):
         s, a, b, c = y
