@@ -114,16 +114,21 @@ print(sys._is_gil_enabled())
     assert (run.stdout, run.stderr) == ("False\n", "")
 
 
-@pytest.mark.needs_jit
-def test_a_daemon_thread_does_not_abort_the_process_at_its_end():
-    code = """
+@pytest.mark.parametrize("fun", ["problem", "in_python"])
+def test_a_daemon_thread_does_not_crash_the_process_at_its_end(fun):
+    code = f"""
 import threading, time
 from eip_scipy import EIPRK4, integrate
 from eip_scipy.problems import kepler
 
 problem = kepler()
+def in_python(t, y):
+    return [y[2], y[3], -y[0], -y[1]]
+def forever():
+    while True:
+        integrate({fun}, (0, 1e4), problem.y0, method=EIPRK4, h=0.01)
 integrate(problem, (0, 1), method=EIPRK4, h=0.01)
-threading.Thread(target=integrate, args=(problem, (0, 1e7)), kwargs={"method": EIPRK4, "h": 0.01}, daemon=True).start()
+threading.Thread(target=forever, daemon=True).start()
 time.sleep(0.3)
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

@@ -156,27 +156,63 @@ void require_one_length(const First &first, const Others &...others) {
     require(((first.points == others.points) && ...), "expected arrays with the same number of points");
 }
 
-// The end of the process: which thread ends it. A daemon thread that then asks for the lock of Python would be ended inside
-// a destructor, which aborts the process, so that it sleeps instead until the process has ended.
-struct Ending {
-    inline static std::atomic<bool> begun = false;
-    inline static std::thread::id by;
-
+// The end of the process: which thread ends it. A daemon thread that then asks for the lock of Python is ended on the spot,
+// wherever it is; below frames of C++ that crashes the process. So threads that are in the engine sleep from then on, and
+// the thread that ends the process waits, for a second at most, until they do.
+class Ending {
+  public:
     static void begin() {
-        by = std::this_thread::get_id();
-        begun = true;
+        by_ = std::this_thread::get_id();
+        begun_ = true;
+        PyThreadState *state = PyEval_SaveThread();
+        for (int k = 0; k < 1000 && inside_ > 0; ++k) std::this_thread::sleep_for(std::chrono::milliseconds(1));
+        PyEval_RestoreThread(state);
     }
+
+    // For a thread without the lock.
     static void sleep_if_begun() {
-        while (begun && by != std::this_thread::get_id()) std::this_thread::sleep_for(std::chrono::hours(1));
+        while (is_for_this_thread()) std::this_thread::sleep_for(std::chrono::hours(1));
     }
+
+    // For a thread with the lock, between two calls of functions in Python.
+    static void leave_if_begun() {
+        if (!is_for_this_thread()) [[likely]]
+            return;
+        PyEval_SaveThread();
+        inside_ -= depth_;
+        sleep_if_begun();
+    }
+
+    // A call of the engine that calls functions in Python.
+    class Inside {
+      public:
+        Inside() {
+            leave_if_begun();
+            ++inside_;
+            ++depth_;
+        }
+        Inside(const Inside &) = delete;
+        ~Inside() {
+            --inside_;
+            --depth_;
+        }
+    };
+
+  private:
+    static bool is_for_this_thread() { return begun_ && by_ != std::this_thread::get_id(); }
+
+    inline static std::atomic<bool> begun_ = false;
+    inline static std::atomic<int> inside_ = 0;
+    inline static std::thread::id by_;
+    inline static thread_local int depth_ = 0;
 };
 
 // Lets other threads run, without the lock of Python, during the life of the object.
-class [[maybe_unused]] Unlocked {
+class [[maybe_unused]] WithoutLock {
   public:
-    Unlocked() = default;
-    Unlocked(const Unlocked &) = delete;
-    ~Unlocked() {
+    WithoutLock() = default;
+    WithoutLock(const WithoutLock &) = delete;
+    ~WithoutLock() {
         Ending::sleep_if_begun();
         PyEval_RestoreThread(state_);
     }
@@ -194,7 +230,7 @@ class [[maybe_unused]] Released {
 
   private:
     static constexpr npy_intp LARGE = 1 << 14;
-    std::optional<Unlocked> released_;
+    std::optional<WithoutLock> released_;
 };
 
 }  // namespace eip

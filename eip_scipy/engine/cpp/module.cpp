@@ -322,8 +322,12 @@ class Engine {
             refuse(PyExc_RuntimeError, "engine: this engine has been cleared or was never set up; make a new one");
         const FloatingPoint mode;
         try {
-            std::optional<Unlocked> released;
-            if (!data_.system.python && !hooks_) released.emplace();
+            std::optional<WithoutLock> released;
+            std::optional<Ending::Inside> inside;
+            if (data_.system.python || hooks_)
+                inside.emplace();
+            else
+                released.emplace();
             return call(Run{data_.method, data_.options, data_.work, data_.system, hooks_.get()});
         } catch (const Broken &) {  // the GIL is taken again
             raise_broken(data_.system);

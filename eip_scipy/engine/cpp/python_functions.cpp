@@ -114,6 +114,7 @@ void PythonCall::operator()(double t, const double *y, const double *f, double *
     const nb::object value =
         owned(PyObject_Vectorcall(fun_.ptr(), arguments + 1, (count - 1) | PY_VECTORCALL_ARGUMENTS_OFFSET, nullptr));
     if (!in_place_) take(value.ptr(), time_object.ptr(), out);
+    Ending::leave_if_begun();
 }
 
 // Copy a list of the expected number of floats, of Python or NumPy, as most functions return; false if it is another value.

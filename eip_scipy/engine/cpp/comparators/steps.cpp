@@ -40,9 +40,9 @@ class Unlocked {
   private:
     using Clock = std::chrono::steady_clock;
     static constexpr std::chrono::milliseconds PAUSE{20};
-    void release() { released_ = std::make_unique<Unlocked>(); }
+    void release() { released_ = std::make_unique<WithoutLock>(); }
 
-    std::unique_ptr<Unlocked> released_;
+    std::unique_ptr<WithoutLock> released_;
     Clock::time_point next_ = Clock::now() + PAUSE;
 };
 
