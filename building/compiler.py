@@ -71,7 +71,7 @@ class Compiler(NamedTuple):
 
 @cache
 def chosen() -> Compiler:
-    """Return the compiler of this build: that of EIP_SCIPY_COMPILER, one that is installed, or zig."""
+    """Return the compiler of this build: the command in EIP_SCIPY_COMPILER, else an installed one, else zig."""
     given, triple = os.environ.get(VARIABLE, ""), target().triple
     if given and given != ZIG:
         return Compiler(tuple(shlex.split(given)))
@@ -88,7 +88,7 @@ def chosen() -> Compiler:
 
 
 def required() -> list[str]:
-    """Return the package ziglang if zig compiles the engine, and no package otherwise."""
+    """Return the further packages that the build needs: ziglang if zig compiles the engine, otherwise none."""
     return [PACKAGE] if "ziglang" in chosen().command else []
 
 

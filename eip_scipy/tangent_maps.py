@@ -171,7 +171,7 @@ class PeriodicOrbit:
     message : str
         A description of the closure.
     run : IntegrationResult
-        The run over the last period.
+        The run over one period from `y0`.
     """
 
     y0: Array
@@ -228,7 +228,9 @@ def _length(every: Any, start: Prepared, pieces: int) -> float:
     if every is None:
         return min(h * np.ceil(span / pieces / h), span) if h else span / pieces
     if not is_number(every) or not 0 < every < np.inf:
-        raise ValueError(f"every must be a time > 0 between two orthonormalisations, got {shown(every)}.")
+        raise ValueError(
+            f"every must be a time > 0, after which tangent vectors are made orthonormal again, got {shown(every)}."
+        )
     return min(float(every), span)
 
 
@@ -328,7 +330,10 @@ def lyapunov_spectrum(
     n, (t0, t_bound) = start.n, _ends(start)
     k = n if count is None else as_count("count", count)
     if k > n:
-        raise ValueError(f"count is {k}, but the state has {n} components and as many exponents.")
+        raise ValueError(
+            f"count is {k}, but the number of exponents is that of the components of the state, {n}. Give a smaller "
+            "count, or omit it to compute all."
+        )
     times, sums, total = [], [], np.zeros(k)
     for piece in _pieces(fun, y0, (t0, t_bound), _orthonormal(n, k), _length(every, start, PIECES), options):
         total = total + np.log(np.abs(np.diag(piece.growth)))
@@ -504,6 +509,8 @@ def periodic_orbit(
     ------
     ValueError, TypeError
         If a value is wrong or an option is one that the function sets itself; also the errors of `integrate`.
+    RuntimeError
+        If a run fails.
 
     Notes
     -----
@@ -597,7 +604,8 @@ def _odd(symmetry: Any, y: Array) -> Array:
 class _Shooting:
     """Function of (y, T) that integrates from y over the time `share` * T, with the state-transition matrix.
 
-    It returns a `_Reached`. RuntimeError is raised if the run fails.
+    It returns a `_Reached`. `odd` is the mask of the components that must vanish at the end, see `_odd`. RuntimeError
+    is raised if the run fails.
     """
 
     fun: Any
@@ -619,7 +627,7 @@ class _Shooting:
 
 @dataclass(frozen=True)
 class _Reached:
-    """Result of a run from `y0` over one `period`, or over half of it, and what follows from its end."""
+    """Result of a run from `y0` over one `period`, or over half of it, with its residual and the next correction."""
 
     shooting: _Shooting
     y0: Array

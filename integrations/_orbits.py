@@ -43,7 +43,8 @@ def run_orbits(
 def kept_invariants(system: Any, w: np.ndarray, times: np.ndarray, pattern_speed: float) -> list[Invariant]:
     """Return those of the energy and L_z whose rates of change are 0 at random states of the size of w = (q, p).
 
-    If `pattern_speed` is not 0, Jacobi's integral, the energy minus `pattern_speed` times L_z, replaces the energy.
+    The times of these states are random, between the first and the last of `times`. If `pattern_speed` is not 0,
+    Jacobi's integral, the energy minus `pattern_speed` times L_z, replaces the energy.
     """
     n = w.size // 2
 

@@ -89,8 +89,9 @@ def problem_from_simulation(
     Notes
     -----
     Particles from ``sim.N_active`` on attract nothing if ``sim.testparticle_type`` is 0: their masses are dropped,
-    which does not change the motion. With 1 they act on the active ones but not on each other; energy and angular
-    momentum are then those of another system, and only masses of 0, or a single one, are accepted.
+    which does not change the motion. With 1 they act on the active particles but not on each other. Two or more such
+    particles are then accepted only if their masses are 0, because otherwise the energy and the angular momentum are
+    those of another system.
 
     "gr" of REBOUNDx uses positions and velocities in Jacobi coordinates, "1pn" those relative to the Sun. The two
     differ in the planets' masses, by a part in a thousand of the effect.
@@ -111,12 +112,13 @@ def problem_from_simulation(
     chosen, known = (check_forces(forces), constants) if forces is not None else _attached(sim)
     if forces is None and constants is not None:
         raise ValueError(
-            "problem_from_simulation: constants= needs forces=...; forces that REBOUNDx has attached have their own."
+            "problem_from_simulation: constants= needs forces=..., the forces to which they belong. Give both, or omit "
+            "constants: forces that REBOUNDx has attached have their own."
         )
     if t_span is not None and isinstance(t_span[0], int | float) and t_span[0] != sim.t:
         raise ValueError(
             f"problem_from_simulation: t_span starts at {t_span[0]:.10g}, but the state is that of t={sim.t:.10g}. "
-            f"Give t_span=({sim.t:.10g}, ...), or count time anew: sim.t = {t_span[0]:.10g}."
+            f"Give t_span=({sim.t:.10g}, ...), or set sim.t = {t_span[0]:.10g}."
         )
     sim.synchronize()
     q, v = state(sim).reshape(2, -1, 3)
@@ -322,7 +324,8 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
             first = (gm, _units(sim)) if first is None else first
             if not np.array_equal(gm, first[0]):
                 raise ValueError(
-                    f"read_archive: bodies or masses in snapshot {k} of {place} differ from those in the first one."
+                    f"read_archive: bodies or masses in snapshot {k} of {place} differ from those in the first one. "
+                    "Read single snapshots by rebound.Simulation(path, snapshot=k)."
                 )
             times.append(sim.t)
             states.append(state(sim))
@@ -538,7 +541,7 @@ def _like(template: rebound.Simulation, bodies: Bodies) -> rebound.Simulation:
     if own.shape != bodies.gm.shape or not np.allclose(own, bodies.gm, rtol=SAME, atol=0):
         raise ValueError(
             f"to_simulation: the template has other bodies: its G times the masses are {shown(own)}, those of the "
-            f"problem {shown(bodies.gm)}."
+            f"problem {shown(bodies.gm)}. Give a template with the bodies of the problem, or omit template."
         )
     return template.copy()
 

@@ -114,7 +114,8 @@ def require_secure(client: distributed.Client) -> None:
     Raises
     ------
     PermissionError
-        If the scheduler or a worker listens so; the message names the address and says what to do.
+        If the scheduler or a worker listens beyond this machine without TLS; the message names the address and says
+        what to do.
     RuntimeError
         If the client is closed.
     """
@@ -214,7 +215,7 @@ class DaskPool:
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """Raise a RuntimeError that says so if the block fails because the client or its cluster is lost or closed."""
+        """Replace an error in the block by a RuntimeError with advice if the client, cluster or tasks are lost."""
         try:
             yield
         except Exception as error:
@@ -275,7 +276,7 @@ class DaskPool:
         if self._losses > LOSSES:
             raise RuntimeError(
                 f"all Dask workers of this machine died, {self._losses} times in a row: while they started, or by "
-                f"the members that they ran. {KEPT}, with fewer workers perhaps: local_client(workers)."
+                f"the members that they ran. {KEPT}, for example with fewer workers: executor=local_client(workers)."
             )
         workers = len(cluster.worker_spec)
         cluster.scale(0)

@@ -150,8 +150,9 @@ class ProjectedTaylor:
     def _run(self, advance: Any, starts: list[Any] | None) -> tuple[Any, ...]:
         """Alternate calls of `advance` and projections until the end of the run; return what heyoka returns.
 
-        The run ends when a call of `advance` ends for another reason than its number of steps. If `starts` is a list,
-        the time and state at the start of each call are appended to it.
+        ``advance()`` lets heyoka make up to `every` steps, and returns what heyoka returns. The run ends when a call of
+        `advance` ends for another reason than its number of steps. If `starts` is a list, the time and state at the
+        start of each call are appended to it.
         """
         state, function = self.integrator.state, self._function
         z, out = np.concatenate([state, self._known()]), np.empty(state.size + len(self.names))

@@ -135,7 +135,7 @@ def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
     -------
     dict of str to float
         ``GMS`` (Sun), ``GM1`` ... ``GM9`` (``GM3`` is Earth alone), ``GMB`` (Earth and Moon), ``GMM`` (Moon),
-        ``MA0001``, ... (asteroids). Rounded to 1e-6 km^3/s^2, which is 2e-11 of Mercury's.
+        ``MA0001``, ... (asteroids). They are rounded to 1e-6 km^3/s^2, an error of 2e-11 of Mercury's GM.
 
     Raises
     ------

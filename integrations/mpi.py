@@ -200,7 +200,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
             "EIPRK4, for example."
         )
     if issubclass(method, SolverOfParts):
-        raise TypeError(f"over_ranks: {method.__name__} is a class for ranks already.")
+        raise TypeError(f"over_ranks: {method.__name__} is a class for ranks already. Use it as it is.")
     members = {"COMM": MPI.COMM_WORLD if comm is None else comm, "__doc__": f"`{method.__name__}` over ranks."}
     return type(f"{method.__name__}OverRanks", (_OverRanks, method), members)
 

@@ -225,7 +225,7 @@ class SlabGrossPitaevskii(GrossPitaevskii):
     def linear_terms(self) -> list[tuple[Axes, Any]]:
         """Return the terms of `GrossPitaevskii.linear_terms`.
 
-        Without rotation, the term of x, which needs transpositions, is separate from that of the other axes.
+        Without rotation, the kinetic term along x, which needs transpositions, is separate from that along other axes.
         """
         if self.Omega != 0:
             return super().linear_terms()

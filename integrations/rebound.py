@@ -57,7 +57,7 @@ class ReboundRun:
     version : str
         REBOUND's version.
     t : ndarray, shape (m,)
-        Saved times k h, including 0 and the end.
+        Saved times, multiples of `h`, including 0 and the end.
     y : ndarray, shape (n, m)
         States (q, v) at `t`, in the frame of the centre of mass.
     wall_time : float
@@ -201,9 +201,9 @@ def run(
     epsilon : float, optional
         Tolerance of "ias15"; default: REBOUND's own, 1e-9, which is tight: about machine precision.
     criterion : {"prs23", "global"}, optional
-        How "ias15" finds its steps: from each body's derivatives, which is REBOUND's default since version 4 and
-        takes very small steps if an acceleration passes through zero; or from the largest over all bodies, as in
-        the paper of 2015. Default: REBOUND's own.
+        How "ias15" finds its steps. "prs23": from each body's derivatives, which is REBOUND's default since version 4
+        and takes very small steps if an acceleration passes through zero. "global": from the largest derivatives over
+        all bodies, as in the paper of 2015. Default: REBOUND's own.
     prepare : callable, optional
         ``prepare(simulation)`` before the run, for example to add forces by REBOUNDx; what it returns is kept alive.
         The errors of the invariants remain those of the Newtonian ones.

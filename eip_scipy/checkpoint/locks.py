@@ -61,7 +61,7 @@ class Lock:
         except Timeout:
             raise CheckpointError(
                 f"{self.name!r} is in use by another run ({_holder(self._file)}). Wait until that run ends, stop it, "
-                "or use another place."
+                "or use another path."
             ) from None
         except OSError as error:
             if error.errno in NO_LOCKS:

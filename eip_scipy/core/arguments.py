@@ -74,7 +74,10 @@ def scalars(extra: tuple[Any, ...]) -> str | None:
 
 
 def floats(extra: tuple[Any, ...]) -> np.ndarray:
-    """Return `extra`, one array or some numbers, as the array of floats for native functions; else an empty array."""
+    """Return further arguments, one array or some numbers, as an array of floats for native functions.
+
+    The array is empty if there are no arguments, or if one of them can only be passed by Python, see `scalars`.
+    """
     if _is_array(extra):
         return np.asarray(extra[0])
     return np.array(extra if scalars(extra) else (), float)

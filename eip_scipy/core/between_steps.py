@@ -63,7 +63,10 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
     if found.shape != like.shape:
         raise ValueError(f"`{name}` was set to an array of {found.size} components; this solver has {like.size}.")
     if found.dtype.kind == "c" and like.dtype.kind != "c":
-        raise ValueError(f"`{name}` was set to complex numbers, but the solver was started with a real y0.")
+        raise ValueError(
+            f"`{name}` was set to complex numbers, but the solver was started with a real y0. Set real numbers, or "
+            "start a new solver with a complex y0."
+        )
     return found.astype(like.dtype)
 
 
@@ -75,8 +78,8 @@ def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: 
     Raises
     ------
     TypeError, ValueError
-        If an attribute has a wrong value, or if one was set that this solver does not use: options of adaptive steps on
-        a solver with a fixed step, or the reverse.
+        If an attribute has a wrong value, if `h` was set on a solver with adaptive steps, or if `h_abs` or `max_step`
+        was set on a solver with a fixed step.
     """
     _check_kind_of_steps(solver, was)
     t, t_bound, sign = (
@@ -102,7 +105,10 @@ def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: 
 
 
 def _check_kind_of_steps(solver: Any, was: Settings) -> None:
-    """Raise ValueError if `h` or `h_abs` was set to a value that does not fit the fixed or adaptive steps."""
+    """Raise ValueError if `h` or `h_abs` was set to a value that the fixed or adaptive steps of the solver cannot use.
+
+    `was` contains the values of the attributes after the last step.
+    """
     if (solver.h is None) != (was.h is None):
         kind = "adaptive steps" if was.h is None else f"the fixed step h = {was.h:g}"
         raise ValueError(f"`h` was set to {shown(solver.h)} on a solver with {kind}; start a new solver.")

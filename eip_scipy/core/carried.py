@@ -155,9 +155,11 @@ class Carried:
         return self.known(t, y, f)[self.given_places]
 
     def rates(self, low: float, high: float, shift: float, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the rates in the form that the engine calls: `functions` if they are given, else Python functions.
+        """Return the `Rates` of the balances for the engine.
 
-        `low` and `high` are the ends of the run's interval; `shift` comes from `time_shift`.
+        `functions` holds the compiled rate of each balance, or None for a balance without a rate; by default the engine
+        calls the user's functions from Python. `low` and `high` are the ends of the run's interval, and `shift` comes
+        from `time_shift`.
         """
         items = tuple((k, self._starts[k + 1] - self._starts[k]) for k in self.items)
         return Rates(items, tuple(map(self._call, self.items) if functions is None else functions), low, high, shift)

@@ -144,8 +144,9 @@ def _check_dense_output(tableau: Tableau, P: np.ndarray) -> None:
     """
     if max(_misses(tableau, P)) > np.sqrt(FLOAT_TOLERANCE):
         raise ValueError(
-            f"eip_method: the dense output P of {tableau.name} does not belong to its steps: it violates one of its "
-            f"conditions by {max(_misses(tableau, P)):.3g}. Correct P."
+            f"eip_method: the dense output P of {tableau.name} does not belong to its steps. Each row of P must sum "
+            "to the weight of its stage in B (0 for the last row), and inside the step P must meet the order "
+            f"conditions; the largest error is {max(_misses(tableau, P)):.3g}. Correct P."
         )
 
 

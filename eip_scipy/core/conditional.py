@@ -33,10 +33,9 @@ VANISHES, UNSEEN = 0.05, 1e-8
 def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Derivative) -> Array | None:
     """Move y by Newton's method towards the targets of all invariants, and return the best state.
 
-    It is the state of the iteration whose largest residual, relative to the terms of its invariant, is least.
-
-    Each Newton step is the shortest one in units of `span`. The function returns None if y itself is that state, for
-    instance because all invariants have their target values there.
+    The best state is the one whose largest residual, relative to the terms of the invariant concerned, is smallest.
+    Each Newton step is the shortest one in units of `span`. The function returns None if y itself is the best state,
+    for instance because all invariants have their target values there.
     """
     state, best, nearest = y, np.inf, None
     weights = np.repeat(span, state.view(float).size // span.size)
@@ -66,7 +65,7 @@ def is_kept_on_a_surface(
     For example, the rate of change of a length is the velocity along it, and a system that constrains the length keeps
     it while that velocity is 0. Near y there are states where this rate is 0, and there the flow does not change the
     rate. If the invariant changes because of friction, a driving force or a wrong term, there is no such surface. The
-    function also returns False, without a search, for states with more than `MOST_COMPONENTS` floats that are not 0 or
+    function also returns False, without a search, if more than `MOST_COMPONENTS` floats of the state are nonzero or
     change.
 
     Parameters
@@ -157,9 +156,10 @@ class _Rate:
         return bool(abs(changes.sum()) <= share * np.abs(changes).sum())
 
     def _newton_step(self, slope: Array, value: float, G: Array) -> Array | None:
-        """Return the shortest move (m,), in units of the weights, that makes the linearised rate 0, or None.
+        """Return the shortest move (m,), in units of the weights, that makes ``value + slope @ move`` 0, or None.
 
-        The move leaves the invariants with the gradients G unchanged, to first order.
+        The move leaves the invariants with the gradients G unchanged, to first order. The result is None if there is
+        no such move.
         """
         rows = np.vstack([slope, G.view(float) * self.weights])
         lengths = np.linalg.norm(rows, axis=1)

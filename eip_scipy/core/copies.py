@@ -25,7 +25,8 @@ BOUND = ("tableau", "work", "invariants", "trust")
 class RunParts(NamedTuple):
     """The values and arrays from which `run_of` makes a `Run` again, apart from the invariants.
 
-    `values` are fields of the run, `work` is a copy of its buffers, and `doubts` and `failed` are those of its `Trust`.
+    `values` are fields of the run, `work` is a copy of its buffers, and `doubts` and `failed` are attributes of its
+    `Trust`.
     """
 
     values: dict[str, Any]

@@ -318,7 +318,10 @@ def _define_binary(function: Any, slope: Callable[..., Any], other: Callable[...
 
 
 def _define_flat(function: Any, arguments: int, *names: Any) -> None:
-    """Define a function of duals whose derivative is 0 or undefined: it returns the plain function of their values."""
+    """Define a function of one or two duals (`arguments`) whose derivative is 0 or undefined.
+
+    It returns a plain number, computed from the values of the duals.
+    """
 
     def typed(x, y):
         return (lambda x, y: function(value_of(x), value_of(y))) if _is_dual(x, y) else None
@@ -439,7 +442,7 @@ def _is_array(kind: Any, *ndims: int) -> bool:
 
 
 def _define_for_arrays(function: Any) -> None:
-    """Define the type of an expression of arrays; Numba turns it into a loop over scalars, which are typed above."""
+    """Define the type of `function` for arrays of duals; Numba turns such calls into loops over scalar duals."""
 
     class _Template(AbstractTemplate):
         key = function

@@ -73,9 +73,10 @@ class Examiner:
         Numbers about the projections of the run, a row for each invariant, see `engine.trust`. The examiner also stores
         rates of change there.
     resolution : callable
-        ``resolution(rhs, t, h, y, end_of_run)``: `resolution.unresolved` with the method and the groups of the run.
+        ``resolution(rhs, t, h, y, end_of_run)``: the function `resolution.unresolved` for the method and the blocks of
+        components of this run.
     largest : float
-        The largest correction at the time of the last examination of a large correction.
+        The largest correction of the run, in local errors, when a large correction was last examined; 0 before.
     """
 
     invariants: InvariantSet
@@ -150,7 +151,7 @@ def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
 def _complaint(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, y: Array, on_manifold: bool
 ) -> str | None:
-    """Return the text of the first of the `complaints` at a state, or None, and note rates of change in the figures.
+    """Return the text of the first of the `complaints` at a state, or None, and note rates of change in `figures`.
 
     Without `on_manifold`, complaints about invariants that depend on other invariants are ignored. A state whose
     derivative is not finite is not examined.
@@ -177,10 +178,11 @@ def _along_chord(
     ends: tuple[Array, Array],
     waited: int,
 ) -> str | None:
-    """Return a sentence about what is wrong between the ends of a step with a large correction, or before it, or None.
+    """Return a sentence about what is wrong in a step with a large correction, or in the steps before it, or None.
 
-    The `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing
-    is examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
+    The states examined in the step are on the straight line between its `ends`, those before it on the trajectory. The
+    `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing is
+    examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
     """
     largest = float(examiner.figures[:, NU].max(initial=0.0))
     if largest < GROWTH * examiner.largest:

@@ -63,7 +63,7 @@ def _not_finite(run: Run, t: float, h: float) -> str:
         if not np.isfinite(work.K[i]).all():
             return _bad_value(run, work.K[i], t + method.c[i] * h)
     if not np.isfinite(work.y_hat).all():
-        return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or h is too large"
+        return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or the step is too long"
     if not np.isfinite(work.K[-1]).all():
         return _bad_value(run, work.K[-1], t + h)
     return f"the error estimate is not finite at t={t + h:.10g}: it overflowed, or y and `atol` are 0 in a component"

@@ -44,7 +44,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
         raise ValueError(
             f"frame: C has shape {C.shape} and S {S.shape}; expected real or complex numbers of shapes (k, {n}) and "
-            f"({n}, k)."
+            f"({n}, k) with k >= 1."
         )
     rows = _rows if C.size <= SMALL else _rows.__wrapped__
     found = rows((C.tobytes(), C.dtype.str), (S.tobytes(), S.dtype.str), n, width)
@@ -81,7 +81,8 @@ def _frame_matrices(C: np.ndarray, S: np.ndarray, width: int) -> tuple[np.ndarra
     shifts = C @ S
     if not np.all(np.isfinite(shifts)) or not np.linalg.cond(shifts) < 1e12:
         raise ValueError(
-            "frame: C S is singular; S must span shifts that change every row of C y, and C and S must be finite."
+            "frame: C S is singular; S must span shifts that change every row of C y, the rows of C must be linearly "
+            "independent, and C and S must be finite."
         )
     return C, np.ascontiguousarray(np.linalg.solve(shifts.T, S.T))
 

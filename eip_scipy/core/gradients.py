@@ -109,9 +109,10 @@ class NumericalGradient:
 
 
 def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
-    """Return the gradient (..., n) of value(y) by central differences of order 6, shifted in units of |y_k| + floor_k.
+    """Return the gradient (..., n) of value(y) by central differences of order 6.
 
-    If differences of order 4 disagree, as near a singularity that is closer than the state's size, the shifts are
+    The shift of y_k is a fixed multiple of ``abs(y[k]) + floor[k]``, rounded to a power of two. If
+    differences of order 4 disagree, as near a singularity that is closer than the state's size, the shifts are
     shortened until both orders agree. If they never agree, the shift with the best agreement is used. The engine's
     differences (engine/cpp/differences.hpp) have the same bits.
     """
@@ -158,8 +159,8 @@ def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: comple
 def typical_sizes(y: Array, f: Array, tau: float) -> Array:
     """Return for each component a size that is added to |y_k|, so that shifts do not vanish with the component.
 
-    The size is the motion of the component in a step, and at least 1e-3 |y_k|. If both are 0, it is the largest size of
-    the other components, or 1 if all are 0.
+    The size is ``abs(tau * f[k])``, the motion in a step of length `tau`, and at least 1e-3 |y_k|. If both are
+    0, it is the largest size of the other components, or 1 if all are 0.
     """
     floors = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
     floors = np.maximum(floors, 1e-3 * np.abs(y))

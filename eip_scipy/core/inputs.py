@@ -185,6 +185,8 @@ def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool
 def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any, what: str, t: float) -> np.ndarray:
     """Return the array of this shape and type that a user's in-place function fills; before, all entries are NaN.
 
+    ``call(out)`` calls the function. Error messages contain its name, `what`, and the time `t`.
+
     Raises
     ------
     TypeError

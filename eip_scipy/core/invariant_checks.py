@@ -53,7 +53,7 @@ DOUBLE = (
     "Compute it in double precision: with JAX call jax.config.update('jax_enable_x64', True), with PyTorch use tensors "
     "and parameters of torch.float64"
 )
-WRONG = "Projecting on it gives a wrong solution"
+WRONG = "Projecting on it gives a wrong solution: omit it, correct it, or pass a Balance if it changes slowly"
 MISSING = "Add that constraint to the invariants, and start on it"
 
 
@@ -85,7 +85,7 @@ class _Samples(NamedTuple):
     """A state, its derivative, and the invariants at and near the state.
 
     `tau` is the length of a step. `span` (n,) is |y| plus the distance that each component moves in a step, or while
-    the state changes by its own size if that is sooner. `directions` (2, n) are random ones, scaled by `span`. `G`
+    the state changes by its own size if that is sooner. `directions` (2, n) are random vectors times `span`. `G`
     (l, n) and `here` (l,) are the gradients and values at the state. `ends` (2, 2, l) are the values at y + s *
     directions and y - s * directions, where s is the first of `CHECK_STEPS`.
     """
@@ -168,7 +168,10 @@ def _blurred(at: _Samples) -> list[Array]:
 
 
 def _rounding(known: InvariantSet, at: _Samples, ways: Array) -> Array:
-    """Return the changes (k, l) of derivatives of invariants along `ways` (k, n) for states changed by roundings."""
+    """Return the rounding errors (k, l) of the derivatives of invariants along the vectors `ways` (k, n).
+
+    They are estimated from the changes of the gradients between `at.y` and the states of `_blurred`.
+    """
     blurred = [known.gradients(at.t, state, at.f) - at.G for state in _blurred(at)]
     return BLUR * np.abs(np.array(blurred)[:, None] * ways[:, None]).sum(axis=3).max(axis=0)
 
@@ -346,9 +349,9 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
 def _complaints_of_rates(
     known: InvariantSet, at: _Samples, found: _Rates, wrong: Array, rhs: Derivative | None
 ) -> Iterator[Complaint]:
-    """Yield a `Complaint` about the quantities that are not invariants, and one about those that depend on others.
+    """Yield a `Complaint` about quantities that change, and one about those that are kept only if constraints hold.
 
-    `wrong` (l,) is a mask of these quantities. Each text names the quantity with the largest relative rate first.
+    `wrong` (l,) is a mask of all these quantities. Each text first names the one with the largest relative rate.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")

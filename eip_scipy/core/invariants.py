@@ -79,7 +79,8 @@ class Invariant:
         replace it at these states.
     target : float or array_like, shape (l_i,), optional
         The value to keep. Default: the value at the start. If a target is given, the start must meet it to 1e-8 of the
-        terms of the invariant. Steps meet it to 1e-9, with further Newton steps if the first one leaves more.
+        largest of ``|I|``, ``|target|``, ``sum_k |G_k y_k|`` (G is the gradient) and `scale`. Steps meet it to 1e-9,
+        with further Newton steps if the first one leaves more.
     args : tuple, optional
         Further arguments of `fun` and `grad`. The ``args`` of `eip_scipy.solve_ivp` and of `integrate` follow these;
         SciPy's own solve_ivp does not pass its ``args`` to invariants.
@@ -297,7 +298,8 @@ def _scale(scale: Any) -> Any:
     found = None if isinstance(scale, bool | np.bool_) else reals(scale)
     if found is None or found.ndim > 1 or found.size == 0 or not ((found >= 0) & (found < np.inf)).all():
         raise ValueError(
-            f"Invariant: scale must be a finite number >= 0, or an array with one for each value, got {shown(scale)}."
+            "Invariant: scale must be a finite number >= 0, or an array with one such number for each value of fun, "
+            f"got {shown(scale)}."
         )
     return float(found) if found.ndim == 0 else found
 
@@ -469,7 +471,7 @@ class InvariantSet:
         self.balances.check(t0, y0, f0)
 
     def _names(self, sizes: list[int]) -> list[str]:
-        """Return names of the l values: the label of the item, with an index if it has several, or `value_names`."""
+        """Return names of the l values: an item's `value_names`, if any, else its label, with an index for arrays."""
         return [
             (label if scalar else f"{label}[{j}]") if not item.value_names else item.value_names[j]
             for item, label, scalar, size in zip(self.items, self.labels, self.scalar, sizes, strict=True)
@@ -478,12 +480,12 @@ class InvariantSet:
 
     @cached_property
     def floors(self) -> Array:
-        """Return the sizes (n,) that are added to those of the components, see `typical_sizes`."""
+        """Return the `typical_sizes` (n,) of the components at the start, units that do not vanish with a component."""
         return typical_sizes(*self._start)
 
     @property
     def by_values(self) -> Array:
-        """Return a mask (l,) of the gradients that come from differences of values."""
+        """Return a mask (l,) of the values whose gradients come from differences, not from `grad` or a complex step."""
         found = [
             item.gradient is None and not (isinstance(grad, NumericalGradient) and grad.complex_step)
             for item, grad in zip(self.items, self.grads, strict=True)
@@ -548,7 +550,12 @@ class InvariantSet:
         return np.where(self.balances.mask, np.nan, self.target)
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the rates of the balances in the form that the engine calls: `functions` if given, else in Python."""
+        """Return the `Rates` of the balances, for the engine.
+
+        `functions` contains for each balance the address of its compiled rate, a `LibraryFunction`, or None without a
+        rate of its own; by default the rates are called in Python. `adaptive` says whether `tau` is the first of
+        adaptive steps or a fixed step: the shift in time of differences for dF/dt depends on it, see `time_shift`.
+        """
         low, high = min(self.t_span), max(self.t_span)
         return self.balances.rates(low, high, time_shift(self.tau, adaptive, self.t_span), functions)
 
@@ -589,7 +596,7 @@ class InvariantSet:
         return item
 
     def _calls(self, shapes: list[tuple[int, ...]], y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
-        """Return the functions of values and those of gradients in the form that the engine calls.
+        """Return the functions of values, one for each item, and those of gradients, in the form that the engine calls.
 
         `shapes` contains the shape of the values of each item.
         """
@@ -685,7 +692,7 @@ class InvariantSet:
         return (rows @ vector) * size * largest
 
     def misses(self, t: float, y: Array, f: Array) -> Array:
-        """Return a mask (l,) of invariants that miss their targets by more than 1e-8 of their terms, plus rounding."""
+        """Return a mask (l,) of invariants that miss their targets by more than 1e-8 `term_sizes`, plus rounding."""
         return ~(self._excess(t, y, f) <= 1.0)
 
     def _excess(self, t: float, y: Array, f: Array) -> Array:
@@ -698,11 +705,12 @@ class InvariantSet:
             return np.where(residual == 0, 0.0, residual / allowed)
 
     def note_rates(self, figures: Array, t: float, y: Array, f: Array, G: Array, here: Array) -> None:
-        """Update the largest rate of change of each value along f, relative to its terms, in `figures` (l, N_FIGURES).
+        """Update the largest rates of change of the values along f in `figures` (l, N_FIGURES).
 
-        `figures` are the numbers about the projections of a run that `engine.trust` judges. `G` and `here` are the
-        gradients and the values at the state. The given rate of a balance is subtracted from its rate of change. Rates
-        of balances without a given rate are not noted.
+        The rates are relative to ``sum_k |G_k f_k|``, the size of the terms that cancel in the rate. `figures` are the
+        numbers about the projections of a run that `engine.trust` judges. `G` and `here` are the gradients and the
+        values at the state. The given rate of a balance is subtracted from its rate of change. Rates of balances
+        without a given rate are not noted.
         """
         own = None
         if self.balances.items:
@@ -728,7 +736,8 @@ class InvariantSet:
     ) -> list[str]:
         """Check gradients against differences along two directions, and that the system keeps the invariants.
 
-        `evaluated` holds the gradients and the values at the state; default: they are evaluated.
+        `f` is the derivative of the state, and `tau` the length of a step. `evaluated` holds the gradients and the
+        values at the state; default: they are evaluated.
 
         Returns
         -------
@@ -777,8 +786,9 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     Returns
     -------
     float
-        Maximum over the components k of ``|grad_k - difference_k| s_k / max_j |grad_j| s_j``, with ``s_k = |y_k|``, or
-        the size of the largest component if ``y_k`` is 0. A correct gradient gives about 1e-12.
+        Maximum over the components k, and over the values of the invariant, of
+        ``|grad_k - difference_k| s_k / max_j |grad_j| s_j``, with ``s_k = |y_k|``, or the size of the largest component
+        if ``y_k`` is 0. A correct gradient gives about 1e-12.
 
     Raises
     ------

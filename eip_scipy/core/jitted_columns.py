@@ -76,10 +76,12 @@ def rhs_by_duals(
 
 
 def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) -> Any:
-    """Return ``copied(params, Y, first)``, which returns params as duals.
+    """Return ``copied(params, Y, first)``, which returns params as numbers of the type `dual`.
 
-    The derivatives of the duals are entries of the columns of Y from the column `first` on. Those of parameters that
-    are not in `parameters` are 0; if `parameters` is empty, params are returned unchanged.
+    The derivatives of these dual numbers are entries of the columns of Y from the column `first` on. Those of
+    parameters that are not in `parameters` are 0; if `parameters` is empty, params are returned unchanged.
+    ``seeded(Y, first, i)`` returns entry i of Y as such a dual number. In Y the parameters follow the `n` entries of
+    the state.
     """
     if not parameters:
         return inside(lambda params, Y, first: params)
@@ -97,7 +99,10 @@ def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) 
 
 
 def _with_out(fun: Any, form: str, has_params: bool, one_by_one: bool) -> Any:
-    """Return ``call(t, x, out, params)``, which returns the value of `fun` at x; an in-place `fun` writes to `out`."""
+    """Return ``call(t, x, out, params)``, which returns the value of `fun` at x; an in-place `fun` writes to `out`.
+
+    `fun` takes the numbers in params as separate arguments if `one_by_one`, else params if `has_params`.
+    """
     if form.endswith("place"):
         if one_by_one:
             return inside(lambda t, x, out, numbers: _second(fun(t, x, out, *numbers), out))

@@ -89,7 +89,7 @@ def new_state(dual: Any, n: int) -> Any:
 
 
 def _slopes_of(shape: tuple[int, ...]) -> Callable[..., Any]:
-    """Return a function of a dual value of this shape, () or (l_i,), that returns its derivatives in the first lane."""
+    """Return a function that returns the derivatives of a dual value of this shape along its first direction."""
     if shape == ():
         return lambda value: slope(value, 0)
 

@@ -39,7 +39,7 @@ class Kind(NamedTuple):
     real : bool
         True if the value is real even if the state is complex.
     takes_f, in_place : bool
-        True if the user's function takes f; True if it fills an argument `out`.
+        True if the user's function takes f, the derivative of the state; True if it fills an argument `out`.
     gradient : bool
         True if the engine calls the function with the arguments of a gradient, which include f.
     scalars : str
@@ -77,7 +77,9 @@ class Native(NamedTuple):
 def native_functions(
     fun: Callable[..., Any], form: str, params: Packed | None, invariants: InvariantSet, y0: np.ndarray
 ) -> NativeFunctions:
-    """Return the addresses of the functions of a run, without those of its events.
+    """Return the addresses of the right-hand side, the invariants and the gradients of a run.
+
+    `with_events`, `with_jacobian` and `with_rates` add those of other functions.
 
     Parameters
     ----------
@@ -138,8 +140,8 @@ def native_functions(
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
     """Return the function that the engine calls for `fun`, and its signature.
 
-    For a function of a state with columns of derivatives, its attribute `of_state` has both. Otherwise the function
-    returns `fun` and `number`.
+    If the state has columns of derivatives, the attribute `of_state` of `fun` has both. Without this attribute,
+    `fun` and `number` are returned.
     """
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
@@ -148,7 +150,9 @@ def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
 def function_alone(
     fun: Callable[..., Any], kind: Kind, name: str, params: np.ndarray | None, *, second_order: bool = False
 ) -> NativeFunctions:
-    """Return `NativeFunctions` with a right-hand side of the signature `kind`, without invariants and events.
+    """Return `NativeFunctions` with the right-hand side `fun` of the signature `kind`, without invariants and events.
+
+    If `second_order`, `fun` returns the accelerations. `name` is the name of `fun` in messages.
 
     Raises
     ------
@@ -209,6 +213,8 @@ def with_rates(
     functions: NativeFunctions, invariants: InvariantSet, params: Packed | None, y0: np.ndarray, adaptive: bool
 ) -> NativeFunctions:
     """Return a copy of `functions` with the addresses of the rates of balances.
+
+    `adaptive` says whether the steps of the run are adaptive, see `InvariantSet.rates`.
 
     Raises
     ------

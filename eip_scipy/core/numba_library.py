@@ -40,8 +40,8 @@ def _jitted(function: Any) -> Any:
     """Return a jitted function that calls a `LibraryFunction` with arrays of any memory layout."""
     if function.own or function.numbers < 0:
         raise TypeError(
-            f"{function.__name__} cannot be called by jitted functions, because it has fixed parameters, or a value of "
-            "no fixed size."
+            f"{function.__name__} cannot be called by jitted functions, because its parameters are fixed, or the size "
+            "of its value is not. Call it outside of jitted functions."
         )
     fill = _inlined(_filling(function))
     if function.in_place and function.takes_f:
@@ -55,9 +55,9 @@ def _jitted(function: Any) -> Any:
 
 
 def _value_of(function: Any, fill: Any) -> Callable[..., Any]:
-    """Return ``value(t, y, f, params)``, which returns the one number that `fill` writes, or an array.
+    """Return ``value(t, y, f, params)``, which returns the value that `fill` writes: a number or a new array.
 
-    A function that takes f, such as a gradient, always returns an array.
+    It is a number if the value of `function` has one component for every state and does not depend on f.
     """
     numbers, of_state = function.numbers, function.fills_states
 
@@ -150,7 +150,10 @@ def _write_back_to(values, out):
 
 @_inlined
 def _apart(values, out):
-    """Return `values`, or a copy if `out` shares memory with them, as library functions read them after writing."""
+    """Return `values`, or a copy if they share memory with `out`.
+
+    Library functions read `values` after they have begun to write to `out`.
+    """
     distance = out.ctypes.data - values.ctypes.data
     if -8 * out.size < distance < 8 * values.size:
         return values.copy()

@@ -172,7 +172,10 @@ def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
 
 
 def _numbers(types: str, jit: Any, k: int = 0) -> Any:
-    """Return ``numbers(params)``, a function that returns params[k:] as a tuple of numbers of these types."""
+    """Return ``numbers(params)``, a function that returns params[k:] as a tuple of numbers.
+
+    `types` has one letter for each of `params`: "d" for a float, "q" for an integer, "?" for a bool.
+    """
     if k == len(types):
         return jit(lambda params: ())
     rest = _numbers(types, jit, k + 1)

@@ -70,14 +70,15 @@ class OneStep(Ordered):
     name, order, error_estimator_order, evaluations
         As in `OneStepMethod`; `error_estimator_order` is None without an estimate.
     b, c : ndarray, shape (1,)
-        Coefficients of a method with one stage, the derivative at the start of the step.
+        The coefficients 1 and 0 of a tableau with a single stage at the start of the step, for code that reads the
+        stages of any method.
     exponent : float
-        Exponent of the step control.
+        Power of the norm of the error estimate by which adaptive steps change: -1 / (`error_estimator_order` + 1).
 
     Raises
     ------
     TypeError
-        If the object is not an instance of `OneStepMethod`.
+        If the object does not have the members of `OneStepMethod`, or is a class.
     ValueError
         If an order is not an integer >= 1, or `evaluations` is not an integer >= 0.
 

@@ -137,8 +137,8 @@ class ProjectionOptions:
         metadata=_text(
             "(C, S)",
             """Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and S, of shape
-            (n, k), whose columns are the directions in which the correction is shifted for this; C S must be
-            invertible.""",
+            (n, k), whose columns are the directions in which the correction is shifted so that C y stays
+            unchanged; C S must be invertible.""",
         ),
     )
     direction: str = field(
@@ -322,7 +322,8 @@ class ProjectionOptions:
             raise ValueError(f"compensated=False: {method.name} always uses compensated sums; omit compensated.")
         if compensated and method.in_python:
             raise ValueError(
-                f"compensated=True needs the sums of a tableau, and {method.name} is not a tableau; omit compensated."
+                f"compensated=True is available for methods made from a tableau, and {method.name} is not a tableau; "
+                "omit compensated."
             )
         return compensated
 
@@ -355,7 +356,7 @@ def _far_by_tolerances(rtol: np.ndarray) -> float:
 
 
 def _band(method: AnyMethod, compensated: bool) -> float:
-    """Return the size of residuals that are not corrected, in units of the rounding error of the invariant's terms."""
+    """Return the largest residual that is not corrected, in units of the rounding error of the invariant's terms."""
     if method.has_history:  # these methods correct only a part of an error within rounding
         return BAND_MULTISTEP
     return BAND_COMPENSATED if compensated else BAND
@@ -367,7 +368,7 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
     Raises
     ------
     ValueError
-        If the shape is wrong, or weights are not finite, negative or all 0.
+        If the shape is wrong, or weights are negative, all 0, or not finite.
     """
     a = real_array(name, sigma)
     if a.shape != (n,):
@@ -385,7 +386,7 @@ def _balances(method: AnyMethod, known: InvariantSet) -> Balances:
 
 
 def _groups(known: InvariantSet, n: int, width: int) -> Groups:
-    """Return the groups of balances that are projected separately.
+    """Return the balances in groups that have the same components and weights; each group is projected by itself.
 
     Raises
     ------

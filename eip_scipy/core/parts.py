@@ -24,7 +24,7 @@ SCALARS = {"values", "g", "band", "before", "defect", "max_defect", "max_correct
 
 
 class SolverOfParts(EIPSolver):
-    """Base class of solvers that every process makes with its part of the state.
+    """Base class of solvers of a distributed state; every process creates a solver with its part of the state.
 
     The right-hand side fills a part of the derivative. An invariant returns the same number on every process, and its
     gradient returns only the components of this process's part. Only fixed steps and the Euclidean metric are
@@ -109,7 +109,10 @@ class _Coordinates:
         self._begins = False
 
     def project(self, t_old: float, t: float, last: bool, y_new: np.ndarray) -> int:
-        """Project the unprojected state of the run, write the result to `y_new`, and return the engine's status."""
+        """Project the unprojected state of the run, write the result to `y_new`, and return the engine's status.
+
+        The step leads from `t_old` to `t`; `last` is True for the last step of the run.
+        """
         self._begins = True
         status: int = self._engine.project(t_old, self._origin, t, last, self._moved)
         y_new[:] = self._at(self._moved)

@@ -415,6 +415,6 @@ def library_variational(function: str, names: tuple[str, ...], parameters: tuple
         known = f"only by parameter 0, {names[0]}" if names else "none by parameters"
         raise ValueError(
             f"variational: {function.partition('.')[0]} has derivatives by its state and {known}; got parameters="
-            f"{tuple(parameters)}. For others, give integrate a jitted function fun(t, y, params)."
+            f"{tuple(parameters)}. For others, call integrate with a jitted function fun(t, y, params) as fun."
         )
     return library[f"{function}_by_parameter"]

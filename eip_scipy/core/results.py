@@ -37,7 +37,7 @@ class Diagnostics:
     max_defect, last_defect : ndarray, shape (l,)
         Largest and last invariant error ``|I - target|`` after a projection, in the unit of each invariant.
     n_projections, n_skipped : int
-        Number of projections, and of those omitted because every invariant error was round-off.
+        Number of projections made, and of projections omitted because every invariant error was round-off.
     n_rank_reduced : int
         Number of projections in which gradients were (nearly) dependent or zero, so that the rank was reduced.
     n_softened : int
@@ -60,12 +60,12 @@ class Diagnostics:
         Invariant, time and size of the largest correction, in units of the local error including round-off: below 5 in
         most correct runs. None if no correction was measured.
     corrections : ndarray, shape (l,)
-        Largest correction of each invariant, in the same unit; nan if none was measured.
+        Largest correction of each invariant, in the unit of `worst`; nan if none was measured.
     slowness : ndarray, shape (l,)
-        Rate of change of each `Balance`: the mean of its rate divided by that of the terms of ``grad @ f``, at some of
-        the projections. It is the larger of a mean over the whole run and a mean over about its last eighth. The error
-        of a balance is about this fraction of the error of an invariant; above 0.05 a balance hardly helps. nan for
-        invariants, and with ``check=False``.
+        Rate of change of each `Balance`: the mean of its rate divided by the mean of the terms of ``grad @ f``, both
+        taken at some of the projections. It is the larger of this ratio over the whole run and over about the last
+        eighth of the run. The error of a balance is about this fraction of the error of an invariant; above 0.05 a
+        balance hardly helps. nan for invariants, and with ``check=False``.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,11 @@ class Diagnostics:
         moved: str = "",
         slow: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        """Keep the buffers of a run, from which the attributes are computed when they are read."""
+        """Keep the buffers of a run, from which the attributes are computed when they are read.
+
+        `estimated` is False if the run has no error estimate. `slow` holds the indices of the balances and the sums
+        (N_SLOW, b) of their rates and terms.
+        """
         self.names = trust.names
         self._trust = trust
         self.max_defect = max_defect
@@ -185,8 +189,8 @@ def slowness(sums: np.ndarray) -> np.ndarray:
     """Return `Diagnostics.slowness` (b,) of the balances, from the sums (N_SLOW, b) of rates and terms.
 
     A mean over the whole run does not detect a balance that is slow only while its terms are large, such as the energy
-    of an oscillator that is damped until its driving dominates. Therefore the larger of two ratios is returned: those
-    of the sums over the whole run, and of the sums over its last part.
+    of an oscillator that is damped until its driving dominates. Therefore the larger of two ratios of rates to terms is
+    returned: the ratio of the sums over the whole run, and that of the sums over its last part.
     """
     rates, terms = sums[[ALL_RATES, LATE_RATES]], sums[[ALL_TERMS, LATE_TERMS]]
     known = terms > 0

@@ -50,8 +50,8 @@ class RunSpec:
     extra : tuple
         Further arguments of the invariants' functions, ``(params,)`` or those of ``args``.
     fun, in_place : callable, bool
-        The user's function or None, and whether it fills an argument `out`. It is examined in case the user passed an
-        acceleration as `fun` by mistake.
+        The user's function or None, and whether it fills an argument `out`. The function is examined in case the user
+        passed an acceleration as `fun` by mistake.
     jacobian : callable
         ``jacobian()`` returns the Jacobian for a multistep method, see `SecondOrder`, or for an implicit method, see
         `Jacobian`, or None.

@@ -139,7 +139,7 @@ class Run:
 
     @property
     def shows(self) -> bool:
-        """Return True if the run returns projected copies of states that are not projected."""
+        """Return True if some steps may stay unprojected; the run then returns projected copies of their states."""
         return self.invariants.size > 0 and (self.options.every != 1 or self.tableau.has_history)
 
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
@@ -178,9 +178,10 @@ class Run:
         self.warned_of_balances = True
         names, bound = [self.invariants.names[place] for place in carried.places[fast]], carried.most_slowness[fast[0]]
         warnings.warn(
-            f"balance {listed(names)} changes at {found[fast].max():.2g} of the terms of its rate (grad @ f), on "
-            f"average. Above {bound:g} a balance hardly improves the result: compare with a run without it, or with "
-            "other tolerances.",
+            f"balance {listed(names)} changes too fast to be of much use: on average its rate is "
+            f"{found[fast].max():.2g} of the sum of the absolute values of the terms of grad @ f (the largest of "
+            f"Diagnostics.slowness). Above {bound:g} a balance hardly improves the result. Compare with a run without "
+            "it, or with other tolerances.",
             UserWarning,
             stacklevel=users_level(),
         )

@@ -263,7 +263,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         )
 
     def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:
-        """Start a run at a state and make its buffers; `check` is `check_start` of `RunSpec.build`."""
+        """Start a run at a state and make its buffers.
+
+        The arguments are those of `RunSpec.build`: the state, its derivative, the length of the first step (the last
+        two are computed if they are None), and `check_start`.
+        """
         run = self._spec.build(y0, f0, tau, check_start=check)
         self._run, self._work = run, run.work
         self._spec = replace(self._spec, method=run.tableau, is_known=True)
@@ -349,7 +353,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._drive(begins=moved)
 
     def _hand_to_scipy(self, solver: OdeSolver, refunctioned: bool) -> None:
-        """Copy the attributes that a step reads to SciPy's solver."""
+        """Copy the attributes that a step reads to SciPy's solver, and `fun` if it was set (`refunctioned`)."""
         if refunctioned:
             solver.fun = self._derivative
         for name in HANDED:
@@ -541,7 +545,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=users_level())
 
     def _sampled(self) -> Interpolants:
-        """Return the interpolants of the run, whose states are projected."""
+        """Return the `Interpolants` of the run, which return projected states; the first call creates them."""
         if self._interpolants is None:
             self._interpolants = Interpolants(self._run, self._engine)
         self._interpolants.record.waiting[:] = self._waits
@@ -778,9 +782,9 @@ class EIPGJ12(EIPSolver):
     -----
     The first states come from `EIPRKN12` (from DOP853 where accelerations depend on velocities), with the same step.
     The corrections of the projection are added to the sums of accelerations that give positions and velocities.
-    `integrate` returns states in the middle of the history of accelerations, whose newest entry is half the order of
-    steps ahead, but not beyond the end of the interval. solve_ivp returns the newest state of the history, whose
-    rounding error is larger.
+    `integrate` returns states in the middle of the history of accelerations: for order p, the state after a step is
+    returned when p / 2 further steps have been made, or all steps up to the end of the interval. solve_ivp returns the
+    newest state of the history, whose rounding error is larger.
     """
 
     TABLEAU = GaussJackson(order=12)

@@ -175,7 +175,10 @@ class Form(NamedTuple):
 
 @singledispatch
 def form(method: Any, brief: bool) -> Form:
-    """Return the form of the interpolants of a method; `brief`: the run has too few steps for a history."""
+    """Return the form of the interpolants of a method.
+
+    `brief` is True if the run has too few steps for the history of a `GaussJackson` method.
+    """
     raise TypeError(
         f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
         "OneStep or Driven."
@@ -269,7 +272,9 @@ def check_halves(n: int) -> None:
 
 
 def depends_on_velocity(rhs: Derivative, start: Any, name: str, hint: Callable[[], str] = str) -> bool:
-    """Return True if the accelerations of q'' = a(t, q, v), y = (q, v), depend on v.
+    """Return True if the accelerations of q'' = a(t, q, v), y = (q, v), depend on v at the start of a run.
+
+    The arguments are those of `checked`.
 
     Raises
     ------

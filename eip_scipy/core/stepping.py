@@ -85,8 +85,8 @@ class Stepping:
     ) -> float:
         """Estimate the first step of an adaptive run (Hairer, Norsett & Wanner I, II.4) with one call of `rhs`.
 
-        The result is NaN if the derivative `f0` is not finite, 0 for an interval of length 0, and infinite for a state
-        without components.
+        `order` is that of the error estimate. The result is NaN if the derivative `f0` is not finite, 0 for an interval
+        of length 0, and infinite for a state without components.
         """
         span = self.span
         if y0.size == 0:
@@ -136,7 +136,7 @@ class StepOptions:
     atol: Any = ATOL
 
     def checked(self, name: str, method: AnyMethod, t0: float, t_bound: float, n: int, *, stacklevel: int) -> Stepping:
-        """Return the step control of a run with n components; `stacklevel` is for a warning.
+        """Return the step control of a run with n components; `stacklevel` is for the warning that `rtol` is too small.
 
         Raises
         ------

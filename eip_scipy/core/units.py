@@ -140,7 +140,9 @@ def apart(span: Any) -> Any:
 
 
 def as_epoch(name: str, value: Any) -> Epoch:
-    """Return a moment as a Julian date in TDB in two parts, from a Time of astropy in any scale, a number, or two.
+    """Return a moment as a Julian date in TDB, in two parts with this sum.
+
+    The moment is a Time of astropy in any scale, a Julian date in TDB, or two numbers whose sum is such a date.
 
     Raises
     ------

@@ -163,7 +163,8 @@ def require_tableau(method: Any) -> None:
 def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in_halves: bool) -> Columns:
     """Return the columns for the option `variations`; columns of an earlier run keep their values.
 
-    `asked` is the option, or the `Columns` of an earlier run. `in_halves` is an attribute of the result.
+    `asked` is the option, or the `Columns` of an earlier run. `params` and `names` are the values and the names of the
+    run's parameters. `in_halves` is stored in the result.
 
     Raises
     ------
@@ -180,7 +181,9 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in
     if isinstance(items, list | tuple) and items and all(map(_is_name, items)):
         own = [_parameter(item, params, names) for item in items if item != STATE]
         if own and in_halves:
-            raise ValueError("variations: Nystrom methods give no derivatives by parameters; use EIPDOP853.")
+            raise ValueError(
+                "variations: Nystrom methods give no derivatives with respect to parameters; use EIPDOP853."
+            )
         if len(set(own)) < len(own) or list(items).count(STATE) > 1:
             raise ValueError(f"variations: {shown(asked)} asks for the same derivatives twice.")
         has_state, p = STATE in items, len(own)
@@ -218,7 +221,8 @@ def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invar
         If the option is True but the columns cannot be kept symplectic.
     """
     reasons = {
-        'derivatives by parameters or along directions do not make a tangent map; ask for variations="state" alone':
+        "derivatives with respect to parameters or along given directions are not a state-transition matrix; use "
+        'variations="state"':
             not columns.is_transition or bool(columns.parameters),
         f"a state of {columns.n} components is not (q, p); omit symplectic": columns.n % 2 == 1,
         "without invariants no step is projected; give the energy, at least": not invariants,
@@ -381,7 +385,7 @@ def right_hand_side(
 ) -> tuple[Callable[..., Any], str]:
     """Return the right-hand side of the wide state, in place, and the source of its products with the Jacobian.
 
-    `own` is the ``variational`` of the problem, or None.
+    `form` is the form of `fun`, one of the names in `FORMS`. `own` is the ``variational`` of the problem, or None.
 
     Raises
     ------
@@ -389,7 +393,7 @@ def right_hand_side(
         If `jvp` is wrong, or no source of derivatives is available.
     """
     if columns.parameters and scalars(extra) != "":
-        raise ValueError("variations: derivatives by parameters need params=[...], one array of numbers.")
+        raise ValueError("variations: derivatives with respect to parameters need params=[...], one array of numbers.")
     if own is not None and jvp is None:
         return _rearranged(own(columns.parameters), columns.order[:, : columns.n]), "problem"
     jvp = by_pointer(jvp, "jvp", GRADIENT, takes_f=True, shape=(columns.n,))
@@ -433,7 +437,11 @@ def _require_products(
         If its value is wrong, or if columns are derivatives with respect to parameters.
     """
     if columns.parameters:
-        raise ValueError("variations: a jvp gives no derivatives by parameters; ask for columns of the state alone.")
+        raise ValueError(
+            "variations: derivatives with respect to parameters cannot be computed with jvp, which gives only products "
+            'with the Jacobian with respect to the state. Omit jvp, or pass variations="state" or an array of initial '
+            "columns."
+        )
     if not callable(jvp):
         raise TypeError(f"jvp must be a function jvp(t, y, dy, ...) -> (n,), got {shown(jvp)}.")
     dy, dp = _direction(y0, 0)
@@ -642,7 +650,10 @@ class _WideInvariant:
 
 
 def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple, compiled: bool) -> Invariant:
-    """Return an invariant as a function of the wide state, with a gradient."""
+    """Return an invariant as a function of the wide state, with a gradient.
+
+    If `compiled`, the engine calls it without Python when it can, see `OfState`.
+    """
     shape = np.shape(item.function(t0, y0.copy(), *item.args, *extra))
     parameters = columns.parameters if extra and not item.args else ()
     found = copy(item)

@@ -75,7 +75,10 @@ class Call(NamedTuple):
 
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: Any) -> Call:
-    """Return a `Call` of ``fun(t, y, ..., *args)``; if the engine does not accept as many `args`, Python adds them."""
+    """Return a `Call` of ``fun(t, y, ..., *args)``; if the engine does not accept as many `args`, Python adds them.
+
+    `shape`, `convert` and `kind` are fields of the `Call`.
+    """
     if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
     return Call(fun, args, shape, convert, **kind)
@@ -89,11 +92,11 @@ class Rates(NamedTuple):
     items : tuple of (int, int)
         For each balance the index of its function among those of the invariants, and the number of its values.
     functions : tuple
-        For each balance its rate, as a `Call` or as an address. If it is None, the rate is computed from the gradient
-        along the flow and from the explicit dependence on time.
+        For each balance its rate, as a `Call`, an address or a `LibraryFunction`. If it is None, the rate is computed
+        from the gradient along the flow and from the explicit dependence on time.
     low, high, shift : float
-        Start and end of the interval within which derivatives with respect to time are computed, and the shift of the
-        time in the finite differences that give them.
+        Lower and upper end of the run's interval, within which derivatives with respect to time are computed, and the
+        shift of the time in the finite differences that give these derivatives.
     """
 
     items: tuple[tuple[int, int], ...] = ()
@@ -121,10 +124,10 @@ class NativeFunctions(NamedTuple):
 
     A function of the library is a `LibraryFunction` instead of an address. Each invariant, gradient and event is a
     pair: the address, and the number of floats that the function fills. If the address of a gradient is None, the
-    gradient is computed by differences, with shifts in units of the size of a component and of its floor, `floors`
-    (n,). `python` contains the functions in Python if events are called from Python; then `event` is empty.
-    `by_parameters` are the derivatives of each invariant with respect to the parameters whose columns of derivatives
-    follow the state.
+    gradient is computed by differences, with a shift of each component that is proportional to the sum of the absolute
+    value of the component and its entry of `floors` (n,). `python` contains the functions in Python if events are
+    called from Python; then `event` is empty. `by_parameters` are the derivatives of each invariant with respect to the
+    parameters whose columns of derivatives follow the state.
     """
 
     rhs: Any
@@ -158,10 +161,11 @@ class Hooks(NamedTuple):
     ``one_step(t, y, h)`` fills work.y_hat, and work.err if `estimates` is True. If `drives` is True, it is instead
     ``one_step(t, y, again)`` of a solver that controls its own error: it fills work.K too, and returns the end of its
     step and the length of the next one, or None if no step is short enough. If `again` is True, it repeats the last
-    step with a shorter length. ``project(t_old, t, last, y_new)`` projects work.y_hat and returns one of the engine's
-    codes. `joint` are the `JointInvariants`, which are tried before `project`. ``agree(here)`` returns True if the
-    result of the step before its projection is finite on all processes that hold a part of the state; `here` is True if
-    it is finite on this process.
+    step with a shorter length. ``project(t_old, t, last, y_new)`` projects work.y_hat, the unprojected state at t,
+    writes the result to `y_new` and returns one of the engine's codes; `last` is True for the last step of the run.
+    `joint` are the `JointInvariants`, which are tried before `project`. ``agree(here)`` returns True if the result of
+    the step before its projection is finite on all processes that hold a part of the state; `here` is True if it is
+    finite on this process.
     """
 
     one_step: Callable[..., Any] | None = None

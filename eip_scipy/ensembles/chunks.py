@@ -29,7 +29,11 @@ AHEAD = 3
 
 
 class Chunk(NamedTuple):
-    """Members that run together, starting at number `first`: initial states (m, n), parameters (m, p) and own times."""
+    """Members that run together: the number `first` of the first one, and the data of all m members.
+
+    `y0s` (m, n) are the initial states, `params` (m, p) the parameters, and `own` the intervals and times if members
+    have different ones.
+    """
 
     first: int
     y0s: np.ndarray

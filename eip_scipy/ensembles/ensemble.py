@@ -348,7 +348,8 @@ def ensemble(
     t_span : (float, float) or array_like, shape (members, 2)
         Start and end: the same for all members, or a row for each.
     y0s : array_like, shape (members, n)
-        Initial states; one state (n,) for all if `params` differ. Default: the initial state of a `Problem`.
+        Initial states; one state (n,) for all if `params`, `t_span` or `t_eval` has a row for each member. Default: the
+        initial state of a `Problem`.
     acceleration : callable, optional
         Instead of `fun`, as for `integrate`.
     params : array_like of float, shape (p,) or (members, p), optional
@@ -364,8 +365,9 @@ def ensemble(
         parameters as the last argument and must have no args.
     executor : None, int, "dask", distributed.Client, DaskExecutor or concurrent.futures.Executor, optional
         Where members run. None: threads on all cores. A number: this number of threads. If functions are not compiled:
-        one thread. "dask": the configured Dask cluster (``DASK_SCHEDULER_ADDRESS``), or a local cluster with one
-        process for each core; see `eip_scipy.integrations.dask`.
+        one thread. A client or an executor: its workers. "dask": the configured Dask cluster
+        (``DASK_SCHEDULER_ADDRESS``), or a local cluster with one process for each core; see
+        `eip_scipy.integrations.dask`.
     save_every : int, optional
         Save every `save_every`-th step of each member in ``.trajectories``; fixed steps only.
     t_eval : array_like or sequence of array_like, optional
@@ -395,7 +397,7 @@ def ensemble(
     progress : bool, optional
         Show a progress bar with the remaining time.
     max_bytes : float, optional
-        Bound on the memory for results; default: half of the free memory.
+        Bound on the memory for results in bytes; default: half of the free memory.
     **keywords
         Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
         direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step, variations,
@@ -411,7 +413,8 @@ def ensemble(
     Raises
     ------
     TypeError, ValueError
-        If every member would fail; the errors are those of `integrate`.
+        If an argument is wrong, or none of up to 8 members, spread over all, can start; the errors are then those of
+        `integrate`.
     MemoryError
         If results would need more than `max_bytes`.
     CheckpointError
@@ -483,7 +486,7 @@ def _check_choices(reduce: Any, callback: Any, progress: Any, max_bytes: Any) ->
 
 
 def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
-    """Warn about members that are not to be trusted.
+    """Warn about members that are not to be trusted; `doubtful` holds the indices of these members.
 
     Raises
     ------
@@ -495,8 +498,8 @@ def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
     k = int(doubtful[0])
     try:
         warnings.warn(
-            f"{doubtful.size} of {result.t.size} members are not to be trusted (.trusted, .message), the first of them "
-            f"member {k}: {result.message[k]}",
+            f"{doubtful.size} of {result.t.size} members are not to be trusted (see .trusted and .message of the "
+            f"result), the first of them member {k}: {result.message[k]}",
             ProjectionWarning,
             stacklevel=3,
         )
@@ -506,7 +509,11 @@ def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
 
 
 class _Gathered:
-    """The finished members so far, from which the result is made."""
+    """The finished members so far, from which the result is made.
+
+    `held` is the number of saved states that are kept in memory for each member. `doubts` holds, by member, the
+    findings of the checks at the start.
+    """
 
     def __init__(
         self,
@@ -662,7 +669,7 @@ class _Gathered:
 
 
 def _separate(result: EnsembleResult, columns: Columns) -> None:
-    """Separate the states of a result from their columns of derivatives."""
+    """Separate the states of a result from the columns of derivatives that follow them, in place."""
     result["y"], result["variations"] = columns.apart(result.y)
     if result.trajectories is not None:
         rows, result["variations"] = columns.apart(result.trajectories.swapaxes(1, 2))
@@ -704,7 +711,7 @@ def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | N
 
 
 def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: OwnTimes) -> Chunk:
-    """Return all members: initial states (m, n), parameters (m, p) with p = 0 if there are none, and own times."""
+    """Return all members as one `Chunk`: states (m, n), parameters (m, p), p = 0 if there are none, and own `times`."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
         y0s = None if problem is None else problem.y0
@@ -719,7 +726,10 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
     elif starts.ndim == 1 and times:
         starts = np.tile(starts, (times.members, 1))
     if starts.ndim != 2 or starts.size == 0:
-        raise ValueError(f"y0s must have the shape (members, n), got {starts.shape}.")
+        raise ValueError(
+            f"y0s must have the shape (members, n), got {starts.shape}; one state (n,) is possible only if params, "
+            "t_span or t_eval has a row for each member."
+        )
     if times and times.members != len(starts):
         raise ValueError(
             f"{times.name} has {times.members} rows for {len(starts)} members; give one row for each member, or one "
@@ -759,9 +769,10 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
 
 
 def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str]]:
-    """Return the plan, made from the first of TRIED members with a valid start; raise the first error if none has one.
+    """Return the plan, made from the first member with a valid start; raise the first error if none has one.
 
-    Also return the findings of the checks at the start, by member: they apply to all members with the same parameters.
+    At most `TRIED` members, spread over all, are tried. Also return the findings of the checks at the start, by member:
+    they apply to all members with the same parameters.
     """
     first: Exception | None = None
     starts, params = everyone.y0s, everyone.params
@@ -804,7 +815,7 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
 
 
 def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:
-    """Raise MemoryError if the results would need too much memory."""
+    """Raise MemoryError if the results, with `rows` saved states for each member, would need too much memory."""
     each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) * (3 + rows) + N_COUNTERS + 4)
     bound = most_bytes(members * each, max_bytes)
     if members * each > bound:

@@ -78,6 +78,8 @@ class OwnTimes(NamedTuple):
 def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) -> OwnTimes:
     """Return the rows of `t_span` and `t_eval` for each member, if they have such rows.
 
+    If `fun` is a `Problem`, times with units and dates are converted to numbers in its units.
+
     Raises
     ------
     ValueError

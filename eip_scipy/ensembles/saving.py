@@ -56,7 +56,7 @@ def unpacked(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def shortened(messages: Sequence[str]) -> dict[str, Any]:
-    """Return the messages of members for JSON: the most frequent one, and the others by number."""
+    """Return the messages of members for JSON: the most frequent one, and the others by the member's number."""
     usual = str(Counter(messages).most_common(1)[0][0])
     return {"usual": usual, "others": {str(k): str(text) for k, text in enumerate(messages) if text != usual}}
 

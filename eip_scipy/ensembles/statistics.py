@@ -95,7 +95,10 @@ def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics 
 
 
 def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there: np.ndarray) -> np.ndarray | None:
-    """Return the values (members, m, k) of the user's function `reduce`, nan where there is no state."""
+    """Return the values (members, m, k) of the user's function `reduce`, nan where the mask `there` is False.
+
+    Return None if `there` is False everywhere.
+    """
     out: np.ndarray | None = None
     for i, j in zip(*np.nonzero(there), strict=True):
         value = np.atleast_1d(np.asarray(reduce(float(t[j]), states[i, j].copy())))
@@ -111,7 +114,7 @@ def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there
 def merge(first: Statistics | None, second: Statistics | None) -> Statistics | None:
     """Return the statistics of the union of two groups (Chan, Golub & LeVeque 1983, eq. 2.1).
 
-    The order affects the last bits: merge chunks in order.
+    None stands for a group without any state. The order affects the last bits: merge chunks in order.
     """
     if first is None or second is None:
         return first if second is None else second

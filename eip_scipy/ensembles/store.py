@@ -186,7 +186,9 @@ class ZarrStore(_Store):
         try:
             group = zarr.open_group(self._place, mode=mode, attributes={LABEL: None}, **FORMAT)
         except FileExistsError as error:
-            raise CheckpointError(f"{self.path!r} is not an ensemble of eip_scipy: {error}") from error
+            raise CheckpointError(
+                f"{self.path!r} is not an ensemble of eip_scipy: {error} (use another place for a new ensemble)"
+            ) from error
         except OSError:
             with suppress(OSError):  # Zarr may have created only the folder
                 os.rmdir(self._place)
@@ -222,11 +224,17 @@ class ZarrStore(_Store):
         except (KeyError, TypeError, ValueError, OSError) as error:  # Zarr raises TypeError for codecs in a wrong order
             old = self._lock is not None and os.path.exists(f"{self._place}/.zgroup")
             why = "it is a Zarr group of format 2, whose metadata may name code to run" if old else error
-            raise CheckpointError(f"{self.path!r} is not an ensemble of eip_scipy: {why}") from error
+            raise CheckpointError(
+                f"{self.path!r} is not an ensemble of eip_scipy: {why} (use another place for a new ensemble)"
+            ) from error
         return found
 
     def _plain(self, name: str, there: Any, how: dict[str, Any]) -> Any:
-        """Return an array of the group after checks of its shape, and that reading it does not run foreign code."""
+        """Return the array `there` of the group, after a check of its shape, chunks and codecs.
+
+        `how` contains the arguments with which it was created, see `_layout`. Unknown codecs are refused, because
+        reading could run foreign code.
+        """
         metadata = there.metadata.to_dict()
         if metadata.get("node_type") != "array":
             raise ValueError(f"its {name!r} is not an array")
@@ -263,7 +271,7 @@ class ZarrStore(_Store):
         if not own:
             raise CheckpointError(
                 f"{self.path!r} is no longer the group that this ensemble writes to: it was replaced or removed. "
-                "Nothing more is written there."
+                "Nothing more is written there. Start the ensemble again with another out=..."
             )
 
     def _layout(self, times: np.ndarray) -> dict[str, dict[str, Any]]:

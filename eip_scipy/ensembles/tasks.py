@@ -256,9 +256,10 @@ class Plan:
         return self.task.prepared(y0, None if self.task.request.params is None else params, own)
 
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
-        """Return the identity of an ensemble in a form for JSON: settings, and values at a start.
+        """Return the data, in a form for JSON, by which a resumed ensemble is recognised as this one.
 
-        These are the first COMPARED values of f and of the invariants, at the start of the member of the task.
+        They are the settings, with the members per chunk, `chunk`, and the first COMPARED numbers of f followed by the
+        invariants, at the start that `task` contains.
         """
         settings = self._ready.identity(starts, params) | {"chunk": chunk}
         settings |= {name: plain(value) for name, value in own.identity.items()}
@@ -267,9 +268,9 @@ class Plan:
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
         """Return values of f and of the invariants at the end of the first member that did not fail, and their sizes.
 
-        There are at most COMPARED components of f, and all invariants; the sizes are those of the terms of each value.
-        A resumed ensemble compares its functions by these values. Both arrays are empty if all members failed, or a
-        value cannot be evaluated or is not finite.
+        There are at most COMPARED components of f, and all invariants. The size of a component is the largest one of f,
+        and that of an invariant is the size of its terms. A resumed ensemble compares its functions by these values.
+        Both arrays are empty if all members failed, or a value cannot be evaluated or is not finite.
         """
         nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
         if not ended.size:

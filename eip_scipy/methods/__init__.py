@@ -1,4 +1,4 @@
-"""Coefficients of methods."""
+"""Integration methods: their coefficients and orders."""
 
 from .multistep import GaussJackson
 from .nystrom import NystromTableau

@@ -109,7 +109,7 @@ class GaussJackson(Ordered):
 
 @cache
 def _inverse_powers(power: int, terms: int) -> Series:
-    """Return the first `terms` coefficients of the series of L^-power in x."""
+    """Return the first `terms` coefficients of the series of L^-power in x; `GaussJackson` defines L and x."""
     L = [Fraction(1, k + 1) for k in range(terms)]
     inverse = [Fraction(1)]
     for k in range(1, terms):
@@ -142,12 +142,18 @@ def _ordinates(series: Series) -> Series:
 
 
 def position_series(back: int, terms: int) -> Series:
-    """Return the series of the position `back` steps before the newest node, without its first terms 1, -1 - back."""
+    """Return `terms` coefficients of the series in x of the position `back` steps before the newest node.
+
+    The first two coefficients of the series, 1 and -1 - back, are left out, see `GaussJackson`.
+    """
     return _shifted(_inverse_powers(2, terms + 2), back)[2:]
 
 
 def velocity_series(back: int, terms: int) -> Series:
-    """Return the series of the velocity `back` steps before the newest node, without its first term 1."""
+    """Return `terms` coefficients of the series in x of the velocity `back` steps before the newest node.
+
+    The first coefficient of the series, 1, is left out, see `GaussJackson`.
+    """
     return _shifted(_inverse_powers(1, terms + 1), back)[1:]
 
 
@@ -224,10 +230,11 @@ def weights(order: int) -> Weights:
 
 
 def _balanced(exact: Series) -> np.ndarray:
-    """Round each weight up or down so that the errors of the first moments of all weights are smallest.
+    """Round each weight to one of two neighbouring floats, so that the moments of orders 0 to 3 are kept best.
 
-    Rounding changes the largest weights, about one hundred, by 1e-14 each, in the same way in every step. That acts as
-    a force along the motion, by which Mercury would drift by 2e-9 AU in 1000 years.
+    The sum of the absolute errors of these moments of the weights is the smallest of all choices. Rounding to the
+    nearest floats would change weights of 100 to 200 (order 14) by about 1e-14, by the same amounts in every step: this
+    acts as a force along the motion, by which Mercury would drift by 2e-9 AU in 1000 years.
     """
     nearest = np.array([float(weight) for weight in exact])
     missed = np.array([float(weight - Fraction(rounded)) for weight, rounded in zip(exact, nearest, strict=True)])
@@ -293,8 +300,8 @@ def damping_limit(order: int) -> float:
 def stability_limit(order: int, corrected: bool) -> float:
     """Return the largest h omega for which the method is stable for q'' = -omega^2 q.
 
-    It follows from the roots of the characteristic polynomial: none may grow by more than GROWTH in a step, including
-    the two roots of the solution.
+    `corrected` is that of `GaussJackson`. The method is called stable if no root of the characteristic polynomial has a
+    modulus above 1 + GROWTH, including the two roots of the solution.
     """
     P = np.array([float(c) for c in position_weights(-1, order)])
     D = np.array([float(c) for c in correction_weights(order)]) if corrected else np.zeros(order + 1)

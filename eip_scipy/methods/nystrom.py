@@ -97,7 +97,7 @@ def nystrom_residuals(A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> 
 
     For a velocity the residuals are sum_i b'_i phi_i(tree) - 1 / density(tree), for trees of up to `order` vertices.
     For a position they are sum_i b_i phi_i(tree) - 1 / ((vertices + 1) density(tree)), for trees of up to one vertex
-    less.
+    less. phi_i(tree) is c_i^leaves times the product of sum_j A_ij phi_j(subtree) over all subtrees.
     """
     A, c = _fixed(A), _fixed(c)
     weights = [_fixed(row.values) for row in rows]
@@ -159,8 +159,9 @@ class NystromTableau(Ordered):
     b_low, b_prime_low : ndarray of float64, shape (s,)
         Rounding errors of `b` and `b_prime` in double precision, for compensated summation, corrected as follows. The
         step uses rounded nodes, with which even exact weights violate the quadrature conditions by 1e-17, with the same
-        sign in each step; therefore the low parts make the first moments exact for the rounded nodes: at most seven, at
-        most `order`, and at most the number of distinct nodes with weights. Weights of zero stay zero.
+        sign in each step; therefore the low parts make the first moments exact for the rounded nodes. The number of
+        these moments is at most seven, at most `order`, and at most the number of distinct nodes whose weights are not
+        zero. Weights of zero stay zero.
     exact : mapping from str to ndarray of object
         A, b, b_prime, c and, if given, b_hat and b_prime_hat, as fractions (floats where floats were given).
     n_stages : int
@@ -289,12 +290,18 @@ def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _velocity_moments(order: int) -> list[Fraction]:
-    """Return the exact sums of b'_i c_i^k for k = 0, 1, ...; there are `order` of them, at most MOMENTS."""
+    """Return the values that a method of this order requires of sum_i b'_i c_i^k, k = 0, 1, ..., `order` - 1.
+
+    There are at most MOMENTS of them.
+    """
     return [Fraction(1, k + 1) for k in range(min(order, MOMENTS))]
 
 
 def _position_moments(order: int) -> list[Fraction]:
-    """Return the exact sums of b_i c_i^k for k = 0, 1, ...; there are `order` - 1 of them, at most MOMENTS."""
+    """Return the values that a method of this order requires of sum_i b_i c_i^k, k = 0, 1, ..., `order` - 2.
+
+    There are at most MOMENTS of them.
+    """
     return [Fraction(1, (k + 1) * (k + 2)) for k in range(min(order - 1, MOMENTS))]
 
 
@@ -307,7 +314,10 @@ def _low_parts_of_used(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]
 
 
 class _Published(NystromTableau):
-    """A tableau of this package, checked by the tests: the 800 trees of RKN1210 would take 60 ms per import."""
+    """A tableau of this package, whose order is checked by the tests instead of at each import.
+
+    The check of the 800 trees of RKN1210 alone would take 60 ms.
+    """
 
     @staticmethod
     def _check_order(name: str, A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> None:

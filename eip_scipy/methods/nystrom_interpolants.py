@@ -55,7 +55,7 @@ def interpolant(tableau: NystromTableau) -> Interpolant:
     The velocity of a step is interpolated by the integral of the polynomial through accelerations at Gauss-Lobatto
     nodes, and the position by the integral of the velocity. If the error of the position at such a node is O(h^s), the
     velocity between the nodes has an error of O(h^(s + 1)). Groups of stages at equidistant nodes are therefore
-    inserted before them, until s is at least p - 1 or no further group helps.
+    inserted before the stages at Gauss-Lobatto nodes, until s is at least p - 1 or no further group helps.
     """
     s = tableau.n_stages - tableau.fsal
     A, c = np.zeros((s + 1, s + 1)), np.ones(s + 1)
@@ -89,9 +89,9 @@ def _extended(A: Array, c: Array, nodes: Array, weights: Array) -> tuple[Array, 
 def _stages(A: Array, c: Array, nodes: Array, order: int) -> tuple[int, Array]:
     """Return the order of the error of positions at `nodes`, at most `order`, and the weights (nodes, stages).
 
-    Each row of weights has the smallest norm among those that meet the order conditions of as many vertices as can be
-    met at all nodes. The conditions are made orthonormal one after the other, by sums of columns: a library's solver
-    would give other bits on another processor.
+    The weights meet the order conditions of all trees with up to k vertices, for the largest k for which this is
+    possible at all nodes, and among such weights they have the smallest norm. The conditions are made orthonormal one
+    after the other by sums over columns, because a library's solver would give other bits on another processor.
     """
     rows, met = np.zeros((c.size, 0)), np.zeros((0, nodes.size))
     power = 2

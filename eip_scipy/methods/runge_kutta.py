@@ -269,7 +269,10 @@ def _stage_matrix(name: str, A: Sequence[Sequence[Number]], s: int) -> np.ndarra
 
 def _check_nodes(name: str, c: np.ndarray, row_sums: np.ndarray) -> None:
     if len(c) != len(row_sums) or any(abs(float(x - y)) > FLOAT_TOLERANCE for x, y in zip(c, row_sums, strict=True)):
-        raise ValueError(f"{name}: c = {list(map(str, c))} differs from the row sums of A, {list(map(str, row_sums))}.")
+        raise ValueError(
+            f"{name}: c = {list(map(str, c))} differs from the row sums of A, {list(map(str, row_sums))}. Correct A or "
+            "c, or omit c."
+        )
 
 
 def _low_parts(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
@@ -407,7 +410,7 @@ RK45 = _Published(
 
 
 def _dop853() -> Tableau:
-    """Return the coefficients from SciPy's public class, so that these 150 numbers are not copied."""
+    """Return the tableau of DOP853, with the coefficients of SciPy's public class so that they are not copied."""
     import scipy.integrate
 
     source = scipy.integrate.DOP853

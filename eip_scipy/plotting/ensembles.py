@@ -51,7 +51,7 @@ def ensemble_figure(
     components : mapping of str to array_like, shape (members, m)
         Values of each component, nan if a member has none. The magnitude of complex components is drawn.
     members : array_like, shape (k,)
-        Numbers of the members whose errors are drawn.
+        Indices of the members whose errors are drawn.
     errors : mapping of str to array_like, shape (k,)
         Largest error of each invariant in these members.
     failed : array_like of bool, shape (k,)
@@ -118,7 +118,7 @@ def _explain(axis: Axes) -> None:
 
 
 def _draw_last(axis: Axes, components: Mapping[str, Any]) -> None:
-    """Draw box plots of the last states of each component: median, 50 % and 90 % of the members, and outliers."""
+    """Draw a box plot of each component in the last states: median, 50 % and 90 % of the members, and outliers."""
     columns = [np.abs(values) if np.iscomplexobj(values) else np.asarray(values) for values in components.values()]
     finite = [column[np.isfinite(column)] for column in columns]
     boxes = axis.boxplot(

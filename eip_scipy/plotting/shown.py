@@ -27,7 +27,7 @@ class ShownFigure(Figure):
     """
 
     def savefig(self, fname: Any, **options: Any) -> None:
-        """Save the figure, at 160 dots per inch unless `dpi` or the rc parameter says otherwise."""
+        """Save the figure, at 160 dots per inch unless `dpi` or the rc parameter ``savefig.dpi`` is set."""
         if rcParams["savefig.dpi"] == "figure":
             options.setdefault("dpi", DPI)
         super().savefig(fname, **options)

@@ -90,7 +90,7 @@ def _damped_gradient(item: Invariant, parts: Parts, t: float, y: np.ndarray, f: 
 def _loss(
     item: Invariant, parts: Parts, total: Callable[[float], float] | None, t: float, y: np.ndarray, f: np.ndarray
 ) -> float:
-    """Return the rate of the balance, Re <gradient, lost>."""
+    """Return the rate of a `damped_invariant`: Re <gradient, lost>, where `lost` is the second result of `parts`."""
     kept, lost = parts(y, f)
     gradient = np.empty_like(y)
     assert item.gradient is not None

@@ -85,8 +85,8 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     refuse_units(s_end=s_end)
     if problem.rhs is None:
         raise ValueError(
-            f"time_transformed: the problem {problem.name!r} has no compiled right-hand side in place (rhs); "
-            "expected one such as kepler() or nbody(...)."
+            f"time_transformed: the problem {problem.name!r} has no compiled right-hand side that fills an "
+            "array (rhs). Use a problem that has one, such as kepler() or nbody(...)."
         )
     params = np.zeros(0) if problem.params is None else problem.params
     rhs = _transformed_rhs(problem.rhs, jitted(g))
@@ -137,8 +137,9 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
 def _transformed_invariant(item: Invariant) -> Invariant:
     if item.is_balance:
         raise ValueError(
-            f"time_transformed: {item!r} is a Balance, whose rate is a derivative with respect to time. Omit it, and "
-            "give the new problem a Balance with the rate in fictitious time: replace(problem, invariants=...)."
+            f"time_transformed: {item!r} is a Balance, whose rate is a derivative with respect to time. Pass "
+            "dataclasses.replace(problem, invariants=...) without it. The new problem may get a Balance in the same "
+            "way, with the rate in fictitious time."
         )
     fun, grad = _transformed_functions(item.function, item.gradient, item.uses_f)
     return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)

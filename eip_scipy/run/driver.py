@@ -322,7 +322,10 @@ def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
 
 
 def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:
-    """Raise MemoryError, with both sizes and `advice`, if `needed` bytes exceed the bound of `most_bytes`."""
+    """Raise MemoryError, with `advice`, if the `needed` bytes for `what` exceed the bound of `most_bytes`."""
     bound = most_bytes(needed, max_bytes)
     if needed > bound:
-        raise MemoryError(f"{what} needs {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB; {advice}.")
+        raise MemoryError(
+            f"{what} needs {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB (max_bytes, by default half of "
+            f"the free memory); {advice}."
+        )

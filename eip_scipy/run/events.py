@@ -126,7 +126,9 @@ class Events:
                 values[k] = self._value(k, t + part, y + part * f)
 
     def handle(self, which: np.ndarray, times: np.ndarray, sol: DenseOutput) -> float | None:
-        """Record events that happen in a step, in the order of their times.
+        """Record the events with indices `which` that happen at `times`, in this order, until one ends the run.
+
+        The states are those of the interpolation `sol` of the step.
 
         Returns
         -------

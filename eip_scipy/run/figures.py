@@ -64,7 +64,10 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
     labels = component_names(result, names)
     pairs = planes(labels)
     if orbit and not pairs:
-        raise ValueError("plot: an orbit needs components named x and y, or x_0 and y_0 and so on; give names=...")
+        raise ValueError(
+            "plot: an orbit needs components named x and y, or x_0 and y_0 and so on; pass such names as names=, or "
+            "omit orbit."
+        )
     y, diagnostics = np.asarray(result.y), result.get("diagnostics")
     paths = {name: (y[i], y[j]) for name, (i, j) in pairs.items()} if orbit is not False else {}
     components = dict(zip(labels, y, strict=True))

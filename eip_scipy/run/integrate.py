@@ -233,7 +233,7 @@ def _check_names(projection: Iterable[str]) -> None:
 class Loop:
     """A run in chunks of steps, with a progress bar, states at `t_eval`, events, callbacks, and checkpoints.
 
-    An error raised in it has a partial result.
+    An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
     def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
@@ -361,13 +361,13 @@ class Loop:
             self._slowed = False
             warnings.warn(
                 f"{self.method}: fun is jitted, and the run could be many times faster, but it is {self.why_not}. "
-                "Pass compiled=False if this is intended.",
+                "Compile the functions of the invariants with numba.njit, or pass compiled=False if this is intended.",
                 UserWarning,
                 stacklevel=5,
             )
 
     def _progress(self, shown: float, k: int) -> float:
-        """Return the progress beyond step `k` if the steps are fixed, else the elapsed time beyond `shown`."""
+        """Return the advance of the progress bar: steps since step `k`, or if adaptive the time beyond `shown`."""
         schedule = self.driver.schedule
         if schedule.span.h != 0.0:
             return self.driver.step - k
@@ -401,8 +401,8 @@ class Loop:
     def _chunk(self, chunk: int) -> int:
         """Return the number of steps to make next: at most `chunk`, and none beyond the next check of the run.
 
-        With a callback, no step goes beyond the next state that is saved. At the end of a multistep run all remaining
-        steps, even if they are more than `chunk`, replace `chunk`.
+        With a callback, no step goes beyond the next state that is saved. Near the end of a multistep run `chunk` is
+        replaced by the number of all remaining steps, even if it is larger.
         """
         driver, schedule = self.driver, self.driver.schedule
         history, left = driver.run.method.multistep, schedule.span.n_steps - driver.step

@@ -41,7 +41,8 @@ def _interpreted_in_place(
 ) -> Callable[..., None]:
     """Return an in-place right-hand side that checks the user's in-place function in its first call.
 
-    `out` is filled with NaN before that call, so that components that the function does not fill are detected.
+    `out` is filled with NaN before each call: the first call raises an error if the function leaves components
+    unfilled, and later ones leave NaN there. Functions of the package's problems are not checked.
     """
     first = not isinstance(fun, LibraryFunction)
 

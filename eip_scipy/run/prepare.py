@@ -336,7 +336,10 @@ class Prepared:
         return [function for function in functions if isinstance(function, PointerFunction)]
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
-        """Return everything except functions that determines the bits of a run from y0, with the names users know."""
+        """Return all settings, except functions, that determine the result of a run from `y0` to the last bit.
+
+        The keys of the dict are the names of arguments and options that users know.
+        """
         found = settings(self.label, y0, params, self.run, self.schedule, self.system.events)
         if self.variations is not None:
             found |= {name: plain(value) for name, value in self.variations.columns.identity.items()}
@@ -425,8 +428,8 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     columns = asked_columns(request.variations, y0, floats(extra), names, request.method.TABLEAU.of_second_order)
     if projection.project_initial and columns.parameters:
         raise ValueError(
-            "variations: project_initial cannot be combined with derivatives with respect to parameters; project y0 "
-            "first."
+            "variations: project_initial cannot be combined with derivatives with respect to parameters. Omit it, "
+            "and pass y0 = eip_scipy.project(y0, ...).y."
         )
     own = None if problem is None else problem.variational
     t0 = interval(_required("t_span", request.t_span))[0]

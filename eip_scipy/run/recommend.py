@@ -139,7 +139,7 @@ def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
         if name not in COMMON:
             raise TypeError(
                 f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} It finds method, step and "
-                "tolerances; pass options for events and the like to run()."
+                "tolerances; pass other options, such as events, to the run() of its result."
             )
     if not is_number(error) or not 0 < error < 1:
         raise ValueError(f"error must be a number between 0 and 1, got {shown(error)}.")

@@ -49,7 +49,8 @@ class Recommendation:
     trials : tuple of Trial
         All trials: ``options``, ``error``, ``nfev``, ``seconds``, and ``trouble`` of those that failed.
     stiff : bool
-        True if an implicit method needs at most 0.33 of the evaluations; `reason` names it.
+        True if an implicit method needs at most 0.33 of the evaluations of the recommended run; `reason` names the
+        method.
     """
 
     problem: Problem
@@ -69,7 +70,7 @@ class Recommendation:
 
     @property
     def error(self) -> float:
-        """Expected error of the state at the end of the interval, relative to the largest component."""
+        """Expected error at the end of the interval, relative to the largest component of the exact state."""
         return self.trial.error
 
     @property

@@ -67,7 +67,7 @@ class WithColumns(Fields):
         """State-transition matrices at the saved times, (m, n, n), of a run with ``variations="state"``.
 
         ``run.stm[k, i, j]`` is the derivative of ``run.y[i, k]`` with respect to component j of the initial state. For
-        an ensemble the shape is that of its `variations`, with one matrix for each member.
+        an ensemble the shape is (members, m, n, n), or (members, n, n) without trajectories.
 
         Raises
         ------
@@ -81,6 +81,9 @@ class WithColumns(Fields):
     @property
     def sensitivities(self) -> np.ndarray:
         """Derivatives of the state with respect to parameters, ``variations=[...]``, at the saved times, (m, n, p).
+
+        p is the number of these parameters. For an ensemble the shape is (members, m, n, p), or (members, n, p)
+        without trajectories.
 
         Raises
         ------
@@ -274,7 +277,7 @@ class IntegrationResult(WithColumns):
         ----------
         t : float
             New end of the run, beyond the present one in its direction; as in `t_span` of `integrate` it may also be a
-            duration from t = 0, or a time.
+            duration from t = 0 or a date, both of astropy.
         **options
             Options of `integrate` that change. `t_eval` is not repeated: pass new times, otherwise the states at both
             ends are saved. Events keep their counts: an event with ``terminal = 3`` that happened twice before ends the
@@ -291,9 +294,9 @@ class IntegrationResult(WithColumns):
         Raises
         ------
         ValueError
-            If `t` is not beyond the end, if the result was loaded, unpickled or copied, or if the last state misses an
-            invariant by more than 1e-8 of its terms, as after an unreliable run or one without checks;
-            ``project_initial=True`` then projects it first.
+            If `t` is not beyond the end, if the result was loaded, unpickled or copied, or if at the last state
+            the error of an invariant exceeds 1e-8 of the terms of this invariant, as after an unreliable run or one
+            without checks; ``project_initial=True`` then projects the state first.
 
         Notes
         -----

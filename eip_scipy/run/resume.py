@@ -329,7 +329,7 @@ class _FileKeeper(Keeper):
         )
 
     def _state(self) -> dict[str, np.ndarray]:
-        """Return the values that identify the functions at the snapshot, none if a function raises an error.
+        """Return the values that identify the functions at the snapshot; {} if a function raises an error.
 
         The evaluations are not counted.
         """

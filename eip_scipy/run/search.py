@@ -178,9 +178,7 @@ class Search:
         agreement, reference = min(found, key=lambda item: item[0])
         least = agreement / LEAST_AGREEMENT
         if least > self.wanted:
-            hint = (
-                f"Ask for {least:.0e} or more, or for a shorter interval." if least < 0.1 else "Shorten the interval."
-            )
+            hint = f"Pass error={least:.0e} or more, or a shorter interval." if least < 0.1 else "Shorten the interval."
             raise ValueError(
                 f"recommend: an error of {self.wanted:g} cannot be reached or cannot be verified: two runs with the "
                 f"smallest tolerances differ by {agreement:.1e} at the end, because rounding errors have grown to that "
@@ -260,7 +258,10 @@ class Search:
         return None if chosen is None else self._with_output(chosen)
 
     def _with_output(self, chosen: Trial) -> Trial:
-        """Replace `chosen` in `trials` by a trial with the evaluations for states at `bench.output`, and return it."""
+        """Replace `chosen` in `trials` by its copy from `Bench.with_output`, and return the copy.
+
+        The copy also counts the evaluations that saving states at the times `bench.output` needs.
+        """
         counted = self.bench.with_output(chosen)
         self.trials[[trial is chosen for trial in self.trials].index(True)] = counted
         self.kinds[id(counted)] = self.kinds.pop(id(chosen))  # an object that is gone may pass its id on
@@ -310,7 +311,10 @@ class Search:
             self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
 
     def _say_that_it_is_stiff(self, chosen: Trial) -> bool:
-        """Return True if an implicit method needs at most 1 / STIFF of the evaluations of a long run; add a remark."""
+        """Return True if an implicit method needs at most 1 / STIFF of the evaluations of `chosen`, and add a remark.
+
+        Runs with fewer than LEAST_BOUND evaluations and complex states are not tested, and the result is False.
+        """
         bench, share = self.bench, self.bench.share
         if chosen.nfev * share < LEAST_BOUND or np.iscomplexobj(bench.truth):
             return False

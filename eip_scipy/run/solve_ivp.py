@@ -285,7 +285,7 @@ def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
     if acceleration is not None and fun is not None:
         raise TypeError("solve_ivp: give fun or acceleration, not both.")
     if given is None:
-        raise TypeError("solve_ivp: fun is missing; give a function fun(t, y), or acceleration=a(t, q).")
+        raise TypeError("solve_ivp: fun is missing; give a function fun(t, y), or a function a(t, q) as acceleration=.")
     if not callable(given):
         hint = "; for a Problem call problem.solve_ivp(method=...)" if hasattr(given, "solve_ivp") else ""
         raise TypeError(f"solve_ivp: {name} must be callable, got {shown(given)}{hint}.")

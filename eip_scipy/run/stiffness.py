@@ -22,7 +22,7 @@ LARGEST = 500
 
 
 class ImplicitRun(NamedTuple):
-    """Tolerances, error and evaluations of a run by EIPRadau; evaluations for Jacobians are counted."""
+    """Tolerances, final error and number of evaluations of a run by `EIPRadau`, including those for Jacobians."""
 
     rtol: float
     atol: float

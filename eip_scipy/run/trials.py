@@ -128,7 +128,11 @@ class Bench:
         return _outcome(run, np.array(states).T, f"it takes more than {self.most} evaluations")
 
     def _with_equal_steps(self, asked: dict[str, Any]) -> Outcome:
-        """Run with equal steps; a multistep method starts only once, because each start costs about 200 evaluations."""
+        """Run with equal steps, and return the outcome with the states at the times of the bench.
+
+        A one-step method continues its run from each of these times to the next. A multistep method makes a single run
+        with ``t_eval``, because each of its starts costs about 200 evaluations.
+        """
         method = asked["method"].TABLEAU
         several = method.has_history
         nfev = abs(self.times[-1] - self.t0) / asked["h"] * (1 if several else method.n_stages)

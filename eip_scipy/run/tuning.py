@@ -30,7 +30,8 @@ AWAY = 0.1
 class Kind:
     """A method with options, tuned by one number: its step `h` or its tolerance `rtol`.
 
-    `size` is the size of the state, from which `atol` follows; `coarsest` is the largest value of the number.
+    `atol` is proportional to `rtol` and to `size`, the magnitude of the state. `coarsest` is the largest step or
+    tolerance that is tried, and `options` are further options of `integrate`.
     """
 
     method: type[EIPSolver]
@@ -60,7 +61,7 @@ class Kind:
         return self.order if self.fixed else self.order / ((self.method.TABLEAU.error_estimator_order or 0) + 1)
 
     def settings(self, value: float) -> dict[str, Any]:
-        """Return the options of `integrate` for a value of the number."""
+        """Return the options of `integrate` for a value of the step or tolerance."""
         if self.fixed:
             return {"method": self.method, "h": value, **self.options}
         return {
@@ -76,17 +77,18 @@ class Kind:
         return _short(value, 3) if self.fixed else _short(max(value, FINEST_RTOL), 2)
 
     def dearness(self, trial: Trial, wanted: float) -> float:
-        """Return an estimate, from one trial, of the number of evaluations for the wanted error."""
+        """Return an estimate, from one trial, of the evaluations of the right-hand side for the error `wanted`."""
         return trial.nfev * (trial.error / wanted) ** (1 / self.order)
 
 
 def tune(
     kind: Kind, value: float, wanted: float, run: Callable[[Mapping[str, Any]], Trial], bound: float
 ) -> list[Trial]:
-    """Run trials of a kind, from `value` of its step or tolerance on, and return them in order.
+    """Run trials of a kind, the first with the step or tolerance `value`, and return them in order.
 
-    The search ends if a trial has between WINDOW and 1 times the wanted error. It ends early if the first trials fail,
-    if no other value is left to try, or if the kind would cost much more than `bound` evaluations.
+    ``run(options)`` makes a trial with options of `integrate`. The search ends if the error of a trial is WINDOW to
+    1 times `wanted`. It ends early if the first trials fail, if no other value is left to try, or if the kind would
+    need many more evaluations of the right-hand side than `bound`.
     """
     tried: dict[float, Trial] = {}
     fine: tuple[float, float] | None = None  # logarithms of number and error of an accurate enough trial
@@ -117,7 +119,8 @@ def tune(
 def _next(kind: Kind, fine: tuple[float, float] | None, coarse: tuple[float, float] | None, aim: float) -> float:
     """Return the logarithm of the step or tolerance at which the logarithm of the error is expected to be `aim`.
 
-    `fine` and `coarse` are such pairs of logarithms of two trials, see `tune`; one of them may be None.
+    `fine` and `coarse` are pairs, logarithms of step or tolerance and of the error, of a trial that is accurate
+    enough and of one that is not (its error is nan if the run failed); one of them may be None.
     """
     farthest = FARTHEST[kind.fixed]
     if fine and coarse:
@@ -135,7 +138,7 @@ def _next(kind: Kind, fine: tuple[float, float] | None, coarse: tuple[float, flo
 
 
 def best(trials: list[Trial], wanted: float) -> Trial | None:
-    """Return the cheapest good trial that is accurate enough, or None."""
+    """Return the good trial (see `Trial`) of least cost whose error is at most `wanted`, or None."""
     enough = [trial for trial in trials if trial.good and trial.error <= wanted]
     return min(enough, key=lambda trial: trial.cost, default=None)
 

@@ -1,6 +1,6 @@
 """Table of the commands, with their classes and purposes, and the exit statuses.
 
-It imports no command, so that ``--help`` is quick.
+This module imports no command, so that ``--help`` is quick.
 """
 
 from __future__ import annotations

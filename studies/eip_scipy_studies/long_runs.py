@@ -36,7 +36,7 @@ class Checkpoints:
     def checkpoint_options(self, name: str) -> dict[str, Any]:
         """Return the options with which `integrate` keeps checkpoints of the run `name` in a separate file.
 
-        Without a folder for checkpoints there are none.
+        The dictionary is empty if no folder for checkpoints is given.
         """
         if self.checkpoint is None:
             return {}

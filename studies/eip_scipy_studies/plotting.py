@@ -376,7 +376,7 @@ def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title:
     Parameters
     ----------
     errors : mapping of str to (float, float)
-        Errors without and with projection by case; values that are not finite or zero are left out.
+        Errors without and with projection by case; values that are zero or not finite are left out.
     what : str
         Name of the error, with its unit.
     title : str, optional

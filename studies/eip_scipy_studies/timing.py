@@ -28,7 +28,8 @@ def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_coun
 def many_calls(call: Callable[[], Any]) -> Action:
     """Make a function that returns the processor time of one call in seconds, as the mean of many calls.
 
-    The time of reading the clock is negligible in it. `call` is called before, to compile and to choose their number.
+    The time of reading the clock is negligible in it. `call` is called before, to compile and to choose the
+    number of calls.
     """
     call()
     calls = max(1, int(2e-3 / max(clocked(call)(), 1e-6)))

@@ -435,7 +435,7 @@ def test_a_fast_balance_is_pointed_out(solve):
         return np.array([y[1], -y[0] + 0.5 * np.cos(1.7 * t)])
 
     balance = Balance(slow_energy, lambda t, y: 0.5 * np.cos(1.7 * t) * y[1], name="E")
-    with pytest.warns(UserWarning, match=r"balance 'E' changes at 0\.\d+ of the terms of its rate") as told:
+    with pytest.warns(UserWarning, match=r"balance 'E' changes too fast .* rate is 0\.\d+ of the sum") as told:
         run = solve(driven, (0, 50), [1.0, 0.0], method=EIPDOP853, h=0.2, invariants=balance)
     assert len(told) == 1
     assert getattr(run, "trusted", True)
@@ -455,11 +455,11 @@ def test_a_balance_that_is_fast_only_at_the_end_is_pointed_out(solve):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         solve(driven, (0, 200), [1.0, 0.3], method=EIPDOP853, h=0.3, invariants=balance)
-    with pytest.warns(UserWarning, match=r"balance 'E' changes at 0\.\d+ of the terms of its rate"):
+    with pytest.warns(UserWarning, match=r"balance 'E' changes too fast .* rate is 0\.\d+ of the sum"):
         solve(driven, (0, 1500), [1.0, 0.3], method=EIPDOP853, h=0.3, invariants=balance)
 
 
-@pytest.mark.filterwarnings("ignore:balance 'energy' changes at:UserWarning")
+@pytest.mark.filterwarnings("ignore:balance 'energy' changes too fast:UserWarning")
 def test_a_right_rate_late_in_time_is_not_accused():
     """The phase omega t of a function of time is rounded, by more the later it is; differences in time see that."""
     frequency, strength = 1.1, 0.2

@@ -280,7 +280,7 @@ def power(t, y, p):
     return -0.02 * y[1] ** 2 + 0.01 * y[1] * np.cos(2 * t)
 
 
-@pytest.mark.filterwarnings("ignore:balance 'E' changes at:UserWarning")
+@pytest.mark.filterwarnings("ignore:balance 'E' changes too fast:UserWarning")
 @pytest.mark.parametrize("options", RUNS)
 def test_a_run_in_two_parts_is_as_slow_as_in_one(options):
     """The energy decays to that of the driving, so that it is slow at the start only."""

@@ -140,7 +140,7 @@ def test_a_wrong_gradient_is_an_error():
 
 
 def test_errors_that_cannot_be_reached():
-    with pytest.raises(ValueError, match=r"error of 1e-15 cannot be reached.*Ask for \de-1[34] or more"):
+    with pytest.raises(ValueError, match=r"error of 1e-15 cannot be reached.*Pass error=\de-1[34] or more"):
         recommend(kepler(0.6, relativistic=0), (0, 50), error=1e-15)
 
     def lorenz(t, y):

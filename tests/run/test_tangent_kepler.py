@@ -198,7 +198,7 @@ def test_what_cannot_carry_them():
 
     with pytest.raises(ValueError, match="carries no derivatives"):
         integrate(kepler, (0, 10), START, method=eip_method(Euler()), **options)
-    with pytest.raises(ValueError, match="no derivatives by parameters"):
+    with pytest.raises(ValueError, match="no derivatives with respect to parameters"):
         integrate(lambda t, y, p: kepler(t, y), (0, 1), START, method=EIPRKN8, h=0.05, params=[1.0], variations=[0])
     with pytest.raises(ValueError, match="EIPRadau carries no derivatives"):
         solve_ivp(kepler, (0, 1), START, "Radau", variations="state")

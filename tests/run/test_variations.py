@@ -96,9 +96,9 @@ def test_says_where_the_products_come_from():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"variations": [[1.0], [0.0]]}, "do not make a tangent map"),
-        ({"variations": 0, "params": [1.0]}, "do not make a tangent map"),
-        ({"variations": ["state", 0], "params": [1.0]}, "do not make a tangent map"),
+        ({"variations": [[1.0], [0.0]]}, "are not a state-transition matrix"),
+        ({"variations": 0, "params": [1.0]}, "are not a state-transition matrix"),
+        ({"variations": ["state", 0], "params": [1.0]}, "are not a state-transition matrix"),
         ({"variations": "state", "invariants": ()}, "without invariants"),
     ],
 )

@@ -201,7 +201,10 @@ def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> t
 
 
 def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
-    """Return True if missing terms in 1/c^4, about v^2/c^2 times the relative size of "eih", are below round-off."""
+    """Return True if the terms in 1/c^4 that the invariants of "eih" lack are below round-off.
+
+    Their relative size is about v^2/c^2 times that of the accelerations that "eih" adds to Newton's.
+    """
     n = y0.size // 6
     newton = np.empty_like(y0)
     library["gravity.rhs"](0.0, y0, newton, params[:n])

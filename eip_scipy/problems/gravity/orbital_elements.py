@@ -173,7 +173,7 @@ def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the states of all bodies except the first in Jacobi's coordinates, and the gravitational parameters.
 
     The states (2, N - 1, 3, ...) are relative to the centre of mass of all bodies before each body. The parameters
-    (N - 1,) are G times the mass of all bodies up to and including this one.
+    (N - 1,) are for each body G times the mass of this body and of all bodies before it.
     """
     if not gm[0] > 0:
         raise ValueError(
@@ -211,7 +211,9 @@ def _around(
         )
     others = [i for i in every if i != k]
     if gm[k] == 0:
-        raise ValueError(f"orbital_elements: the primary {names[k]!r} has no mass, so nothing orbits it. Give another.")
+        raise ValueError(
+            f"orbital_elements: the primary {names[k]!r} has no mass, so nothing orbits it. Give another primary."
+        )
     return state[:, others] - state[:, [k]], gm[k] + gm[others], others
 
 
@@ -280,7 +282,7 @@ def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.nda
 def _mean_anomaly(e: np.ndarray, f: np.ndarray, a: np.ndarray, r: np.ndarray, rv: np.ndarray) -> np.ndarray:
     """Return the mean anomaly by Kepler's equation, between 0 and 2 pi for an ellipse, NaN for a parabola.
 
-    `rv` is q . v / sqrt(mu), and `f` the true anomaly.
+    `f` is the true anomaly, `r` the distance, and `rv` is q . v / sqrt(mu).
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         sine, cosine = rv / np.sqrt(np.abs(a)), 1 - r / a  # e times those of the eccentric anomaly

@@ -195,7 +195,11 @@ def _is_below(about: Array, body: int, top: int) -> bool:
 
 
 def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orbit:
-    """Return the orbit of `body`, together with all bodies that move about it, about the body ``about[body]``."""
+    """Return the orbit of `body`, together with all bodies that move about it, about the body ``about[body]``.
+
+    If `neutral` is True, or `body` does not move about the heaviest body, corrections leave the centre of mass
+    unchanged: the bodies on the other side of the orbit move in the opposite direction.
+    """
     centre = int(about[body])
     group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
     total = float(gm[group].sum())

@@ -140,7 +140,7 @@ def _pole(axes: str) -> tuple[float, float, float]:
 
 
 def _units(units: str) -> tuple[float, float]:
-    """Return the length of one AU and of one day in the given units."""
+    """Return the AU in the unit of length and the day in the unit of time of `units`."""
     if units == "AU, yr":
         return 1.0, 1.0 / YEAR_D
     if units == "SI":

@@ -1,4 +1,4 @@
-"""Exact flows of the linear part, free motion with rotation, by factors of the modes along one axis after another."""
+"""Exact flows of the linear part of the Gross-Pitaevskii equation, by factors of Fourier modes along axes in turn."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ class LinearFlow:
         return axes, [first / points, *rest]
 
     def apply(self, psi: np.ndarray, work: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the field after the flow, which starts at `psi`, in one of the two arrays, and the other array.
+        """Return the array that contains the field after the flow from `psi`, and the other one of the two arguments.
 
-        Both arrays are overwritten.
+        Both arrays are overwritten; the content of `work` is not used.
         """
         for axes, factors in self._factors:
             self._fft.forward(psi, axes, work)

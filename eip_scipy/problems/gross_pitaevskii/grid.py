@@ -89,7 +89,7 @@ class Grid:
         return tuple(self._along(axis, self.points(axis)) for axis in range(self.dim))
 
     def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
-        """Return the wavenumbers along one axis, with the shape as in `mesh`; if `odd`, it is 0 for the Nyquist mode.
+        """Return the wavenumbers along one axis, shaped as in `mesh`; if `odd`, that of the Nyquist mode is set to 0.
 
         The Nyquist mode, the highest mode of an even number of points, has no sign: odd derivatives of it are 0 at the
         points, even derivatives are not.
@@ -169,7 +169,7 @@ class Multiplier:
         fft.backward(out, self.axes)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
-        """Return the sum over the grid of conj(psi) times the field of `apply`, with one transform (Parseval)."""
+        """Return the grid's sum of conj(psi) times the field of `apply`, by one transform into `work` (Parseval)."""
         fft.forward(psi, self.axes, work)
         return float(weighted_square(work, self._factor))
 

@@ -105,7 +105,7 @@ def ground_state(
 
 
 class _Descent:
-    """State of the search: psi, the direction p, and the linear part with the potential applied to both."""
+    """State of the search: psi, the direction p, and their images under the linear part plus the potential."""
 
     def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray) -> None:
         self.gpe, self.psi = gpe, psi
@@ -152,7 +152,7 @@ class _Descent:
         return mu - 0.5 * self.gpe.beta * self.gpe.grid.cell * float(np.vdot(density, density))
 
     def refresh(self) -> None:
-        """Normalise psi, recompute its image to remove accumulated rounding errors, and adapt the preconditioner."""
+        """Normalise psi, recompute its `image` by `apply` to remove rounding errors, and adapt the preconditioner."""
         self.psi /= sqrt(self.inner(self.psi, self.psi))
         self.apply(self.psi, self.image)
         self.preconditioner.fit(self.psi)

@@ -45,7 +45,7 @@ def soliton(
         Length of the ring; on the ring the closed form has an error of exp(-a length / 2).
     t_end : float
     h : float, optional
-        Default: half of `GrossPitaevskii.largest_step`, which is that of RK4.
+        Default: half of the largest stable step of RK4, `GrossPitaevskii.largest_step`.
     **options
         Options of `GrossPitaevskii`.
 
@@ -148,7 +148,7 @@ def plane_wave(
         k, a whole number along each axis.
     amplitude, beta, t_end : float
     h : float, optional
-        Default: half of `GrossPitaevskii.largest_step`, which is that of RK4.
+        Default: half of the largest stable step of RK4, `GrossPitaevskii.largest_step`.
     **options
         Options of `GrossPitaevskii`.
 
@@ -212,7 +212,8 @@ def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> Gr
     kappa : float
         The paper computes the ground state for 0.3, and starts the dynamics by a change of kappa to 0.7.
     points : int
-        Number of points along each axis; with the paper's 256 the phase turns by Omega r h = 1.8 between two points.
+        Number of points along each axis. With the paper's 256, the phase at the ring's radius r turns by
+        Omega r dx = 1.8 between neighbouring points, which are dx apart.
     **options
         Options of `GrossPitaevskii`.
 
@@ -262,7 +263,10 @@ def _breather(x: np.ndarray, length: float, amplitude: float, velocity: float, b
 
 
 def _moving(x: np.ndarray, length: float, velocity: float, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances of points from a centre that moves around the ring, and the factors of the moving phase."""
+    """Return the signed distances of points from a centre that moves around the ring, and factors for the field.
+
+    The factors exp(i phase) turn the field of a soliton at rest, taken at these distances, into that of a moving one.
+    """
     # The phase follows the distance, so that nothing jumps where it turns.
     s = np.remainder(x - velocity * t + length / 2, length) - length / 2
     return s, np.exp(1j * (velocity * (s + velocity * t) - 0.5 * velocity**2 * t))

@@ -34,7 +34,9 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
         If beta is not positive, or the density reaches the ends of the box.
     """
     if not gpe.beta > 0:
-        raise ValueError(f"a Thomas-Fermi density needs beta > 0, got {gpe.beta:g}; give a start of your own.")
+        raise ValueError(
+            f"a Thomas-Fermi density needs beta > 0, got {gpe.beta:g}; call ground_state with a start of your own."
+        )
     r2 = sum(a**2 for a in gpe.grid.mesh()[:2]) if gpe.Omega else 0.0
     well = gpe.V - 0.5 * gpe.Omega**2 * r2
     cell, low = gpe.grid.cell, float(well.min())

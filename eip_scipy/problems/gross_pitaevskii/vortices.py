@@ -57,7 +57,8 @@ def vortices(
         Index along z of the plane, in three dimensions; default: the middle.
     Omega : float, optional
         Angular velocity of the rotating frame in which neighbouring phases are compared; default: that of the equation.
-        Without it, phases that turn by more than pi between two points of the grid would be miscounted.
+        With Omega = 0, the phase of a fast rotating field may turn by more than pi between two points of the grid, and
+        the charges would be wrong.
 
     Returns
     -------

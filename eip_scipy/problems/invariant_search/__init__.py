@@ -76,8 +76,8 @@ def find_invariants(
     Notes
     -----
     Quantities that are conserved on a manifold only (for example of unit quaternions) are not conserved at random
-    points, and are not found. A quantity whose rate is below 1e-12 of its terms cannot be distinguished from an
-    invariant.
+    points, and are not found. A quantity whose rate is below both bounds of `rtol` cannot be distinguished from an
+    invariant; by default the second bound is 1e-12 of the sum of the absolute values of all products in the rate.
 
     Examples
     --------

@@ -101,11 +101,12 @@ class Search:
     def _numerical_null_space(self, columns: Any) -> Array:
         """Return the constant functions and the singular vectors of singular values that are 0 up to rounding, as rows.
 
-        There are none if the smallest other singular value is not far above rounding.
+        There are no rows, not even those of constant functions, if no singular value is above rounding, or the smallest
+        one above rounding is less than `APART` times as large.
 
-        These rows are not tested. Because of rounding such a row contains small multiples of all columns. Near points
-        at which all terms of the invariant vanish, these multiples exceed the terms, so that the row would fail the
-        test of `_is_kept` there. An example is y1**2 + y0**4/2 near y0 = 0.
+        The rows are not tested by `_is_kept`. Because of rounding such a row contains small multiples of all columns.
+        Near points at which all terms of the invariant vanish, these multiples exceed the terms, so that the row would
+        fail the test there. An example is y1**2 + y0**4/2 near y0 = 0.
         """
         still, values, rows = self._singular(columns)
         if not values.size:
@@ -132,10 +133,12 @@ class Search:
         return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
-        """Return True if the rate of a candidate vanishes at new points.
+        """Return True if a candidate I is conserved: its rate is 0 up to rounding at points that did not determine it.
 
-        Its bounds are `rtol` times the sum of the absolute values of ``dI/dz_i dz_i/dt``, and 0.001 `rtol` times that
-        of all products in these terms.
+        At each of these points (`fresh`) the rate, the sum of the terms ``dI/dz_i dz_i/dt``, must satisfy two bounds:
+        `rtol` times the sum of the absolute values of these terms, and `ROUND_OFF` `rtol` times a sum that is at least
+        as large, in which the contributions of the single monomials and given functions do not cancel (the `sizes` of
+        `Sample`).
         """
         rate = np.abs(self.fresh.rates @ row)
         if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
@@ -212,9 +215,9 @@ class Search:
     def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
         """Return the key that sorts rows by simplicity.
 
-        The key consists of the number of coefficients that are not 0, the negated number of differences, the number of
-        products of different variables, and the indices of the coefficients. Differences are counted because angular
-        momenta contain them.
+        The key consists of the number of nonzero coefficients; minus the number of those with the rarer sign, because
+        angular momenta are differences; the number of products of different variables; and the indices of the nonzero
+        coefficients.
         """
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0]).tolist()
         negative = sum(row[k] < 0 for k in support)
@@ -244,7 +247,11 @@ class Search:
         return row
 
     def _rational(self, row: Array) -> Array:
-        """Return the scaled row; its coefficients for y become small fractions if all are close to such fractions."""
+        """Return a multiple of the row whose first nonzero coefficient is positive.
+
+        The coefficients, converted to those of functions of y, are small fractions or integers if all are close to such
+        numbers for a suitable multiple.
+        """
         raw = row * self.units
         raw = raw / raw[np.argmax(np.abs(row))]
         for unit in (1.0, np.min(np.abs(raw[raw != 0]))):

@@ -123,7 +123,7 @@ def _speeds_are_rates(parts: Parts, names: Names, t: float, y: np.ndarray, param
 
 
 def _products(parts: Parts, names: Names, t: float, y: np.ndarray, params: np.ndarray | None) -> list[np.ndarray]:
-    """Return the products q_i q_i' (nq,) of all coordinates: first at zero speeds, then with one speed equal to 1."""
+    """Return the products q_i q_i' (nq,) of all coordinates: at zero speeds, then with each speed in turn set to 1."""
     nq, n = len(names.coordinates), len(names.speeds)
     speeds = np.vstack([np.zeros(n), np.eye(n)])
     return [y[:nq] * _rates(parts, names, t, np.append(y[:nq], u), params) for u in speeds]

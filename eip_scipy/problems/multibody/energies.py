@@ -84,7 +84,10 @@ def energy_of(
             slowest, least = item, slowness
     if slowest is None:
         return None, "not known; give energy= or potential="
-    described = f"{slowest.description}, which changes at {least:.2g} of the terms of its rate"
+    described = (
+        f"{slowest.description}, whose rate of change is about {least:.2g} of the sum of the absolute values of the "
+        "terms of that rate"
+    )
     if least > Balance.most_slowness:
         return None, f"not kept: {described}"
     kept = Balance(slowest.value, slowest.power, slowest.gradient, args=args, in_place=True, name="energy")
@@ -94,7 +97,10 @@ def energy_of(
 def _require_power(
     item: Energy, rates: np.ndarray, terms: np.ndarray, states: Sequence[tuple], args: tuple[Any, ...]
 ) -> None:
-    """Raise ValueError if the power given for an energy is not its rate of change."""
+    """Raise ValueError if the power given for an energy is not its rate of change.
+
+    `rates` and `terms` are what `rates_of` returns for the other arguments.
+    """
     if item.power is None:
         return
     given = np.array([float(plain(item.power)(t, y, *args)) for t, y in states])
@@ -168,7 +174,10 @@ def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
 def rates_of(
     item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates (k,) of an energy at all states, and the sums (k,) of the absolute values of their terms."""
+    """Return the rates of change (k,) of an energy at k states, and the sums (k,) of the sizes of the rates' terms.
+
+    The size of a term is its absolute value. `args` are the further arguments of the functions of the energy.
+    """
     rates, terms = np.zeros(len(states)), np.zeros(len(states))
     for k, (t, y) in enumerate(states):
         gradient = np.empty(y.size)

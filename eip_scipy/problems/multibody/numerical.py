@@ -63,7 +63,7 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
 
 
 def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
-    """Return `Outputs` that call the functions of the user; None if there are none."""
+    """Return `Outputs` that call the user's functions in ``given.outputs``; None if there are no such functions."""
     functions = tuple(given.outputs.values())
 
     def fill(t: float, x: Array, out: Array) -> None:
@@ -80,7 +80,7 @@ def _energy(given: Given) -> Callable[..., Any] | None:
 
 
 def _sizes(y: Array) -> Array:
-    """Return the sizes of components, the units for steps of differences; for a zero that of the largest one."""
+    """Return ``|y_k|``, or the largest ``|y_j|`` where y_k is 0: the units of steps for differences."""
     return np.where(y != 0, np.abs(y), np.abs(y).max(initial=0.0) or 1.0)
 
 
@@ -116,7 +116,7 @@ class _Constraints:
         return own, slopes[:, -1]
 
     def velocities(self, t: float, q: Array, u: Array) -> Array:
-        """Return the values of the constraints on velocities: first the derivatives of those on positions."""
+        """Return the values of the constraints on velocities: first the time derivatives of those on positions."""
         J, explicit = self.jacobian(t, q)
         others = self.given.velocity_constraints
         own = [] if others is None else [np.asarray(others(t, q, u), float)]

@@ -33,7 +33,8 @@ class Parts(NamedTuple):
     ``fill`` is the argument of `motion`. ``values(t, y, out, *params)`` fills `out` with the constraints on positions
     and then those on velocities, m in total, and ``gradient`` fills it with their derivatives (m, n) with respect to
     the state. `energies` and `momenta` are quantities that may be constant, `note` is a line for the repr, `outputs`
-    are the quantities that the user defines, and `origin` is what the functions can be made from again.
+    are the quantities that the user defines, and `origin` holds the arguments of `parts_of` from which the functions
+    can be made again, or None.
     """
 
     fill: Callable[..., None]

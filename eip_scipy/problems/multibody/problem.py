@@ -348,8 +348,9 @@ def _require_accelerations(
         one, two = sorted(names.velocities[k] for k in np.argsort(-np.abs(left))[:2])
         raise ValueError(
             f"{what}: no accelerations meet the constraints {one!r} and {two!r} at the start, where their gradients "
-            f"depend on each other: {np.abs(left).max():.3g} remains, expected 0. Remove a constraint that "
-            "contradicts others, or start with speeds that the mechanism can have at this singular position."
+            f"depend on each other: the rates of the constraints on velocities remain up to {np.abs(left).max():.3g}, "
+            "expected 0. Remove a constraint that contradicts others, or start with speeds that the mechanism can have "
+            "at this singular position."
         )
 
 

@@ -123,10 +123,10 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
 
 
 def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return the state near `y` at which the residuals of `item` are 0, found by Newton's method; `y` if it fails.
+    """Return the state near `y` at which the residuals of `item` are 0, found by Newton's method.
 
     Distances are measured in units of `sigma`; components with `sigma` 0 do not change. If Newton's method does not
-    converge, the returned state has residuals.
+    converge, the returned state has residuals; it is `y` itself if `project` raises ValueError.
     """
     try:
         with warnings.catch_warnings():
@@ -137,9 +137,9 @@ def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -
 
 
 def _downhill(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return the state with the smallest residuals, for guesses from which Newton's method fails.
+    """Return what `nearest_start` finds from a better guess, for a guess `y` from which it fails.
 
-    Components with `sigma` 0 do not change. Newton's method is then applied to the state with the smallest residuals.
+    The better guess minimises the sum of squares of the residuals. Components with `sigma` 0 do not change.
     """
     free = sigma > 0
 

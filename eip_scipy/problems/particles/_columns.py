@@ -28,8 +28,8 @@ def variational(
     Each derivative is a column of 6 numbers after the state, see `variational` of `Problem`.
 
     Jitted functions of the field are differentiated by dual numbers. Others are differentiated by complex steps if
-    these give correct derivatives at `start`, otherwise by differences of order 6, whose shifts are proportional to the
-    distances of the coordinates from 0 and to `length`.
+    these give correct derivatives at `start`, otherwise by differences of order 6. The shift of a coordinate is then
+    proportional to its distance from 0 plus `length`.
 
     Parameters
     ----------
@@ -37,6 +37,7 @@ def variational(
         The right-hand side ``rhs(t, y, out, params)`` of the state alone.
     functions : FieldFunctions
     form : {"canonical", "velocity"}
+        "canonical" if the state is (x, p), "velocity" if it is (x, v).
     length : float
         See `ParticleField`.
     start : tuple of float

@@ -274,7 +274,8 @@ def _nested(what: str) -> Iterator[None]:
         yield
     except RecursionError:
         raise ValueError(
-            f"{what}: the expressions or their derivatives nest too deep for SymPy; write the functions by hand."
+            f"{what}: the expressions or their derivatives nest too deep for SymPy; pass Python functions to "
+            "integrate instead."
         ) from None
 
 

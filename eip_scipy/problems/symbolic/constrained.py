@@ -246,7 +246,10 @@ def rate_function(rate: Any, system: Constrained) -> Callable[..., float]:
 
 
 def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Callable[..., None]:
-    """Return ``fill(t, y, out, *params)``, which fills `out` with the values of expressions, most of which may be 0."""
+    """Return ``fill(t, y, out, *params)``, which fills `out` with the values of expressions.
+
+    Expressions that are 0 are not compiled. `what` describes the values in tracebacks and errors.
+    """
     found = {k: item for k, item in enumerate(expressions) if item != 0}
     return function(what, list(found.values()), arguments, in_place=True, places=list(found))
 

@@ -1,4 +1,4 @@
-"""Problems of models of sympy.physics.mechanics."""
+"""Problems that are made from models of sympy.physics.mechanics."""
 
 from __future__ import annotations
 

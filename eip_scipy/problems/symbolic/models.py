@@ -37,7 +37,9 @@ class Model(NamedTuple):
     independent : tuple of str or None
         The components of the state that the model calls independent; None if it has no dependent ones.
     position_names, velocity_names : tuple of str
+        Names of the constraints on positions, and of those on velocities.
     notes : tuple of str
+        Remarks for the user: velocity constraints that were added, and inputs that are called as functions.
     """
 
     system: Constrained

@@ -227,7 +227,11 @@ class Reader:
         raise self._refuse(node, "is not allowed")
 
     def _chain(self, node: ast.expr, pair: tuple[type, type], inverse: Any, depth: int) -> list[sympy.Expr]:
-        """Return the operands of a chain such as a + b - c or a * b / c, whose nodes are nested to the left."""
+        """Return the operands of a chain such as a + b - c or a * b / c, whose nodes are nested to the left.
+
+        `pair` holds the types of the two operators. Operands after the second one, - or /, are replaced by their
+        `inverse`.
+        """
         found = []
         while isinstance(node, ast.BinOp) and isinstance(node.op, pair):
             item = self._expression(node.right, depth + 1)

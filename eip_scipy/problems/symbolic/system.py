@@ -37,7 +37,8 @@ class System(NamedTuple):
     """Equations and their invariants and balances as expressions. Equal systems share their compiled functions.
 
     `rates` are the time derivatives of `components`. `invariants` holds pairs (name, expression). `balances` holds
-    triples (name, expression, rate) of quantities that are not conserved but change at a known rate.
+    triples (name, expression, rate) of quantities that are not conserved but change at a known rate. `constraints` are
+    the names of the invariants that are 0.
     """
 
     components: tuple[str, ...]
@@ -64,10 +65,11 @@ class System(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Functions made from a `System`: its derivative (in place), and its accelerations and their Jacobian, or None.
+    """Functions made from a `System`.
 
-    They are followed by (value, gradient) for each invariant and (value, gradient, rate) for each balance. Gradients
-    are in place.
+    `rhs` fills an array with the derivative of the state. `acc` returns the accelerations, and `jacobian` is their
+    Jacobian times a vector; each is None if there is none. `invariants` holds (value, gradient) for each invariant, and
+    `balances` holds (value, gradient, rate) for each balance. Gradients fill an array.
     """
 
     rhs: Callable[..., None]
@@ -383,7 +385,11 @@ def _checked(
     pairs: Any,
     slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
-    """Return the problem after checks of the names and of the given invariants and constraints."""
+    """Return the problem after checks of the names and of the given invariants and constraints.
+
+    `kept` maps the names of invariants that are known already to their expressions, and `checks` maps them to how they
+    were shown to be conserved; the given ones are added to both. `slow` holds the balances as in `System`.
+    """
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
     for kind, items in given._asdict().items():

@@ -42,10 +42,10 @@ class SineGordon:
 
     Notes
     -----
-    The energy ``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``, with w the size of a cell, is an invariant of the equations
-    on the grid for every field. The momenta ``-w sum p dq``, with dq the derivative of q along an axis, are conserved
-    to spectral accuracy only, because sin q has modes that the grid does not have; their aliases do not vanish if the
-    field is not resolved.
+    The energy ``w sum ((p^2 + |grad q|^2) / 2 + 1 - cos q)``, with w the size of a cell, is an invariant of the
+    equations on the grid for every field. The momenta ``-w sum p dq``, with dq the derivative of q along an axis, are
+    conserved to spectral accuracy only, because sin q has modes that the grid does not have; their aliases do not
+    vanish if the field is not resolved.
 
     Examples
     --------
@@ -92,7 +92,7 @@ class SineGordon:
         return out
 
     def energy(self, y: np.ndarray) -> float:
-        """Return the energy ``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``, where w is the size of a cell."""
+        """Return the energy ``w sum ((p^2 + |grad q|^2) / 2 + 1 - cos q)``, where w is the size of a cell."""
         n = self.grid.size
         q, p = y[:n], y[n:]
         laplacian = self._modes.backward(-self._square * self._modes.forward(q))
@@ -206,6 +206,7 @@ class SineGordon:
         reference : callable, optional
             ``reference(t) -> y``, a closed form of the solution.
         source : str, optional
+            Source of the equation and data, see `Problem`.
 
         Returns
         -------

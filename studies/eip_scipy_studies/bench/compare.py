@@ -20,7 +20,8 @@ class Row(NamedTuple):
     Attributes
     ----------
     suite, scene, takes, peer : str
-        Name of the suite, title of the problem, kind of function that the method takes (see `Peer`), its name.
+        Name of the suite, title of the problem, kind of function that the method takes (see `Peer`), and name of the
+        method.
     setting : float or None
         Relative tolerance or number of steps.
     seconds : float or None

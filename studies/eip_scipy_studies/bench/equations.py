@@ -169,7 +169,7 @@ class Scene:
         if self.equations == "bodies":
             return _jitted_bodies(np.array(self.params["gm"]), njit)
         if name not in EQUATIONS:
-            raise NotImplementedError("the bench has hard cases and fields as plain Python functions only")
+            raise NotImplementedError("the bench has no Numba functions for hard cases and fields, only plain ones")
         fun, values, gradients, acc = EQUATIONS[name](math.sqrt)
         return Functions(
             _filling(njit(fun), njit),

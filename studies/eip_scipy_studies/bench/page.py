@@ -111,7 +111,7 @@ def _factor(value: float) -> str:
 
 
 def _losses(group: list[Standing]) -> list[str]:
-    """Make a line for each reason: the methods that are faster for this reason, with ratio and error."""
+    """Make a line for each reason why methods are faster than ours: these methods, with ratio and error."""
     by_reason: dict[str, list[str]] = {}
     for each in group:
         if each.lost:

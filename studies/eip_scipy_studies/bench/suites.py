@@ -102,7 +102,7 @@ RIGID_BODY = {
 
 
 def kepler() -> list[dict[str, Any]]:
-    """Return six records: three small systems over a short time, and for compiled code over a time 20 times as long.
+    """Return six records: three small systems over a short time, and for compiled code the same over 20 times that.
 
     Compiled code needs longer runs, because the checks of a call take milliseconds.
     """
@@ -247,7 +247,7 @@ def _described() -> tuple[Suite, ...]:
 
 
 def cheap() -> list[dict[str, Any]]:
-    """Return one record: a rigid body, whose right-hand side is cheap, with three components that are products."""
+    """Return one record: a rigid body, whose right-hand side is cheap, because its three components are products."""
     return [record for record in kepler() if record["title"] == "rigid body, t = 1000"]
 
 

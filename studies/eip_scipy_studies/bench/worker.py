@@ -32,8 +32,8 @@ Answers = Iterator[dict[str, Any]]
 def precision(peer: Peer, request: Mapping[str, Any]) -> Answers:
     """Yield time, error and drift of the method on each problem at each of its settings, in their order.
 
-    If a run fails, yield the first line of its error in their place. After a run that takes longer than the request's
-    `patience`, the further settings of the problem are left out.
+    If a run fails, the first line of its error is yielded instead of time, error and drift. After a run that takes
+    longer than the request's `patience`, the further settings of the problem are left out.
     """
     for record in request["scenes"]:
         try:

@@ -80,7 +80,7 @@ def runge_kutta(*names: str) -> Contender:
 
 
 def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Contender:
-    """Return the one-step method ``base(gpe)`` with projection onto the invariants `names`, run at these steps.
+    """Return the one-step method ``base(gpe)`` with projection onto `names`, run with the step lengths `steps`.
 
     Without names it is the plain method.
     """
@@ -92,7 +92,7 @@ def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Cont
 
 
 def implicit(scheme: Callable[..., Any]) -> Contender:
-    """Return one of the paper's implicit schemes, a function of `comparators`, as a method that is run at `LONG`."""
+    """Return one of the paper's implicit schemes, a function of `comparators`, run with the step lengths `LONG`."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> tuple[np.ndarray, int, str]:
         result = scheme(problem.equation, (0.0, t_end), problem.y0, h)

@@ -28,14 +28,15 @@ FRAMES_PER_SECOND = 8
 class Ring(QuenchStudy):
     """Command ``eip-scipy gpe ring``.
 
-    The tightened ring contracts, keeps its angular momentum, and so turns faster than the frame: `sense` is 1.
+    The tightened ring contracts, keeps its angular momentum, and so turns faster than the rotating frame, in which its
+    vortices turn anticlockwise: `sense` is 1, see `Quench`.
 
     Attributes
     ----------
     condensate : callable
         ``condensate(kappa, points)`` returns the equation, see `ring_condensate`.
     kappas : (float, float)
-        Values of kappa, which determines the trap, before and after the quench, its sudden change at t = 0.
+        Values of kappa, which determines the trap, before and after the quench, the sudden change of the trap at t = 0.
     saved : float
         Time between two saved states.
     """
@@ -72,7 +73,7 @@ class Ring(QuenchStudy):
     def measure(self, session: Session) -> QuenchRuns:
         """Do all runs from the ground state.
 
-        It is read from the file `start` or from the folder of the checkpoints, or computed.
+        The ground state is read from the file `start` or from the folder of the checkpoints, or computed.
         """
         before, after = (self.condensate(kappa, self.points) for kappa in self.kappas)
         if self.start is not None:
@@ -114,7 +115,10 @@ class Ring(QuenchStudy):
 
 
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
-    """Return one panel for each saved state, all cropped to the region that the condensate reaches in any of them."""
+    """Return one panel for each saved state, all cropped to the region that the condensate reaches in any state.
+
+    The panels show the density and the vortices in `moved`.
+    """
     from ..plotting import FieldPanel
 
     fields = np.abs(gpe.grid.field(y)) ** 2

@@ -307,7 +307,7 @@ def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
 
 
 def _value(value: Any) -> str:
-    """Format the value of a check: errors with few digits, other numbers with those in which they are compared."""
+    """Format the value of a check: floats below `SMALL`, which are errors, with 3 digits, other floats with 6."""
     if isinstance(value, float):
         return compact(value, 3) if abs(value) < SMALL else f"{value:.6g}"
     return str(value)

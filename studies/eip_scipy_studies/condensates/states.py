@@ -138,7 +138,7 @@ def lines(settings: GroundStates, update: Update) -> list[Found]:
 
 
 def search_saddle(points: int, update: Update) -> Found:
-    """Return the paper's state with four lines.
+    """Return the paper's state with four vortex lines, on a grid with `points` points along each axis.
 
     It is a saddle of the energy, which the descent reaches because it keeps the square symmetry of the start.
     """
@@ -439,5 +439,8 @@ def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
             )
     psi = content["psi"]
     if psi.shape != gpe.grid.shape or psi.dtype.kind != "c" or not np.isfinite(psi).all():
-        raise UsageError(f"{str(path)!r}: psi must be a finite complex field of shape {gpe.grid.shape}")
+        raise UsageError(
+            f"{str(path)!r}: psi must be a finite complex field of shape {gpe.grid.shape}. Give another file, or leave "
+            "out --resume or --start."
+        )
     return psi

@@ -300,7 +300,8 @@ def measure(
     spread : Spread
     rebound : module, optional
     callback : callable, optional
-        ``callback()`` after each of the ``repeats`` runs of each point, including those that are left out.
+        ``callback()`` is called once for each of the ``spread.repeats`` runs of each method at each setting, also for
+        runs that are left out.
 
     Returns
     -------

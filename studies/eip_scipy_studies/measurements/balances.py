@@ -152,8 +152,8 @@ def laplace_loss(t, y, c):
 def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[str, Any] | None = None) -> Any:
     """Return a function that makes the case of a planet with e = 0.2 and the drag -`strength` times the velocity.
 
-    It has `steps` steps per revolution. `rates`, if given, are other rates of the energy by their names, wrong ones;
-    each is then a set.
+    The runs have `steps` steps per revolution. `rates`, if given, maps names to wrong rates of the energy; each of them
+    makes a set, and there are no other sets.
     """
     energy = Balance(kepler_energy, energy_loss, name="E")
     others = [Balance(spin, spin_loss, name="h"), Balance(laplace, laplace_loss, name="e")]
@@ -200,7 +200,8 @@ def bodies(
 ) -> Any:  # fmt: skip
     """Return a function that makes the case of some bodies of a data set over `years`; the Sun's error does not count.
 
-    `h` is the step in years, and `finer` is that of `Case`. With `wrong` the balance is that of the Moon about the Sun.
+    `h` is the step in years, and `finer` is that of `Case`. With `wrong` the only balance is the Moon's energy about
+    the Sun, which is the wrong centre.
     """
     known = load(data)
     places = [list(known.bodies).index(name) for name in names]

@@ -1,13 +1,13 @@
 """``eip-scipy study bodies``: cost and error against the number of bodies, EIPRKN12, REBOUND's IAS15 and its leapfrog.
 
 A star with N - 1 light planets (G m = 1e-9 of the star's) on nearly circular, nearly coplanar orbits of semi-major axes
-from 1 to 30, random phases. EIPRKN12 takes 25 steps in the innermost period, and 4, with every=10, compensated; IAS15
-takes its own steps; leapfrog takes 400 and 800 in a period. All use one thread, as REBOUND does without OpenMP, except
-in the row that says so. Times are the least of three or more (of one for REBOUND with more than 300 bodies). Errors are
-the largest distance of a body from its place in a run of EIPRKN12 with 50 steps. The steps that leapfrog needs for
-the error of the run with 4 steps are extrapolated by its order, 2: the more accurate runs are beyond its rounding
-errors. The share of the projection is that of the processor time, compared with runs without invariants; with few
-bodies it contains the start of a run.
+from 1 to 30, random phases. EIPRKN12, with every=10 and compensated=True, takes 25 or 4 steps in the innermost period;
+IAS15 chooses its steps; leapfrog takes 400 or 800 in this period. All use one thread, as REBOUND does without OpenMP,
+except in the row that says so. Times are the least of three or more (of one for REBOUND with more than 300 bodies).
+Errors are the largest distance of a body from its place in a run of EIPRKN12 with 50 steps. The steps that leapfrog
+needs for the error of the run with 4 steps are extrapolated by its order, 2: the more accurate runs are beyond its
+rounding errors. The share of the projection is that of the processor time, compared with runs without invariants; with
+few bodies it contains the start of a run.
 """
 
 from __future__ import annotations
@@ -119,7 +119,10 @@ def _compare(n: int, periods: int, rebound: Any) -> dict[str, Any]:
 
 
 def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict[str, Row], dict[str, float]]:
-    """Return the rows of this package by the names of its runs, and what `_shares` returns."""
+    """Return the rows of this package by the names of its runs, and the shares of the projection, see `_shares`.
+
+    ``row(seconds, steps, end)`` makes a row from the time, the number of steps and the final state of a run.
+    """
     coarse, h = f"EIPRKN12, {COARSE} steps", PERIOD / COARSE
     shared, alone = problem.y0.size >= 6 * SHARED, working_alone()
     actions = {"EIPRKN12": alone(partial(_seconds, problem))}

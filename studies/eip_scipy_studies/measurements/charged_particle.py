@@ -1,9 +1,9 @@
 """``eip-scipy study charged-particle``: speed of the compiled step, and error against cost, for charged particles.
 
-1. Time of a step in the tokamak: plain RK4, EIP-HL with both metrics and with wider spacings, Boris, implicit midpoint;
-   and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp: 5000). Runs take
-   turns, and the least time of each counts, without the time before the first step. Ratios are those within one
-   process.
+1. Time of a step in the tokamak: plain RK4, EIP-HL with both metrics, projected at each or each fifth step, Boris,
+   implicit midpoint; and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp:
+   5000). Runs take turns, and the least time of each counts, without the time before the first step. Ratios are those
+   within one process.
 2. Error against cost in the uniform field and on both orbits of the tokamak: error of position and of the guiding
    centre (averaged over a gyration) at the end of the paper's interval, EIP methods and the same without projection in
    the canonical form, Boris and heyoka (if installed) in the form (x, v).
@@ -46,7 +46,7 @@ ROUNDS = 5
 def speed(turns: int, share: float) -> dict[str, float]:
     """Return the microseconds per step of each method on the banana orbit, the least of `turns` measurements.
 
-    A run has `share` of `SPEED_STEPS`, or of `SOLVE_IVP_STEPS` in solve_ivp.
+    A measured run has `share` times `SPEED_STEPS` steps, or `share` times `SOLVE_IVP_STEPS` in solve_ivp.
     """
     problem, other = tokamak(), tokamak(form="velocity")
     h, rhs = problem.h, problem.rhs

@@ -145,7 +145,7 @@ def relative_cost(found: Sequence[dict[str, Any]], control: str) -> float:
 
 
 def lines(found: Sequence[dict[str, Any]], method: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the rows of the table for a method: one with the relative costs in each case, and their geometric means."""
+    """Yield the table's rows for a method: its name, the relative costs in each case, and geometric means."""
     own, costs = [row for row in found if row["method"] == method], []
     yield method, []
     for case in dict.fromkeys(row["case"] for row in own):

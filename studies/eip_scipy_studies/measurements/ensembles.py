@@ -115,8 +115,9 @@ def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
 def memory(members: int) -> dict[str, float]:
     """Return the memory of a process that runs an ensemble, with the number of members.
 
-    It is given as the size of all states ("states", in units of 1e6 bytes), the peak of the process ("peak") and the
-    peak less the memory after the imports and the making of the starts ("above", both in units of 2^20 bytes).
+    It is given as the size that all states would have if they were stored ("states", in units of 1e6 bytes), the peak
+    of the process ("peak") and the peak less the memory after the imports and the making of the starts ("above"; these
+    two in units of 2^20 bytes).
     """
     code = MEMORY.format(members=members, h=H)
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

@@ -43,7 +43,8 @@ class Found(NamedTuple):
     """Results: times (m,) in years, and wall times in seconds and errors of the runs by their names.
 
     `apart` are the distances [AU] (m, 10) of the bodies from their places in the finest run, for each other run.
-    `known` are the distances [AU] (10,) of the finest run from the packaged reference, at the times which this has.
+    `known` are the distances [AU] (10,) of the finest run from the packaged reference, by time, for those of
+    `times` that the reference has.
     """
 
     times: np.ndarray

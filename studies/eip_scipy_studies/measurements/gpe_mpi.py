@@ -2,7 +2,8 @@
 
     mpirun -n 2 python -m mpi4py -m eip_scipy study gpe-mpi
 
-Least wall-clock times, taken in turn; ranks that do not take part in a measurement sleep. One thread on each rank.
+The table has the least of several wall-clock times, measured in turn for each number of ranks. Each rank has one
+thread, and ranks that do not take part in a measurement sleep.
 """
 
 from __future__ import annotations

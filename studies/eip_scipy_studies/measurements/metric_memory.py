@@ -864,9 +864,10 @@ def row(name: str, found: list[Outcome]) -> tuple[str, list[str]]:
 
 
 def scatter(chosen: Iterable[Case]) -> str:
-    """Return a text that says how often the final error becomes more than three times larger.
+    """Return a text that says how often the final error is more than three times that of an unprojected run.
 
-    It has the counts for unprojected runs whose step is 2 to 6 % shorter, which is chance, and for projected runs.
+    It has two counts: that of unprojected runs whose step is 2 to 6 % shorter, where the cause is chance, and that of
+    projected runs, each compared with the unprojected run of the same step.
     """
     chance, projected = [], []
     for case in chosen:

@@ -1,9 +1,9 @@
 """``eip-scipy study metric-table``: effect of the projection's metric on the solar system.
 
 RK4, h = 0.002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; the rows differ in
-the planets that the corrections move. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged
-reference states after 100 and 2000 years. Below them, for random rotations of the axes: the position error of Mercury
-by plain RK4 divided by that by EIP, with blocks of 3 and without.
+the planets that the corrections move. Errors are those of unwrapped heliocentric ecliptic longitudes [rad] against the
+packaged reference states after 100 and 2000 years. Below them, for random rotations of the axes: the position error of
+Mercury by plain RK4 divided by that by EIP, with blocks of 3 and without.
 """
 
 from __future__ import annotations

@@ -156,7 +156,11 @@ def against_heyoka(quick: bool) -> Table:
 
 
 def kepler_table(found: Table) -> str:
-    """Lay out the results of `against_heyoka`, and the least times for an error of `WANTED` divided by heyoka's."""
+    """Lay out the results of `against_heyoka`, and compare the least times for an error of at most `WANTED`.
+
+    Below the table is a line for each method of this package: its least time of the whole call and of the steps alone,
+    each divided by heyoka's least time of the whole call.
+    """
     body = [(name, [f"{row['call']:.3f}", f"{row['steps']:.3f}", f"{row['error']:.1e}"]) for name, row in found.items()]
     lines = [table([["call [ms]"], ["steps [ms]"], ["error"]], body), ""]
     enough = {name: row for name, row in found.items() if row["error"] <= WANTED}
@@ -209,7 +213,8 @@ def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray]
 def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem, int], Methods], turns: int) -> Table:
     """Run all methods `turns` times, first in the original axes and then in new random ones each time.
 
-    ``methods(problem, turn)`` returns the methods, and `truth` is the final state. Return the rows of `rows`.
+    ``methods(problem, turn)`` returns the methods, and `truth` is the final state. Return what `orbits.rows` makes of
+    the runs.
     """
     found = []
     for turn, rotation in enumerate([Rotation.identity(), *Rotation.random(turns - 1, np.random.default_rng(1))]):
@@ -222,8 +227,8 @@ def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem
 def compared(found: Table, mercury: float, others: float) -> list[str]:
     """Return a line of text for each method of this package: the time of its cheapest run that is accurate enough.
 
-    Errors [AU] must be at most `mercury` and, of other planets, `others`. The time is compared with the one in which
-    WHFast reaches the error `mercury`, and with that of IAS15.
+    The largest error [AU] must be at most `mercury` for Mercury and `others` for other planets. The time is compared
+    with the time in which WHFast reaches the error `mercury`, and with the time of IAS15.
     """
     whfast = [row for name, row in found.items() if name.startswith("WHFast")]
     there = cost_to_reach([row["least"] for row in whfast], [row["worst"] for row in whfast], mercury)

@@ -2,11 +2,11 @@
 
 The options are a projection only if the invariant error exceeds round-off (`every="auto"`), and compensated sums. Runs
 with either or both are compared with a run with neither. Ten bodies over 100 and 1000 years, orbits of exoplanets, the
-hard problems and all hard cases whose forces do not change with the velocity; fixed steps that bring EIPRKN12 to about
-1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances. Each number is over three neighbouring steps or tolerances, because a
-single run's last digits are luck: the geometric mean of the errors at the end and of the largest changes of an
-invariant along the run (up to 4000 of its rows), the sum of the times, and how many runs were not reliable. Exoplanets
-need heyoka and REBOUNDx.
+hard problems and all hard cases whose forces do not change with the velocity; fixed steps with which EIPRKN12 has
+errors of about 1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances. Each number is over three neighbouring steps or
+tolerances, because a single run's last digits are luck: the geometric mean of the errors at the end and of the largest
+changes of an invariant along the run (up to 4000 of its rows), the sum of the times, and how many runs were not
+reliable. Exoplanets need heyoka and REBOUNDx.
 
 Result: the error is that of projecting each step, compensated or not, unless rounding is most of it; then both options
 together divide it by up to 1000 (1000 years). But compensation takes 10 to 40 % more time in most runs, "auto" leaves

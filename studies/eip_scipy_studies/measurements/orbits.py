@@ -76,9 +76,10 @@ def daily(name: str, run: Runner, *days: float) -> Methods:
 
 
 def rows(turns: Sequence[Sequence[TimedRun]]) -> dict[str, Row]:
-    """Return for each method the step, the least and median time [s], and errors of position [AU], over all turns.
+    """Return for each method the step, the least and median time [s], and errors of position [AU].
 
-    "best" and "worst" are the least and the largest error of Mercury, "others" the largest of another planet.
+    `turns` are repetitions of the same runs. "best" and "worst" are the least and the largest error of Mercury,
+    "others" the largest of another planet.
     """
     found = {}
     for name in dict.fromkeys(item.method for turn in turns for item in turn):

@@ -62,7 +62,7 @@ class Reference(Study[Found]):
 
 
 def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
-    """Return pairs (variable, rate) of the equations of motion in (x, v), as expressions of heyoka.
+    """Return pairs (variable, rate) of the equations of motion in (x, v) in the field `name`, as expressions of heyoka.
 
     `potential` is the factor of 1/r in the electric potential of the field "uniform"; other fields do not use it.
     """
@@ -80,7 +80,7 @@ def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
 
 
 def vector_potential(name: str, x: Any, number: Any) -> list[Any]:
-    """Return the vector potential at `x`, for the canonical momenta, in the arithmetic of `number`.
+    """Return the vector potential of the field `name` at `x`, for the canonical momenta, in the arithmetic of `number`.
 
     ``number(value)`` converts a float to this arithmetic.
     """

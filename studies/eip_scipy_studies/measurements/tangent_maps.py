@@ -1,10 +1,10 @@
-"""``eip-scipy study tangent-maps``: effect of projection on derivatives of the state by the start.
+"""``eip-scipy study tangent-maps``: effect of projection on derivatives with respect to the start.
 
 The state-transition matrix of Kepler's problem against its closed form; periodic orbits of the restricted three-body
 problem; Lyapunov exponents compared with heyoka's variational equations, from one start and as means over a chaotic
-sea; MEGNO compared with REBOUND's variational particles, and with relativity, which these lack, compared with
-differences of orbits; the cost of columns of the state-transition matrix, for each way to compute products with the
-Jacobian, and the time that these columns save in a fit. The figure is a map of MEGNO over the
+sea; MEGNO compared with REBOUND's variational particles; the growth of tangent vectors under relativity, which these
+particles lack, compared with differences of orbits; the cost of columns of the state-transition matrix, for each way to
+compute products with the Jacobian, and the time that these columns save in a fit. The figure is a map of MEGNO over the
 semi-major axis and the eccentricity of the second of two planets, by this package and by REBOUND.
 
 The study needs Numba and SymPy; heyoka and REBOUND are optional:

@@ -209,9 +209,10 @@ def _cells(series: Series, errors: list[float]) -> list[Cell]:
 
 
 def _orders(series: Series, errors: list[float], exact: list[float], roundoff: float) -> list[Value | None]:
-    """Return None for the first step, and for each other one the order of convergence from the step before.
+    """Return None for the longest step, and for each shorter one the order of convergence from the next longer step.
 
-    The `roundoff` of an order is how much round-off in its two errors may change it.
+    `errors` are those of this package and `exact` those in 50 digits, for each length of the step. The `roundoff` of an
+    order is how much round-off in its two errors may change it.
     """
     refinement = -np.diff(np.log(series.steps))
     observed, expected = (-np.diff(np.log(np.abs(values))) / refinement for values in (errors, exact))
@@ -222,7 +223,7 @@ def _orders(series: Series, errors: list[float], exact: list[float], roundoff: f
 
 
 def _multiplier_errors(series: Series) -> list[float]:
-    """Return the errors in table 1: |lambda_hat - lambda_star| of the last step."""
+    """Return the errors in table 1: |lambda_hat - lambda_star| in the last step of the run with each step length."""
     return [_multiplier_error(series, h) for h in series.steps]
 
 
@@ -264,7 +265,7 @@ def _raw_step(solver: type[EIPSolver], problem: Problem, y: np.ndarray, h: float
 
 
 def _last_defects(series: Series) -> list[float]:
-    """Return the errors in tables 2 and 4: the change of the first kept invariant from start to end, for each step."""
+    """Return the errors in tables 2 and 4: the change of the first kept invariant over a run, for each step length."""
     problem = harmonic(OMEGA) if series.table == 2 else kepler(eccentricity=0.6, relativistic=0.005)
     return [_last_defect(problem, series, h) for h in series.steps]
 

@@ -21,7 +21,7 @@ Found = dict[str, ParticleStudy]
 
 @dataclass(frozen=True, kw_only=True)
 class ChargedParticle(Study[Found]):
-    """Command ``eip-scipy charged-particle``, in both fields.
+    """Command ``eip-scipy charged-particle``: runs in the uniform field and in the tokamak.
 
     `paper_only`: do only the runs of the paper's figures, and name the files as in ``eip-scipy reproduce``.
     """

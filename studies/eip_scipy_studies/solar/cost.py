@@ -187,7 +187,7 @@ def cost(
     repeats : int
         Number of runs of each method and step; a run longer than `ENOUGH_SECONDS` is not repeated.
     callback : callable, optional
-        ``callback()`` after each run, including those that are left out.
+        ``callback()`` after each run, and for each repetition that is left out.
 
     Returns
     -------

@@ -38,7 +38,10 @@ class PointErrors(NamedTuple):
 
 @dataclass
 class SolarRuns:
-    """The completed runs and their results; it remains usable after an interruption."""
+    """The completed runs and their results, which can also be used after an interruption.
+
+    `order` is that of the method asked for, and `tight` the most accurate run, with which the others are compared.
+    """
 
     scene: SolarScene
     order: int
@@ -47,7 +50,7 @@ class SolarRuns:
     cost: list[TimedRun] = field(default_factory=list)
     cost_scene: SolarScene | None = None
     repeats: int = 3
-    """Timed runs of each, the least time of which counts."""
+    """Number of timed runs of each method in `cost`; the least time counts."""
     beside: str = ""
     """Name of the run that another core did in parallel; empty if all runs were done one after the other."""
 
@@ -193,7 +196,10 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
 
 
 def _reference_checks(scene: SolarScene, tight: MethodRun) -> list[Check]:
-    """Return a check that the run along which turns are counted agrees with the last stored state in its span."""
+    """Return, as a list, a check that the run `tight` agrees with the last stored state.
+
+    If there is no stored state, or the run ended before it, the check is that the run reached the end.
+    """
     stored = [year for year in report_times(scene) if stored_state(scene, year) is not None]
     at_end = errors_at(scene, tight, stored[-1], tight) if stored else None
     if at_end is None:

@@ -76,7 +76,7 @@ def _cell(study: SolarRuns, run: MethodRun, errors: PointErrors | None, quantity
 
 
 def _counts(tight: MethodRun | None) -> bool:
-    """Return whether there is a run along which whole turns can be counted."""
+    """Return True if whole turns of the longitudes can be counted along the run `tight`: it exists and did not fail."""
     return tight is not None and not tight.failure
 
 

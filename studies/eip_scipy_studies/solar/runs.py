@@ -280,7 +280,10 @@ def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun
 
 
 def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run EIPRKN12, the method for small errors over long times, with its usual step divided by `shorter`."""
+    """Run EIPRKN12, the method for small errors over long times, with its usual step divided by `shorter`.
+
+    `name` is the name of the run, and `word` the second line of the name in a table's head.
+    """
     per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
     return _long(scene, EIPRKN12, name, word, per_save, progress, **KEPT, **checkpoint)
 

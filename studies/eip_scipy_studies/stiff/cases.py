@@ -233,9 +233,9 @@ def separation() -> Case:
 
 
 def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> Case:
-    """Return the chain with dampers, with its constraints as invariants.
+    """Return the chain with dampers, see `chain`, with its constraints as invariants.
 
-    Its reference is a run of the same chain with the angles of the links as coordinates.
+    The reference is a run of `chain_by_angles`, the same chain with the angles of the links as coordinates.
     """
     made, (fun, start, state) = chain(angles), chain_by_angles(angles)
 

@@ -42,7 +42,7 @@ class Peer:
     warm : bool
         True if each setting compiles its own code, so that an uncounted run comes first.
     projects : bool
-        True if the method is also given the problem's invariants.
+        True for a method of another package that is given the problem's invariants too.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Correct runs, which must not be reported: the invariants are true ones, and the steps are suitable."""
+"""Correct runs, which must not be reported as faulty: the invariants are true ones, and the steps are suitable."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def two_pendulums() -> Problem:
 
 
 def each(before: str, options: Iterable[str], after: str = "") -> str:
-    """Return the text `ways` for `runs`: a part for each of the options, with `before` and `after` around it."""
+    """Return the argument `ways` of `runs`: for each option, "before option after", separated by commas."""
     return ", ".join(f"{before} {option} {after}" for option in options)
 
 

@@ -70,7 +70,7 @@ def one_bead(strength: float) -> Problem:
 
 
 def light_planet(mass: float) -> Problem:
-    """Return a star, a giant planet at 5.2, and a planet of this mass at 0.2, whose period is 0.56."""
+    """Return a star with G M = 1, a giant planet at 5.2, and a planet with G M = `mass` at 0.2, of period 0.56."""
     q = [[0.0, 0.0, 0.0], [5.2, 0.0, 0.0], [0.2, 0.0, 0.0]]
     v = [[0.0, 0.0, 0.0], [0.0, 5.2**-0.5, 0.0], [0.0, 0.2**-0.5, 0.0]]
     return nbody([1.0, 1e-3, mass], q, v, t_span=(0.0, 200.0))

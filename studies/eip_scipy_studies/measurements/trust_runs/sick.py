@@ -330,7 +330,10 @@ def swapped(G, k, m):
 
 
 def spoilt(spoil: Callable[..., None], y0: Any, problem: Problem | None = None, k: int = 1, m: int = 2) -> Problem:
-    """Return a problem with a correct energy and a wrong gradient, changed by ``spoil(gradient, k, m)``."""
+    """Return a problem with a correct energy and a wrong gradient, changed by ``spoil(gradient, k, m)``.
+
+    `k` and `m` are indices of components of the gradient.
+    """
     problem = problem or replace(s.henon_heiles(), y0=np.array(y0), t_span=(0.0, 10.0))
     (energy,) = problem.invariants
 

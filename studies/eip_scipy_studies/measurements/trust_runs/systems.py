@@ -162,7 +162,10 @@ def henon_heiles(cubic: float = 1.0, q0: Any = (0.3, 0.2), v0: Any = (0.0, 0.0),
 def central(
     name: str, extra: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant, strength: float = 1.0
 ) -> Problem:
-    """Return Kepler's attraction plus the acceleration extra(t, y) in the plane, with the claimed invariants `kept`."""
+    """Return Kepler's attraction plus the acceleration extra(t, y) in the plane, with the claimed invariants `kept`.
+
+    `strength` is G M of the attraction.
+    """
 
     def fun(t, y):
         return np.concatenate([y[2:], -strength * y[:2] / np.hypot(y[0], y[1]) ** 3 + extra(t, y)])
@@ -218,7 +221,8 @@ def chain(
 ) -> Problem:
     """Return masses in a row between walls, connected by springs, with a claimed energy.
 
-    `force` is a function of the elongations. `spring_energy` and its derivative `claimed_force` are the claimed ones.
+    `force` is a function of the elongations of the springs. The claimed energy is computed with `spring_energy`, whose
+    derivative is `claimed_force`, and with `claimed_masses`.
     """
     q0 = np.array(q0, dtype=float)
 
@@ -244,7 +248,7 @@ def chain(
 
 
 def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bool = False) -> Problem:
-    """Return Toda's lattice with one mass displaced.
+    """Return Toda's lattice with one mass displaced, which also has a velocity at the start if `moving`.
 
     The claimed energy is the true one or, if `claim_harmonic` is true, that of harmonic springs.
     """
@@ -379,7 +383,10 @@ def compiled_spring(
     y0: Any = (1.0, 0.0),
     h: float | None = None,
 ) -> Problem:
-    """Return a spring with friction and a driving force, jitted, with the claimed energy of a free spring."""
+    """Return a spring with friction and a driving force, jitted, with the claimed energy of a free spring.
+
+    `square` is the square of the spring's angular frequency; the driving force is ``force * sin(frequency * t)``.
+    """
     params = np.array([square, friction, force, frequency])
     return Problem(
         name="spring",
@@ -458,7 +465,10 @@ def _trap_gradient(t, y, out, params):
 
 
 def compiled_trap(square: float, end: float = 20.0, h: float | None = None) -> Problem:
-    """Return a body in an anisotropic trap that starts on an axis, jitted, with a claimed angular momentum."""
+    """Return a body in an anisotropic trap that starts on an axis, jitted, with a claimed angular momentum.
+
+    The squares of the trap's angular frequencies are 1 along that axis and `square` along the other.
+    """
     params = np.array([square])
     return Problem(
         name="trap",
@@ -480,7 +490,7 @@ def _doubled_gradient(t, y, out, params):
 
 
 def spring_of_doubled_gradient() -> Problem:
-    """Return the spring with its energy's gradient doubled, jitted."""
+    """Return the problem of `compiled_spring` with twice the true gradient of the energy, jitted."""
     spring = compiled_spring()
     wrong = Invariant(_spring_energy, _doubled_gradient, args=(spring.params,), in_place=True, name="energy")
     return replace(spring, invariants=(wrong,))
