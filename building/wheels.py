@@ -156,8 +156,9 @@ def checked(wheel: Path) -> str:
 def need(module: Path, platform: str) -> str:
     """Return the requirement of an extension module as text for the table.
 
-    It is the newest symbol of glibc that the module needs, the oldest macOS on which it works, or the C runtime of
-    Windows. Stops the program if the module needs a library, a symbol or a glibc that the platform may lack.
+    `platform` is a key of `PLATFORMS`, such as "win_amd64". The requirement is the newest symbol of glibc that the
+    module needs, the oldest macOS on which it works, or the C runtime of Windows. Stops the program if the module needs
+    a library, a symbol or a glibc that the platform may lack.
     """
     system = PLATFORMS[platform].system
     binary = lief.parse(str(module))
@@ -188,7 +189,10 @@ def libraries(binary: lief.Binary) -> Iterator[str]:
 
 
 def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
-    """Return the newest symbol of glibc that a module needs, as "symbol@version"; stop if it is newer than `GLIBC`."""
+    """Return the newest symbol of glibc that a module needs, as "symbol@version"; stop if it is newer than `GLIBC`.
+
+    `binary` is the parsed file `module`; the message of an error names `module` and `platform`.
+    """
     found = []
     for symbol in binary.imported_symbols:
         if symbol.symbol_version and symbol.symbol_version.has_auxiliary_version:

@@ -131,7 +131,10 @@ class FixedSteps(NamedTuple):
 
 
 def _message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
-    """Return the message of a run; `reason` is the reason why it was interpreted, "" if it was compiled."""
+    """Return the message of a run from its saved times `t` (m,) and states `ys` (m, n).
+
+    `reason` is the reason why the run was interpreted; it is empty if the run was compiled.
+    """
     text = f"interpreted: {reason}" if reason else "compiled"
     finite = np.isfinite(ys).all(axis=1)
     if finite.all():
@@ -208,7 +211,10 @@ def run_second_order(
 
 
 def _converter(size: int) -> Callable[[Any, float], np.ndarray]:
-    """Return a function that checks values of `acc`: NumPy would silently broadcast scalars or drop imaginary parts."""
+    """Return a function that returns a value of `acc` as an array (size,) after checks.
+
+    Without the checks NumPy would silently broadcast scalars or drop imaginary parts.
+    """
 
     def convert(value: Any, t: float) -> np.ndarray:
         if value is None:
@@ -237,7 +243,9 @@ def _run(
 ) -> FixedStepResult:
     """Make all steps from y, which is overwritten, and return the result.
 
-    `fun` is called by its address; if it has none, `in_python` is called.
+    `fun` is called by its address; if it has none, `in_python` is called. `kind` is the signature of `fun`, and `name`
+    its name in messages. `second_order` is True if `fun` returns accelerations. See `run_in_place` for the other
+    arguments.
     """
     functions: NativeFunctions | PythonFunctions
     try:

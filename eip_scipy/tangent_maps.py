@@ -200,7 +200,10 @@ class _Piece(NamedTuple):
 
 
 def _refuse(function: str, options: dict[str, Any], also: Sequence[str] = ()) -> None:
-    """Raise TypeError if `options` contains an option in OWN or `also`, or one that `integrate` does not have."""
+    """Raise TypeError if `options` contains an option in `OWN` or `also`, or one that `integrate` does not have.
+
+    `function` is the name of the calling function, for the message.
+    """
     for name in (*OWN, *also):
         if name in options:
             raise TypeError(
@@ -219,7 +222,7 @@ def _start(fun: Any, t_span: Any, y0: Any, options: dict[str, Any]) -> Prepared:
 
 
 def _length(every: Any, start: Prepared, pieces: int) -> float:
-    """Return the time between two orthonormalisations after a check of `every`.
+    """Return the time between two orthonormalisations in the run `start`: `every` after a check of its value.
 
     If `every` is None, this is 1 / `pieces` of the interval, rounded up to a whole number of steps if they are equal.
     """
@@ -235,10 +238,11 @@ def _length(every: Any, start: Prepared, pieces: int) -> float:
 
 
 def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: float, options: Any) -> Iterator[_Piece]:
-    """Yield the pieces of a run from t[0] to t[1], in which the columns are orthonormal at the start of each piece.
+    """Yield the pieces of a run from t[0] to t[1], in which the tangent vectors are orthonormal when a piece starts.
 
-    A piece is repeated with half its length if its columns become too long, too different in length, or not finite. A
-    piece that fails for another reason is the last one.
+    `columns` are the tangent vectors at t[0], and `every` is the duration of a piece. A piece is repeated with half its
+    duration if its tangent vectors become too long, too different in length, or not finite. A piece that fails for
+    another reason is the last one.
     """
     begin, end = t
     now, sign, run = begin, np.sign(end - begin), None
@@ -331,8 +335,8 @@ def lyapunov_spectrum(
     k = n if count is None else as_count("count", count)
     if k > n:
         raise ValueError(
-            f"count is {k}, but the number of exponents is that of the components of the state, {n}. Give a smaller "
-            "count, or omit it to compute all."
+            f"count is {k}, but the state has {n} components and as many exponents. Give a smaller count, or omit it "
+            "to compute all."
         )
     times, sums, total = [], [], np.zeros(k)
     for piece in _pieces(fun, y0, (t0, t_bound), _orthonormal(n, k), _length(every, start, PIECES), options):
@@ -840,7 +844,10 @@ class TrajectoryFit:
 
 
 def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
-    """Return the interval of the run, the distinct times of the data, and for each column of data its time's index."""
+    """Return the interval of the run, the distinct times of the data, and an array of indices.
+
+    The array holds, for each column of the data, the index of its time among the distinct times.
+    """
     times = _numbers(t)
     if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all():
         raise ValueError(f"t must be a 1-D array of finite times, one for each column of data, got {shown(t)}.")

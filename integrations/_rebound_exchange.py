@@ -440,7 +440,7 @@ def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants 
 
 
 def _parameter(thing: Any, name: str) -> Any:
-    """Return a parameter that REBOUNDx keeps for a particle or a force, or None if it is not set."""
+    """Return the parameter `name` that REBOUNDx keeps for `thing`, a particle or a force; None if it is not set."""
     try:
         return thing.params[name]
     except AttributeError:
@@ -448,7 +448,10 @@ def _parameter(thing: Any, name: str) -> Any:
 
 
 def _force_names(extras: Any) -> list[str]:
-    """Return the names of the forces that REBOUNDx has attached, from its list in C: no function of it returns them."""
+    """Return the names of the forces that are attached to a simulation by `extras`, its `reboundx.Extras` object.
+
+    The names are read from the list in C, because no function of REBOUNDx returns them.
+    """
     import reboundx
 
     names, node = [], extras._additional_forces
@@ -512,8 +515,8 @@ def _new(bodies: Bodies) -> rebound.Simulation:
 def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | None:
     """Return REBOUND's names of the problem's units of length and time, and of a unit of mass.
 
-    The unit of mass is the one in which G has the given value, and "msun" if `G` is None. Return None if the problem
-    knows no units or REBOUND has no names for them.
+    The unit of mass is one in which the gravitational constant has the value `G`, and "msun" if `G` is None. Return
+    None if the problem has no units of length and time, or if REBOUND has no name for one of the three units.
     """
     known = problem.unit_system
     if known is None:

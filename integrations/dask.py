@@ -179,7 +179,10 @@ def pool(executor: Any, task: Task, key: str) -> DaskPool:
 
 
 class DaskPool:
-    """Pool that runs the chunks of an ensemble as tasks of Dask, which repeats the tasks of lost workers on others."""
+    """Pool that runs the chunks of an ensemble as tasks of Dask, which repeats the tasks of lost workers on others.
+
+    `task` and `key` are as for `pool`. If `own` is True, `close` closes the client and its cluster.
+    """
 
     def __init__(self, client: distributed.Client, task: Task, key: str, *, own: bool) -> None:
         self._client, self._task, self._key, self._own = client, task, key, own
@@ -304,7 +307,8 @@ class DaskPool:
         """Run a chunk that killed its workers in halves, again and again, to find the member that kills them.
 
         Return the results of all members of the chunk, in their order. The status of a member that kills its workers is
-        `FAILED`; the others have been run.
+        `FAILED`; the others have been run. `task` is the task with which the halves run, `plan` makes the result of
+        a member that kills its workers, and `error`, the error of the chunk, is named in the message of this member.
         """
         m = len(chunk.y0s)
         if m == 1:

@@ -202,7 +202,8 @@ class ProjectedTaylor:
 class TaylorOutput:
     """Dense output of a run: a function of times between ``bounds[0]`` and ``bounds[1]`` that returns projected states.
 
-    It stores the time and state after each projection, and integrates again from these.
+    `flow` made the run. `starts` contains the time and state at the start of the run and after each projection except
+    the last, as `ProjectedTaylor._run` stores them; the output integrates again from these.
     """
 
     def __init__(self, flow: ProjectedTaylor, starts: Sequence[Any]) -> None:
@@ -255,9 +256,10 @@ def _named(invariants: Any, integrator: Any) -> dict[str, Any]:
 def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
     """Compile a function of state, parameters and targets that returns the projected state and the residuals.
 
-    The residuals (l,) are the targets minus the invariants. The function takes one Newton step: it adds the correction
-    x of smallest norm with G x = residuals, where the rows of G are the gradients, which are made orthogonal one after
-    the other.
+    `names`, `pars` and `expressions` are the state variables, the parameters and the invariants as expressions of
+    heyoka. The residuals (l,) are the targets minus the invariants. The function takes one Newton step: it adds the
+    correction x of smallest norm with G x = residuals, where the rows of G are the gradients, which are made orthogonal
+    one after the other.
     """
     targets = _variables("__target", len(expressions))
     basis: list[list[Any]] = []
@@ -285,7 +287,8 @@ def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> An
 def _examination(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
     """Compile a function of state and parameters that returns the invariants (l,) and the sizes of their terms (l,).
 
-    The size of the terms of an invariant is the norm of the products of the components of its gradient and the state.
+    The arguments are those of `_projection`. The size of the terms of an invariant is the norm of the products of the
+    components of its gradient and the state.
     """
     terms = [_dot(row := [heyoka.diff(item, name) * name for name in names], row) for item in expressions]
     return heyoka.cfunc(

@@ -303,8 +303,9 @@ def _comments(path: _StrPath | None) -> str:
 
 
 def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
-    """Return the kernel's segments (pairs of codes) and the name of GM of each body, by the names of the bodies.
+    """Return the kernel's segments and the name of GM of each body, by the names of the bodies.
 
+    A segment is given by the NAIF numbers of its centre and its target. GM has its name in the kernel's comments.
     The bodies are in the order of their distance from the Sun; if `moon`, Earth and Moon replace EMB.
     """
     bodies = {}
@@ -314,7 +315,10 @@ def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
 
 
 def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, int]], str]]) -> list[list[Any]]:
-    """Return for each body the segments whose sum is its position relative to the solar system's barycentre."""
+    """Return for each body the segments whose sum is its position relative to the solar system's barycentre.
+
+    `bodies` is the mapping that `_bodies` returns, and `path` is the path of the kernel, for the error message.
+    """
     missing = [name for name, (pairs, _) in bodies.items() if any(pair not in kernel.pairs for pair in pairs)]
     if missing:
         raise ValueError(f"{path} has no segment for {', '.join(missing)}; expected a planetary kernel such as DE440")
@@ -323,7 +327,10 @@ def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, i
 
 @contextmanager
 def _whole(path: Path) -> Iterator[None]:
-    """Replace the TypeError that jplephem raises in the block if the file is cut off by a ValueError that says so."""
+    """Replace a TypeError in the block, which jplephem raises for an incomplete file, by a ValueError that says so.
+
+    `path` is the path of the kernel.
+    """
     try:
         yield
     except TypeError as error:

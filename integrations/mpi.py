@@ -206,7 +206,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
 
 
 class _OverRanks(SolverOfParts):
-    """Base class that `over_ranks` puts before a method."""
+    """Base class that `over_ranks` combines with the class of a method; `COMM` is the communicator."""
 
     COMM: MPI.Comm
 
@@ -263,7 +263,7 @@ def _refuse(name: str, options: dict[str, Any]) -> None:
 
 
 def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.ndarray, h: float) -> None:
-    """Check that invariants are the same on all ranks, and that they agree with their gradients.
+    """Check that the invariants `known` are the same on all ranks, and that they agree with their gradients.
 
     The gradients are checked as in a run on one rank, but only on the plane through y along two random directions.
 

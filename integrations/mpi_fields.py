@@ -137,7 +137,8 @@ def _cuts(n: int, ranks: int) -> list[int]:
 class _TurnedMultiplier(Multiplier):
     """Multiplier of the modes along x by a real factor, which may vary with y and z.
 
-    It is applied between two transpositions.
+    It is applied between two transpositions by `way`. `factor` (J, K[, L]) is given on the whole grid; axes along
+    which it is constant may have the length 1.
     """
 
     def __init__(self, way: Transposition, factor: np.ndarray) -> None:
@@ -146,13 +147,16 @@ class _TurnedMultiplier(Multiplier):
         super().__init__(way.turned, (0,), here)
 
     def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
-        """Fill `out` with the field `psi` whose modes along x are multiplied by the factor."""
+        """Fill `out` with the field `psi` whose modes along x are multiplied by the factor; `first` is not used."""
         self._way.turn(psi)
         super().apply(fft, self._way.here, self._way.image)
         self._way.turn_back(out)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
-        """Return this rank's part of the expectation value, which is a sum over all modes."""
+        """Return this rank's part of the sum over the grid of conj(psi) times the field of `apply`.
+
+        `work` is not used.
+        """
         self._way.turn(psi)
         return super().expectation(fft, self._way.here, self._way.image)
 

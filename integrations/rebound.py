@@ -380,7 +380,7 @@ def _set_ias15(sim: rebound.Simulation, integrator: str, epsilon: float | None, 
     if not given:
         return
     if integrator != "ias15":
-        raise ValueError(f"{' and '.join(given)}: for 'ias15' only, got {integrator!r}")
+        raise ValueError(f"{' and '.join(given)} can be given only with integrator='ias15', got {integrator!r}")
     options = getattr(sim, "ri_ias15", None) or sim.integrator
     if epsilon is not None:
         if not (epsilon > 0 and math.isfinite(epsilon)):

@@ -131,7 +131,10 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
 
 
 def existing(name: str, what: str) -> CheckpointError:
-    """Return the error for a run without ``resume=True`` whose file or group `name` exists; `what` is a kind of run."""
+    """Return the error for a run without ``resume=True`` whose checkpoint file or Zarr group `name` exists.
+
+    `what` names the kind of run in the message: "run" or "ensemble".
+    """
     return CheckpointError(
         f"{name!r} exists. Pass resume=True to continue the {what} that it holds; for a new {what}, use another "
         "place or delete this one."

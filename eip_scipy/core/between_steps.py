@@ -73,7 +73,7 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
 def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: int) -> Stepping:
     """Return the step control for the next steps of a solver, made from its present attributes.
 
-    `was` contains the values of the attributes after the last step.
+    `was` contains the values of the attributes after the last step. `stacklevel` is that of warnings.
 
     Raises
     ------

@@ -135,7 +135,7 @@ def _own_functions(solver: type[OdeSolver], base: type[OdeSolver]) -> list[str]:
 
 
 def _check_dense_output(tableau: Tableau, P: np.ndarray) -> None:
-    """Check that the dense output `P` gives the step's result at its end, and has order LEAST_ORDER inside the step.
+    """Check that the dense output `P` gives the step's result at its end, and has order `LEAST_ORDER` inside it.
 
     Raises
     ------

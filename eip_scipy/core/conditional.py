@@ -101,7 +101,10 @@ def is_kept_on_a_surface(
 
 
 class _Rate:
-    """Rate of change of invariant k as a function of the m floats of a state, which move in units of `weights` (m,)."""
+    """Rate of change of invariant k as a function of the m floats of a state, which move in units of `weights` (m,).
+
+    The floats start at those of y. The weights are the entries of `span`, twice each for complex states.
+    """
 
     def __init__(self, known: InvariantSet, k: int, t: float, y: Array, span: Array, rhs: Derivative) -> None:
         self._known, self._k, self._t, self._rhs, self._dtype = known, k, t, rhs, y.dtype

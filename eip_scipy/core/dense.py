@@ -160,7 +160,10 @@ def _record(run: Run, events: int) -> Dense:
 
 
 class ExactEnds(AtRealTimes):
-    """A dense output that returns exactly the states at both ends of the step, without the rounding of interpolants."""
+    """A dense output that returns exactly the states at both ends of the step, without the rounding of interpolants.
+
+    `inner` is the dense output that is evaluated in between, and `y_old` and `y` are the states at the two ends.
+    """
 
     def __init__(self, inner: DenseOutput, y_old: Array, y: Array) -> None:
         super().__init__(inner.t_old, inner.t)
@@ -173,7 +176,7 @@ class ExactEnds(AtRealTimes):
 
 
 class ManifoldDenseOutput(AtRealTimes):
-    """An interpolant over one step, see `Interpolants`.
+    """An interpolant over one step, see `Interpolants`; `piece` are the floats of the interpolant.
 
     A pickle does not hold functions of the run. It holds the polynomial through projected states at Chebyshev nodes of
     the step, whose degree of 8, 16, 32 or 64 is chosen by its error. This polynomial meets the states at both ends
@@ -206,7 +209,10 @@ class ManifoldDenseOutput(AtRealTimes):
 
 
 class _Pieces(Sequence[ManifoldDenseOutput]):
-    """Sequence of the interpolants of all steps; each `ManifoldDenseOutput` is created when it is requested."""
+    """Sequence of the interpolants of all steps; each `ManifoldDenseOutput` is created when it is requested.
+
+    `pieces` (m, floats) holds the floats of the interpolants, a row for each step.
+    """
 
     def __init__(self, interpolants: Interpolants, pieces: Array) -> None:
         self._interpolants, self._pieces = interpolants, pieces

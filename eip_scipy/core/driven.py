@@ -257,7 +257,7 @@ class Stepper:
         raise NotImplementedError
 
     def _describe(self, h: float, rows: Array) -> None:
-        """Fill `rows` with the vectors that the method's `weights` combine into the interpolant of the last step."""
+        """Fill `rows` with the vectors that the `polynomials` of `Driven` combine into the last step's interpolant."""
         raise NotImplementedError
 
     def _slope(self, rows: Array) -> Array:

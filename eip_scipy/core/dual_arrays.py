@@ -38,7 +38,10 @@ class _NumPy(python_types.ModuleType):
 
 
 def for_duals(fun: Any, dual: Dual) -> Any:
-    """Return a copy of a jitted function, and of the functions that it calls, in which new arrays hold duals."""
+    """Return a copy of a jitted function, and of the functions that it calls, in which new arrays hold duals.
+
+    `dual` is the Numba type of these dual numbers.
+    """
     by_name = _array_functions(dual)
     others = {id(getattr(np, name)): function for name, function in by_name.items()}
     return _replaced(fun, others | {id(np): _NumPy(by_name)})
@@ -78,7 +81,10 @@ def _of_floats(dtype: Any) -> bool:
 
 @cache
 def _array_functions(dual: Dual) -> dict[str, Callable[..., Any]]:
-    """Return replacements of NumPy's empty, zeros, ones, array and cross, by name; only compiled code calls them."""
+    """Return replacements of NumPy's empty, zeros, ones, array and cross, by name; only compiled code calls them.
+
+    Arrays that empty, zeros and ones return hold numbers of the type `dual` in place of floats.
+    """
 
     def empty(shape, dtype=float):
         pass

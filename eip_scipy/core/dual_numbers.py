@@ -320,7 +320,8 @@ def _define_binary(function: Any, slope: Callable[..., Any], other: Callable[...
 def _define_flat(function: Any, arguments: int, *names: Any) -> None:
     """Define a function of one or two duals (`arguments`) whose derivative is 0 or undefined.
 
-    It returns a plain number, computed from the values of the duals.
+    It returns a plain number, computed from the values of the duals. `names` are other functions that are replaced by
+    `function` for duals.
     """
 
     def typed(x, y):

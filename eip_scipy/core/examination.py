@@ -151,10 +151,11 @@ def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
 def _complaint(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, y: Array, on_manifold: bool
 ) -> str | None:
-    """Return the text of the first of the `complaints` at a state, or None, and note rates of change in `figures`.
+    """Return the text of the first of the `complaints` at a state, or None, and note rates of change.
 
-    Without `on_manifold`, complaints about invariants that depend on other invariants are ignored. A state whose
-    derivative is not finite is not examined.
+    Rates of change are written to ``examiner.figures``. `known` is a copy of the examiner's invariants whose functions
+    raise `_RefusedError`. Without `on_manifold`, complaints about invariants that depend on other invariants are
+    ignored. A state whose derivative is not finite is not examined.
     """
     f = rhs(t, y)
     if not BUILD.are_finite(f.view(float)):
@@ -166,7 +167,10 @@ def _complaint(
 
 
 def _unresolved(examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, h: float, y: Array) -> str | None:
-    """Return a sentence on the part of the state that steps from (t, y) do not resolve, or None."""
+    """Return a sentence on the part of the state that steps of length h from (t, y) do not resolve, or None.
+
+    `known` is as for `_complaint`.
+    """
     return examiner.resolution(rhs, t, h, y, known.t_span[1])
 
 
@@ -183,6 +187,7 @@ def _along_chord(
     The states examined in the step are on the straight line between its `ends`, those before it on the trajectory. The
     `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing is
     examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
+    `times` are the times of `ends`, and `known` is as for `_complaint`.
     """
     largest = float(examiner.figures[:, NU].max(initial=0.0))
     if largest < GROWTH * examiner.largest:
@@ -202,7 +207,7 @@ def _on_the_way(
 ) -> str | None:
     """Return a sentence about what is wrong on the trajectory that led to `start`, a time and a state, or None.
 
-    The trajectory is followed backwards for about `steps` steps of length h.
+    The trajectory is followed backwards for about `steps` steps of length h. `known` is as for `_complaint`.
     """
     (t, y), part = start, h / BACK
     begin = known.t_span[0]

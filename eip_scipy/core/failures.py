@@ -17,7 +17,8 @@ __all__ = ["failure", "projection_failure"]
 def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     """Return the message for a failed projection: the largest residual, and the rank of the gradients.
 
-    The largest residual is the one that most exceeds its dead band, within which it would not be corrected.
+    The largest residual is the one that most exceeds its dead band, within which it would not be corrected. `work` has
+    the buffers of the step, which hold the residuals and the rank.
     """
     excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))

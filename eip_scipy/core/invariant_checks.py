@@ -431,8 +431,9 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
 def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Array, tau: float) -> tuple[Array, Array]:
     """Return the partial time derivatives (l,) of the invariants and their rounding errors (l,).
 
-    Only times inside the run's interval are used. A derivative that is unknown has the value 0 and an infinite error:
-    if the interval contains no time other than t, or if the step `tau` is 0, infinite, or too short to change t.
+    `G` (l, n) and `here` (l,) are the gradients and the values of the invariants at t and y, and `tau` is the length of
+    a step. Only times inside the run's interval are used. A derivative that is unknown has the value 0 and an infinite
+    error: if the interval contains no time other than t, or if `tau` is 0, infinite, or too short to change t.
     """
     none = np.zeros(known.size)
     low, high = min(known.t_span), max(known.t_span)

@@ -314,7 +314,10 @@ def _labels(items: Sequence[Invariant]) -> list[str]:
 
 
 def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array, extra: tuple) -> Array:
-    """Return the value at the start, a number or (l_i,); `fun` is the invariant's function with its arguments bound."""
+    """Return the value at the start, a number or (l_i,); `fun` is the invariant's function with its arguments bound.
+
+    `label` is the invariant's name in messages. `extra` are the run's further arguments, also for messages only.
+    """
     try:
         value = fun(t, y.copy())
     except TypeError:
@@ -331,7 +334,10 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
 def _first_gradient(
     invariant: Invariant, gradient: Call, label: str, start: tuple[float, Array, Array], extra: tuple
 ) -> Array:
-    """Return the gradient (n,) or (l_i, n) at `start`, which holds a time, a state and its derivative."""
+    """Return the gradient (n,) or (l_i, n) at `start`, which holds a time, a state and its derivative.
+
+    `label` and `extra` are as for `_first_value`.
+    """
     t, y, f = start
     what, states = f"gradient of invariant {label!r}", (y.copy(), f.copy()) if gradient.takes_f else (y.copy(),)
 
@@ -471,7 +477,10 @@ class InvariantSet:
         self.balances.check(t0, y0, f0)
 
     def _names(self, sizes: list[int]) -> list[str]:
-        """Return names of the l values: an item's `value_names`, if any, else its label, with an index for arrays."""
+        """Return names of the l values: an item's `value_names`, if any, else its label, with an index for arrays.
+
+        `sizes` are the numbers of values of the items.
+        """
         return [
             (label if scalar else f"{label}[{j}]") if not item.value_names else item.value_names[j]
             for item, label, scalar, size in zip(self.items, self.labels, self.scalar, sizes, strict=True)
@@ -581,7 +590,8 @@ class InvariantSet:
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
         """Return a copy, with a compiled gradient, of a jitted invariant without one; any other invariant is unchanged.
 
-        If the gradient cannot be compiled, the copy has none, and the reason is stored in `why_not`.
+        `n` is the size of the state, and `shape` that of the invariant's value. If the gradient cannot be compiled, the
+        copy has none, and the reason is stored in `why_not` by `label`.
         """
         numbers = scalars(self.extra)
         if not _lacks_gradient(item) or numbers is None:
@@ -666,7 +676,7 @@ class InvariantSet:
         return found
 
     def term_sizes(self, t: float, y: Array, f: Array) -> Array:
-        """Return the sizes (l,) of the terms in the invariants: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
+        """Return the sizes (l,) of the terms in the invariants: ``max(|I|, |target|, sum_k |G_k y_k|, scale)``."""
         return self.sizes_of_terms(y, self.gradients(t, y, f), self.values(t, y))
 
     def sizes_of_terms(self, y: Array, G: Array, values: Array) -> Array:
@@ -705,7 +715,7 @@ class InvariantSet:
             return np.where(residual == 0, 0.0, residual / allowed)
 
     def note_rates(self, figures: Array, t: float, y: Array, f: Array, G: Array, here: Array) -> None:
-        """Update the largest rates of change of the values along f in `figures` (l, N_FIGURES).
+        """Update the largest rates of change of the values along f in `figures`, of the shape (l, `N_FIGURES`).
 
         The rates are relative to ``sum_k |G_k f_k|``, the size of the terms that cancel in the rate. `figures` are the
         numbers about the projections of a run that `engine.trust` judges. `G` and `here` are the gradients and the

@@ -101,7 +101,8 @@ def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) 
 def _with_out(fun: Any, form: str, has_params: bool, one_by_one: bool) -> Any:
     """Return ``call(t, x, out, params)``, which returns the value of `fun` at x; an in-place `fun` writes to `out`.
 
-    `fun` takes the numbers in params as separate arguments if `one_by_one`, else params if `has_params`.
+    `form` is that of `fun`, see `native_functions`. `fun` takes the numbers in params as separate arguments if
+    `one_by_one`, else params if `has_params`.
     """
     if form.endswith("place"):
         if one_by_one:
@@ -125,6 +126,7 @@ def _second(first, second):
 def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
     """Return the in-place right-hand side of a state with `columns` columns of derivatives, from a jitted `fun`.
 
+    `form` is that of `fun`, see `native_functions`, and `n` is the size of the state without the columns. The function
     ``jvp(t, y, dy, ...)`` returns the derivative (n,) of the right-hand side along dy.
     """
     taken = n // 2 if form.startswith("acceleration") else n

@@ -78,7 +78,10 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
 
 
 def dual_along(directions: int) -> Dual:
-    """Return the smallest dual type that needs the fewest calls for derivatives along `directions` directions."""
+    """Return the smallest dual type with which derivatives along `directions` directions need the fewest calls.
+
+    The calls are those of the function that is differentiated, each along at most `LANES` directions.
+    """
     passes = -(-directions // LANES)
     return Dual(-(-directions // passes))
 

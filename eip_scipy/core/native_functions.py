@@ -140,8 +140,9 @@ def native_functions(
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
     """Return the function that the engine calls for `fun`, and its signature.
 
-    If the state has columns of derivatives, the attribute `of_state` of `fun` has both. Without this attribute,
-    `fun` and `number` are returned.
+    If the state has columns of derivatives, the attribute `of_state` of `fun` has the function of the state alone and
+    the size of the state. Without this attribute, `fun` and `number` are returned. `number` is the signature of a
+    function that returns a number.
     """
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
@@ -238,8 +239,9 @@ def with_rates(
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:
     """Raise the exception of a function whose call failed in the engine.
 
-    The arguments after `functions` are those of the `FailedCallError` that the engine raised: `group` and `k` identify
-    the function, which was called with t, y and f, and returned `status`.
+    The arguments after `functions` are those of the `FailedCallError` that the engine raised. `group` and `k` identify
+    the function: it is number `k` of the list that ``functions.owner`` has for the key `group`, such as "rhs", "inv" or
+    "grad". It was called with `t` and the arrays whose bytes are `y` and `f`, and returned `status`.
 
     Raises
     ------

@@ -40,7 +40,11 @@ def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
 
 @lru_cache(maxsize=16)
 def _is_as_expected(context: Any, value: types.Type, state: types.Array) -> bool:
-    """Return True if this version of Numba passes arguments and values in the way that the engine assumes."""
+    """Return True if this version of Numba passes arguments and values in the way that the engine assumes.
+
+    `context` is the target context of Numba's compiled code, `value` the Numba type of the function's value, and
+    `state` that of its argument y.
+    """
     number = context.get_data_type(state.dtype).as_pointer()
     returned = context.get_data_type(value)
     if isinstance(value, types.Array):

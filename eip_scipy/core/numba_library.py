@@ -57,7 +57,8 @@ def _jitted(function: Any) -> Any:
 def _value_of(function: Any, fill: Any) -> Callable[..., Any]:
     """Return ``value(t, y, f, params)``, which returns the value that `fill` writes: a number or a new array.
 
-    It is a number if the value of `function` has one component for every state and does not depend on f.
+    `function` is a `LibraryFunction`, and `fill` is the jitted function that `_filling` makes for it.
+    It is a number if the value of `function` has one component for states of any size and does not depend on f.
     """
     numbers, of_state = function.numbers, function.fills_states
 

@@ -388,6 +388,8 @@ def _balances(method: AnyMethod, known: InvariantSet) -> Balances:
 def _groups(known: InvariantSet, n: int, width: int) -> Groups:
     """Return the balances in groups that have the same components and weights; each group is projected by itself.
 
+    The state has `n` components of `width` floats each: 1 if it is real, 2 if it is complex.
+
     Raises
     ------
     ValueError

@@ -66,7 +66,7 @@ class PointerFunction:
     name : str
         Name of the function in messages.
     kind : str
-        VALUE or GRADIENT, the required signature.
+        `VALUE` or `GRADIENT`, the required signature.
     takes_f : bool, optional
         Whether Python passes f. The engine always passes f to a gradient; without `takes_f` Python passes NaN.
     shape : tuple of int, optional

@@ -86,8 +86,9 @@ class Diagnostics:
     ) -> None:
         """Keep the buffers of a run, from which the attributes are computed when they are read.
 
+        `counters` are the engine's counts of projections by kind. `trust` holds the findings of the checks.
         `estimated` is False if the run has no error estimate. `slow` holds the indices of the balances and the sums
-        (N_SLOW, b) of their rates and terms.
+        (`N_SLOW`, b) of their rates and terms.
         """
         self.names = trust.names
         self._trust = trust
@@ -186,7 +187,7 @@ class Diagnostics:
 
 
 def slowness(sums: np.ndarray) -> np.ndarray:
-    """Return `Diagnostics.slowness` (b,) of the balances, from the sums (N_SLOW, b) of rates and terms.
+    """Return `Diagnostics.slowness` (b,) of the balances, from the sums (`N_SLOW`, b) of rates and terms.
 
     A mean over the whole run does not detect a balance that is slow only while its terms are large, such as the energy
     of an oscillator that is damped until its driving dominates. Therefore the larger of two ratios of rates to terms is
@@ -198,7 +199,10 @@ def slowness(sums: np.ndarray) -> np.ndarray:
 
 
 def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return the sums (N_SLOW, b) of a run, `one`, and its continuation, `two`, as if they were a single run."""
+    """Return the sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation together.
+
+    `one` are the sums of the run, and `two` are those of the continuation.
+    """
     both = one + two
     late = [LATE_RATES, LATE_TERMS]
     kept = (one[SAMPLES] / np.maximum(both[SAMPLES], 1.0)) ** (1 / LATE_SHARE)

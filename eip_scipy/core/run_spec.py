@@ -242,7 +242,7 @@ def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
 def _moved(before: Array, after: Array, floors: Array) -> str:
     """Return a sentence on how far the projection moved the components of the start.
 
-    It is "" if no component moved by more than TARGET_TOLERANCE of its size, which is at least `floors` (n,).
+    It is "" if no component moved by more than `TARGET_TOLERANCE` of its size, which is at least `floors` (n,).
     """
     share = np.abs(after - before) / np.maximum(np.abs(before), floors)
     count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0

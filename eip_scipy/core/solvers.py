@@ -360,7 +360,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             setattr(solver, name, getattr(self, name))
 
     def _restart(self, here: Start) -> None:
-        """Start a new run at a state that was set; counts and the largest residuals are taken over from the old run."""
+        """Start a new run at `here`, a time and a state of which at least one was set by the user.
+
+        The counts, the largest residuals and the largest corrections are taken over from the old run.
+        """
         old = self._run
         self._start(*here[1:], check=False)
         new, counters = self._run, self._work.counters
@@ -372,7 +375,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         new.trust.failed = old.trust.failed
 
     def _go_on(self, here: Start) -> None:
-        """Continue from the last state with other tolerances, another interval or another function."""
+        """Continue from `here`, the last time and state, with other tolerances, or another interval or function."""
         run, spec = self._run, self._spec
         method, _ = spec.examined(here.y, here.f)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))

@@ -224,8 +224,9 @@ def _(method: GaussJackson, brief: bool) -> Form:
 
 @singledispatch
 def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> Any:
-    """Return the method after a check of the equations; a `GaussJackson` method gets the right `velocities`.
+    """Return the method after a check of the equations.
 
+    The attribute `velocities` of a `GaussJackson` method is set: it is True if the accelerations depend on velocities.
     If the equations must be of second order, `rhs` is evaluated once more, with other velocities.
 
     Parameters

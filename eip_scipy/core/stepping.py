@@ -67,6 +67,9 @@ class Stepping:
     ) -> float:
         """Return the length of the first step: `h`, at most the length of the interval, `first_step` or an estimate.
 
+        `f0` is the derivative at the start `y0`. The estimate uses the order of the error estimate of the method,
+        `tableau`.
+
         Raises
         ------
         ValueError
@@ -266,7 +269,7 @@ def _slack(h: float, t0: float, t_bound: float) -> float:
 
 
 def fixed_steps(h: float, t0: float, t_bound: float) -> int:
-    """Return the number of steps of length h from t0 to t_bound; UNBOUNDED for an infinite interval.
+    """Return the number of steps of length h from t0 to t_bound; `UNBOUNDED` for an infinite interval.
 
     It is the length of the interval divided by h, rounded if that is an integer up to round-off. Otherwise it is
     rounded up, so that the last step is shorter. An interval that is not empty has at least one step, for any h.

@@ -105,7 +105,8 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
 def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch | None, whose: str) -> Any:
     """Convert dates, durations or plain numbers to numbers in the unit of time.
 
-    Dates are counted from `epoch`. `whose` names the owner of the epoch in messages.
+    `known` are the units of length and time, see `in_unit`. Dates are counted from `epoch`. `whose` names the owner of
+    the epoch in messages.
 
     Raises
     ------

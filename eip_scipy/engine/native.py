@@ -107,7 +107,12 @@ class Rates(NamedTuple):
 
 
 class PythonFunctions(NamedTuple):
-    """The functions of a run in Python. If `second_order`, the state is (q, v) and `rhs` returns the accelerations."""
+    """The functions of a run in Python. If `second_order`, the state is (q, v) and `rhs` returns the accelerations.
+
+    `inv`, `grad` and `event` are the invariants, their gradients and the event functions. `jacobian` computes the
+    Jacobian of the accelerations times a vector. `native` is False here and True in `NativeFunctions`; the engine tells
+    the two classes apart by it.
+    """
 
     rhs: Call
     inv: tuple[Call, ...]

@@ -199,7 +199,7 @@ def _large_corrections(figures: np.ndarray) -> np.ndarray:
 
 
 def _extreme(figures: np.ndarray) -> np.ndarray:
-    """Return a mask of the rows with a single correction that is larger than in any correct run."""
+    """Return a mask of the rows with a single correction or error that is larger than in any correct run."""
     large = _may_leak(figures) & (figures[..., NU] > BEYOND_DOUBT)
     return large | (figures[..., RAW] > TOO_FAR * figures[..., FAR_FROM]) | (figures[..., SHARE] > 0)
 

@@ -173,7 +173,7 @@ def cores() -> int:
 
 
 def in_order(pool: Pool, chunks: Iterable[Chunk]) -> Iterator[tuple[Chunk, Part]]:
-    """Run chunks and yield each with its results, in order; at most AHEAD per worker are submitted at a time."""
+    """Run chunks and yield each with its results, in order; at most `AHEAD` per worker are submitted at a time."""
     waiting = iter(chunks)
     under_way: deque[tuple[Chunk, Any]] = deque()
     while True:

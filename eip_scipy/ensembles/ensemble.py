@@ -511,8 +511,9 @@ def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
 class _Gathered:
     """The finished members so far, from which the result is made.
 
-    `held` is the number of saved states that are kept in memory for each member. `doubts` holds, by member, the
-    findings of the checks at the start.
+    `everyone` has the inputs of all members, `chunk` is the number of members in a chunk, and `store` writes `out` or
+    `checkpoint`, if one is given. `held` is the number of saved states that are kept in memory for each member.
+    `doubts` holds, by member, the findings of the checks at the start.
     """
 
     def __init__(
@@ -534,7 +535,7 @@ class _Gathered:
         self._begin = time.perf_counter()
 
     def run(self, pool: Callable[[], Pool], progress: bool) -> EnsembleResult:
-        """Run all chunks that are not stored yet, and return the result."""
+        """Run all chunks that are not stored yet in the pool that ``pool()`` makes, and return the result."""
         from tqdm import tqdm
 
         done = self._stored()
@@ -695,7 +696,10 @@ def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
 
 
 def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
-    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change."""
+    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change.
+
+    `every` is the option `checkpoint_every`, in seconds.
+    """
     refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
@@ -771,8 +775,8 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
 def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str]]:
     """Return the plan, made from the first member with a valid start; raise the first error if none has one.
 
-    At most `TRIED` members, spread over all, are tried. Also return the findings of the checks at the start, by member:
-    they apply to all members with the same parameters.
+    At most `TRIED` of the members `everyone`, spread over all, are tried. Also return the findings of the checks at
+    the start, by member: they apply to all members with the same parameters.
     """
     first: Exception | None = None
     starts, params = everyone.y0s, everyone.params
@@ -800,9 +804,10 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
-    """Return the number of members in a chunk: at most about one second of work, and a multiple of LANES.
+    """Return the number of members in a chunk: at most about one second of work, and a multiple of `LANES`.
 
-    The number depends on the problem and on the number of members, and not on the number of workers.
+    `members` is the number of all members, and `fun` the right-hand side or a `Problem`. The returned number
+    depends on the problem and on the number of members, and not on the number of workers.
     """
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
     native = is_compiled(rhs) or isinstance(rhs, PointerFunction)

@@ -40,7 +40,10 @@ def happened(count: int, which: np.ndarray, t: np.ndarray, y: np.ndarray) -> Hap
 
 
 def flattened(members: Sequence[Happened], events: int, n: int, dtype: Any) -> Flat:
-    """Return the events of members as flat arrays."""
+    """Return the events of members as flat arrays.
+
+    `events` is the number of event functions, `n` the number of components of a state, and `dtype` that of the states.
+    """
     counts = np.zeros((len(members), events), np.int64)
     times: list[np.ndarray] = [np.zeros(0)]
     states: list[np.ndarray] = [np.zeros((0, n), dtype)]

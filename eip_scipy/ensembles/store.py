@@ -54,6 +54,8 @@ LEAST_RATIO = 19.0
 class _Store:
     """Base class of the two stores of an ensemble's finished chunks on disk.
 
+    A chunk consists of successive members that are run and stored together; all chunks but the last have one size.
+
     Attributes
     ----------
     path : str
@@ -82,7 +84,10 @@ class _Store:
             self._lock.close()
 
     def _require_same(self, there: dict[str, Any], here: dict[str, Any], missing: list[str]) -> None:
-        """Raise CheckpointError if the stored identity `there` differs from `here`, or arrays are `missing`."""
+        """Raise CheckpointError if the stored identity `there` differs from `here`, or names of arrays are `missing`.
+
+        `Plan.identity` returns an identity; the names are those of arrays that should be stored and are not.
+        """
         checkpoint.require_same(self.path, there.get("settings"), here["settings"])
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
@@ -98,13 +103,13 @@ class _Store:
 def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
     """Compare the values of f and of the invariants at the end of a member of the last finished chunk.
 
-    `there` are the stored values, `here` those of the present functions, `sizes` the sizes of their terms, and `first`
-    is the number of the first member of the chunk.
+    `there` are the stored values, `here` those of the present functions, and `sizes` the sizes relative to which they
+    are compared, see `Plan.known_by`. `first` is the number of the first member of the chunk.
 
     Raises
     ------
     CheckpointError
-        If a value differs by more than SAME of its size, which allows for rounding errors on another machine.
+        If a value differs by more than `SAME` times its size, which allows for rounding errors on another machine.
     """
     if there.size and not (there.shape == here.shape and bool(np.all(np.abs(there - here) <= SAME * sizes))):
         raise _other_functions(path, f"at the end of a member from number {first} on")
@@ -118,23 +123,26 @@ def _other_functions(path: str, where: str) -> CheckpointError:
 
 
 class ZarrStore(_Store):
-    """A group of arrays whose first axis is the member, with one Zarr chunk for each chunk of the ensemble.
+    """A Zarr group with the results of an ensemble, in arrays whose first axis is the member.
 
-    The status of the members of a chunk is written last: if it is present, the chunk is complete. (Zarr writes each
-    file under a temporary name and renames it.) A group in the local file system is locked. Before each write a check
-    makes sure that it is still the group that was opened.
+    The arrays have one Zarr chunk for each chunk of the ensemble. The status of the members of a chunk is written last:
+    if it is present, the chunk is complete. (Zarr writes each file under a temporary name and renames it.) A group in
+    the local file system is locked. Before each write a check makes sure that it is still the group that was opened.
 
     Parameters
     ----------
     path : path-like or str
         A folder, or the URL of a store.
     identity : dict
-        Identity of the ensemble, which must agree when it is resumed.
+        Identity of the ensemble, see `Plan.identity`, which must agree when it is resumed.
     resume : bool
+        Whether an existing group may be continued.
     empty : Members
         Buffers of one chunk, which define shapes and types.
     times : ndarray, shape (m,) or (members, m)
+        Times of the saved states, common to all members or one row for each; empty if no states are saved.
     members : int
+        Number of members of the ensemble.
     events : int
         Number of events whose times and states are stored.
 
@@ -175,7 +183,7 @@ class ZarrStore(_Store):
         self.states, self.saved_values = self._arrays.get("states"), self._arrays.get("invariants")
 
     def _open(self, zarr: Any, identity: dict[str, Any], times: np.ndarray, resume: bool) -> Any:
-        """Open the existing group or create one; return its identity."""
+        """Open the existing Zarr group or create one; return its stored identity."""
         mode: Any = "w-"
         if self._exists(zarr):
             if not resume:
@@ -210,7 +218,7 @@ class ZarrStore(_Store):
         return True
 
     def _existing(self, zarr: Any, identity: dict[str, Any], times: np.ndarray) -> dict[str, Any] | None:
-        """Open the existing group; return its identity, or None if its creation was interrupted."""
+        """Open the existing Zarr group; return its stored identity, or None if its creation was interrupted."""
         try:
             group = zarr.open_group(self._place, mode="r+", **FORMAT)
             found: dict[str, Any] | None = group.attrs[LABEL]
@@ -365,8 +373,9 @@ class CheckpointStore(_Store):
     ----------
     path : path-like
     identity : dict
-        Identity of the ensemble, which must agree when it is resumed.
+        Identity of the ensemble, see `Plan.identity`, which must agree when it is resumed.
     resume : bool
+        Whether an existing file may be continued.
     every : float
         Seconds from one writing to the next; longer if writing would take more than 5 % of the time.
 
@@ -459,7 +468,7 @@ Store = ZarrStore | CheckpointStore
 
 
 def _as_stored(value: Any) -> np.ndarray:
-    """Return a field of `Members` as an array with the axes of the group, or convert an array of the group back.
+    """Return a field of `Members` as an array with the axes of the Zarr group, or convert an array of the group back.
 
     The last two axes of an array of three dimensions are exchanged: time is the last axis in the group, and the second
     one in `Members`.
@@ -469,7 +478,10 @@ def _as_stored(value: Any) -> np.ndarray:
 
 
 def _name_of(times: np.ndarray) -> str:
-    """Return the name of the array of times: "time" if it is common to all members, "times" if members have rows."""
+    """Return the name of the array of the times of saved states in the Zarr group.
+
+    It is "time" if all members have the same times (m,), and "times" if each member has a row of `times` (members, m).
+    """
     return "time" if times.ndim == 1 else "times"
 
 

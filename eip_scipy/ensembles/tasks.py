@@ -96,13 +96,13 @@ class Members(NamedTuple):
     t : ndarray, shape (m,)
         Times of the last states.
     status : ndarray, shape (m,)
-        As in `integrate`: 0, 1, or FAILED; NOT_RUN for members that did not run.
+        As in `integrate`: 0, 1, or `FAILED`; `NOT_RUN` for members that did not run.
     message : list of str
         Reason for the end of each member.
     max_defect : ndarray, shape (m, l)
         Largest invariant errors.
     counters : ndarray, shape (m, N_COUNTERS)
-        Counters of the step.
+        The engine's counters, such as that of the evaluations of f (index `NFEV`).
     max_correction : ndarray, shape (m,)
         Largest correction in units of the local error.
     side_by_side : ndarray of bool, shape (m,)
@@ -145,7 +145,10 @@ class Members(NamedTuple):
 
     @classmethod
     def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
-        """Return the results of `m` members that did not run."""
+        """Return the results of `m` members that did not run.
+
+        A state has `n` components, `invariants` is the number of invariants, and `times` that of saved states.
+        """
         return cls(
             y=np.full((m, n), np.nan, dtype),
             t=np.full(m, np.nan),
@@ -258,8 +261,8 @@ class Plan:
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
         """Return the data, in a form for JSON, by which a resumed ensemble is recognised as this one.
 
-        They are the settings, with the members per chunk, `chunk`, and the first COMPARED numbers of f followed by the
-        invariants, at the start that `task` contains.
+        They are the settings, including the number of members per chunk, `chunk`; and the first `COMPARED` of these
+        numbers at the start that `task` contains: all components of f, followed by the values of the invariants.
         """
         settings = self._ready.identity(starts, params) | {"chunk": chunk}
         settings |= {name: plain(value) for name, value in own.identity.items()}
@@ -268,8 +271,8 @@ class Plan:
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
         """Return values of f and of the invariants at the end of the first member that did not fail, and their sizes.
 
-        There are at most COMPARED components of f, and all invariants. The size of a component is the largest one of f,
-        and that of an invariant is the size of its terms. A resumed ensemble compares its functions by these values.
+        There are at most `COMPARED` components of f, and all invariants. The size of a component is the largest one of
+        f, and that of an invariant is the size of its terms. A resumed ensemble compares its functions by these values.
         Both arrays are empty if all members failed, or a value cannot be evaluated or is not finite.
         """
         nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
@@ -351,7 +354,7 @@ def run_members(
     -------
     Members
         Results in the order of the initial states. A member that fails, also by an exception in the user's functions,
-        has the status FAILED and a message with the reason; it does not affect the others.
+        has the status `FAILED` and a message with the reason; it does not affect the others.
 
     Raises
     ------
@@ -391,7 +394,7 @@ def _alone(
     watch: _Watch,
     own: Mapping[str, Any] = NOTHING,
 ) -> None:
-    """Run member `k` as `integrate` does, and store its results in `out`."""
+    """Run member `k` as `integrate` does, and store its results in `out`; `own` is that of `Task.prepared`."""
     try:
         loop = plan.loop(y0, params, own)
     except Exception as error:
@@ -479,6 +482,8 @@ def _reason(error: BaseException) -> str:
 
 class Sweeper:
     """A compiled run with its buffers, which the engine uses for all members.
+
+    In the methods, `each` holds the inputs of the members and the buffers that the engine fills, and `out` the results.
 
     Attributes
     ----------
@@ -626,7 +631,7 @@ class Sweeper:
             self._judge(k, each, out, [])
 
     def _side_by_side(self, each: data.Members, out: Members, watch: _Watch) -> None:
-        """Run all members in batches of eight, except those that must run individually, whose status stays NOT_RUN."""
+        """Run members in batches of eight, except those that must run individually, whose status stays `NOT_RUN`."""
         m, where = len(each.t), each.where
         while where[0] < m:
             watch.update()
@@ -639,9 +644,9 @@ class Sweeper:
         self._arrived(done, each, out)
 
     def _adapt(self, seconds: float) -> None:
-        """Choose the number of steps of the next call, so that it takes about SWEEP_SECONDS.
+        """Choose the number of steps for the next call of the engine, so that it takes about `SWEEP_SECONDS`.
 
-        `seconds` is the time of the last call, which has made all of its steps.
+        `seconds` is the duration of the last call, which made all of its steps. The number is at most doubled.
         """
         self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / max(seconds, 1e-9))))
 

@@ -301,7 +301,7 @@ def stability_limit(order: int, corrected: bool) -> float:
     """Return the largest h omega for which the method is stable for q'' = -omega^2 q.
 
     `corrected` is that of `GaussJackson`. The method is called stable if no root of the characteristic polynomial has a
-    modulus above 1 + GROWTH, including the two roots of the solution.
+    modulus above 1 + `GROWTH`, including the two roots of the solution.
     """
     P = np.array([float(c) for c in position_weights(-1, order)])
     D = np.array([float(c) for c in correction_weights(order)]) if corrected else np.zeros(order + 1)

@@ -73,7 +73,7 @@ def _density(tree: NystromTree) -> int:
 
 
 def _fixed(values: np.ndarray) -> np.ndarray:
-    """Return numbers as integers in units of 2**-FIXED_BITS."""
+    """Return numbers as integers in units of ``2**-FIXED_BITS``."""
     integers = np.empty(values.shape, dtype=object)
     for place, value in np.ndenumerate(values):
         exact = Fraction(value)
@@ -292,7 +292,7 @@ def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 def _velocity_moments(order: int) -> list[Fraction]:
     """Return the values that a method of this order requires of sum_i b'_i c_i^k, k = 0, 1, ..., `order` - 1.
 
-    There are at most MOMENTS of them.
+    At most `MOMENTS` values are returned, those for the smallest k.
     """
     return [Fraction(1, k + 1) for k in range(min(order, MOMENTS))]
 
@@ -300,13 +300,16 @@ def _velocity_moments(order: int) -> list[Fraction]:
 def _position_moments(order: int) -> list[Fraction]:
     """Return the values that a method of this order requires of sum_i b_i c_i^k, k = 0, 1, ..., `order` - 2.
 
-    There are at most MOMENTS of them.
+    At most `MOMENTS` values are returned, those for the smallest k.
     """
     return [Fraction(1, (k + 1) * (k + 2)) for k in range(min(order - 1, MOMENTS))]
 
 
 def _low_parts_of_used(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
-    """Return the output of `_low_parts` for the weights that are not zero, and 0 for the others."""
+    """Return the output of `_low_parts` for those weights `b` that are not zero, and 0 for the others.
+
+    `c` are the nodes, and `moments` the values that are required of sum_i b_i c_i^k for k = 0, 1, ...
+    """
     used = np.array([x != 0 for x in b])
     low = np.zeros(len(b))
     low[used] = _low_parts(b[used], c[used], moments)

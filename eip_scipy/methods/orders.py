@@ -9,7 +9,10 @@ __all__ = ["AT_REST", "AtRest", "Ordered", "named_constant"]
 
 
 def named_constant(value: Any, names: Mapping[str, Any]) -> str | None:
-    """Return the name of an object in `names`, the globals of its module, for pickling by name; None if it has none."""
+    """Return the name under which `names`, the globals of a module, contain the object `value`, for pickling by name.
+
+    Return None if they do not contain it.
+    """
     return next((name for name, own in names.items() if own is value), None)
 
 

@@ -239,7 +239,7 @@ class Tableau(Ordered):
 
     @property
     def paired(self) -> bool:
-        """True if the estimate has two parts."""
+        """True if the error estimate has two parts, with the weights `e` and `e_low`."""
         return bool(np.any(self.e_low))
 
     def __repr__(self) -> str:

@@ -56,7 +56,10 @@ def stability_map(
 
 
 def draw_stability(axis: Axes, x: Any, y: Any, megno: Any, most: float) -> Any:
-    """Draw the cells of a stability map, and return them as the QuadMesh for a colour bar."""
+    """Draw the cells of a stability map, and return them as the QuadMesh for a colour bar.
+
+    The arguments after `axis` are those of `stability_map`.
+    """
     x, y, values = (np.asarray(item, dtype=float) for item in (x, y, megno))
     if values.shape != (y.size, x.size):
         raise ValueError(
@@ -75,6 +78,7 @@ def indicator_figure(t: Any, curves: Mapping[str, Any], *, ylabel: str, level: f
     ----------
     t : array_like, shape (m,)
     curves : mapping of str to array_like, shape (m,)
+        Values of each indicator at the times `t`, by the name of the indicator in the legend.
     ylabel : str
     level : float, optional
         Value to mark by a horizontal line.

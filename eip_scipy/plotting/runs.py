@@ -141,9 +141,9 @@ def _draw_lines(
 
 
 def _by_size(components: Mapping[str, Any]) -> list[list[str]]:
-    """Return the names in two groups if the sizes of components have a gap of a factor WIDE, else in one group.
+    """Return the names in two lists if the sizes of components have a gap of a factor `WIDE`, else in one list.
 
-    The size of a component is its largest magnitude; the largest gap separates the groups.
+    The size of a component is its largest magnitude; the largest gap separates the lists.
     """
     sizes = {name: np.max(np.abs(values), initial=0.0) for name, values in components.items()}
     ordered = sorted((size, name) for name, size in sizes.items() if 0 < size < np.inf)
@@ -163,7 +163,7 @@ def _counted(axis: Axes, there: int) -> None:
 
 
 def _above_zero(magnitudes: np.ndarray) -> np.ndarray:
-    """Return magnitudes for a log axis, with zeros replaced by the smallest positive magnitude."""
+    """Return magnitudes for a log axis, zeros replaced by the smallest positive one, or by `FLOOR` if all are 0."""
     positive = magnitudes[magnitudes > 0]
     return np.maximum(magnitudes, positive.min() if positive.size else FLOOR)
 

@@ -27,7 +27,11 @@ FIRST_ROWS, FIRST_BYTES = 1024, 2**24
 
 
 class Driver:
-    """One run: its functions, buffers and saved rows, and with `keeps_steps` the interpolants of its steps."""
+    """One run: its functions, buffers and saved rows, and with `keeps_steps` the interpolants of its steps.
+
+    A row is a saved time with its state. `events` collects the times and states of the events that the engine's loop
+    finds. `max_bytes` bounds the memory of the rows and that of the interpolants, see `most_bytes`.
+    """
 
     def __init__(
         self,
@@ -71,9 +75,10 @@ class Driver:
                 self._events.take(*interpolants.roots())
 
     def sweep(self, members: Members, steps: int) -> int:
-        """Run members of an ensemble, starting at members.where, for `steps` steps in total, on this run's buffers.
+        """Run members of an ensemble, starting at `members.where`, for `steps` steps in total, on this run's buffers.
 
-        Return OK if all have ended or if more calls are needed, else the code of the current member.
+        Return the code `OK` if all members have ended or if more calls of `sweep` are needed. Otherwise return the code
+        of what happened to the current member.
         """
         with self.own_errors():
             code = int(self.engine.sweep(members, steps, self.state, self.new, self.t))
@@ -81,7 +86,7 @@ class Driver:
         return code
 
     def sweep_octets(self, members: Members, steps: int) -> None:
-        """Run members in batches of eight until all have ended or `steps` steps are made.
+        """Run members in batches of eight until all have ended or `steps` steps of batches are made.
 
         Members whose status is not set afterwards must be run individually.
         """
@@ -300,7 +305,7 @@ def _first(size: int) -> int:
 
 
 def saved_rows(schedule: Schedule) -> int:
-    """Return the number of states that a run saves, including its start; 0 if it is not known in advance."""
+    """Return the number of states that a run saves: those at `t_eval`, or the start and later ones; 0 if unknown."""
     if schedule.t_eval.size:
         return schedule.t_eval.size
     if schedule.save_every == 0:

@@ -20,7 +20,7 @@ __all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
 def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[..., Any]]) -> tuple[Any, ...]:
     """Return `others`, one function for each of `events`, as a tuple that replaces `events`.
 
-    If `events` is a `ContinuedEvents`, the result is one too, with the same times.
+    If `events` is a `ContinuedEvents`, the result is one too, with the same times in `happened`.
     """
     return ContinuedEvents(others, events.happened) if isinstance(events, ContinuedEvents) else tuple(others)
 
@@ -111,7 +111,10 @@ class Events:
         self.last = t, y
 
     def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
-        """Fill `values` with the values of all events at (t, y)."""
+        """Fill `values` with the values of all events at (t, y).
+
+        `params` is not used, because the events have their own further arguments.
+        """
         for k in range(len(self.functions)):
             values[k] = self._value(k, t, y.copy())
 
@@ -119,6 +122,8 @@ class Events:
         """Replace the value of each event that happened at the start (t, y) of a continued run by a slightly later one.
 
         The value of such an event at the start is a rounding error, whose sign could make the event happen again.
+        `values` holds the values of all events. The later state is y plus a small part of `step` times the derivative
+        `f`.
         """
         part = step / 4096
         for k, times in enumerate(self._happened):

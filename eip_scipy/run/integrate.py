@@ -237,7 +237,10 @@ class Loop:
     """
 
     def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
-        """Prepare the run; `compiled` replaces the option `compiled` of the request, unless it is None."""
+        """Prepare the run; `keeper` writes its checkpoints, if there are any.
+
+        `compiled` replaces the option `compiled` of the request, unless it is None.
+        """
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
@@ -523,7 +526,11 @@ def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
-    """Return True if a jitted right-hand side is called from Python only because invariants are not jitted."""
+    """Return True if a jitted right-hand side is called from Python only because invariants are not compiled.
+
+    `fun` is the right-hand side as the user gave it, `functions` are those that the loop of steps calls, and `run` is
+    the `Run` with the invariants.
+    """
     if not (isinstance(functions, PythonFunctions) and is_jitted(fun)):
         return False
     kept = [found for item in run.invariants.items for found in (item.function, item.gradient)]

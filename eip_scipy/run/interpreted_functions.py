@@ -25,7 +25,11 @@ FORMS = {  # (given as an acceleration, in place) -> name of the form of the use
 
 
 def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun") -> Callable[..., None]:
-    """Return an in-place right-hand side that calls a function of the user and checks its value."""
+    """Return an in-place right-hand side that calls the user's function `fun` and checks its value.
+
+    `extra` are the arguments of `fun` after t and y, `y0` has the shape and dtype of a value, and `name` is the name of
+    `fun` in messages.
+    """
     n, dtype, shape = y0.size, y0.dtype, y0.shape
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
@@ -39,7 +43,9 @@ def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, na
 def _interpreted_in_place(
     fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun"
 ) -> Callable[..., None]:
-    """Return an in-place right-hand side that checks the user's in-place function in its first call.
+    """Return an in-place right-hand side that checks the user's in-place function `fun` in its first call.
+
+    `extra` are the arguments of `fun` after t, y and out, and `name` is the name of `fun` in messages.
 
     `out` is filled with NaN before each call: the first call raises an error if the function leaves components
     unfilled, and later ones leave NaN there. Functions of the package's problems are not checked.
@@ -63,7 +69,8 @@ def _second_order(
 ) -> Callable[..., None]:
     """Return the in-place right-hand side of y = (q, v) for the acceleration `fun`.
 
-    `interpreted` is the function of this module that makes `fun` in-place and checks its values.
+    `interpreted` is the function of this module that makes `fun` in-place and checks its values, and `extra` are the
+    last arguments of `fun`.
     """
     check_halves(y0.size)
     half = y0.size // 2

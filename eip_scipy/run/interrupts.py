@@ -94,7 +94,10 @@ def look_for_signals() -> None:
 
 
 def _is_ours(number: int, usual: object) -> bool:
-    """Return True if a signal may be handled here: in the main thread, and without a user-defined handler."""
+    """Return True if signal `number` may be handled here: in the main thread, and without a user-defined handler.
+
+    `usual` is the handler that the signal has if the user has not defined one.
+    """
     return threading.current_thread() is threading.main_thread() and _signal.getsignal(number) == usual
 
 

@@ -22,7 +22,7 @@ def check_bytes(max_bytes: Any) -> None:
 def most_bytes(needed: float, max_bytes: float | None) -> float:
     """Return the bound in bytes on the memory of a run that needs `needed` bytes.
 
-    It is `max_bytes` if this is given, else SMALL for a run that needs no more, else half of the free memory.
+    It is `max_bytes` if this is given, else `SMALL` for a run that needs no more, else half of the free memory.
     """
     if max_bytes is not None:
         return max_bytes

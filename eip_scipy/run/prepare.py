@@ -133,7 +133,8 @@ class Request(NamedTuple):
 class System:
     """The user's functions of a run: `fun` as given, and `rhs`, the interpreted form that the loop calls.
 
-    `acc` is the acceleration of a problem that has one, if the method needs nothing else.
+    `form` is the form of `fun`, a name in `FORMS`. `acc` is the acceleration of a problem that has one, if the method
+    needs nothing else.
     """
 
     def __init__(self, request: Request, form: str, acc: Any) -> None:
@@ -324,7 +325,7 @@ class Prepared:
 
     @property
     def epoch(self) -> tuple[float, float] | None:
-        """Epoch of the problem."""
+        """Epoch of the problem, a Julian date (TDB) in two parts, or None if it has none."""
         return self.asked.fun.epoch if isinstance(self.asked.fun, Problem) else None
 
     @property
@@ -392,7 +393,10 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
 
 
 def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
-    """Return the specification of the run; `given` is the function or the problem as given."""
+    """Return the specification of the run.
+
+    `given` is the function or the problem as given, and `calls` the right-hand side, which counts its calls.
+    """
     problem = given if isinstance(given, Problem) else None
     return RunSpec(
         name=request.method.__name__,
@@ -412,7 +416,10 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
 
 
 def _variations(given: Any, request: Request, form: str) -> Variations | None:
-    """Return the `Variations` for the option `variations` of the request, or None if it was not given."""
+    """Return the `Variations` for the option `variations` of the request, or None if it was not given.
+
+    `given` is the function or the problem as given, and `form` the form of `request.fun`, a name in `FORMS`.
+    """
     if request.variations is None:
         if request.jvp is not None or request.symplectic is not None:
             raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
@@ -533,7 +540,7 @@ def _given_or_brought(request: Request) -> tuple[Any, Any]:
 
 
 def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
-    """Return the function that the engine calls, and the name of its form in FORMS."""
+    """Return the function that the engine calls, and the name of its form in `FORMS`."""
     acceleration = isinstance(fun, AccelerationField)
     if acceleration:
         fun, in_place = fun.acceleration, fun.in_place
@@ -546,7 +553,7 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
 def _with_problem(request: Request) -> tuple[Request, str]:
     """Return the request, completed by the attributes of its `Problem` if it has one, and the form of its function.
 
-    The form is a name in FORMS.
+    The form is a name in `FORMS`.
     """
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params

@@ -150,9 +150,10 @@ def _telling(options: Mapping[str, Any]) -> str:
 
 
 def _one_each(trials: tuple[Trial, ...], chosen: Trial) -> list[Trial]:
-    """Return one trial for each set of options without h, rtol and atol.
+    """Return one trial of each group of trials that differ only in the values of `h`, or of `rtol` and `atol`.
 
-    It is `chosen` if this trial belongs to the set, else the last good trial, or the last trial if none is good.
+    It is `chosen` if this trial belongs to the group, else the last trial whose `Trial.good` is True, or the last trial
+    if there is none.
     """
     ways: dict[str, Trial] = {}
     for trial in trials:

@@ -175,8 +175,9 @@ class _Snapshot(NamedTuple):
 
 
 class _FileKeeper(Keeper):
-    """Checkpoints in a file, written every `every` seconds; `found` is the content of an existing file.
+    """Checkpoints in the file `name`, written every `every` seconds; `found` is the content of an existing file.
 
+    `origin` is a note for the message of the result if a run that should be resumed has no file, otherwise "".
     The file always contains the last snapshot, never the current buffers, because an interruption may come inside a
     step. Saved rows and events only grow, so a snapshot needs only their number.
     """

@@ -82,7 +82,11 @@ class Look:
 
 
 class Search:
-    """Search for the cheapest method for one problem; `trials` holds all trials in the order in which they were run."""
+    """Search for the cheapest method for one problem; `trials` holds all trials in the order in which they were run.
+
+    `common` are the options that all trials have in common, and `wanted` is the largest error allowed. `max_nfev` and
+    `output` are the arguments `max_nfev` and `t_eval` of `recommend`.
+    """
 
     def __init__(
         self, problem: Problem, common: Mapping[str, Any], wanted: float, max_nfev: int | None, output: Any = None
@@ -311,9 +315,9 @@ class Search:
             self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
 
     def _say_that_it_is_stiff(self, chosen: Trial) -> bool:
-        """Return True if an implicit method needs at most 1 / STIFF of the evaluations of `chosen`, and add a remark.
+        """Return True if an implicit method needs at most 1 / `STIFF` of the evaluations of `chosen`, and add a remark.
 
-        Runs with fewer than LEAST_BOUND evaluations and complex states are not tested, and the result is False.
+        Runs with fewer than `LEAST_BOUND` evaluations and complex states are not tested, and the result is False.
         """
         bench, share = self.bench, self.bench.share
         if chosen.nfev * share < LEAST_BOUND or np.iscomplexobj(bench.truth):
@@ -371,7 +375,7 @@ class Search:
 
 
 def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:
-    """Return the `velocities` of `Look`, and whether the functions are native.
+    """Return the `velocities` of `Look`, and whether all functions are called natively, not from Python.
 
     The start is checked as for a run with the invariants: a wrong gradient raises an error, and a quantity that the
     system does not conserve causes a warning.

@@ -215,7 +215,11 @@ def solve_ivp(
 def _solve(
     method: type[EIPSolver], function: Any, t_span: Any, y0: Any, common: dict[str, Any], options: dict[str, Any]
 ) -> OdeResult:
-    """Return the result of a run with an EIP method; `common` has the options of SciPy's solve_ivp itself."""
+    """Return the result of a run with an EIP method.
+
+    `function` is the right-hand side, `common` has the options of SciPy's solve_ivp itself, and `options` those of the
+    method, ``variations`` and ``jvp``.
+    """
     common["args"], extra = _unpacked(common["args"])
     variations, jvp = options.pop("variations", None), options.pop("jvp", None)
     if "invariants" in options and extra:
@@ -254,7 +258,7 @@ def _variations(
 ) -> Variations:
     """Return the `Variations` for the option `variations` (`asked`): functions of the state followed by its columns.
 
-    The invariants `items` have their arguments bound.
+    `extra` are the further arguments of `fun` and `jvp`, from ``args``. The invariants `items` have theirs bound.
     """
     require_tableau(method)
     start, t0 = initial_state(y0), interval(t_span)[0]
@@ -280,7 +284,10 @@ def _split(sol: Any, wide: Variations) -> None:
 
 
 def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
-    """Return `fun`, or the right-hand side that belongs to `acceleration`."""
+    """Return `fun`, or the right-hand side that belongs to `acceleration`.
+
+    Raise a TypeError if both are given, or if one of the arguments that a run needs is missing.
+    """
     name, given = ("fun", fun) if acceleration is None else ("acceleration", acceleration)
     if acceleration is not None and fun is not None:
         raise TypeError("solve_ivp: give fun or acceleration, not both.")
@@ -295,7 +302,10 @@ def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
 
 
 def _with_projection(method: Any, given: list[str]) -> Any:
-    """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself."""
+    """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself.
+
+    `given` has the names of these options.
+    """
     known = class_named(method)
     if isinstance(method, str) and known is not None and method.upper() == known.upper():
         raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {known}`.")

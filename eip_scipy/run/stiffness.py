@@ -52,7 +52,7 @@ def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> Implici
     -------
     ImplicitRun or None
         The first run with the wanted error. None if no run has it, a run fails or needs more than `most` evaluations,
-        or the state has more than LARGEST components.
+        or the state has more than `LARGEST` components.
     """
     y0, times = bench.problem.y0, bench.times
     if y0.size > LARGEST:

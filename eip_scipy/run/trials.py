@@ -130,6 +130,7 @@ class Bench:
     def _with_equal_steps(self, asked: dict[str, Any]) -> Outcome:
         """Run with equal steps, and return the outcome with the states at the times of the bench.
 
+        `asked` contains all options of the run, those in `common` included.
         A one-step method continues its run from each of these times to the next. A multistep method makes a single run
         with ``t_eval``, because each of its starts costs about 200 evaluations.
         """

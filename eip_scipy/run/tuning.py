@@ -28,7 +28,7 @@ AWAY = 0.1
 
 @dataclass(frozen=True)
 class Kind:
-    """A method with options, tuned by one number: its step `h` or its tolerance `rtol`.
+    """A method with options, tuned by one number: its step `h` if `fixed` is True, otherwise its tolerance `rtol`.
 
     `atol` is proportional to `rtol` and to `size`, the magnitude of the state. `coarsest` is the largest step or
     tolerance that is tried, and `options` are further options of `integrate`.
@@ -72,7 +72,10 @@ class Kind:
         }
 
     def near(self, value: float) -> float:
-        """Return a step or tolerance, limited to its bounds and rounded to three digits (step) or two (tolerance)."""
+        """Return `value`, rounded to three digits if it is a step, or to two if it is a tolerance.
+
+        The value is first limited to at most `coarsest`, and a tolerance also to at least `FINEST_RTOL`.
+        """
         value = min(value, self.coarsest)
         return _short(value, 3) if self.fixed else _short(max(value, FINEST_RTOL), 2)
 
@@ -86,9 +89,9 @@ def tune(
 ) -> list[Trial]:
     """Run trials of a kind, the first with the step or tolerance `value`, and return them in order.
 
-    ``run(options)`` makes a trial with options of `integrate`. The search ends if the error of a trial is WINDOW to
-    1 times `wanted`. It ends early if the first trials fail, if no other value is left to try, or if the kind would
-    need many more evaluations of the right-hand side than `bound`.
+    ``run(options)`` makes a trial with options of `integrate`. The search ends if the error of a trial is between
+    ``WINDOW * wanted`` and `wanted`, or after `MOST_TRIALS` trials. It ends early if the first trials fail, if no other
+    value is left to try, or if the kind would need many more evaluations of the right-hand side than `bound`.
     """
     tried: dict[float, Trial] = {}
     fine: tuple[float, float] | None = None  # logarithms of number and error of an accurate enough trial

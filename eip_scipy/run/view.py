@@ -112,7 +112,10 @@ def _numbers(values: Any, digits: int = 5) -> list[float | None]:
 
 
 def _state(y: np.ndarray, labels: tuple[str, ...], bodies: dict[str, tuple[int, int]], frames: np.ndarray) -> Any:
-    """Return the data of the animation: bodies in the plane, two components, curves in time, or a profile."""
+    """Return the data of the animation: bodies in the plane, two components, curves in time, or a profile.
+
+    `labels` are the names of the components, `bodies` the result of `planes`, and `frames` that of `_frames`.
+    """
     real = np.abs(y) if np.iscomplexobj(y) else y
     if not bodies and len(y) == 2 and not np.iscomplexobj(y):
         bodies = {f"{labels[1]} over {labels[0]}": (0, 1)}
@@ -146,14 +149,15 @@ def _errors(result: Any, y: np.ndarray, labels: Any, bodies: Any, reference: Any
 
 
 def _largest(row: np.ndarray, frames: np.ndarray) -> list[float | None]:
-    """Return the largest value since the previous frame, for each frame, so that no peak is lost."""
+    """Return, for each frame, the largest value in `row` since the previous frame, so that no peak is lost."""
     return _numbers([row[0], *np.fmax.reduceat(row[1:], frames[:-1])], 3)
 
 
 def _distances(difference: np.ndarray, labels: tuple[str, ...], bodies: dict[str, Any]) -> dict[str, np.ndarray]:
     """Return the position error (m,) of each body by name, from the differences (n, m) of states at the saved times.
 
-    The error includes z if the body has such a component. Without bodies it is the largest component of the difference.
+    `labels` are the names of the components, and `bodies` is the result of `planes`. The error includes z if the body
+    has such a component. Without bodies it is the largest component of the difference.
     """
     if not bodies:
         return {"largest component": np.abs(difference).max(axis=0)}
@@ -166,7 +170,10 @@ def _distances(difference: np.ndarray, labels: tuple[str, ...], bodies: dict[str
 
 
 def _reference(result: Any, given: Any) -> np.ndarray | None:
-    """Return the reference states at the saved times, (n, m), NaN where they are unknown; None without a reference."""
+    """Return the reference states at the saved times, (n, m), NaN where they are unknown; None without a reference.
+
+    `given` is the argument `reference` of `view`.
+    """
     t, shape = np.asarray(result.t), np.shape(result.y)
     if given is None:
         given = _own_reference(result)

@@ -109,7 +109,10 @@ class Examined(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Study[Examined]):
-    """Command ``eip-scipy doctor``."""
+    """Command ``eip-scipy doctor``.
+
+    `trials` has for each trial its name, the largest acceptable error, and the function that returns the error.
+    """
 
     trials: tuple[tuple[str, float, Callable[[], float]], ...] = CHECKS
     writes_files = False

@@ -80,7 +80,11 @@ class CaseEquations(NamedTuple):
 
 
 class _Function:
-    """One of the functions of a `CaseEquations`, which is pickled as the names and parameters that make it."""
+    """One of the functions of a `CaseEquations`, which is pickled as the arguments from which it is made.
+
+    `equations` is a key of `EQUATIONS`, `params` are the keywords of the function found there, and `which` is the name
+    of a field of the `CaseEquations` that it returns.
+    """
 
     def __init__(self, equations: str, params: dict[str, Any], which: str) -> None:
         self._made = equations, params, which
@@ -521,7 +525,10 @@ def schwarzschild() -> CaseEquations:
 
 
 def rigid_body(i1: float, i2: float, i3: float) -> CaseEquations:
-    """Return Euler's top, y = the angular momentum; invariants: Casimir function, energy."""
+    """Return Euler's top with the moments of inertia i1, i2, i3, y = the angular momentum.
+
+    Invariants: Casimir function, energy.
+    """
 
     def fun(t, y):
         a, b, c = y
@@ -539,7 +546,10 @@ def rigid_body(i1: float, i2: float, i3: float) -> CaseEquations:
 
 
 def euler_detest(k2: float) -> CaseEquations:
-    """Return problem B5 of DETEST, whose solutions are Jacobi's elliptic functions; two quadratic invariants."""
+    """Return problem B5 of DETEST, whose solutions are Jacobi's elliptic functions; two quadratic invariants.
+
+    `k2` is the square of the modulus of the elliptic functions.
+    """
 
     def fun(t, y):
         a, b, c = y
@@ -637,7 +647,11 @@ def volterra_lattice() -> CaseEquations:
 
 
 def zabusky_kruskal(c1: float, c2: float) -> CaseEquations:
-    """Return Korteweg and de Vries's equation in Zabusky and Kruskal's scheme; invariants: sum of u, sum of u^2."""
+    """Return Korteweg and de Vries's equation in Zabusky and Kruskal's scheme; invariants: sum of u, sum of u^2.
+
+    For u_t + u u_x + delta^2 u_xxx = 0 on points with the distance d, `c1` is 1 / (6 d), and `c2` is
+    delta^2 / (2 d^3).
+    """
 
     def fun(t, y):
         a, b = np.roll(y, -1), np.roll(y, 1)

@@ -34,7 +34,7 @@ class Listing(Study[Found]):
     writes_files = False
 
     def measure(self, session: Session) -> Found:
-        """Return, for each kind of entry, the names with a line of description, most of them from docstrings."""
+        """Return, for each heading such as "methods", names with a line of description, mostly from docstrings."""
         sets = {name: solar_data.load(name) for name in solar_data.available()}
         others = {name: getattr(comparators, name) for name in comparators.__all__}
         functions = {name: make for name in problems.__all__ if _is_function(make := getattr(problems, name))}

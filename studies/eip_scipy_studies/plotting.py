@@ -249,6 +249,7 @@ class KeplerRun(NamedTuple):
     ----------
     t : array_like, shape (m,)
     energy_error, momentum_error, position_error : array_like, shape (m,)
+        Absolute errors.
     orbit : array_like, shape (2, k)
         Positions to draw.
     """
@@ -296,6 +297,7 @@ class Curves(NamedTuple):
     x, y : str
         Labels of the axes.
     paths : mapping of str to array_like, shape (2, k)
+        The x and y of the points of each curve; the keys are not drawn.
     """
 
     x: str
@@ -311,11 +313,11 @@ class ParticleRow(NamedTuple):
     orbits : mapping of str to Curves
         Curves by the panels' titles.
     invariants : mapping of str to (array_like, array_like)
-        Times and relative errors.
+        Times and relative errors of each invariant, by label in the legend.
     trajectory : str
         Label of the trajectory's errors, with unit.
     errors : mapping of str to (array_like, array_like)
-        Times and errors of the trajectory.
+        Times and errors of each trajectory, by label in the legend.
     """
 
     orbits: Mapping[str, Curves]
@@ -619,7 +621,10 @@ def _draw_linkages(figure: Figure, above: Any, drawings: Mapping[str, Linkage], 
 
 
 def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> None:
-    """Draw a dotted line of the given slope a little below a method's curve, labelled with the slope."""
+    """Draw a dotted line of the given slope a little below a method's curve, labelled with the slope.
+
+    `h` and `error` are the costs and the errors of the points of the curve.
+    """
     ends = np.array([h.min(), h.max()])
     line = 0.25 * error[np.argmax(h)] * (ends / ends[1]) ** slope
     axis.plot(ends, line, color="0.4", lw=1.0, ls=":")
@@ -776,7 +781,10 @@ def surfaces_figure(
 
 
 def _shaded(corners: np.ndarray, part: np.ndarray, view: tuple[float, float]) -> np.ndarray:
-    """Return colours (m, 4) of triangles in a light that comes from the viewer's side."""
+    """Return colours (m, 4) of triangles in a light that comes from the viewer's side.
+
+    `corners` and `part` are those of a `SurfacePanel`, and `view` is that of `surfaces_figure`.
+    """
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal /= np.where(length > 0, length, 1.0)

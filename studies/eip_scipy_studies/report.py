@@ -133,9 +133,9 @@ def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict
     ----------
     command : str
     arguments : mapping
-        The options of the run.
+        The options of the command, by name.
     **content
-        The numbers.
+        The command's numbers, by the names that they have in the file.
 
     Returns
     -------

@@ -157,7 +157,7 @@ class Session:
     out : Path
         Folder of figures and CSV files.
     json : Path or None
-        File of the numbers.
+        File to which the result of `Study.numbers` is written; None if there is none.
     quiet : bool
         Print nothing but errors.
     absent : list of str
@@ -185,13 +185,17 @@ class Session:
         return not self.quiet and sys.stderr is not None and sys.stderr.isatty()
 
     def bar(self, total: int | None, what: str, unit: str = "run", **settings: Any) -> Any:
-        """Make a progress bar of tqdm, to be used in a ``with``."""
+        """Make a progress bar of tqdm with the label `what`, to be used in a ``with``.
+
+        `total` and `unit` are the number and the name of the items that the bar counts; `settings` are other arguments
+        of tqdm.
+        """
         from tqdm import tqdm
 
         return tqdm(total=total, desc=what, unit=unit, disable=not self.shown, **{"leave": False, **settings})
 
     def peer(self, name: str, methods: str) -> Any:
-        """Import the adapter to another package, an integration or one of `PEERS`.
+        """Import the adapter to another package: its module in `PEERS`, or else the integration with this name.
 
         If the package is missing, return None, and print a line about it at the end of the command.
 
@@ -225,7 +229,7 @@ class Session:
         self.written.add(path)
 
     def name_files(self) -> None:
-        """Print the names of the files written since the last call, with an empty line before the first name of all."""
+        """Print the names of the files that have not been named yet, with an empty line before the first of all."""
         first = len(self.unnamed) == len(self.written)
         for k, path in enumerate(self.unnamed):
             self.say(f"\nwrote {path}" if first and k == 0 else f"wrote {path}")
@@ -244,7 +248,7 @@ class Command(ABC):
         """Run the command, and return the exit status."""
 
     def arguments(self) -> dict[str, Any]:
-        """Return the user's settings, for the JSON."""
+        """Return the user's settings, for the JSON file."""
         return {item.name: getattr(self, item.name) for item in fields(self) if "help" in item.metadata}
 
 
@@ -259,14 +263,17 @@ class Study(Command, Generic[Found]):
 
     @abstractmethod
     def measure(self, session: Session) -> Found:
-        """Compute and return the results; after an interrupt by the user, perhaps raise `PartlyDone` with a part."""
+        """Compute and return the results.
+
+        After an interrupt by the user, `PartlyDone` may be raised with the results so far.
+        """
 
     @abstractmethod
     def text(self, found: Found) -> str:
         """Return the text to be printed."""
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """Return the content of the JSON."""
+        """Return the results for the JSON file."""
         return {}
 
     def tables(self, found: Found) -> Mapping[str, Rows]:
@@ -278,11 +285,17 @@ class Study(Command, Generic[Found]):
         return ()
 
     def figures(self, found: Found) -> Figures:
-        """Yield pairs (file name, figure). If an ImportError shows that matplotlib is missing, it is printed."""
+        """Yield pairs of a file name and a figure, or a function that writes the file.
+
+        If matplotlib is missing, the ImportError is printed as a warning.
+        """
         return ()
 
     def refine(self, found: Found, session: Session) -> bool:
-        """Measure a long second part after the files are written; return True if these must be written again."""
+        """Add measurements that take long to `found`, after the first results are printed and their files are written.
+
+        Return True if the CSV and JSON files must be written again.
+        """
         return False
 
     def when_interrupted(self) -> str:
@@ -303,7 +316,7 @@ class Study(Command, Generic[Found]):
 
 
 class Measurement(Study[Found]):
-    """Base class of studies of times.
+    """Base class of studies that measure run times.
 
     The result of `measure` is the content of the JSON file. The text is the description of the machine and `table`.
     """
@@ -312,7 +325,7 @@ class Measurement(Study[Found]):
 
     @abstractmethod
     def table(self, found: Found) -> str:
-        """Lay out the measurements."""
+        """Return the measurements as a table of text."""
 
     def text(self, found: Found) -> str:
         return f"{describe_machine()}\n\n{self.table(found)}"

@@ -15,7 +15,7 @@ FEWEST = 3
 
 
 def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> Action:
-    """Make a function that calls `call` once and returns the seconds, on this clock, that the call took."""
+    """Make a function that calls `call` once and returns its duration in seconds, a difference of two ``clock()``."""
 
     def run() -> float:
         begin = clock()
@@ -28,8 +28,8 @@ def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_coun
 def many_calls(call: Callable[[], Any]) -> Action:
     """Make a function that returns the processor time of one call in seconds, as the mean of many calls.
 
-    The time of reading the clock is negligible in it. `call` is called before, to compile and to choose the
-    number of calls.
+    There are enough calls that the time of reading the clock is negligible. `call` is also called twice when the
+    function is made, to compile `call` and to choose the number of calls.
     """
     call()
     calls = max(1, int(2e-3 / max(clocked(call)(), 1e-6)))

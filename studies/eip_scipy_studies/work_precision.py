@@ -78,9 +78,9 @@ def work_precision(
     repeats : int, optional
         Number of runs of each point, of which the least time counts: disturbances make a timing longer, never shorter.
     enough_seconds : float, optional
-        A point (method and step) whose run took longer is not run again.
+        A point (method and step) whose fastest run took more than this number of seconds is not run again.
     in_all : float, optional
-        A point whose runs took this number of seconds together is not run again.
+        A point whose runs together took more than this number of seconds is not run again.
     callback : callable, optional
         ``callback()`` after each of the ``repeats`` runs of each point, including those that are left out.
 
@@ -148,6 +148,7 @@ def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -
     Returns
     -------
     dict of str to Curve
+        For each method two lists, the costs and the errors of its runs.
     """
     found: dict[str, Curve] = {}
     for run in runs:
@@ -160,7 +161,8 @@ def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -
 def costs_at(curve: Curve, levels: Iterable[float], factor: float = 1.0) -> list[str]:
     """Return cells of a table: `factor` times the cost of reaching each of the errors `levels`.
 
-    A cell has "<" before the cost if the cheapest run is more accurate, and is "-" if no run is as accurate.
+    `curve` holds the costs and the errors of a method's runs, see `curves`. A cell has "<" before the cost if the error
+    of the cheapest run is at most the level, and is "-" if no run has so small an error.
     """
     return [("<" if curve[1][0] <= level else "") + compact(factor * cost_to_reach(*curve, level)) for level in levels]
 

@@ -330,7 +330,7 @@ def test_a_run_goes_on_and_is_stored(method, tmp_path):
     ("options", "message"),
     [
         ({"h": 0.1}, "h=0.1: the steps of EIP.* are those of SciPy's .*Omit h, and give rtol and atol"),
-        ({"compensated": True}, "compensated=True needs .* omit compensated"),
+        ({"compensated": True}, "compensated=True is available .* omit compensated"),
         ({"rtol": [1e-3, 1e-4, 1e-3, 1e-3]}, "takes one number. Give atol by component"),
         ({"jac": np.eye(3)}, "`jac` is expected to have shape"),
         ({"invariants": Balance(RADIUS.fun, rate=lambda t, y: 0.0)}, "does not carry a Balance"),

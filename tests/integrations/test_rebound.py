@@ -323,7 +323,7 @@ def test_epsilon_and_criterion_change_the_steps():
 @pytest.mark.parametrize(
     ("integrator", "options", "message"),
     [
-        ("whfast", {"epsilon": 1e-6}, "epsilon: for 'ias15' only, got 'whfast'"),
+        ("whfast", {"epsilon": 1e-6}, "epsilon can be given only with integrator='ias15', got 'whfast'"),
         ("ias15", {"epsilon": 0.0}, "epsilon must be positive and finite, got 0.0"),
         ("ias15", {"criterion": "aarseth"}, "unknown criterion 'aarseth': expected one of 'global', 'prs23'"),
     ],

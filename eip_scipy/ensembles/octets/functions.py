@@ -9,7 +9,7 @@ __all__ = ["compiled_for_octets"]
 
 
 def compiled_for_octets(one: Compiled) -> Compiled:
-    """Return a function of one member compiled for eight members, with its address.
+    """Compile the function of `one` again, for eight members instead of one, and return it with its address.
 
     Raises
     ------

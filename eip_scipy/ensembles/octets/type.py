@@ -67,7 +67,10 @@ def _cast_number(context, builder, from_type, to_type, value):  # emits LLVM
 
 
 def _define(function: Any, arguments: int, emit: Callable[..., Any]) -> None:  # emits LLVM
-    """Define the types and the LLVM code of a function of vectors, any argument of which may be a plain number."""
+    """Define the types and the LLVM code of a function of vectors, any argument of which may be a plain number.
+
+    `arguments` is the number of its arguments, and ``emit(builder, *vectors)`` writes its code.
+    """
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -119,7 +122,10 @@ _define(min, 2, _smaller)
 
 
 def _define_by_lanes(function: Any, arguments: int) -> None:  # emits LLVM
-    """Define a function without a vector instruction: it is called as a function of floats for each lane."""
+    """Define a function without a vector instruction: it is called as a function of floats for each lane.
+
+    `arguments` is the number of its arguments.
+    """
 
     @infer_global(function)
     class _Template(AbstractTemplate):

@@ -108,7 +108,8 @@ def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
 def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | None) -> tuple[Any, Any, Any]:
     """Return G m, positions and velocities as plain numbers in the problem's units; masses become G m.
 
-    If none of the arguments has a unit, they are returned unchanged.
+    `known` are the problem's units of length and time, or None if they are not known. If none of `gm`, `position` and
+    `velocity` has a unit, all three are returned unchanged.
 
     Raises
     ------
@@ -137,7 +138,7 @@ def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | N
 
 
 def _gravitational(gm: Any, known: tuple[Unit, Unit]) -> Any:
-    """Return G m as plain numbers, from values of G m or masses with units."""
+    """Return G m as plain numbers in the units `known` of length and time, from values of G m or masses with units."""
     if isinstance(gm, tuple | list) or type(gm) is np.ndarray:
         return np.array([_gravitational(value, known) for value in gm])
     if not _is_mass(gm):  # a plain 0 among others is a test particle

@@ -222,8 +222,8 @@ def _balance(
 ) -> Balance:
     """Return the balance of one quantity for all orbits.
 
-    Its functions are those of the `group` ("orbits" or "planets") of the library, with the parameters `entries`. `end`
-    is the end of the name of the rate's function.
+    Its functions are those of the `group` ("orbits" or "planets") of the library, with the parameters `entries`. The
+    function of the rate is called "group.quantity" followed by `end`. `names` are those of all bodies.
     """
     fun, grad, rate = (library[f"{group}.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
     each = 1 if quantity == "energy" else 3

@@ -68,7 +68,8 @@ def lowest_ring(
     seed : int, optional
         Seed of the noise that breaks the symmetry of the best state before the last search.
     report : callable, optional
-        ``report(count, winding, energy)``, called for each pair of numbers that is tried.
+        ``report(count, winding, energy)``, called for each pair of a number of vortices and a winding number that is
+        tried.
 
     Returns
     -------

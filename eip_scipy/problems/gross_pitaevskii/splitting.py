@@ -28,6 +28,7 @@ class Scheme(NamedTuple):
     linear : tuple of float, length s
         Fractions of the step for the flows of -Laplace / 2 - Omega Lz, each between two local flows.
     reference : str
+        Citation of the scheme.
     """
 
     name: str

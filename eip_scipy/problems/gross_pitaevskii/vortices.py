@@ -117,7 +117,10 @@ def _least_of_corners(a: np.ndarray) -> np.ndarray:
 
 
 def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: float) -> tuple[float, float]:
-    """Return x and y of the zero of the linear function that fits the field best at the four corners of a cell."""
+    """Return x and y of the zero of the linear function that fits the field best at the four corners of a cell.
+
+    `corners` (2, 2) holds the field there. The arguments `x` and `y` are the smallest coordinates in the cell.
+    """
     u = np.array([[-0.5], [0.5]])
     middle = x + 0.5 * dx, y + 0.5 * dy
     c = corners * np.exp(-1j * Omega * (middle[0] * dy * u.T - middle[1] * dx * u))

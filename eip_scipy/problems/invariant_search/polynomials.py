@@ -49,8 +49,8 @@ def functions(
 ) -> Functions:
     """Return value and gradient of a polynomial of n variables plus multiples of given functions.
 
-    `terms` are pairs of a given function and its coefficient. Value and gradient are jitted if `like` and the given
-    functions are jitted.
+    `terms` are pairs of a given function and its coefficient. Value and gradient are jitted if the given functions
+    and `like`, the user's right-hand side, are jitted.
     """
     found = _of_polynomial(polynomial, n)
     compiled = [like]

@@ -33,7 +33,8 @@ class Search:
 
     A candidate for an invariant is represented by a row of coefficients: first those of the monomials of z = y / scale,
     then those of the given functions (`terms` of `Surroundings`). `columns` are indices in such a row: the monomials
-    and given functions that a candidate may contain.
+    and given functions that a candidate may contain. `degree` is the largest degree of the monomials, and `rtol` the
+    tolerance of the test whether a candidate is conserved (`_is_kept`).
     """
 
     def __init__(self, around: Surroundings, degree: int, rtol: float) -> None:

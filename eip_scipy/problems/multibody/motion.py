@@ -47,7 +47,7 @@ class Motion(NamedTuple):
         ``rhs(t, y, out, *params)`` fills `out` with (q', u').
     solved : callable
         ``solved(t, y, rates, accelerations, multipliers, *params)`` fills the arrays with q' (the first entries of
-        `rates`), u' and lambda. It returns the rank of the constraints, or NOT_FINITE if a matrix is not finite, and
+        `rates`), u' and lambda. It returns the rank of the constraints, or `NOT_FINITE` if a matrix is not finite, and
         raises ValueError if the mass matrix is singular.
     """
 

@@ -63,7 +63,10 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
 
 
 def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
-    """Return `Outputs` that call the user's functions in ``given.outputs``; None if there are no such functions."""
+    """Return `Outputs` that call the user's functions in ``given.outputs``; None if there are no such functions.
+
+    `nq` and `n` are the numbers of coordinates and of speeds.
+    """
     functions = tuple(given.outputs.values())
 
     def fill(t: float, x: Array, out: Array) -> None:
@@ -85,7 +88,10 @@ def _sizes(y: Array) -> Array:
 
 
 class _Constraints:
-    """Constraints on positions and velocities, and their derivatives."""
+    """Constraints on positions and velocities, and their derivatives.
+
+    They are made from the user's functions `given`. t and q are the time and the coordinates at the start.
+    """
 
     def __init__(self, given: Given, names: Names, t: float, q: Array) -> None:
         self.given = given

@@ -38,7 +38,9 @@ def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarra
 
 
 def required_outputs(what: str, outputs: Any, taken: Any) -> dict[str, Any]:
-    """Return the argument `outputs` as a dictionary after checks; `taken` are the names of components of the state.
+    """Return the argument `outputs` as a dictionary after checks.
+
+    `what` names the caller in messages, and `taken` are the names of the components of the state.
 
     Raises
     ------

@@ -334,7 +334,11 @@ def mechanics_problem(
 def _require_accelerations(
     what: str, parts: Parts, functions: Motion, names: Names, t: float, y: np.ndarray, params: np.ndarray | None
 ) -> None:
-    """Raise ValueError if constraints depend on each other at the start and no acceleration meets all of them."""
+    """Raise ValueError if constraints depend on each other at the start and no acceleration meets all of them.
+
+    `what` is the name of the problem, with which the message begins. `functions` are those that `motion` makes from
+    `parts`.
+    """
     nq, n, m = len(names.coordinates), len(names.speeds), len(names.velocities)
     sizes, extra = Sizes(nq, n, m), () if params is None else (params,)
     rates, accelerations, matrices = np.empty(nq), np.empty(n), np.empty(sizes.matrices + nq)
@@ -357,7 +361,10 @@ def _require_accelerations(
 def _constraints_invariant(
     fill: Callable[..., None], gradient: Callable[..., None], names: Names, params: np.ndarray | None
 ) -> tuple[Invariant, ...]:
-    """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints."""
+    """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints.
+
+    `fill` fills an array with the values of all constraints, and `gradient` an array with their gradients.
+    """
     size = len(names.positions) + len(names.velocities)
     if size == 0:
         return ()

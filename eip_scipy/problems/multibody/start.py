@@ -59,7 +59,11 @@ def started(
     t: float,
     independent: Iterable[str] | None,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return a state that meets the constraints, and notes on computed components; see `MechanicsProblem.start`."""
+    """Return a state that meets the constraints, and notes on computed components; see `MechanicsProblem.start`.
+
+    `what` is the name of the problem, for error messages. `constraints` is empty, or contains one `Invariant` for all
+    constraints.
+    """
     held = _independent(names, independent)
     y = np.concatenate(
         [
@@ -102,7 +106,8 @@ def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
 def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.ndarray:
     """Return the values of `given`, a mapping or an array, in the order of `names`.
 
-    Names that are missing from a mapping have the value 0; a ValueError is raised if one of them is in `held`.
+    Names that are missing from a mapping have the value 0; a ValueError is raised if one of them is in `held`. `what`,
+    "q0" or "u0", is the name of the argument in error messages.
     """
     if isinstance(given, Mapping):
         by_name = {name_of(name): value for name, value in given.items()}
@@ -162,7 +167,11 @@ def _gradient(item: Invariant, t: float, y: np.ndarray) -> np.ndarray:
 
 
 def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, float]:
-    """Return the index of the constraint that is violated most, its value, and the value relative to its terms."""
+    """Return the index of the constraint that is violated most, its value, and the violation.
+
+    The violation is the absolute value of a constraint divided by the larger of ``sum(|g_i y_i|)`` and ``max(|g_i|)``,
+    where g is its gradient.
+    """
     values = np.asarray(item.fun(t, y), float)
     gradient = np.abs(_gradient(item, t, y))
     # The size of a constraint is that of its terms, or its change while a component changes by 1.
@@ -173,7 +182,10 @@ def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, fl
 
 
 def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> None:
-    """Raise ValueError if a constraint is violated by more than MET times the size of its terms."""
+    """Raise ValueError if a constraint is violated by more than `MET` times the size of its terms.
+
+    `what` is the name of the problem, and `sigma` is 0 for the components whose values were kept.
+    """
     worst, residual, share = _violation(y, item, t)
     if share <= MET:
         return
@@ -192,7 +204,8 @@ def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.
 def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
     """Return the reason why the constraint with the index `worst` is not met, and what to do.
 
-    `gradient` holds the derivatives of all constraints with respect to the components that are computed.
+    `values` are the values of all constraints, and `gradient` holds their derivatives with respect to the components
+    that are computed.
     """
     sizes = np.linalg.norm(gradient, axis=1)
     if sizes[worst] <= DEPENDENT * sizes.max():

@@ -148,7 +148,7 @@ def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[floa
     """Return ``slopes(t, y, y)``, the derivatives of a field's function with respect to the position y[:3].
 
     The second y is not used. `ndim` is 1 if the function returns a vector, and 2 if it returns three rows. The last
-    index of the derivatives is that of the position.
+    index of the derivatives is that of the position. `length` and `start` are the arguments of `variational`.
     """
     if is_jitted(fun) and not jit_is_off():
         try:

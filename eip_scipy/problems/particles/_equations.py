@@ -218,7 +218,10 @@ def _velocity(field: FieldFunctions) -> ParticleEquations:
 
 @jitable
 def velocity_rhs(E, B, t, y, out, ratio):
-    """Fill `out` with Newton's equations, x' = v and v' = (q / m) (E + v x B) (Cai, Gong & Wang, eq. 3.8)."""
+    """Fill `out` with Newton's equations, x' = v and v' = (q / m) (E + v x B) (Cai, Gong & Wang, eq. 3.8).
+
+    `ratio` is q / m.
+    """
     e = E(t, y[0], y[1], y[2])
     b = B(t, y[0], y[1], y[2])
     u, v, w = y[3], y[4], y[5]

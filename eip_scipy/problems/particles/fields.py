@@ -150,7 +150,7 @@ class ParticleField:
         return jit_like(fields, E, B)
 
     def _plain(self, key: str) -> Callable[..., Any]:
-        """Return a given function as an interpreted function of (t, x, y, z)."""
+        """Return the given function in the attribute `key` as an interpreted function of (t, x, y, z)."""
         fun = getattr(self, key)
         return (lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where))
 

@@ -269,7 +269,7 @@ def mechanics(
 
 @contextmanager
 def _nested(what: str) -> Iterator[None]:
-    """Replace a RecursionError of SymPy by a ValueError that names the reason."""
+    """Replace a RecursionError of SymPy by a ValueError with the reason; `what` names the function in its message."""
     try:
         yield
     except RecursionError:

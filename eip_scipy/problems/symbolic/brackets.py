@@ -163,7 +163,7 @@ def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float
 def _beside_switches(
     expressions: Sequence[Any], variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield points on both sides of each place at which max, min, abs or a similar function changes its branch.
+    """Yield points on both sides of each place at which a max, min, abs or the like in `expressions` changes branch.
 
     Points are yielded with the result of ``rate.at``, if the rate is finite and real there.
     """

@@ -43,7 +43,7 @@ class Switches:
         draw : callable
             ``draw()``: a random point.
         at : callable
-            ``at(expression, point)``: the value at the point, None if it is not finite and real.
+            ``at(expression, point)``: the value of the expression at the point, None if it is not finite and real.
 
         Raises
         ------
@@ -62,7 +62,10 @@ class Switches:
         return found
 
     def _sides(self, difference: Any, point: dict[Any, Any], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
-        """Return two points on a line along a variable where the difference has opposite signs; [] if none is found."""
+        """Return two points at which `difference` has opposite signs; [] if none are found.
+
+        Both points lie on a line through `point` along one of the variables. `at` is the argument of `points`.
+        """
         for variable in sorted(difference.free_symbols & set(self._variables), key=str):
             places = [sign * sympy.Integer(2) ** power for sign in (-1, 1) for power in POWERS]
             places = [sympy.Integer(0), point[variable], *places]

@@ -103,7 +103,7 @@ def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) 
     system : Constrained
     speeds_by_rate : callable
         ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds with respect to the rate of coordinate k, or []
-        if they are not known.
+        if they are not known; coordinate k is then left out.
     """
     known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
     inputs = {symbol(name) for name, _ in system.inputs}
@@ -177,7 +177,11 @@ def parts_of(
 
 @lru_cache(maxsize=64)
 def matrices(system: Constrained) -> Callable[..., None]:
-    """Return ``fill(t, y, out, *params)``, which fills `out` with M, F, G, gamma and q' in the order of `motion`."""
+    """Return the argument `fill` of `motion`: ``fill(t, y, out, *params)`` writes M, F, G, gamma and q' to `out`.
+
+    The rows of G are the derivatives of `velocities` with respect to the speeds, and gamma are the rates of change of
+    `velocities` for u' = 0. The constraints are therefore met if G u' = -gamma.
+    """
     speeds = system.variables[len(system.coordinates) :]
     gradients = [sympy.diff(item, u) if item.has(u) else sympy.Integer(0) for item in system.velocities for u in speeds]
     gammas = map(system.rate, system.velocities)

@@ -121,7 +121,10 @@ def _traced(
 
 
 def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
-    """Return for each key of an input that is not an expression its name and a function ``f(t, y)`` of one number."""
+    """Return for each of `keys`, functions of time, its name and a function ``f(t, y)`` that returns one number.
+
+    The number is that component of the value of `fun`, which is called because it cannot be converted to expressions.
+    """
     from .models import name_of
 
     if len(keys) == 1:

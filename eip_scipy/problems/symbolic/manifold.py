@@ -100,7 +100,10 @@ class Manifold:
         )
 
     def _function(self, what: str, items: Sequence[Any]) -> Callable[[float, np.ndarray], np.ndarray | None]:
-        """Return a function of (t, y) with the values of `items`, which returns None if they are not finite."""
+        """Return a function of (t, y) that returns the values of the expressions `items`, or None if one is not finite.
+
+        `what` describes the values, for tracebacks and errors.
+        """
         places = {k: item for k, item in enumerate(items) if item != 0}
         fill = plain(function(what, list(places.values()), self._arguments, in_place=True, places=list(places)))
 

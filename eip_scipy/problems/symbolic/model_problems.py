@@ -93,7 +93,7 @@ def _swapped(function: Any) -> Any:
 
 
 def _by_name(given: Any, names: tuple[str, ...]) -> Any:
-    """Return a mapping with the names of its keys as keys; return an array unchanged.
+    """Return the mapping `given` with the names of its keys as keys; return an array unchanged.
 
     Keys that are not in `names` are left out, unless this would leave nothing.
     """

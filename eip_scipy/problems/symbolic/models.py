@@ -53,7 +53,13 @@ class Model(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """A model's equations in its own symbols."""
+    """A model's equations in its own symbols.
+
+    The motion follows from q' = `rates` and `mass` u' = `forces` plus the forces of the constraints, where q are the
+    `coordinates` and u the `speeds`. `positions` and `velocities` are the expressions that the constraints on positions
+    and on velocities set to 0. `energies` are pairs (description, expression), and `independent` is None if the model
+    has no dependent coordinates or speeds, as in `Model`.
+    """
 
     coordinates: list[Any]
     speeds: list[Any]
@@ -101,6 +107,7 @@ def read(
     outputs : mapping
         Expressions of the quantities that are computed at saved states, by name.
     start : Start
+        Time, coordinates and speeds at which `read_inputs` calls inputs that are functions.
     """
     method = _method(model)
     found = _of_lagrange(method) if hasattr(method, "_L") else _of_kane(method)
@@ -147,7 +154,10 @@ class Start(NamedTuple):
 
 
 class _Conversion:
-    """Converter of expressions from a model's functions of time and symbols to the real symbols of this package."""
+    """Converter of expressions from a model's functions of time and symbols to the real symbols of this package.
+
+    `found` are the model's equations; `inputs` and `start` are those of `read`.
+    """
 
     def __init__(self, found: _Equations, inputs: Any, start: Start) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
@@ -439,9 +449,10 @@ def _require_distinct(names: Mapping[Any, str]) -> None:
 
 
 def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the names of the parameters that occur in the equations, in the order of `values`.
+    """Return the names of the parameters that occur in the equations or in `others`, in the order of `values`.
 
-    A ValueError is raised if one of them has no value.
+    `others` are expressions of energies, momenta and outputs, and `values` maps names to values. A ValueError is raised
+    if a parameter has no value.
     """
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
     known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
@@ -462,7 +473,8 @@ def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -
     """Add the derivatives of constraints on positions that do not follow from the constraints on velocities.
 
     KanesMethod ignores a configuration constraint without its velocity constraint. The result is the system, and the
-    names g1, g2, ... of the constraints on positions whose derivatives were added.
+    names g1, g2, ... of the constraints on positions whose derivatives were added. Dependence is tested at random
+    states with the `values` of the parameters.
     """
     if not system.positions:
         return system, []

@@ -40,7 +40,10 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
-    """Return the message for names without a partner, or for an H without names."""
+    """Return the error message for the names `left`, which have no partner, or for an H without names.
+
+    `pairs` are the pairs (coordinate, momentum) that were found; the message lists them.
+    """
     rule = "Names are paired as x with px, q1 with p1, theta with p_theta; others by hamiltonian(H, 'a b', 'pa pb')."
     if not left:
         return f"hamiltonian: H contains neither coordinates nor momenta. {rule}"
@@ -57,7 +60,7 @@ def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
 def _coordinate(momentum: str, free: set[str]) -> str | None:
     """Return the name of the coordinate to which `momentum` belongs; None if it is not the name of a momentum.
 
-    The coordinate need not be one of the names in `free`, because H may not depend on it.
+    `free` are the names in H. The coordinate need not be one of them, because H may not depend on it.
     """
     if not momentum.startswith("p") or momentum == "p":
         return None

@@ -53,6 +53,8 @@ def symbol(name: str) -> sympy.Symbol:
 def as_names(what: str, names: Any) -> tuple[str, ...]:
     """Return the names in "x y", "x, y", or a sequence of strings, SymPy symbols and dynamicsymbols.
 
+    `what` describes the names in messages.
+
     Raises
     ------
     TypeError, ValueError
@@ -140,7 +142,10 @@ def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
 
 
 class Reader:
-    """Converter of one text to a SymPy expression; `what` describes the expression in messages."""
+    """Converter of one text to a SymPy expression; `what` describes the expression in messages.
+
+    Names in `declared` are neither constants nor functions, as for `as_expression`.
+    """
 
     def __init__(self, what: str, text: str, declared: Iterable[str] = ()) -> None:
         self.what, self.text = what, " ".join(text.split())  # the text may have several lines
@@ -230,7 +235,7 @@ class Reader:
         """Return the operands of a chain such as a + b - c or a * b / c, whose nodes are nested to the left.
 
         `pair` holds the types of the two operators. Operands after the second one, - or /, are replaced by their
-        `inverse`.
+        `inverse`. `depth` is the depth of nesting of `node` in the whole text.
         """
         found = []
         while isinstance(node, ast.BinOp) and isinstance(node.op, pair):

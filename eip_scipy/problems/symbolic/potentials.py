@@ -95,8 +95,8 @@ def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) ->
 def _is_simple(term: Any, q: Any) -> bool:
     """Return True if SymPy can integrate a term over q quickly; the integration of other terms may not end.
 
-    Such a term has at most MOST_FACTORS factors that depend on q: powers of q and of one polynomial of degree at most 2
-    in q, or powers of q and of sines, cosines and exponentials of linear functions of q.
+    Such a term has at most `MOST_FACTORS` factors that depend on q: powers of q and of one polynomial of degree at most
+    2 in q, or powers of q and of sines, cosines and exponentials of linear functions of q.
     """
     powers = [item.as_base_exp() for item in sympy.Mul.make_args(term) if item.has(q)]
     if len(powers) > MOST_FACTORS:

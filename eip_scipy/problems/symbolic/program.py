@@ -270,7 +270,10 @@ def _set(target: ast.expr, value: ast.expr) -> ast.stmt:
 
 
 class Writer:
-    """Writer of statements that compute expressions; the same operation on the same values is written once."""
+    """Writer of statements that compute expressions; the same operation on the same values is written once.
+
+    `what` describes the values in errors. The statements are appended to `body`.
+    """
 
     def __init__(self, what: str, arguments: Arguments) -> None:
         self.what = what

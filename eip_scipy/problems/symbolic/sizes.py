@@ -103,7 +103,7 @@ def require_function(name: str, arguments: Iterable[Any], compared: int) -> int:
 
 
 def require_constant(number: Any) -> None:
-    """Raise TooLargeError if `number` is not rational and has more than LARGEST_CONSTANT operations."""
+    """Raise TooLargeError if `number` is not rational and has more than `LARGEST_CONSTANT` operations."""
     if not number.is_Rational and number.count_ops() > LARGEST_CONSTANT:
         raise TooLargeError(
             f"is a constant of more than {LARGEST_CONSTANT} operations; write its value, or make it a parameter"
@@ -111,7 +111,7 @@ def require_constant(number: Any) -> None:
 
 
 def expanded_terms(expression: Any) -> int:
-    """Return an upper bound for the number of terms of the expanded expression, at most EXPANDED_TERMS + 1."""
+    """Return an upper bound for the number of terms of the expanded expression, at most `EXPANDED_TERMS` + 1."""
     most = EXPANDED_TERMS + 1
     match expression:
         case sympy.Add():

@@ -281,6 +281,20 @@ def _with_perturbation(
 
     Balances are quantities that the system of H alone conserves, with their rates of change due to the perturbation and
     the dissipation.
+
+    Parameters
+    ----------
+    energy : sympy.Expr
+        H.
+    names, rates : sequence
+        Names of the components of the state, and their derivatives in the system of H alone.
+    values : mapping
+        Values of the parameters by name.
+    declared : set of str
+        Names that expressions may contain, next to `names`, without being read as constants or functions.
+    perturbed : Perturbed
+    flow : callable
+        ``flow(expression)`` returns the derivatives of the components that belong to this Hamiltonian.
     """
     if energy.has(symbol("t")):
         raise ValueError(
@@ -332,7 +346,11 @@ def _timed(given: Any, timed: Timed) -> Any:
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
-    """Return the names of the components, a function that returns (dH/dp, -dH/dq) of H, and the pairs of names."""
+    """Return the names of the components, a function that returns (dH/dp, -dH/dq) of H, and the pairs of names.
+
+    If neither q nor p is given, the pairs are found from the names in `energy`, which is H, except those of the
+    parameters, the keys of `values`.
+    """
     if q is None and p is None:
         q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
     elif q is None or p is None:
@@ -353,7 +371,11 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
 
 
 def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
-    """Return the names of the components, a function that returns B(y) grad H of H, and no pairs, as `_canonical`."""
+    """Return the names of the components, a function that returns B(y) grad H of H, and no pairs, as `_canonical`.
+
+    B is the matrix `poisson`. Names in `declared` are not read as constants or functions in its entries. `p` must be
+    None.
+    """
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= give the names of the whole state as q, and omit p.")
     names = as_names("q", y)
@@ -387,8 +409,11 @@ def _checked(
 ) -> SymbolicProblem:
     """Return the problem after checks of the names and of the given invariants and constraints.
 
-    `kept` maps the names of invariants that are known already to their expressions, and `checks` maps them to how they
-    were shown to be conserved; the given ones are added to both. `slow` holds the balances as in `System`.
+    `names` and `rates` are the components and their derivatives, and `values` maps the names of parameters to their
+    values. `kept` maps the names of invariants that are known already to their expressions, and `checks` maps them to
+    how they were shown to be conserved; the `given` ones are added to both. `pairs` are those of `SymbolicProblem`, and
+    `slow` holds the balances as in `System`. `what` is the user's argument that contains the equations, "H" or "f"; it
+    is named in messages.
     """
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
@@ -427,7 +452,10 @@ def _checked(
 
 
 def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> Any:
-    """Return the SymPy expression of an invariant or a constraint after a check of its names.
+    """Return the SymPy expression of `given`, an invariant or a constraint, after a check of its names.
+
+    `what` describes it in messages, `names` are the components of the state, and `known` are all names that it may
+    contain.
 
     Raises
     ------
@@ -447,7 +475,9 @@ def _how_kept(
     """Return how a quantity was shown to be conserved, such as "symbolically", see `SymbolicProblem`.
 
     If it is not conserved at all states, it must be conserved at those that meet the constraints, otherwise ValueError
-    is raised.
+    is raised. `label` is the name of the quantity, `names` and `rates` are the components and their derivatives, and
+    `parameters` maps the symbols of parameters to their values. `manifold` stands for the states that meet the
+    constraints; if it is None, there are no constraints, and `hint` is added to the message of the error.
     """
     try:
         return how_kept(label, quantity, [symbol(item) for item in names], rates, parameters)
@@ -532,7 +562,7 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
 def _deferred_jacobian(system: System) -> Deferred | None:
     """Return the function for the Jacobian of the accelerations times a vector, as a `Deferred` made when it is called.
 
-    Return None if the system is not of the form q'' = a(t, q), has more than LARGEST_JACOBIAN accelerations, or has
+    Return None if the system is not of the form q'' = a(t, q), has more than `LARGEST_JACOBIAN` accelerations, or has
     accelerations that jump.
     """
     found = system.accelerations

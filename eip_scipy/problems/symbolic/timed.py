@@ -91,7 +91,7 @@ def _listed(given: Any) -> list[Any]:
 
 
 def _is_rate(key: Any) -> bool:
-    """Return True if a key is a first derivative with respect to time."""
+    """Return True if `key`, a key of the mapping `f` of `Timed`, is a first derivative with respect to time."""
     return isinstance(key, sympy.Derivative) and key.variables == (TIME,)
 
 

@@ -31,7 +31,10 @@ class NotTraceableError(TypeError):
 
 
 class Number:
-    """Expression that can take the place of a number in functions of NumPy and of math."""
+    """Expression that can take the place of a number in functions of NumPy and of math.
+
+    `size` counts symbols, constants and operations in the expression, which may have at most `MOST_OPERATIONS`.
+    """
 
     __slots__ = ("expression", "size")
 
@@ -185,8 +188,8 @@ for _name in dir(math):
 def _replaced(item: Any, known: dict[int, Any]) -> Any:
     """Return the replacement of a global or closure variable, or the variable itself if it needs none.
 
-    NumPy, math and their functions are replaced by those of NUMPY and MATH. A Python or Numba function is replaced by a
-    copy whose own variables are replaced. `known` holds the copies made so far, by the id of the function.
+    NumPy, math and their functions are replaced by those of `NUMPY` and `MATH`. A Python or Numba function is replaced
+    by a copy whose own variables are replaced. `known` holds the copies made so far, by the id of the function.
     """
     if item is np:
         return NUMPY

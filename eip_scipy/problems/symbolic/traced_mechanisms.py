@@ -78,9 +78,10 @@ def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
 
 
 def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
-    """Return the name and the expression of each output; an empty list if one of them cannot be converted.
+    """Return the name and the expression of each output of the mechanism.
 
-    `by_name` has, for "t", "q" and "u", a pair of the names of the components and their values at the start.
+    The list is empty if an output cannot be converted, or if its expression has another value at the start. `by_name`
+    has, for "t", "q" and "u", a pair of the names of the components and their values at the start.
     """
     symbols, numbers = zip(*(by_name[letter] for letter in "tqu"), strict=True)
     names = Names(by_name["q"][0], by_name["u"][0], (), ())
@@ -98,7 +99,8 @@ def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
 def _require_agreement(what: str, found: Any, value: Any, names: Names, numbers: Any) -> None:
     """Raise NotTraceableError if the expressions `found` do not have the value of the function at the start.
 
-    `value` is this value, and `numbers` are (t, q, u) at the start.
+    `what` is the name of the function, `value` is its value, `names` are those of the components of (q, u), and
+    `numbers` are (t, q, u) at the start.
     """
     t, q, u = numbers
     values = {symbol("t"): t, **{symbol(k): x for k, x in zip(names.state, (*q, *u), strict=True)}}

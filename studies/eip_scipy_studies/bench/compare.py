@@ -103,6 +103,7 @@ def standings(rows: Iterable[Row], levels: Sequence[float] = LEVELS) -> list[Sta
     """Compare each method of another package with our best method for the same kind of function, at each of `levels`.
 
     If none of our methods takes this kind of function, our best one that takes compiled functions is used.
+    `levels` are errors of the final state.
     """
     known = groups(rows)
     found = []

@@ -19,7 +19,10 @@ SHORT = {PYTHON: "python", COMPILED: "compiled", OWN: "own"}
 
 
 def drawn(rows: list[Row], machine: str) -> Iterator[tuple[Where, str, Any]]:
-    """Yield (suite, problem, kind of function), file name and figure of each figure of error against time."""
+    """Yield (suite, problem, kind of function), file name and figure of each figure of error against time.
+
+    `suite` is a key of `SUITES`, and the kind of function is `PYTHON`, `COMPILED` or `OWN`. `machine` is the footnote.
+    """
     from ..plotting import side_by_side_figure
 
     known = groups(rows)

@@ -49,7 +49,8 @@ class Found:
 class Table:
     """Table of the report: a heading, the heads of its columns, rows of cells, and lines below.
 
-    `where` is the suite, problem and kind of function of a table at equal error, and None for other tables.
+    `where` is the suite, the problem and the kind of function (`Row.takes`) of a table at equal error, and None for
+    other tables.
     """
 
     title: str
@@ -80,7 +81,10 @@ def _times(value: float) -> str:
 
 
 def _equal_error(found: Found, suite: str) -> list[Table]:
-    """Make a table for each problem and kind of function: times at each error of `LEVELS`, and ratios to our best."""
+    """Make a table for each problem and kind of function (`Row.takes`) of a suite.
+
+    The tables contain the run time of each method at each error in `LEVELS`, and its ratio to that of our best method.
+    """
     known = [each for each in standings(found.rows) if each.suite == suite]
     tables = []
     for where in dict.fromkeys((each.suite, each.scene, each.takes) for each in known):
@@ -111,7 +115,10 @@ def _factor(value: float) -> str:
 
 
 def _losses(group: list[Standing]) -> list[str]:
-    """Make a line for each reason why methods are faster than ours: these methods, with ratio and error."""
+    """Make a line for each reason why methods in `group` are faster than ours.
+
+    The line lists these methods, each with the ratio of run times and the error at which they are compared.
+    """
     by_reason: dict[str, list[str]] = {}
     for each in group:
         if each.lost:

@@ -68,7 +68,10 @@ def _record(
 
 
 def _for(peer: Peer, records: list[dict[str, Any]], tolerances: tuple[float, ...] = TOLERANCES) -> list[dict[str, Any]]:
-    """Return those of the records that this method runs, with its settings: numbers of steps, or else `tolerances`."""
+    """Return those of the records that the method `peer` runs, with the settings of this method.
+
+    Settings are those that a record has for this kind of method, such as numbers of steps, or else `tolerances`.
+    """
     if " LSODA" in peer.name.upper():
         tolerances = tuple(max(tolerance, TIGHTEST) for tolerance in tolerances)
     found = []

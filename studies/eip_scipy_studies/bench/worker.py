@@ -30,10 +30,11 @@ Answers = Iterator[dict[str, Any]]
 
 
 def precision(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Yield time, error and drift of the method on each problem at each of its settings, in their order.
+    """Yield time [s], error and drift of the method for each problem, at each of the problem's settings in order.
 
-    If a run fails, the first line of its error is yielded instead of time, error and drift. After a run that takes
-    longer than the request's `patience`, the further settings of the problem are left out.
+    A setting is a tolerance or a number of steps; `Scene.error` and `Scene.drift` define error and drift. If a run
+    fails, its error, shortened by `first_line`, is yielded instead of the three numbers. After a run that takes longer
+    than the request's `patience` in seconds, the further settings of the problem are left out.
     """
     for record in request["scenes"]:
         try:
@@ -92,14 +93,21 @@ def _least(action: Callable[[], np.ndarray], enough: float, repeats: int) -> tup
 
 
 def first(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Yield the error of one solution; the parent process times it together with the start of this process."""
+    """Yield the error of one run: that of the request's only problem at its first setting.
+
+    The parent process times the run together with the start of this process.
+    """
     (record,) = request["scenes"]
     scene = scene_from(record)
     yield {"scene": record["title"], "error": scene.error(peer.prepare(scene)(record["settings"][0]))}
 
 
 def asked(peer: Peer, request: Mapping[str, Any]) -> Answers:
-    """Yield the response of the package to each problem: the first line of its error or warning, or the accuracy."""
+    """Yield the response of the package to each problem, as text.
+
+    It is the first line of the package's error or warning, or else the error of the state and the change of the
+    invariants.
+    """
     for record in request["scenes"]:
         scene, extra = scene_from(record), dict(record["extra"])
         functions = scene.plain()

@@ -107,12 +107,13 @@ class FixedPoint:
     """Solver of ``m = psi - i c (K + W(m)) m``: K and a constant w are implicit, W - w comes from the previous iterate.
 
     The iteration ``m <- (1 + i c (K + w))^-1 rhs(m)``, ``rhs(m) = psi - i c (W(m) - w) m``, contracts by about
-    c max|W - w| if W is pointwise. The change of `rhs` from one iterate to the next is the residual of the equation
+    ``c max|W - w|`` if W is pointwise. The change of `rhs` from one iterate to the next is the residual of the equation
     itself, not of the preconditioned one, and costs no transform.
 
     Parameters
     ----------
     scheme : FieldScheme
+        The scheme whose transforms and K are used, and whose ``nfev`` counts the iterations.
     tol : float
         Bound on the norm of the residual relative to that of the state.
     c, w : float

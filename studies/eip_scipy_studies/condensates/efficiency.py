@@ -141,8 +141,8 @@ class Trial:
     Attributes
     ----------
     rows : dict
-        For each (name of a method, h) the results of its run by their names: `errors`, "seconds", "pairs" of transforms
-        and "remark".
+        For each (name of a method, h) a dict with the results of this run: "method", "h", the entries of the dict that
+        `errors` returns, "seconds", "pairs" (the number of pairs of transforms) and "remark".
     """
 
     def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:

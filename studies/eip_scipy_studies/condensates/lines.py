@@ -136,7 +136,8 @@ def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[
 def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
     """Return a line that gives the distance of the reference's final state from the closed form.
 
-    The closed form is the start, turned and multiplied by exp(-i mu t).
+    The closed form is the start, turned and multiplied by exp(-i mu t). `before` is the equation with the slower
+    rotation, of which the start is a stationary state.
     """
     assert made.reference is not None
     start = made.quench.problem.y0

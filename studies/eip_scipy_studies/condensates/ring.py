@@ -117,7 +117,8 @@ class Ring(QuenchStudy):
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
     """Return one panel for each saved state, all cropped to the region that the condensate reaches in any state.
 
-    The panels show the density and the vortices in `moved`.
+    The panels show the density and the vortices. The saved states are the columns of `y`, and `moved` has the vortices
+    of each of them.
     """
     from ..plotting import FieldPanel
 

@@ -88,7 +88,10 @@ class Found:
 
 
 def trap(settings: GroundStates, update: Update) -> list[Found]:
-    """Return, for each angular velocity in a harmonic trap, the state of lowest energy from several starts."""
+    """Return, for each angular velocity in a harmonic trap, the state of lowest energy from several starts.
+
+    ``update(text)`` shows what is being computed.
+    """
     grid = Grid((settings.trap_points, settings.trap_points), -10.0, 10.0)
     found = []
     for Omega, published in settings.published.items():
@@ -103,12 +106,15 @@ def trap(settings: GroundStates, update: Update) -> list[Found]:
 
 
 def ring(settings: GroundStates, update: Update) -> list[Found]:
-    """Return the ground state of the paper's ring, as a list of one."""
+    """Return the ground state of the paper's ring, as a list of one; `update` is as for `trap`."""
     return [search_ring(settings.seed, update)]
 
 
 def search_ring(seed: int, update: Update) -> Found:
-    """Search over numbers of vortices and windings for the ground state of the paper's ring."""
+    """Search over numbers of vortices and windings for the ground state of the paper's ring.
+
+    `seed` is that of the noise in `lowest_ring`, and ``update(text)`` shows which pair is being tried.
+    """
     gpe = ring_condensate(points=RING_POINTS)
     tried: list[tuple[float, int, int]] = []
 
@@ -124,7 +130,7 @@ def search_ring(seed: int, update: Update) -> Found:
 def lines(settings: GroundStates, update: Update) -> list[Found]:
     """Return states of the paper's 3D condensate found from noisy starts with 0 ... 4 vortex lines, and the saddle.
 
-    The saddle, the last one, is the state of `search_saddle`.
+    The saddle, the last one, is the state of `search_saddle`. `update` is as for `trap`.
     """
     gpe = line_condensate(points=LINE_POINTS)
     rng = np.random.default_rng(settings.seed)
@@ -141,6 +147,7 @@ def search_saddle(points: int, update: Update) -> Found:
     """Return the paper's state with four vortex lines, on a grid with `points` points along each axis.
 
     It is a saddle of the energy, which the descent reaches because it keeps the square symmetry of the start.
+    `update` is as for `trap`.
     """
     update(f"lines, {SADDLE_LINES} imprinted without noise")
     gpe = line_condensate(points=points)
@@ -149,7 +156,10 @@ def search_saddle(points: int, update: Update) -> Found:
 
 
 def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
-    """Return the lower state to which the descent of the energy leads from a saddle with a little noise."""
+    """Return the lower state to which the descent of the energy leads from a saddle with a little noise.
+
+    `saddle` is a field of the equation `gpe`, `seed` that of the noise, and `update` as for `trap`.
+    """
     update("lines, down from the saddle")
     start = with_noise(saddle, np.random.default_rng(seed))
     state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
@@ -167,7 +177,7 @@ Results = dict[str, list[Found]]
 
 
 class KnownState(NamedTuple):
-    """Check of a number of a state: its known value, and the one that was found (`ours`)."""
+    """Check of a quantity of a state: its known value, the computed one (`ours`), and whether the check `passed`."""
 
     quantity: str
     known: float
@@ -201,7 +211,11 @@ def _count(text: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class GroundStates(Study[Results]):
-    """Command ``eip-scipy gpe ground-state``."""
+    """Command ``eip-scipy gpe ground-state``.
+
+    `published` holds the published energies in the trap by angular velocity, and `trap_points` is the number of points
+    of the trap's grid along each axis.
+    """
 
     scene: Sequence[str] | None = some_of("scene", SCENES)
     starts: int = option(
@@ -220,7 +234,10 @@ class GroundStates(Study[Results]):
             return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
 
     def checks(self, found: Results) -> list[KnownState]:
-        """Compare with known energies. A lower energy than a published one is not a failure."""
+        """Compare energies and numbers of vortex lines with known ones.
+
+        In the trap, a lower energy than the published one is not a failure.
+        """
         checks = []
         for item in found.get("trap", ()):
             known, ours = self.published[item.equation.Omega], item.state.energy
@@ -305,7 +322,7 @@ def _rows(results: Results) -> Rows:
 
 
 def panels(name: str, found: list[Found]) -> dict[str, Any]:
-    """Return the densities to draw, one panel for each state.
+    """Return the densities to draw by title, one `FieldPanel` for each state of the problem `name`.
 
     States with vortex lines are shown in the plane z = 0, the lowest one also in x = 0.
     """

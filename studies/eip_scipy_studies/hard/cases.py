@@ -297,7 +297,10 @@ def _times(gain: float) -> str:
 
 
 def text(results: Sequence[Comparison], checks: Sequence[Check], arguments: dict[str, Any]) -> str:
-    """Lay out table, summary, cases that get worse, and checks, at most 79 columns."""
+    """Return table, summary, cases that projection makes worse, and checks as text of at most 79 columns.
+
+    `arguments` are those of `HardCases.arguments`: the method, the metric and the tolerances of the runs.
+    """
     known, rtol = summary(results), arguments["rtol"]
     head = [
         f"Hard cases: {arguments['method']}, metric {arguments['metric']!r}, rtol = {rtol:g}, atol = {rtol / 1000:g}",
@@ -367,7 +370,7 @@ def cause(result: Comparison) -> str:
 
 
 def rows(results: Sequence[Comparison]) -> list[dict[str, Any]]:
-    """Make the lines of the CSV file."""
+    """Return the rows of the CSV file: for each case a dictionary of values by the names of the columns."""
     lines: list[dict[str, Any]] = []
     for r in results:
         line: dict[str, Any] = {"case": r.case.name, "gain": r.gain}
@@ -397,7 +400,7 @@ class HardCases(Study[list[Comparison]]):
         return self.rtol or TOLERANCES.get(self.method, USUAL_TOLERANCE)
 
     def arguments(self) -> dict[str, Any]:
-        """Return the options, and values that follow from them."""
+        """Return the method, the metric, rtol and atol of the runs, by name."""
         rtol = self.tolerance
         return {"method": self.method, "rtol": rtol, "atol": ATOL_PER_RTOL * rtol, "metric": self.metric}
 

@@ -89,6 +89,9 @@ class KeplerFigures(Study[Found]):
 
     The reference is EIPDOP853 with 1/6 of the step and compensated sums; with 1/3 of the step it differs by 1e-11 at
     t = 2000.
+
+    Each entry of `known` consists of a method, an attribute of `KeplerRun`, a description, "end" or "max" (for the
+    error at `t_end` or its maximum), and the known value.
     """
 
     t_end: float = 2000.0

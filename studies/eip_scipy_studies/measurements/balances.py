@@ -6,6 +6,8 @@ rotations of the axes, oscillators from several phases of the driving, and chaos
 runs of DOP853 with shorter steps and compensated sums; their own error is the difference from a run with steps of
 twice the length. A warning is any that a run raises, or a run that is not reliable; a run that ends early has an
 infinite error.
+
+A function with the arguments `turned` and `turn` gets a rotation matrix (3, 3) of the axes and its number 0, 1, ...
 """
 
 from __future__ import annotations
@@ -153,7 +155,7 @@ def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[st
     """Return a function that makes the case of a planet with e = 0.2 and the drag -`strength` times the velocity.
 
     The runs have `steps` steps per revolution. `rates`, if given, maps names to wrong rates of the energy; each of them
-    makes a set, and there are no other sets.
+    makes one of the `sets` of the `Case`, and there are no other sets.
     """
     energy = Balance(kepler_energy, energy_loss, name="E")
     others = [Balance(spin, spin_loss, name="h"), Balance(laplace, laplace_loss, name="e")]
@@ -529,8 +531,8 @@ class Row(NamedTuple):
 
     `calls` and `calls_with` are the numbers of calls of the right-hand side, `without` and `with_balances` the errors,
     in the unit of the `System`. `slowness` is the largest `Diagnostics.slowness` of a balance, `warned` tells whether
-    the run with balances gave a warning or was not reliable, and `said` are these texts. `of_reference` is the error of
-    the reference.
+    the run with balances gave a warning or was not reliable, and `said` contains the warnings and the message of a run
+    that is not reliable. `of_reference` is the error of the reference.
     """
 
     system: str
@@ -567,7 +569,10 @@ def distance(case: Case, a: np.ndarray, b: np.ndarray) -> Any:
 
 
 def measured(name: str, system: System, turned: np.ndarray, turn: int) -> list[Row]:
-    """Run a system without and with balances, and return one row for each set of balances."""
+    """Run a system without and with balances in one rotation; return a `Row` for each set of balances.
+
+    `turned` is the rotation matrix (3, 3) and `turn` its number, as for `System.make`.
+    """
     case = system.make(turned, turn)
     right = case.run(**finer_steps(case)).y[:, -1]
     of_reference = distance(case, case.run(**finer_steps(case, 2.0)).y[:, -1], right)

@@ -227,7 +227,7 @@ def costs(name: str, repeats: int, share: float, with_heyoka: bool) -> list[Poin
 
 
 def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
-    """Return the problem over a share of its interval, which is a whole number of the longest steps."""
+    """Return the problem over about `share` of its interval, rounded to a whole number of the longest steps."""
     assert problem.h is not None
     if share == 1:
         return problem

@@ -2,9 +2,9 @@
 
 The projection removes the part of the estimate e along the directions M G^T of its corrections, so that
 P e = e - M G^T (G M G^T)^-1 G e remains. The runs compare the norm of e, by which the methods choose their steps, with
-that of P e in the metric M of the run, with max(|P e|, 0.3 |e|), and with P in the Euclidean metric. Each number is the
-geometric mean, over errors of the final state, of the calls of f relative to those of the control by e at the same
-error. The last column is the largest ratio of the errors of P e and e with the same tolerance.
+that of P e in the metric M of the run, with ``max(|P e|, 0.3 |e|)``, and with P in the Euclidean metric. Each number
+is the geometric mean, over errors of the final state, of the calls of f relative to those of the control by e at the
+same error. The last column is the largest ratio of the errors of P e and e with the same tolerance.
 
 Result: none of these controls saves calls in the mean. The estimate is the error of a result of lower order, and its
 direction differs from that of the error of the step. P e is small where the corrections happen to be along e, although
@@ -71,7 +71,7 @@ class Projected:
     """The projected step of a method with another step control, in the form of a `OneStepMethod`.
 
     `one_step` projects the state and returns an error estimate whose norm is the one that controls the step. Runs with
-    this method are therefore given no invariants.
+    this method are therefore given no invariants. `control` is one of the names in `CONTROLS`.
     """
 
     def __init__(self, case: HardCase, method: type[EIPSolver], rtol: float, control: str) -> None:
@@ -133,7 +133,8 @@ def run_one(case: HardCase, name: str, exponent: float, control: str) -> dict[st
 def relative_cost(found: Sequence[dict[str, Any]], control: str) -> float:
     """Return the calls of f of a control divided by those of the package's control ("before") at the same error.
 
-    It is the geometric mean over the errors that both reach; nan if one of them has no run with an error below
+    `found` are results of `run_one` for one method and case, and `control` is one of the names in `CONTROLS`. The
+    number is the geometric mean over the errors that both reach; nan if one of them has no run with an error below
     `LARGEST`.
     """
     runs = [[row for row in found if row["control"] == x and row["error"] < LARGEST] for x in ("before", control)]
@@ -145,7 +146,10 @@ def relative_cost(found: Sequence[dict[str, Any]], control: str) -> float:
 
 
 def lines(found: Sequence[dict[str, Any]], method: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the table's rows for a method: its name, the relative costs in each case, and geometric means."""
+    """Yield the table's rows for a method: its name, a row of relative costs for each case, and geometric means.
+
+    `found` are results of `run_one`. A case's last number is the largest ratio of the errors of "after" and "before".
+    """
     own, costs = [row for row in found if row["method"] == method], []
     yield method, []
     for case in dict.fromkeys(row["case"] for row in own):

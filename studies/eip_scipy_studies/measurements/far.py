@@ -40,7 +40,7 @@ def ways() -> dict[str, dict[str, Any]]:
 
 
 class Found(NamedTuple):
-    """Results: times (m,) in years, and wall times in seconds and errors of the runs by their names.
+    """Results of all runs: `times` (m,) in years, and `seconds`, the wall times of the runs by their names.
 
     `apart` are the distances [AU] (m, 10) of the bodies from their places in the finest run, for each other run.
     `known` are the distances [AU] (10,) of the finest run from the packaged reference, by time, for those of

@@ -46,9 +46,10 @@ def grid_error(gpe, turning, resting):
 def runners(psi, t_end, points):
     """Return the methods to run from the field `psi` to the time `t_end`, and what is needed to judge the runs.
 
-    The four results are a dict of (run, steps) by method; a dict of (change of mass, change of energy) by (method, h),
-    which the runs fill in; the result of `grid_error`; and a function that returns the norm of a field.
-    ``run(h) -> (seconds, y)``, where y is the difference of the final state from the reference in the same frame.
+    The grid has `points` points along each axis. The four results are a dict of (run, steps) by method; a dict of
+    (change of mass, change of energy) by (method, h), which the runs fill in; the result of `grid_error`; and a
+    function that returns the norm of a field. ``run(h) -> (seconds, y)``, where y is the difference of the final state
+    from the reference in the same frame.
     """
     gpe = ring_condensate(0.7, points=points)
     problem = gpe.problem(psi, t_end)

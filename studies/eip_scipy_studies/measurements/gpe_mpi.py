@@ -90,12 +90,18 @@ class Case:
         return method(self.gpe.fun, 0.0, self.psi, 1e3, h=h, invariants=invariants, metric="euclidean")
 
     def measure(self):
-        """Return the least seconds (3,) of a call of f, a step without invariants, and one keeping mass and energy."""
+        """Return the least seconds (3,) of a right-hand side, a step without invariants, and a projected step.
+
+        The projected step keeps mass and energy.
+        """
         functions = [lambda: self.gpe.rhs(0.0, self.psi, self.out), *(solver.step for solver in self.solvers)]
         return np.array([min(timed(function, self.comm) for _ in range(IN_A_ROW)) for function in functions])
 
     def results(self):
-        """Return two fields, whole on rank 0: f at the start, and the state after `STEPS` steps with projection."""
+        """Return two fields, whole on rank 0: the right-hand side at the start, and the state after `STEPS` steps.
+
+        The steps keep mass and energy.
+        """
         solver = self.solvers[1]
         for _ in range(STEPS):
             solver.step()
@@ -112,8 +118,9 @@ def counts():
 def compare(shape, seconds):
     """Return, on rank 0, {ranks: [times of f, of RK4 and of EIP-ME in ms, relative errors of f and of the state]}.
 
-    The times are those of one call or one step; EIP-ME keeps mass and energy. Errors are differences from the run
-    without MPI. Other ranks return an empty dict. `seconds` is the time that is spent on measuring.
+    The times are those of one call or one step; f is the right-hand side, and EIP-ME keeps mass and energy. Errors are
+    differences from the run without MPI. Other ranks return an empty dict. `seconds` is the time that is spent on
+    measuring.
     """
     cases = {ranks: Case(shape, ranks) for ranks in counts()}
     results = {}

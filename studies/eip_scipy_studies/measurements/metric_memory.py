@@ -168,7 +168,7 @@ def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
 
 
 def discs(seed: int, cut: float = 2.5) -> Case:
-    """Return nine discs with a truncated Lennard-Jones force, in a box with soft walls."""
+    """Return nine discs, at first at random (`seed`), with a Lennard-Jones force that ends at the distance `cut`."""
     shift = 4 * (cut**-12 - cut**-6)
 
     @njit
@@ -208,7 +208,7 @@ def discs(seed: int, cut: float = 2.5) -> Case:
 
 
 def backlash(stiffness: float, start: float, speed: float) -> Case:
-    """Return one body on a spring with a dead zone of half width 0.5."""
+    """Return one body on a spring with a dead zone of half width 0.5, at first at `start` with the velocity `speed`."""
 
     @njit
     def energy(q):
@@ -226,7 +226,7 @@ def backlash(stiffness: float, start: float, speed: float) -> Case:
 
 
 def gear(stiffness: float) -> Case:
-    """Return two bodies that turn against each other with play, one of them on a soft spring."""
+    """Return two bodies in contact with play, the first one on a soft spring; `stiffness` is that of the contact."""
 
     @njit
     def energy(q):
@@ -247,7 +247,10 @@ def gear(stiffness: float) -> Case:
 
 
 def wall(stiffness: float, power: int, speed: float) -> Case:
-    """Return a body that flies freely between soft walls at -1 and 1."""
+    """Return a body that flies freely between soft walls at -1 and 1, at first with the velocity `speed`.
+
+    At a depth d in a wall the force is `stiffness` d^`power`.
+    """
 
     @njit
     def energy(q):
@@ -265,7 +268,10 @@ def wall(stiffness: float, power: int, speed: float) -> Case:
 
 
 def round_wall(power: int) -> Case:
-    """Return a body that flies freely inside a round soft wall in the plane; energy and angular momentum are kept."""
+    """Return a body that flies freely inside a round soft wall in the plane; energy and angular momentum are kept.
+
+    The force of the wall grows as the depth to the `power`.
+    """
 
     @njit
     def energy(q):
@@ -295,7 +301,7 @@ def round_wall(power: int) -> Case:
 
 
 def ball(stiffness: float) -> Case:
-    """Return a ball that bounces on a Hertz contact under gravity."""
+    """Return a ball that bounces under gravity on a Hertz contact, whose force is `stiffness` times depth^1.5."""
 
     @njit
     def energy(q):
@@ -340,7 +346,10 @@ def beads(count: int) -> Case:
 
 
 def huber(width: float, bodies: int) -> Case:
-    """Return springs whose force is constant beyond `width`: one body, or a chain between walls."""
+    """Return springs whose force is constant beyond the elongation `width`.
+
+    They hold one body, or a chain of several `bodies` between walls.
+    """
 
     @njit
     def well(d):
@@ -380,7 +389,7 @@ CHARGE, MASSES = 1.602176634e-19, {"electron": 9.1093837e-31, "proton": 1.672621
 def magnetic(name: str, momenta: bool) -> Case:
     """Return a particle in SI units in a uniform field of 1 T and a Penning trap's potential.
 
-    The state is (x, p) if `momenta` is true, otherwise (x, v).
+    `name` is a key of `MASSES`. The state is (x, p) if `momenta` is true, otherwise (x, v).
     """
     mass = MASSES[name]
     charge, field_, size = CHARGE, 1.0, 1e-3
@@ -421,7 +430,10 @@ def magnetic(name: str, momenta: bool) -> Case:
 
 
 def trap(name: str, exponent: int) -> Case:
-    """Return a particle in SI units on a line, (x, p), in a trap whose potential grows as x^`exponent`."""
+    """Return a particle in SI units on a line, (x, p), in a trap whose potential grows as x^`exponent`.
+
+    `name` is a key of `MASSES`.
+    """
     mass, size = MASSES[name], 1e-3
     frequency = 0.1 * CHARGE / mass
     strength = mass * frequency**2 * size ** (2 - exponent)

@@ -173,7 +173,8 @@ def kepler_table(found: Table) -> str:
 def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
     """Return a function that runs the problem and returns its final state, and one for the seconds of the last run.
 
-    The seconds are those of the steps, without compilation and without the time before the steps.
+    The `options` are those of `integrate`. The seconds are those of the steps, without compilation and without the time
+    before the steps.
     """
     last = [0.0]
 
@@ -213,8 +214,9 @@ def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray]
 def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem, int], Methods], turns: int) -> Table:
     """Run all methods `turns` times, first in the original axes and then in new random ones each time.
 
-    ``methods(problem, turn)`` returns the methods, and `truth` is the final state. Return what `orbits.rows` makes of
-    the runs.
+    ``methods(problem, turn)`` returns the methods for the problem in the axes of the turn with the index `turn`, which
+    is 0 for the original axes. `truth` is the reference state at the end, in the original axes. Return what
+    `orbits.rows` makes of the runs.
     """
     found = []
     for turn, rotation in enumerate([Rotation.identity(), *Rotation.random(turns - 1, np.random.default_rng(1))]):

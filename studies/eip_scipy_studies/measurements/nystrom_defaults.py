@@ -163,7 +163,8 @@ def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], ro
 def steps(system: System) -> list[int]:
     """Return the first numbers of steps at which the error of EIPRKN12 with projection is below each of `LEVELS`.
 
-    Numbers grow by a factor of 1.3 from 8 on. Levels that are not reached with `MOST_STEPS` steps are left out.
+    Numbers grow by a factor of 1.3 from 8 on. Levels that are not reached with fewer than `MOST_STEPS` steps
+    (`MOST_STEPS` / 8 for runs in Python) are left out.
     """
     found, n, left = list[int](), 8, list(LEVELS)
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])

@@ -68,7 +68,7 @@ def potential(sim: Any) -> Any:
 
 
 def methods(problem: Problem) -> Methods:
-    """Return `Methods` with an entry for each method and step."""
+    """Return the runs of each method with each of its steps, by name, in the form that `work_precision` takes."""
     found = yearly("EIPGJ14", by_us(problem, EIPGJ14), *MULTISTEP)
     found |= yearly("EIPRKN12", by_us(problem, EIPRKN12, every=10, compensated=True), *NYSTROM)
     for name, days in DAYS.items():

@@ -54,6 +54,9 @@ def edge(field):
 class GridRun:
     """A run on `points` x `points` points, by RK4 in the rotating frame if `turning`, otherwise by splitting at rest.
 
+    The run starts from the square field `psi`, which may have another number of points. `shown` is the option
+    `progress` of `integrate`.
+
     Attributes for each snapshot are the field in the frame at rest, the number of vortices (`counts`), and the angle in
     rad by which the vortices have turned in the rotating frame (`turned`).
     """

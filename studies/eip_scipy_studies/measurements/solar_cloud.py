@@ -3,7 +3,7 @@
 `ensemble` runs EIPRKN12 and EIPGJ14 on one core, every member with its own H and L. It is compared with `integrate`,
 which makes the same runs one at a time, and with WHFast (corrector 17) and IAS15 from REBOUND. Runs one at a time use a
 sample of the members, because each costs the same. The errors are the largest in the sample, of Mercury's position [AU]
-at the end, relative to IAS15, which is accurate to 1e-11. The times are the least processor times of five turns.
+at the end, relative to IAS15, which is accurate to 1e-11. The times are the least processor times of five runs.
 """
 
 from __future__ import annotations

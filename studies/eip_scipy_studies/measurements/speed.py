@@ -101,8 +101,9 @@ def _weight(err, old, new, rtol, atol):
 def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
     """Run EIP-RK4 on Kepler's problem, written out by hand: stages, metric, normal equations, residuals.
 
-    The start is the position (a, b) with the velocity (c, d). With `error_metric` the metric is that of the local
-    error, otherwise euclidean. Return the four components of the final state, and the largest residual of an invariant.
+    The start is the position (a, b) with the velocity (c, d). `steps` steps of length h keep the energy `energy0` and
+    the angular momentum `momentum0`. With `error_metric` the metric is that of the local error, otherwise
+    euclidean. Return the four components of the final state, and the largest residual of an invariant.
     """
     rtol, atol = 1e-3, 1e-6
     worst = 0.0

@@ -73,7 +73,8 @@ def double_pendulum(heyoka: Any, a: Any, b: Any, p: Any, r: Any) -> Any:
 class Chaotic(NamedTuple):
     """A Hamiltonian system in the forms of this package and of heyoka, with start, step and length of the run.
 
-    `share` is the length of the run divided by the setting `time` of the study.
+    `text` is the Hamiltonian as text for `hamiltonian`, and ``energy(heyoka, *variables)`` returns it as an expression
+    of heyoka. `share` is the length of the run divided by the setting `time` of the study.
     """
 
     text: str
@@ -450,8 +451,9 @@ def _standard_error(values: np.ndarray) -> float:
 def _relativity(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float]]:
     """Compare the growth of a tangent vector with that of the distance of two orbits, under relativity.
 
-    Return, for each force and start, the logarithm of the growth by columns, by differences of orbits and without
-    relativity, and MEGNO. REBOUND's variational particles lack these forces.
+    Return, for each relativistic force and start, a list: the logarithms of the growth of the tangent vector, of the
+    growth of the distance, and of the growth of the tangent vector without relativity, and last MEGNO with it.
+    REBOUND's variational particles lack these forces.
     """
     found, t_end, eps = {}, 50 * PERIOD, 1e-6
     direction = np.random.default_rng(0).standard_normal(18)
@@ -536,7 +538,10 @@ def _costs(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]
 
 
 def _costs_of_ready_problems() -> dict[str, float]:
-    """Return times of ready-made problems with k columns, relative to k + 1 runs without; all keep their invariants."""
+    """Return times of runs of ready-made problems with k columns of derivatives; all runs keep the invariants.
+
+    Each time is divided by that of k + 1 runs without columns.
+    """
     bodies = solar_system()
     n = bodies.y0.size
     cases: dict[str, tuple[Any, float, Any, int]] = {
@@ -560,9 +565,10 @@ def _seconds(fun: Any, n: int, **options: Any) -> float:
 
 
 def _fit(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
-    """Fit an orbit to observed positions, with the Jacobian from columns and from differences of plain runs.
+    """Fit an orbit to observed positions, with the Jacobian from two sources.
 
-    Return the seconds, numbers of runs and errors of the fitted start for both, and the ratio of the times.
+    The sources are columns of the state-transition matrix and differences of plain runs. Return the seconds, numbers of
+    runs and errors of the fitted start for both, and the ratio of the times.
     """
     problem = hamiltonian(KEPLER, invariants={"L": "x*py - y*px"})
     options: dict[str, Any] = {"method": EIPDOP853, "h": PERIOD / 80}

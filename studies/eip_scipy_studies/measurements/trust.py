@@ -50,7 +50,10 @@ def all_runs() -> list[Run]:
 
 
 def record(run: Run) -> dict[str, Any]:
-    """Carry out one run, and return its properties and results as a dict without arrays."""
+    """Carry out one run, and return its properties and results as a dict without arrays.
+
+    The entry "group" is the name of the group to which the run belongs: the kind of fault, or of correct run.
+    """
     begin = time.perf_counter()
     outcome = carry_out(run)
     if (run.sick is False or run.group == LATE) and outcome.y is not None:
@@ -73,7 +76,7 @@ def spoilt(run: Run, outcome: Outcome) -> bool:
 
 
 def listing(rows: Iterable[dict[str, Any]]) -> str:
-    """Lay out a line for each run, below the names of their groups."""
+    """Lay out a line for each of `rows`, the results of `record`, below the name of the run's group."""
     lines, group = [], None
     for row in rows:
         if row["group"] != group:
@@ -91,7 +94,7 @@ def harmful(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return rows by group, in the order in which they come."""
+    """Return the results of `record` by the group of the run, in the given order."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         found.setdefault(row["group"], []).append(row)

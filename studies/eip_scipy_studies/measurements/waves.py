@@ -86,7 +86,7 @@ def errors(problem: Any, t: float, y: np.ndarray) -> tuple[float, float]:
 def costs(problem: Any, steps: Any, tolerances: Any, times: Any, repeats: int) -> list[dict[str, Any]]:
     """Return a row for each run: its least processor time in seconds, calls of f, and errors of the field at `times`.
 
-    "field" and "invariants" are the largest errors at the last of these times.
+    Each run is made up to `repeats` times. "field" and "invariants" are the largest errors at the last of `times`.
     """
     runs = methods(problem, steps, tolerances)
     rows: dict[tuple[str, float], dict[str, Any]] = {}
@@ -153,7 +153,10 @@ class Waves(Measurement[dict[str, dict[str, list[dict[str, Any]]]]]):
 
 
 def figure(found: dict[str, list[dict[str, Any]]]) -> Any:
-    """Draw the waves in space and time, and below each the errors against processor time."""
+    """Draw the waves in space and time, and below each the errors against processor time.
+
+    `found` has the rows of `costs` by the names of the waves.
+    """
     from eip_scipy.plotting import method_styles
 
     from ..plotting import blank_figure, log_x

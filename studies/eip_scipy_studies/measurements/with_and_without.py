@@ -47,9 +47,9 @@ def momentum(t, y):
 
 
 class Errors(NamedTuple):
-    """Times (m,) of a run of the comet, relative errors of the energy, errors of the position, and calls of `fun`.
+    """Times (m,) of a run of the comet, relative errors of its energy (m,), and errors of its position (m,).
 
-    Errors of the position are in units of the semi-major axis.
+    Errors of the position are in units of the semi-major axis; `nfev` is the number of calls of `fun`.
     """
 
     t: np.ndarray
@@ -68,7 +68,10 @@ class Errors(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """Times of a run [days], Kepler energy of the satellite [km^2/s^2], errors of its position [m], calls of `fun`."""
+    """Times of a run [days], and the satellite's Kepler energy [km^2/s^2] and errors of position [m] at these times.
+
+    `nfev` is the number of calls of `fun`.
+    """
 
     t: np.ndarray
     energy: np.ndarray

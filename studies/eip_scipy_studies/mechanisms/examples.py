@@ -38,7 +38,8 @@ FINEST = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
 def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
     """Return the N-four-bar mechanism of `n` windows, in the coordinates of the ends of its cranks.
 
-    All cranks start upright, and their ends move at 1 m/s.
+    A window consists of two cranks and the coupler between their ends; neighbouring windows share a crank. All cranks
+    start upright, and their ends move at 1 m/s. The `options` are passed to `mechanism`.
     """
     ends = n + 1
     M, weights = np.eye(ends) / 3, np.full(ends, 0.5)
@@ -233,6 +234,7 @@ def bricard(section: float = 0.1, axes: bool = True, t_end: float = 10.0, **opti
 
     Its coordinates are those of the corners P2 to P5 and, if `axes` is true, of the axes of the joints there: 24
     constraints of rank 23. Otherwise the axes follow from the rods, which are then slender: 12 constraints of rank 11.
+    The `options` are passed to `mechanism`.
     """
     whole, weights = np.zeros((6, 6)), np.zeros(6)
     for i, j in ((k, (k + 1) % 6) for k in range(1, 6)):
@@ -426,7 +428,11 @@ def _rolled(start: np.ndarray, t: float) -> np.ndarray:
 
 
 def _centre_velocity(yaw: float, lean: float, u1: float, u2: float) -> tuple[float, float, float]:
-    """Return the velocity r (w x L.z) = u2 L.x - u1 L.y of the centre of a disc that rolls, in the frame at rest."""
+    """Return the velocity u2 L.x - u1 L.y of the centre of a rolling disc of radius 1, in the frame at rest.
+
+    L.x and L.y are unit vectors of a frame that takes part in yaw and lean but not in the spin, and `u1` and `u2` are
+    the components of the angular velocity along them.
+    """
     return (
         u2 * np.cos(yaw) + u1 * np.sin(yaw) * np.cos(lean),
         u2 * np.sin(yaw) - u1 * np.cos(yaw) * np.cos(lean),

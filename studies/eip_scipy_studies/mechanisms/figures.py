@@ -18,7 +18,10 @@ TOLERANCE, LAST = 1e-4, np.array([2.0, 1.5, 1.0, 0.5, 0.0])  # of the runs that 
 
 
 def joints(y: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
-    """Return the ends of the links of the four-bar linkage of these sizes at states (6, k), as an array (k, 4, 2)."""
+    """Return the ends of the links of the four-bar linkage at the states `y` (6, k), as an array (k, 4, 2).
+
+    `sizes` has the lengths of the three moving links, "la", "lb" and "lc".
+    """
     angles = np.cumsum(y[:3], axis=0).T
     lengths = np.array([sizes[name] for name in ("la", "lb", "lc")])[:, None]
     ends = np.cumsum(lengths * np.stack([np.cos(angles), np.sin(angles)], axis=-1), axis=1)
@@ -28,7 +31,8 @@ def joints(y: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
 def four_bar_figures(panels: Sequence[Any]) -> tuple[Any, Any]:
     """Draw the linkage by RK45 without projection and with all invariants kept.
 
-    Return two figures: one with the panels of errors against costs below the linkages, and one of the linkages alone.
+    Return two figures: one of the two linkages with errors against costs below them, and one of the linkages alone.
+    `panels` are the two `CostPanel` objects for the errors against costs.
     """
     from ..plotting import Linkage, linkage_figure, linkages_figure
 

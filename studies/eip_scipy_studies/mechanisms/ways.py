@@ -71,9 +71,10 @@ def ways(problem: MechanicsProblem, session: Session) -> dict[str, Way]:
 
 
 def kept(problem: MechanicsProblem, invariants: Any, tolerance: float, **options: Any) -> Any:
-    """Run a mechanism by `integrate` with EIPDOP853, these invariants and rtol = atol = `tolerance`; return its result.
+    """Run a mechanism by `integrate` with EIPDOP853, `invariants` and rtol = atol = `tolerance`; return the result.
 
-    Warnings are suppressed; the result's `trusted` tells whether the run is reliable.
+    `options` are further options of `integrate`. Warnings are suppressed; the result's `trusted` tells whether the run
+    is reliable.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a run that is not reliable is marked
@@ -94,7 +95,7 @@ def _projected(problem: MechanicsProblem, invariants: Any, tolerance: float) -> 
 
 
 class _Calls:
-    """Counter of calls; `add` raises an error after more than `MOST_CALLS` of them, to end the run."""
+    """Counter of calls of the right-hand side; `add` raises an error after more than `MOST_CALLS`, to end the run."""
 
     number = 0
 
@@ -125,8 +126,9 @@ def _by_scipy(problem: MechanicsProblem, fun: Any, method: str, tolerance: float
 def _by_ida(problem: MechanicsProblem, ida: Any, tolerance: float) -> Outcome:
     """Run `problem` by IDA, with the constraints on positions and velocities as equations, and a multiplier for each.
 
-    The multipliers move q' and u' along the gradients of the constraints (Gear, Gupta and Leimkuhler 1985). They are 0
-    in the exact motion, since the accelerations satisfy the constraints already.
+    `ida` is the class ``sksundae.ida.IDA``. The multipliers move q' and u' along the gradients of the constraints
+    (Gear, Gupta and Leimkuhler 1985). They are 0 in the exact motion, since the accelerations satisfy the constraints
+    already.
     """
     (item,) = problem.constraints
     n, nq, m = problem.y0.size, len(problem.names.coordinates), item.size or 0
@@ -161,7 +163,8 @@ def _by_ida(problem: MechanicsProblem, ida: Any, tolerance: float) -> Outcome:
 def lambdified(problem: MechanicsProblem, factor: float) -> Callable[[float, np.ndarray], np.ndarray]:
     """Return the right-hand side of the four-bar linkage as users write it: lambdify and numpy.linalg.solve.
 
-    Baumgarte's terms, -2 `factor` g' - `factor`^2 g, are added to the constraints on the accelerations.
+    Baumgarte's terms, -2 `factor` g' - `factor`^2 g for the constraints g = 0, are added to the constraints on the
+    accelerations.
     """
     import sympy
 

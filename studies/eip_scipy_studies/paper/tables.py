@@ -117,7 +117,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Series:
-    """The paper's numbers of one method at successively shorter steps, as they are stored."""
+    """The paper's numbers of one method at successively shorter steps, as they are stored.
+
+    The lengths of the steps are `h` divided by each of `divisors`. `iterations` is the number of Newton steps of a
+    projection, and `invariants` has the initials of the kept invariants, such as "HL". `errors` and `orders` are the
+    numbers as printed, with the misprints corrected, and `mpmath` are the errors in 50 digits. `errata` has the
+    misprints by the index of the error, and `Omega` is the angular velocity of the rotation in table 5.
+    """
 
     table: int
     name: str

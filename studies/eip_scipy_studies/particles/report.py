@@ -26,7 +26,7 @@ TITLES = {
 
 
 class RangeCheck(NamedTuple):
-    """Check of a number that must lie between two bounds."""
+    """Check that a number, named `what`, lies between two bounds in the problem `scene`."""
 
     scene: str
     what: str

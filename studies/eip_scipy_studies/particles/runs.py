@@ -80,10 +80,11 @@ class ParticleStudy:
         All problems have ``energy_error``, ``momentum_error`` (relative, largest), ``phase_error`` (of the gyration at
         the end, rad), ``position_error`` (at the end), ``nfev`` and ``wall_time``. Uniform field: ``gyroradius_first``
         and ``gyroradius_last`` (half the range of R in the first and the 100th turn, or the last where there are
-        fewer), and ``angle_error`` (of the guiding centre, averaged over a gyration; largest). Tokamak: ``tips``,
-        ``tip_nearest`` and ``tip_farthest`` (guiding centre's R), ``extrema_error`` (largest error of the extrema of R
-        and z in a poloidal turn of the reference) and ``moment_change`` (relative, of the magnetic moment averaged over
-        a turn, from the first to the last of these turns).
+        fewer), and ``angle_error`` (of the guiding centre, averaged over a gyration; largest). Tokamak: ``tips``
+        (number of banana tips), ``tip_nearest`` and ``tip_farthest`` (least and largest R of the guiding centre at a
+        tip), ``extrema_error`` (largest error of the extrema of R and z in a poloidal turn of the reference) and
+        ``moment_change`` (relative, of the magnetic moment averaged over a turn, from the first to the last of these
+        turns).
         """
         special = _uniform_numbers if self.scene == "uniform" else _tokamak_numbers
         return {

@@ -157,7 +157,10 @@ def timed(
 
 
 def panels(runs: Sequence[TimedRun], time: str = "wall time [s]") -> list[list[Any]]:
-    """Return panels for `eip_scipy_studies.plotting.cost_figure`: Mercury's error, and the largest of the others."""
+    """Return panels for `eip_scipy_studies.plotting.cost_figure`: Mercury's error, and the largest of the others.
+
+    `time` is the label of the axis of times.
+    """
     from ..plotting import CostPanel
 
     kinds = {"mercury": "Mercury", "others": "the worst of the other planets"}
@@ -213,6 +216,7 @@ def cost_methods(
         The method asked for. It is timed with and without its projection; EIPRK5 (or EIPRK4 if `method` is EIPRK5),
         Stoermer-Verlet, EIPRKN12, EIPGJ14 and, if there is a `peer`, REBOUND's methods are timed as well.
     metric : {"error", "euclidean"}
+        Metric of the projection.
     peer : callable or None
         REBOUND, if it is installed.
 

@@ -41,6 +41,8 @@ class SolarRuns:
     """The completed runs and their results, which can also be used after an interruption.
 
     `order` is that of the method asked for, and `tight` the most accurate run, with which the others are compared.
+    `cost` has the timed runs of the figure of error against cost, and `cost_scene` their problem, which may be shorter
+    than `scene`.
     """
 
     scene: SolarScene
@@ -65,7 +67,7 @@ class SolarRuns:
 
 
 def ecliptic(scene: SolarScene, vectors: np.ndarray) -> np.ndarray:
-    """Rotate vectors (k, 3, m) from the axes of the data to those of the ecliptic."""
+    """Rotate vectors (k, 3, m) of k bodies at m times from ``scene.data.axes`` to the axes of the ecliptic."""
     if scene.data.axes != "ICRF":
         return vectors
     c, s = math.cos(OBLIQUITY), math.sin(OBLIQUITY)
@@ -148,7 +150,10 @@ def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun |
 
 
 def _turns(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None, wrapped: np.ndarray) -> np.ndarray:
-    """Return the whole turns, as angles, to be added to errors in (-pi, pi]; they are counted along the run `tight`."""
+    """Return the whole turns (9,), as angles, to be added to the errors of longitude `wrapped`, in [-pi, pi).
+
+    The turns are counted along the run `tight`; they are nan if `tight` is None or has no state at `year`.
+    """
     if tight is None or _state_at(tight, year) is None:
         return np.full_like(wrapped, np.nan)
     counted = longitude_errors(scene, run, tight)[:, _index(tight, year)]

@@ -100,7 +100,10 @@ def _span(study: SolarRuns) -> str:
 
 
 def _longitudes(study: SolarRuns) -> dict[str, np.ndarray]:
-    """Return the errors of longitude (9, m) in rad along each run except the reference, by name."""
+    """Return the errors of longitude (9, m) in rad along each run except the reference, by the name of the run.
+
+    Without a reference run the dictionary is empty.
+    """
     tight = study.tight
     if tight is None:
         return {}

@@ -19,7 +19,10 @@ __all__ = ["cost_rows", "csv_rows", "json_content", "text"]
 
 
 def text(study: SolarRuns, settings: Any) -> str:
-    """Lay out the head, the table, the notes and the checks, 90 characters wide with the usual names."""
+    """Lay out the head, the table, the notes and the checks, 90 characters wide with the usual names of methods.
+
+    `settings` is the command, whose `h` is the step that was requested.
+    """
     parts = [_head(study, settings), _table(study), _notes(study), *_check_lines(study)]
     return "\n".join(["", *parts])
 

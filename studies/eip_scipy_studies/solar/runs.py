@@ -112,7 +112,7 @@ class MethodRun:
     y : ndarray, shape (60, m)
         States in AU and AU/yr.
     energy_error, momentum_error : ndarray, shape (m,)
-        |H - H(0)| / |H(0)| and |L - L(0)| / |L(0)|.
+        ``|H - H(0)| / |H(0)|`` and ``|L - L(0)| / |L(0)|``.
     failure : str
         Reason why the run did not reach its end; empty if it did.
     """
@@ -170,9 +170,10 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScen
 
 
 def _save_interval(years: float) -> float:
-    """Return the time between saved states in years.
+    """Return the time in years between two saved states of a run of `years` years.
 
-    It is short enough to count turns and to draw curves, and such that states at 1, 10, 100 ... years are saved.
+    It is short enough to count the turns of the planets and to draw curves, and such that states at 1, 10, 100 ...
+    years are saved.
     """
     for least_years, interval in ((200.0, 1.0), (100.0, 0.5), (40.0, 0.2), (1.0, 0.1)):
         if years >= least_years:
@@ -201,8 +202,9 @@ def plan(
     method : type
         `EIPRK1` ... `EIPRK5` or another fixed-step class.
     metric : {"error", "euclidean"}
+        Metric of the projection.
     peer : callable or None
-        REBOUND, if it is installed.
+        REBOUND's `run`, if REBOUND is installed.
     checkpoint_of : callable, optional
         ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
 
@@ -294,13 +296,16 @@ def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRu
 
 
 def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
-    """Return the options with which `integrate` keeps each planet's energy about the Sun instead of the totals."""
+    """Return options of `integrate` that keep each planet's energy about the Sun.
+
+    These energies take the place of the total energy and the total angular momentum.
+    """
     problem = solar_system(data, balances="kepler")
     return {"invariants": problem.invariants, "frame": problem.frame}
 
 
 def _balanced(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run EIPGJ14 with each planet's energy about the Sun kept as a balance, instead of the totals."""
+    """Run EIPGJ14 with the options of `orbits_kept`, which keep each planet's energy about the Sun as a `Balance`."""
     per_save = whole_number(scene.interval / MULTISTEP_STEP)
     return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **orbits_kept(scene.data), **checkpoint)
 
@@ -323,7 +328,10 @@ def _verlet(scene: SolarScene) -> MethodRun:
 
 
 def leapfrog(problem: Problem, step: float, save_every: int | None) -> StormerVerletResult:
-    """Run Stoermer-Verlet in its kick-drift-kick form with this step, and return the result of `stormer_verlet`."""
+    """Run Stoermer-Verlet in its kick-drift-kick form with steps of length `step`; return its `StormerVerletResult`.
+
+    Every `save_every`-th state is saved in addition to the first and the last; None saves only these two.
+    """
     assert problem.acc is not None  # N bodies have accelerations
     return stormer_verlet(problem.acc, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
 
@@ -331,7 +339,8 @@ def leapfrog(problem: Problem, step: float, save_every: int | None) -> StormerVe
 def rebound_run(scene: SolarScene, peer: Peer, name: str, integrator: str, per_save: int, progress: bool) -> MethodRun:
     """Run an integrator of REBOUND with `per_save` steps between two saved states.
 
-    Integrators with fixed steps are timed in a second run without saves, because each save costs a synchronisation.
+    `peer` is REBOUND's `run`; `progress` is not used. Integrators with fixed steps are timed in a second run without
+    saves, because each save costs a synchronisation.
     """
     step = scene.interval / per_save
     run = partial(peer, scene.problem.params, scene.problem.y0, integrator, h=step, n_steps=scene.n_saves * per_save)

@@ -37,7 +37,11 @@ BESIDE_FIGURES, OWN_FIGURES = (
 
 
 class Found(NamedTuple):
-    """The runs, REBOUND's `run` if it is installed, and the second process, which does the longest run and draws."""
+    """Results of the command.
+
+    `peer` is the function `run` of `eip_scipy.integrations.rebound`, or None if REBOUND is not installed. `beside` is
+    the second process, which does the longest run and draws figures, or None if there is none.
+    """
 
     runs: SolarRuns
     peer: Peer | None
@@ -49,7 +53,8 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
     """Command ``eip-scipy solar-system``.
 
     From a length of `beside_years` on, a second process does the longest run; in shorter runs it costs more than it
-    gains.
+    gains. For the error against cost, ``timed_methods(scene, method, metric, peer)`` returns the methods and steps as
+    `cost_methods` does, and each is timed at most `repeats` times.
     """
 
     years: float = option(2000.0, "length in Julian years (default: %(default)g)", type=positive)
@@ -99,7 +104,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return data
 
     def _integrate(self, runs: SolarRuns, session: Session, peer: Peer | None, beside: Beside | None) -> None:
-        """Do the runs, the last of them in the second process if there is one."""
+        """Do the runs and add them to `runs`; the last one is done in the second process, `beside`, if there is one."""
         method = fixed_step_methods()[self.method]
         tasks = plan(runs.scene, method, self.metric, peer, self.checkpoint_options)
         starts: list[Callable[[], MethodRun]] = [partial(task.start, session.shown) for task in tasks]

@@ -42,12 +42,16 @@ class Model(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the name in the table, in the words of the command line."""
+        """Return the model's name in the table: "Newton", and the words of the option ``--forces``, joined by " + "."""
         return " + ".join(["Newton", *self.forces, *[MOON] * self.moon])
 
 
 class ModelRun(NamedTuple):
-    """Errors of a model against the ephemeris: times `years` (m,), and for each planet errors in km and arcsec (m,)."""
+    """Errors of a model against the ephemeris at the times `years` (m,).
+
+    `km` and `arcsec` have for each body the distance from its position in the ephemeris, and the angle between both
+    positions seen from the Sun, (m,).
+    """
 
     model: Model
     years: np.ndarray
@@ -58,7 +62,9 @@ class ModelRun(NamedTuple):
 
 
 def models(forces: Sequence[str] | None) -> list[Model]:
-    """Return the models to be compared: Newton's gravitation and the model with these `forces`, or the standard ones.
+    """Return the models to be compared: Newton's gravitation and the model with `forces`, or those in `STANDARD`.
+
+    The name `MOON` among the forces makes the Moon a separate body. `STANDARD` is used if `forces` is None.
 
     Raises
     ------
@@ -109,7 +115,9 @@ def run_model(
     data : SolarSystemData
         Initial data, with the Moon as a separate body if the model has it.
     times : ndarray, shape (m,)
-        Years, from `save_times`, with `every` and `step`.
+    every : int
+    step : float
+        Results of `save_times`: times in years, number of steps between two of them, and step in years.
     truth : dict of str to ndarray, shape (m, 3)
         Heliocentric positions at these times, km.
     progress : bool, optional
@@ -128,9 +136,10 @@ def run_model(
 def _positions(
     model: Model, data: SolarSystemData, times: np.ndarray, every: int, step: float, progress: bool
 ) -> dict[str, np.ndarray]:
-    """Return the heliocentric positions (m, 3) in km of each body but the Sun at `times`.
+    """Integrate a model, and return the heliocentric positions (m, 3) in km of each body but the Sun at `times`.
 
-    If the Moon is a separate body, "EMB" is the centre of mass of Earth and Moon.
+    There are `every` steps of `step` years between two saved states. If the Moon is a separate body, "EMB" is the
+    centre of mass of Earth and Moon.
     """
     problem = solar_system(data, years=float(times[-1]), h=step, forces=model.forces)
     method = named(EIPDOP853, model.name)
@@ -148,7 +157,10 @@ def _positions(
 def errors(
     own: dict[str, np.ndarray], truth: dict[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return distances in km, and angles seen from the Sun in arcsec, between positions (m, 3) of each body."""
+    """Return, by body, the distances in km and the angles in arcsec (m,) between the positions `own` and `truth`.
+
+    Positions are heliocentric, (m, 3), in km; angles are seen from the Sun.
+    """
     km = {body: np.linalg.norm(own[body] - there, axis=1) for body, there in truth.items()}
     chord = {body: np.linalg.norm(_unit(own[body]) - _unit(there), axis=1) for body, there in truth.items()}
     return km, {body: 2 * np.arcsin(np.minimum(c / 2, 1.0)) * ARCSEC for body, c in chord.items()}
@@ -159,7 +171,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 class Found(NamedTuple):
-    """The runs of all models, the start in words, and the step in years."""
+    """The runs of all models, the epoch at which they start (`start`) as text, and the step in years."""
 
     runs: list[ModelRun]
     start: str
@@ -214,7 +226,7 @@ class Truth(AnyEpoch, Study[Found]):
         return found
 
     def checks(self, found: Found) -> list[Check]:
-        """Check that the error of the steps is only a small part of each error."""
+        """Check that halving the step moves no body by more than `STEP_KM` plus `STEP_SHARE` of its final error."""
         return [
             Check(
                 f"{run.model.name}: halving the step moves {body} by {moved:.2g} km, "
@@ -289,7 +301,7 @@ def csv_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
 
 
 def _row(run: ModelRun, k: int, body: str) -> dict[str, Any]:
-    """Return a row with the errors of a body at the saved time `k`."""
+    """Return a row with the errors of a body at the time ``run.years[k]``."""
     return {
         "model": run.model.name,
         "years": float(run.years[k]),

@@ -66,9 +66,9 @@ class Case:
         return y / self.size if self.view is None else self.view(y)
 
     def error(self, method: Any, rtol: float, share: float = 1e-2, **options: Any) -> tuple[float, int]:
-        """Run the problem; return the error of the last state, and the calls of `fun`, including those for Jacobians.
+        """Run the problem; return the error of the last state and the number of calls of `fun`.
 
-        The error is the largest difference of a value of `view` from the reference.
+        Calls for Jacobians are included. The error is the largest difference of a value of `view` from the reference.
 
         Parameters
         ----------
@@ -235,7 +235,8 @@ def separation() -> Case:
 def chain_case(angles: Sequence[float] = (1.2, 0.9, 0.5), end: float = 5.0) -> Case:
     """Return the chain with dampers, see `chain`, with its constraints as invariants.
 
-    The reference is a run of `chain_by_angles`, the same chain with the angles of the links as coordinates.
+    `angles` are the angles of the links from the vertical at the start, in radians. The reference is a run of
+    `chain_by_angles`, the same chain with the angles of the links as coordinates.
     """
     made, (fun, start, state) = chain(angles), chain_by_angles(angles)
 

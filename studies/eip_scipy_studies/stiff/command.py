@@ -57,7 +57,7 @@ def mean(rows: Sequence[dict[str, Any]], *names: str) -> float:
 
 
 def of(rows: Sequence[dict[str, Any]], **wanted: Any) -> list[dict[str, Any]]:
-    """Return the rows that have these values in the columns of these names."""
+    """Return the rows in which each column named in `wanted` has the value given there."""
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
@@ -144,7 +144,8 @@ class Stiff(Study[Found]):
 def _ratios(rows: Sequence[dict[str, Any]], calls: float | None = None) -> list[str]:
     """Return cells of a table: the mean ratio of errors, `calls` if it is given, and the mean ratio of calls.
 
-    The ratios are those with projection to without.
+    `calls` is the mean number of calls without projection. Each ratio is the number with projection divided by that
+    without.
     """
     shown = [] if calls is None else [f"{calls:.0f}"]
     return [f"{mean(rows, 'projected', 'error'):.2g}", *shown, f"{mean(rows, 'projected calls', 'calls'):.2f}"]

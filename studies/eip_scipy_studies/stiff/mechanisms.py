@@ -152,8 +152,8 @@ def governor() -> Natural:
     """Make the flyball governor: rods whose couplers to the slider are stiff springs with dampers.
 
     The coordinates are the direction u of the shaft (2), the height of the slider, and the balls (3 each); heights are
-    measured from the rods' joints. The rods are uniform bars from the joints, u JOINT and -u JOINT, to the balls. The
-    constraints are |u| = 1, the rods' lengths, and that the balls stay in the plane of u and the axis.
+    measured from the rods' joints. The rods are uniform bars from the joints, ``u JOINT`` and ``-u JOINT``, to the
+    balls. The constraints are ``|u| = 1``, the rods' lengths, and that the balls stay in the plane of u and the axis.
     """
     n = 9
     pick = np.eye(n)

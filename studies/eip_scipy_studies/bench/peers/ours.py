@@ -105,8 +105,8 @@ def _native(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
 def _each(takes: str, make: Any, scenes: tuple[str, ...]) -> list[Peer]:
     """Return EIPDOP853, EIPRKN12 and EIPGJ12 as `Peer` objects, for functions of the kind `takes`.
 
-    The last two are only for problems q'' = a(q). ``make(method, scene, ...)`` prepares a method, and `scenes` selects
-    problems, as `prepare` and `scenes` of `Peer` do.
+    `takes` is `PYTHON`, `COMPILED` or `OWN`. ``make(method, scene, ...)`` prepares a method, and `scenes` selects
+    problems, as `prepare` and `scenes` of `Peer` do. The last two methods are only for problems q'' = a(q).
     """
     label = {PYTHON: "", COMPILED: " (jitted)", OWN: " (problem)"}[takes]
     second = scenes or SECOND_ORDER

@@ -73,7 +73,10 @@ def two_pendulums() -> Problem:
 
 
 def each(before: str, options: Iterable[str], after: str = "") -> str:
-    """Return the argument `ways` of `runs`: for each option, "before option after", separated by commas."""
+    """Return the argument `ways` of `runs`: a text "before option after" for each option, separated by commas.
+
+    `before` and `after`, such as a method and further options, are the same for all.
+    """
     return ", ".join(f"{before} {option} {after}" for option in options)
 
 

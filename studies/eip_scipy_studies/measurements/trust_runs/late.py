@@ -54,7 +54,7 @@ def inelastic_bumper(strength: float) -> Problem:
 
 
 def kicks(strength: float) -> Problem:
-    """Return a pendulum that is pushed three times for a short time, with the claimed energy of a free one."""
+    """Return a pendulum that is pushed three times for a short time; the claimed energy is that of a free one."""
 
     def push(t):
         return 10 * strength * sum(np.exp(-(((t - at) / 0.2) ** 2)) for at in (6.1, 11.7, 17.3))
@@ -70,7 +70,10 @@ def one_bead(strength: float) -> Problem:
 
 
 def light_planet(mass: float) -> Problem:
-    """Return a star with G M = 1, a giant planet at 5.2, and a planet with G M = `mass` at 0.2, of period 0.56."""
+    """Return a star with G M = 1, a giant planet at the distance 5.2, and a planet with G M = `mass` at 0.2.
+
+    The period of the latter is 0.56.
+    """
     q = [[0.0, 0.0, 0.0], [5.2, 0.0, 0.0], [0.2, 0.0, 0.0]]
     v = [[0.0, 0.0, 0.0], [0.0, 5.2**-0.5, 0.0], [0.0, 0.2**-0.5, 0.0]]
     return nbody([1.0, 1e-3, mass], q, v, t_span=(0.0, 200.0))
@@ -87,7 +90,7 @@ def two_oscillators() -> Problem:
 
 
 def late_leaks() -> Iterator[Run]:
-    """Yield faulty runs with late or local leaks of five kinds."""
+    """Yield faulty runs of five systems whose energy changes only at some times or places."""
     leak = partial(runs, LATE)
     for make, more in (
         (friction_from_5, ""),

@@ -28,10 +28,10 @@ CHANNELS = (ERROR, START, WARNING, FAILED, UNTRUSTED)
 class Run:
     """Definition of one run.
 
-    `way` is "solve_ivp", "integrate" (compiled if the functions are jitted), "interpreted" (by integrate, not
-    compiled), or "ensemble" (with y0s and perhaps params in the options). `sick`: whether the run is faulty and must be
-    reported; for an ensemble, the indices of the faulty members. `truth`: if false, the true final state is not
-    computed.
+    `group` is the heading under which the tables list the run, and `name` names its system. `way` is "solve_ivp",
+    "integrate" (compiled if the functions are jitted), "interpreted" (by integrate, not compiled), or "ensemble" (with
+    y0s and perhaps params in the options). `sick`: whether the run is faulty and must be reported; for an ensemble, the
+    indices of the faulty members. `truth`: if false, the true final state is not computed.
     """
 
     group: str
@@ -73,7 +73,8 @@ def runs(
     """Yield runs of one system, as the text `ways` describes: "RK45 1e-6, RK4 h=0.05 every=10 integrate".
 
     Each part names the method, then a tolerance or options, then the way if it is not "solve_ivp". The method "user" is
-    the one-step method in `user`. Further options that are not text are given as keywords.
+    the one-step method in `user`. Further options that are not text are given as keywords. All other arguments are
+    fields of `Run`.
     """
     for text in ways.split(","):
         word, *rest = text.split()
@@ -94,9 +95,10 @@ def _option(item: str) -> dict[str, Any]:
 
 @dataclass
 class Outcome:
-    """Result of a run: how it was reported (`told`), its last state, and its error with and without projection.
+    """Result of a run: how a fault was reported (`told`), its last state, and its error with and without projection.
 
-    For an ensemble, `flagged` has the indices of the members that are not reliable.
+    `told` has those of the `CHANNELS` that reported a fault. For an ensemble, `flagged` has the indices of the members
+    that are not reliable.
     """
 
     told: list[str]

@@ -332,7 +332,8 @@ def swapped(G, k, m):
 def spoilt(spoil: Callable[..., None], y0: Any, problem: Problem | None = None, k: int = 1, m: int = 2) -> Problem:
     """Return a problem with a correct energy and a wrong gradient, changed by ``spoil(gradient, k, m)``.
 
-    `k` and `m` are indices of components of the gradient.
+    `k` and `m` are indices of components of the gradient. If `problem` is None, it is the system of Hénon and Heiles
+    with the start `y0`; otherwise `y0` is not used.
     """
     problem = problem or replace(s.henon_heiles(), y0=np.array(y0), t_span=(0.0, 10.0))
     (energy,) = problem.invariants
@@ -346,7 +347,10 @@ def spoilt(spoil: Callable[..., None], y0: Any, problem: Problem | None = None, 
 
 
 def sleeping(spoil: Callable[..., None], k: Any = 4, m: Any = 10) -> Problem:
-    """Return a chain that moves at one end, with a wrong gradient at the other, where y_k = f_k = 0 at first."""
+    """Return a chain that moves at one end, with a wrong gradient at the other, where y_k = f_k = 0 at first.
+
+    The parameters are those of `spoilt`.
+    """
     chain = s.chain("chain", np.expm1, lambda d: np.expm1(d) - d, np.expm1, [0.8, 0.0, 0.0, 0.0, 0.0, 0.0], 20.0)
     return spoilt(spoil, None, chain, k, m)
 

@@ -322,7 +322,9 @@ def waves(
 ) -> Problem:
     """Return i psi' = -psi''/2 + V psi + beta |psi|^2 psi on a periodic line, with claimed mass and energy.
 
-    `claimed_beta` and `claimed_potential` are beta and V in the claimed energy; default: the true ones at t = 0.
+    `potential` is the function V(t, x), `start` the function of x that is the field at t = 0, and `keep` has the names
+    of the invariants that are claimed. `claimed_beta` and `claimed_potential` are beta and V in the claimed energy;
+    default: the true ones at t = 0.
     """
     x = np.linspace(-8, 8, n, endpoint=False)
     dx = x[1] - x[0]
