@@ -290,7 +290,9 @@ class DaskPool:
         return False
 
     def _wait_for_workers(self) -> None:
-        """Wait until there is a worker; start new processes on this machine if none appears.
+        """Wait until there is a worker. If none appears, start new processes in a cluster on this machine.
+
+        For a cluster elsewhere, warn once and continue to wait.
 
         Dask's supervisor of a worker (its "nanny") does not replace a process that died before the nanny knew that it
         had started.

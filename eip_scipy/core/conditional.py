@@ -73,10 +73,11 @@ def is_kept_on_a_surface(
     known : InvariantSet
     k : int
     held : ndarray of bool, shape (l,)
-        Mask of the invariants that the system keeps. The surface is first looked for at states where these invariants
-        have the same values as at y. Otherwise a small violation of a constraint could do the work that compensates
-        friction. If there is no such surface, all states are searched, and a state counts only if at
-        least one of these invariants, which is not 0 at y, becomes 0 there: y then violates a constraint.
+        Mask of the invariants that the system keeps. The first search is limited to states where, to first order,
+        these invariants have the same values as at y. Without this limit a nearby state that violates a constraint a
+        little could be found, at which the violation cancels the effect of friction, and the result would be wrong.
+        If this search finds no surface, all states are searched. A state then counts only if one of these invariants
+        is not 0 at y and is smaller there by the factor `CONVERGED`, which shows that y violates a constraint.
     t : float
     y, f : ndarray, shape (n,)
         A state and its derivative there.

@@ -123,7 +123,10 @@ def _smallest(rows: Array, met: Array) -> Array:
 
 
 def _stage_factors(A: Array, c: Array, tree: NystromTree) -> Array:
-    """Return the factors phi_i(tree) of a tree at all stages i."""
+    """Return phi_i(tree), the factor of stage i in the order condition of a tree, for all stages; (s,).
+
+    It is c_i^leaves times the product of sum_j A_ij phi_j(subtree) over all subtrees, see `nystrom_residuals`.
+    """
     factors = c**tree.leaves
     for sub in tree.subtrees:
         factors = factors * (A.T * _stage_factors(A, c, sub)[:, None]).sum(axis=0)

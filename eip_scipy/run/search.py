@@ -137,7 +137,16 @@ class Search:
     # --- preparation: size, steps, a reference solution ---
 
     def _look(self, max_nfev: int | None) -> Look:
-        """Run once without projection, over as much of the interval as a trial may cover; return the `Look`."""
+        """Run once by `EIPDOP853` without projection, and return the `Look`.
+
+        The run stops after about 1 / `FIRST_PART` of the evaluations that one trial may take (`max_nfev`, or else
+        `MOST_NFEV`). If it stops before the end of the interval, all later trials end there too.
+
+        Raises
+        ------
+        ValueError
+            If the run fails.
+        """
         bench, problem = self.bench, self.bench.problem
         rtol = min(max(self.wanted, 1e-10), 1e-4)
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
