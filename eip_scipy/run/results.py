@@ -345,7 +345,10 @@ class IntegrationResult(WithColumns):
         return cls(found)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Return the content of a pickle, with outputs and multipliers, because it does not contain the functions."""
+        """Compute the outputs and multipliers of the problem, if it has any, and return the content of a pickle.
+
+        They are usually computed when they are first requested; an unpickled result has no functions for that.
+        """
         self._observe()
         return super().__reduce_ex__(protocol)
 

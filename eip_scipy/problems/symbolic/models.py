@@ -170,7 +170,9 @@ class _Conversion:
         self.inputs = read_inputs(inputs, _functions_of_time(found), self.names, (start.t, state))
         self._called = {name for name, _ in self.inputs.called}
         if taken := self._called & {*self.names.values(), "t"}:
-            raise ValueError(f"inputs: {taken.pop()!r} is also the name of a component of the state; rename one.")
+            raise ValueError(
+                f"inputs: {taken.pop()!r} is also the name of a component of the state or of the time; rename the input."
+            )
 
     def __call__(self, expression: Any) -> Any:
         """Return the converted expression."""

@@ -205,9 +205,9 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneReference(Reference):
-    """Command ``eip-scipy study scene-reference``: final states of the hard problems.
+    """Command ``eip-scipy study scene-reference``: states of the problems without a closed form, see `scenes`.
 
-    It prints their differences from states computed in 113 bits and, if REBOUND is installed, by IAS15.
+    It prints their differences from states computed in `CHECK_BITS` bits and, if REBOUND is installed, by IAS15.
     """
 
     file = "scene_references.json"
@@ -226,7 +226,7 @@ class SceneReference(Reference):
             for t, a, b in zip(times, difference(rows, fewer), difference(rows, double), strict=True):
                 lines.append(f"{problem.name:14} t = {t:<12.6g} from {CHECK_BITS} bits: {a:.1e}   from IAS15: {b:.1e}")
         about = (
-            "Final states (q of all bodies, v of all bodies) of the problems in problems/scenes.py: heyoka "
+            "Final states (q of all bodies, v of all bodies) of the problems in problems/gravity/scenes.py: heyoka "
             f"{heyoka.__version__}, Taylor, {self.bits}-bit arithmetic; made by `eip-scipy study scene-reference`."
         )
         return Found(lines, about, stored)
