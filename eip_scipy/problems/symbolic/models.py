@@ -171,7 +171,7 @@ class _Conversion:
         self._called = {name for name, _ in self.inputs.called}
         if taken := self._called & {*self.names.values(), "t"}:
             raise ValueError(
-                f"inputs: {taken.pop()!r} is also the name of a component of the state or of the time; rename the input."
+                f"inputs: {taken.pop()!r} is also the name of the time or of a component of the state; rename it."
             )
 
     def __call__(self, expression: Any) -> Any:
