@@ -287,12 +287,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._work.K[0] = self.f
         self._schedule = bare_schedule(self._spec.stepping.span, float(self.h_abs or 0.0))
         self._schedule.place[PENDING] = 1  # the solver shows the end of the last step
-        (values, gradients), jacobian = self._run.invariants.calls, None
+        jacobian = None
         if callable(self._jacobian):
             jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
         rates = self._run.invariants.rates(self._run.options.adaptive)
-        rhs, *calls = (with_entry(call, self.y.dtype) for call in (self._call, *values, *gradients))
-        inv, grad = tuple(calls[: len(values)]), tuple(calls[len(values) :])
+        dtype = self.y.dtype
+        rhs = with_entry(self._call, dtype)
+        inv, grad = (tuple(with_entry(call, dtype) for call in group) for group in self._run.invariants.calls)
         functions = PythonFunctions(rhs, inv, grad, (), second_order=False, jacobian=jacobian, rates=rates)
         self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
 
