@@ -28,15 +28,16 @@ inline void make_stages(const AnyRun &run, const Step &step) {
 // Return whether the derivative at y_hat serves the projection only, and another one follows.
 inline bool is_for_projection(const Options &o, const Step &step) { return step.project && !o.reuse_f; }
 
-// Computes f at y_hat in w.last() and, if one pass finds them all, values and gradients there if the step is to be projected.
+// Computes f at y_hat in w.last(), and if the step is to be projected what else one pass finds there.
 template <class AnyRun>
 inline void evaluate_raw(const AnyRun &run, const Step &step) {
     const auto &w = run.work;
     ++w.counters[NFEV];
     if constexpr (IS_SINGLE<AnyRun>) {
         auto &system = run.system;
-        system.all_at_raw = system.together && step.project;
-        if (system.all_at_raw) return system.together->all(w.y_hat, w.last(), w.values, w.G, system.params);
+        system.at_raw = Known::NOTHING;
+        if (step.project && (system.together || system.with_energy))
+            return system.evaluate_for_projection(w, step.t_new, w.y_hat, w.last());
         if (!is_for_projection(run.options, step)) return system.rhs_of_whole(w, step.t_new, w.y_hat, w.last());
     }
     run.system.rhs(w, step.t_new, w.y_hat, w.last());

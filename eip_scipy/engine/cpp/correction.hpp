@@ -54,27 +54,26 @@ template <class W>
     return w.Q;
 }
 
-// w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction along rows Q, neutral to the frame; out = y_hat + move.
+// w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction along rows Q, neutral to the frame; out = y_hat + move. In one
+// pass, which writes in vectors what the next step reads in vectors.
 template <class Value, class W>
 [[gnu::always_inline]] inline void move_along(const Options &o, const W &w, const Value *__restrict Q,
                                               Value *__restrict out) {
     const int64_t m = w.m;
-    const Value *__restrict mu = w.mu, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
-    Value *__restrict move = w.move;
-    for (int64_t j = 0; j < m; ++j) out[j] = mu[0] * Q[j];
-    for (int64_t k = 1; k < w.l; ++k)
-        for (int64_t j = 0; j < m; ++j) out[j] += mu[k] * Q[k * m + j];
-    if (o.frame.rows > 0) {
-        for (int64_t j = 0; j < m; ++j) out[j] *= sigma[j];
-        keep_frame(o.frame, w, out, move);
-        for (int64_t j = 0; j < m; ++j) out[j] = y_hat[j] + move[j];
-        return;
-    }
-    for (int64_t j = 0; j < m; ++j) {
-        const Value x = sigma[j] * out[j];
-        move[j] = x;
-        out[j] = y_hat[j] + x;
-    }
+    const bool framed = o.frame.rows > 0;
+    in_blocks(out, m, [&]<class Part, int COUNT>(int64_t first) {
+        for (int c = 0; c < COUNT; ++c) {
+            const int64_t j = first + c * static_cast<int64_t>(sizeof(Part) / sizeof(Value));
+            Part x = spread<Part>(w.mu[0]) * load_as<Part>(Q + j);
+            for (int64_t k = 1; k < w.l; ++k) x = x + spread<Part>(w.mu[k]) * load_as<Part>(Q + k * m + j);
+            x = load_as<Part>(w.sigma + j) * x;
+            store_as(x, framed ? out + j : w.move + j);
+            if (!framed) store_as(load_as<Part>(w.y_hat + j) + x, out + j);
+        }
+    });
+    if (!framed) return;
+    keep_frame(o.frame, w, out, w.move);
+    for (int64_t j = 0; j < m; ++j) out[j] = w.y_hat[j] + w.move[j];
 }
 
 // Coefficients w.mu of the rows of B in their least-norm solution, and its rank. One row, the usual case, by itself.
@@ -375,8 +374,8 @@ template <class AnyRun>
 inline Code project_step(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
-    const bool known = std::exchange(run.system.all_at_raw, false);
-    if (!known) run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    const Known known = std::exchange(run.system.at_raw, Known::NOTHING);
+    if (known != Known::ALL) run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     note_rates(run, step);
     if (o.every != 1 && (o.metric == BY_ERROR || o.every == AUTO || o.adaptive)) {
@@ -386,10 +385,8 @@ inline Code project_step(const AnyRun &run, const Step &step) {
             return POSTPONED;
         }
     }
-    if (known)
-        add_carried(run, w.carry_hat, w.G);
-    else
-        evaluate_invariants(run, step.t_new, w.y_hat);
+    run.system.inv_at_raw(w, step.t_new, w.y_hat, w.values, known);
+    add_carried(run, w.carry_hat, w.G);
     return project_evaluated(run, step);
 }
 

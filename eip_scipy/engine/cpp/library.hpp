@@ -35,6 +35,14 @@ struct Together {
     std::span<const LibraryPointer<double>> values_alone, gradients_alone;
 };
 
+// Fills `out` with a derivative, or accelerations, of a state of at least `least` parameters, and returns the value of the
+// invariant `energy` there, both with the bits that they have one by one.
+struct WithEnergy {
+    double (*both)(const double *y, const double *params, int64_t p, double *out);
+    LibraryPointer<double> energy;
+    int64_t least;
+};
+
 // A function of `Given` as such a pointer.
 template <class T, void (*FUNCTION)(const Given<T> &)>
 void plain(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p) {
@@ -61,6 +69,7 @@ struct LibraryFunction {
     ApartPointer apart = nullptr;               // null where there is none
     LibraryPointer<double> by_pulls = nullptr;  // of rates: from such pulls in the place of f
     const Together *together = nullptr;         // of a derivative; null where there is none
+    const WithEnergy *with_energy = nullptr;    // as well
     std::vector<double> own{};                  // parameters that replace those of the run; empty in the library itself
 
     bool is_gradient() const { return value == Value::GRADIENT || value == Value::GRADIENT_BY_F; }
@@ -85,6 +94,7 @@ struct LibraryCall {
     ApartPointer apart = nullptr;
     LibraryPointer<T> by_pulls = nullptr;
     const Together *together = nullptr;
+    const WithEnergy *with_energy = nullptr;
 
     explicit operator bool() const { return pointer; }
     [[gnu::always_inline]] void operator()(double t, const T *y, const T *f, T *out, const T *params, int64_t n,

@@ -88,6 +88,22 @@ inline Truth<Value> component_sizes(const Value *__restrict y, double rounding, 
     return extreme;
 }
 
+// Replaces squares by their roots. A few that have just been written float by float are not read in vectors, which would wait
+// until all those stores are done.
+template <class Value>
+inline void take_roots(Value *squares, int64_t n) {
+    if constexpr (std::is_same_v<Value, double>)
+        if (n < WIDTH) {
+            for (int64_t b = 0; b < n; ++b) {
+                double root = sqrt(squares[b]);
+                stay_alone(root);
+                squares[b] = root;
+            }
+            return;
+        }
+    for (int64_t b = 0; b < n; ++b) squares[b] = sqrt(squares[b]);
+}
+
 // Computes for each block w.scale = max(|rtol y|, |rtol y_hat|) and w.ratio = |(err, rounding y_hat)|; returns whether
 // some sizes are too extreme for squares.
 template <class Value, class W>
@@ -103,13 +119,13 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
         sizes[b] = max(sizes[b], errors[b]);
         extreme = extreme | is_extreme(sizes[b]);
     }
-    for (int64_t b = 0; b < o.blocks.count; ++b) sizes[b] = sqrt(sizes[b]);
+    take_roots(sizes, o.blocks.count);
     for (int64_t i = 0; i < w.m; ++i) {
         const Value x = rounding * w.y_hat[i];
         scratch[i] = w.err[i] * w.err[i] + x * x;
     }
     block_sums(scratch, o.blocks, errors);
-    for (int64_t b = 0; b < o.blocks.count; ++b) errors[b] = sqrt(errors[b]);
+    take_roots(errors, o.blocks.count);
     return extreme;
 }
 

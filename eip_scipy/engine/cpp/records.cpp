@@ -367,7 +367,8 @@ static void take(const LibraryFunction &function, LibraryCall<double> &place) {
              std::ssize(function.own),
              function.apart,
              function.by_pulls,
-             function.together};
+             function.together,
+             function.with_energy};
 }
 static void take(const LibraryFunction &function, LibraryCall<Octet> &place) {
     if (function.own.empty()) place = {function.eight};

@@ -39,7 +39,7 @@ inline void store(Vector v, double *a) { store_as(v, a); }
 // part.template operator()<Value, COUNT>(i): COUNT vectors, or floats, from i on, until n. No entry is met twice, and
 // vectors begin at multiples of their length: what has just been written in such vectors is read at once.
 template <class Part>
-inline void in_blocks(int64_t n, const Part &part) {
+[[gnu::always_inline]] inline void in_blocks(int64_t n, const Part &part) {
     int64_t i = 0;
     for (; i + 4 * WIDTH <= n; i += 4 * WIDTH) part.template operator()<Vector, 4>(i);
     if (i + 2 * WIDTH <= n) part.template operator()<Vector, 2>(i), i += 2 * WIDTH;

@@ -38,6 +38,10 @@ class Functions {
 
 struct Step;
 
+// What one pass over the functions has found at the raw result of a step beside the derivative: nothing, the value of one
+// invariant, which is System::energy, or values and gradients of all.
+enum class Known { NOTHING, ENERGY, ALL };
+
 // Parts of a step that Python code replaces: the raw step of a user-defined one-step method, the end of the step by a
 // subclass, the projection by `JointInvariants`, which may decline, and the projection of a state whose parts lie on
 // several processes. Such processes also have to agree whether a raw result is finite. The codes are those of the step.
@@ -102,9 +106,12 @@ struct System {
     std::vector<double> scratch, scratch_f, scratch_G, state, slope_of_state;
     std::vector<double> pulls;  // those that come with accelerations
     bool rates_by_pulls = false;
-    const Together *together = nullptr;  // where these are all functions of a problem
-    bool all_at_raw = false;             // whether values and gradients are known at the raw result of the step
-    Shifts shifts;                       // for gradients without a function
+    const Together *together = nullptr;       // where these are all functions of a problem
+    const WithEnergy *with_energy = nullptr;  // where the invariant `energy_item` is one that comes with the derivative
+    int64_t energy_item = 0;
+    double energy = 0.0;
+    Known at_raw = Known::NOTHING;
+    Shifts shifts;  // for gradients without a function
     FailedCall failed;
     // The description of the columns, in runs by pointer whose states have columns of derivatives behind them;
     // otherwise null. The functions of the invariants then take the state alone, and so does `rhs_pointer` if
@@ -144,6 +151,35 @@ struct System {
         if (by_pointer && second_order) return call_rhs_pointer(w, t, y, a, w.m / 2);
         rhs_of_scratch(w, t, y, f);
         copy(f + w.m / 2, a, w.m / 2);
+    }
+
+    // The derivative at the raw result of a step that is to be projected, and what the same pass finds besides: `together` or
+    // `with_energy` is set.
+    template <class W>
+    void evaluate_for_projection(const W &w, double t, const double *y, double *out) {
+        if (together) {
+            together->all(y, out, w.values, w.G, params);
+            at_raw = Known::ALL;
+        } else {
+            const int64_t half = second_order ? w.m / 2 : 0;
+            copy(y + half, out, half);
+            energy = with_energy->both(y, params, n_params, out + half);
+            at_raw = Known::ENERGY;
+        }
+    }
+
+    // The values at the raw result of a step, where `known` says what of them is known.
+    template <class W>
+    void inv_at_raw(const W &w, double t, const double *y, double *values, Known known) {
+        if (known == Known::ALL) return;
+        if (known == Known::NOTHING) return inv(w, t, y, values);
+        for (int64_t k = 0; k < std::ssize(inv_pointers); ++k) {
+            if (k == energy_item)
+                values[0] = energy;
+            else
+                call_for_values(w, inv_pointers, "inv", k, t, y, values);
+            values += inv_pointers[k].floats;
+        }
     }
 
     template <class W>
@@ -190,6 +226,7 @@ struct System {
     void choose() {
         choose_rates();
         choose_together();
+        choose_energy();
     }
 
     // Sets `together` if these are the functions of a problem with one pass for all of them, in a run without columns.
@@ -202,6 +239,19 @@ struct System {
         const bool all = by_pointer && known && !columns && same(inv_pointers, known->values_alone) &&
                          same(grad_pointers, known->gradients_alone);
         together = all ? known : nullptr;
+    }
+
+    // Sets `with_energy` if one of the invariants comes with the derivative, in a run without columns.
+    void choose_energy() {
+        const WithEnergy *known = rhs_pointer.library.with_energy;
+        with_energy = nullptr;
+        if (!by_pointer || !known || columns || rhs_pointer.library.own || n_params < known->least) return;
+        for (energy_item = 0; energy_item < std::ssize(inv_pointers); ++energy_item) {
+            const LibraryCall<double> &library = inv_pointers[energy_item].library;
+            if (library.pointer != known->energy || library.own) continue;
+            with_energy = known;
+            return;
+        }
     }
 
     // Sets `rates_by_pulls` if all rates are found from the pulls that come with the derivative: those of the same masses.

@@ -36,7 +36,22 @@ template <class Value>
 inline const Value &load_as(const Octet *a) {
     return *a;
 }
+inline void store_as(const Octet &x, Octet *a) { *a = x; }
+template <class Value>
+inline const Octet &spread(const Octet &x) {
+    return x;
+}
 inline Octet absolute(const Octet &x) { return abs(x); }
+
+// in_blocks of the entries of an array: floats in vectors, and vectors one by one. The pointer says which.
+template <class Part>
+[[gnu::always_inline]] inline void in_blocks(const double *, int64_t n, const Part &part) {
+    in_blocks(n, part);
+}
+template <class Part>
+[[gnu::always_inline]] inline void in_blocks(const Octet *, int64_t n, const Part &part) {
+    for (int64_t i = 0; i < n; ++i) part.template operator()<Octet, 1>(i);
+}
 
 template <class Term>
 inline Octet sum_of(const Octet *, int64_t n, const Term &term) {

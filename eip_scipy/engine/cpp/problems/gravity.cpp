@@ -25,6 +25,14 @@ void energy(const Given<T> &g) {
     g.out[0] = energy_sum(g.y, g.params, g.p);
 }
 
+double rhs_with_energy(const double *y, const double *gm, int64_t bodies, double *out) {
+    std::copy(y + 3 * bodies, y + 6 * bodies, out);
+    return accelerate_with_energy(y, gm, bodies, out + 3 * bodies);
+}
+
+constexpr WithEnergy RHS_WITH_ENERGY{rhs_with_energy, plain<double, energy<double>>, MANY};
+constexpr WithEnergy ACC_WITH_ENERGY{accelerate_with_energy, plain<double, energy<double>>, MANY};
+
 template <class T>
 void gradient_of_energy(const Given<T> &g) {
     energy_gradient(g.y, g.f, g.params, g.p, g.out);
@@ -50,8 +58,10 @@ constexpr const char *POSITIONS = "positions, 3 numbers per body, and G m of eve
 #define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
 #define EIP_OF_BODIES(function) plain<double, of_bodies<double, function>>, plain<Octet, of_bodies<Octet, function>>
 const LibraryFunction functions[] = {
-    {"gravity.rhs", Value::DERIVATIVE, 0, EIP_OF_BODIES(newton_rhs), in_phase_space, BODIES, rhs_apart},
-    {"gravity.acc", Value::ACCELERATION, 0, EIP_OF_BODIES(accelerate), at_positions, POSITIONS, acc_apart},
+    {"gravity.rhs", Value::DERIVATIVE, 0, EIP_OF_BODIES(newton_rhs), in_phase_space, BODIES, rhs_apart, nullptr,
+     nullptr, &RHS_WITH_ENERGY},
+    {"gravity.acc", Value::ACCELERATION, 0, EIP_OF_BODIES(accelerate), at_positions, POSITIONS, acc_apart, nullptr,
+     nullptr, &ACC_WITH_ENERGY},
     {"gravity.variational", Value::DERIVATIVE, 0, plain<double, variational>, nullptr, with_columns, COLUMNS},
     {"gravity.central", Value::GRADIENT_BY_F, 1, EIP_BOTH(central), at_positions_first, POSITIONS},
     {"gravity.energy", Value::NUMBERS, 1, EIP_BOTH(energy), in_phase_space, BODIES},

@@ -25,11 +25,16 @@ inline Vector root_estimate(Vector x) {
     return y * p;
 }
 
-// x^-1/2, nearly always rounded correctly: y (1 + h/2 + 3/8 h^2), h = 1 - x y^2 without the rounding of y^2.
+// x^-1/2, nearly always rounded correctly: y (1 + h/2 + 3/8 h^2), h = 1 - x y^2 without the rounding of y^2. For y near it, y^2
+// and 1 - x y^2.
+inline Vector over_root(Vector x, Vector y, Vector y2, Vector difference) {
+    const Vector h = fused(-x, fused(y, y, -y2), difference);
+    return fused(y * h, fused(spread_vector(3.0 / 8.0), h, spread_vector(1.0 / 2.0)), y);
+}
+
 inline Vector over_root(Vector x) {
     const Vector y = root_estimate(x), y2 = y * y;
-    const Vector h = fused(-x, fused(y, y, -y2), fused(-x, y2, spread_vector(1.0)));
-    return fused(y * h, fused(spread_vector(3.0 / 8.0), h, spread_vector(1.0 / 2.0)), y);
+    return over_root(x, y, y2, fused(-x, y2, spread_vector(1.0)));
 }
 
 inline Octet over_root(const Octet &x) {
@@ -53,6 +58,13 @@ struct Cube {
     Octet times(const Octet &m) const {
         const Octet w = m * y * y2;
         return multiply_add(w * h, p, w);
+    }
+
+    // x^-1/2 as by `over_root`.
+    Octet root(const Octet &x) const {
+        Octet out;
+        for (int v = 0; v < VECTORS; ++v) out.part[v] = over_root(x.part[v], y.part[v], y2.part[v], h.part[v]);
+        return out;
     }
 
     // x^-3/2, for products with both masses of a pair.

@@ -9,7 +9,8 @@
 // The energy, in which large terms nearly cancel, is summed with the rounding errors carried along: what a projection
 // cannot see it cannot correct.
 //
-// From MANY bodies on every pair is taken once, for both bodies, and threads share the rows of pairs (PairRows).
+// From MANY bodies on every pair is taken once, for both bodies, and threads share the rows of pairs (PairRows). The energy of so
+// many can come with the accelerations, in a third of the time that it takes alone, with the same bits.
 //
 // With APART the accelerations come with a second sum, of all pulls but those between a body and the first one, for motion about
 // the first body: what is there before its pull is added, which is the last one in its stream, and the reaction in its place.
@@ -329,24 +330,146 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out, T *pulls 
     if constexpr (APART) std::copy(out, out + 3, pulls);
 }
 
+// A number and what its rounding left.
+struct Carried {
+    Octet total = 0.0, carry = 0.0;
+
+    void add_product(const Octet &a, const Octet &b) {
+        const Octet sum = multiply_add(a, b, total);
+        carry += multiply_add(a, b, total - sum);
+        total = sum;
+    }
+};
+
+// a + b, and its rounding error (Knuth) in `lost`.
+template <class T>
+inline T carried_sum(const T &a, const T &b, T &lost) {
+    const T total = a + b, part = total - a;
+    lost = (a - (total - part)) + (b - part);
+    return total;
+}
+
+// gm (square / 2 - potential) with its carry.
+inline Carried energy_of(const Octet &gm, const Carried &square, const Carried &potential) {
+    Octet lost;
+    const Octet energy = carried_sum<Octet>(0.5 * square.total, -potential.total, lost);
+    lost += 0.5 * square.carry - potential.carry;
+    Carried out;
+    out.add_product(gm, energy);
+    out.carry = multiply_add(gm, lost, out.carry);
+    return out;
+}
+
+// All lanes of total + carry, added by halves.
+inline double carried_fold(const Carried &sum) {
+    double total[LANES], carry[LANES];
+    sum.total.store(total);
+    sum.carry.store(carry);
+    for (int width = LANES / 2; width > 0; width /= 2)
+        for (int k = 0; k < width; ++k) {
+            double lost;
+            total[k] = carried_sum(total[k], total[k + width], lost);
+            carry[k] = (carry[k] + carry[k + width]) + lost;
+        }
+    return total[0] + carry[0];
+}
+
+// Adds to `potential` what source j makes of it at the bodies x, each times `mass`; `start` is 1 where that is 0.
+inline void add_potential(const double *q, int64_t j, const Octet *x, const Octet &mass, const Octet &start,
+                          Carried &potential) {
+    Octet d[3];
+    for (int c = 0; c < 3; ++c) d[c] = Octet(q[3 * j + c]) - x[c];
+    potential.add_product(mass, over_root(squares(d[0], d[1], d[2], start)));
+}
+
+// The pairs of the bodies first + skip ... first + 7, which are at x, with each other.
+inline void add_own_pairs(const double *q, const double *gm, int64_t first, int64_t skip, const Octet *x,
+                          Carried &potential) {
+    for (int64_t j = first + skip + 1; j < first + LANES; ++j) {
+        // Not the body itself, nor those after it in the block, which meet this one as a source.
+        const Octet done = LANES_FROM(j - first);
+        add_potential(q, j, x, multiply_add(Octet(-gm[j]), done, Octet(gm[j])), done, potential);
+    }
+}
+
+// Their energy, with this potential.
+inline double energy_of_block(const double *v, const double *gm, int64_t first, int64_t skip,
+                              const Carried &potential) {
+    Octet u[3];
+    Carried square;
+    load_targets<LANES>(v, first, u);
+    for (const Octet &part : u) square.add_product(part, part);
+    return carried_fold(energy_of(Octet::load(gm + first) * LANES_FROM(skip), square, potential));
+}
+
+// Their energy, with the pairs that they make with later bodies.
+[[gnu::flatten, gnu::noinline]] inline double energy_with_later(const double *q, const double *v, const double *gm,
+                                                                int64_t n, int64_t first, int64_t skip) {
+    Octet x[3];
+    Carried potential;
+    load_targets<LANES>(q, first, x);
+    add_own_pairs(q, gm, first, skip, x, potential);
+    for (int64_t j = first + LANES; j < n; ++j) add_potential(q, j, x, gm[j], 0.0, potential);
+    return energy_of_block(v, gm, first, skip, potential);
+}
+
+// The energy of eight bodies, with the pairs that they make with earlier ones.
+[[gnu::flatten, gnu::noinline]] inline double energy_with_earlier(const double *q, const double *v, const double *gm,
+                                                                  int64_t first) {
+    Octet x[3];
+    Carried potential;
+    load_targets<LANES>(q, first, x);
+    add_own_pairs(q, gm, first, 0, x, potential);
+    for (int64_t j = first - 1; j >= 0; --j) add_potential(q, j, x, gm[j], 0.0, potential);
+    return energy_of_block(v, gm, first, 0, potential);
+}
+
+// The energy of 8 bodies or more, in blocks.
+inline double energy_in_blocks(const double *q, const double *v, const double *gm, int64_t n) {
+    double total = 0.0;
+    for (int64_t block = 0; block < n; block += LANES) {
+        const int64_t first = std::min(block, n - LANES);
+        total += energy_with_later(q, v, gm, n, first, block - first);
+    }
+    return total;
+}
+
 // Number of bodies from which every pair is taken once and threads share the work: with fewer bodies it does not pay.
 constexpr int64_t MANY = 128;
 constexpr int64_t TILE = 32;  // sources whose reactions stay in the fastest cache
 
+// Number of the first of so many bodies, which are special in all sums.
+inline int64_t first_ones(int64_t n) { return LANES + n % LANES; }
+
+// What is found in addition to the accelerations: the pulls except those of the first body, or the energy.
+enum class Also { NOTHING, PULLS, ENERGY };
+
 // Accelerations of many bodies. The targets, in blocks of eight, form rows. A row takes its pairs with all bodies before
 // them: the pulls stay with the targets, and the reactions are stored for each row. They are added afterwards, always in
 // one order. The first bodies, 8 to 15, meet every body twice instead, so that their pulls, which may be the largest, are
-// the last terms of all sums.
-template <bool APART>
+// the last terms of all sums. The energies of the blocks are those of `energy_with_earlier`, with the terms in its order.
+template <Also ALSO>
 struct PairRows {
-    const double *q, *gm;
-    int64_t n, first = 8 + n % 8;
+    static constexpr bool APART = ALSO == Also::PULLS, ENERGY = ALSO == Also::ENERGY;
+    const double *q, *v, *gm;  // v: for the energy
+    int64_t n, first = first_ones(n);
     double *out, *pulls;
     int64_t length = ((n - first - 1) / (16 * TILE) + 1) * TILE,
             count = (n - first - 1) / length + 1;                    // at most 16 rows
     std::unique_ptr<double[]> reactions{new double[3 * n * count]};  // of every row on all bodies
+    int64_t blocks = ENERGY ? (n - first) / LANES : 0;
+    std::unique_ptr<Carried[]> potentials{new Carried[blocks]};
+    std::unique_ptr<double[]> energies{new double[blocks]};
 
+    // Computes all that is asked for.
+    void fill() const {
+        share(count + 1, [this](int64_t k) { k == 0 ? first_bodies() : take(k - 1); });
+        share(count, [this](int64_t k) { finish(k); });
+    }
+
+  private:
     int64_t start(int64_t row) const { return std::min(first + row * length, n); }
+    Carried &potential_of(int64_t block) const { return potentials[(block - first) / LANES]; }
 
     [[gnu::flatten, gnu::noinline]] void first_bodies() const {
         accelerate_block<APART, LANES>(q, gm, n, 0, out, pulls);
@@ -359,6 +482,7 @@ struct PairRows {
             load_targets<LANES>(q, block, own);
             for (int64_t j = block + LANES - 1; j >= block; --j) add_sources<LANES>(q, gm, own, j, block, sums, 1.0);
             store_targets<LANES>(sums, out, block);
+            if constexpr (ENERGY) add_own_pairs(q, gm, block, 0, own, potential_of(block));
         }
         for (int64_t tile = start(row + 1) - 1 - (start(row + 1) - 1 - first) % TILE; tile >= first; tile -= TILE)
             meet(row, tile);
@@ -370,14 +494,18 @@ struct PairRows {
         Vector kept[TILE][3][KEPT] = {};
         for (int64_t block = std::max(start(row), tile); block < start(row + 1); block += LANES) {
             Octet own[3], sums[3];
+            Carried potential;
             load_targets<LANES>(q, block, own);
             load_targets<LANES>(out, block, sums);
+            if constexpr (ENERGY) potential = potential_of(block);
             const Octet masses = -Octet::load(gm + block);
             for (int64_t j = std::min(tile + TILE, block) - 1; j >= tile; --j) {
                 Octet d[3];
                 for (int c = 0; c < 3; ++c) d[c] = Octet(q[3 * j + c]) - own[c];
-                const Octet cube = Cube(squares(d[0], d[1], d[2], 0.0)).alone();
-                const Octet w = cube * gm[j], back = cube * masses;
+                const Octet r2 = squares(d[0], d[1], d[2], 0.0);
+                const Cube powers(r2);
+                if constexpr (ENERGY) potential.add_product(gm[j], powers.root(r2));
+                const Octet cube = powers.alone(), w = cube * gm[j], back = cube * masses;
                 for (int c = 0; c < 3; ++c) {
                     sums[c] = multiply_add(w, d[c], sums[c]);
                     Vector *sum = kept[j - tile][c];
@@ -385,6 +513,7 @@ struct PairRows {
                 }
             }
             store_targets<LANES>(sums, out, block);
+            if constexpr (ENERGY) potential_of(block) = potential;
         }
         for (int64_t j = tile; j < std::min(tile + TILE, n); ++j)
             for (int c = 0; c < 3; ++c) {
@@ -406,6 +535,11 @@ struct PairRows {
             if constexpr (APART) add_sources<LANES, true>(q, gm, own, 0, block, sums, 1.0, apart);
             store_targets<LANES>(sums, out, block);
             if constexpr (APART) store_targets<LANES>(apart, pulls, block);
+            if constexpr (ENERGY) {
+                Carried &potential = potential_of(block);
+                for (int64_t j = first - 1; j >= 0; --j) add_potential(q, j, own, gm[j], 0.0, potential);
+                energies[(block - first) / LANES] = energy_of_block(v, gm, block, 0, potential);
+            }
         }
     }
 };
@@ -413,9 +547,7 @@ struct PairRows {
 template <bool APART>
 [[gnu::noinline]] inline void accelerate_many(const double *q, const double *gm, int64_t n, double *out,
                                               double *pulls) {
-    const PairRows<APART> rows{.q = q, .gm = gm, .n = n, .out = out, .pulls = pulls};
-    share(rows.count + 1, [&](int64_t k) { k == 0 ? rows.first_bodies() : rows.take(k - 1); });
-    share(rows.count, [&](int64_t k) { rows.finish(k); });
+    PairRows<APART ? Also::PULLS : Also::NOTHING>{.q = q, .gm = gm, .n = n, .out = out, .pulls = pulls}.fill();
 }
 
 template <bool APART>
@@ -483,17 +615,25 @@ inline Octet difference(const Octet *q, int64_t i, int64_t j, Octet *d) {
     return multiply_add(d[2], d[2], multiply_add(d[1], d[1], d[0] * d[0]));
 }
 
-// Many bodies of eight members, one member after the other: a vector holds eight bodies of one member then.
-[[gnu::noinline]] inline void accelerate_each(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
-    std::vector<double> one(7 * n);
-    double *place = one.data(), *mass = place + 3 * n, *pull = mass + n;
-    const auto *places = reinterpret_cast<const double *>(q), *masses = reinterpret_cast<const double *>(gm);
+// Many bodies of eight members, one member after the other: a vector holds eight bodies of one member then. one(state, masses,
+// result) fills `results` numbers from a state of `size`.
+template <class One>
+inline void one_by_one(const Octet *y, int64_t size, const Octet *gm, int64_t n, Octet *out, int64_t results,
+                       const One &one) {
+    std::vector<double> own(size + n + results);
+    double *state = own.data(), *mass = state + size, *result = mass + n;
+    const auto *states = reinterpret_cast<const double *>(y), *masses = reinterpret_cast<const double *>(gm);
     for (int64_t lane = 0; lane < LANES; ++lane) {
-        for (int64_t i = 0; i < 3 * n; ++i) place[i] = places[LANES * i + lane];
+        for (int64_t i = 0; i < size; ++i) state[i] = states[LANES * i + lane];
         for (int64_t i = 0; i < n; ++i) mass[i] = masses[LANES * i + lane];
-        accelerate(place, mass, n, pull);
-        for (int64_t i = 0; i < 3 * n; ++i) reinterpret_cast<double *>(out)[LANES * i + lane] = pull[i];
+        one(state, mass, result);
+        for (int64_t i = 0; i < results; ++i) reinterpret_cast<double *>(out)[LANES * i + lane] = result[i];
     }
+}
+
+[[gnu::noinline]] inline void accelerate_each(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
+    one_by_one(q, 3 * n, gm, n, out, 3 * n,
+               [n](const double *place, const double *mass, double *pull) { accelerate(place, mass, n, pull); });
 }
 
 // Computes the accelerations for eight members: every pair once, and sums in the same order as for one state. Bodies
@@ -526,71 +666,6 @@ inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
         }
 }
 
-// A number and what its rounding left.
-struct Carried {
-    Octet total = 0.0, carry = 0.0;
-
-    void add_product(const Octet &a, const Octet &b) {
-        const Octet sum = multiply_add(a, b, total);
-        carry += multiply_add(a, b, total - sum);
-        total = sum;
-    }
-};
-
-// a + b, and its rounding error (Knuth) in `lost`.
-template <class T>
-inline T carried_sum(const T &a, const T &b, T &lost) {
-    const T total = a + b, part = total - a;
-    lost = (a - (total - part)) + (b - part);
-    return total;
-}
-
-// gm (square / 2 - potential) with its carry.
-inline Carried energy_of(const Octet &gm, const Carried &square, const Carried &potential) {
-    Octet lost;
-    const Octet energy = carried_sum<Octet>(0.5 * square.total, -potential.total, lost);
-    lost += 0.5 * square.carry - potential.carry;
-    Carried out;
-    out.add_product(gm, energy);
-    out.carry = multiply_add(gm, lost, out.carry);
-    return out;
-}
-
-// All lanes of total + carry, added by halves.
-inline double carried_fold(const Carried &sum) {
-    double total[LANES], carry[LANES];
-    sum.total.store(total);
-    sum.carry.store(carry);
-    for (int width = LANES / 2; width > 0; width /= 2)
-        for (int k = 0; k < width; ++k) {
-            double lost;
-            total[k] = carried_sum(total[k], total[k + width], lost);
-            carry[k] = (carry[k] + carry[k + width]) + lost;
-        }
-    return total[0] + carry[0];
-}
-
-// Energy of the bodies first + skip ... first + 7, with the pairs that they make with later ones.
-[[gnu::flatten, gnu::noinline]] inline double energy_block(const double *y, const double *gm, int64_t n, int64_t first,
-                                                           int64_t skip) {
-    Octet x[3], u[3];
-    Carried square, potential;
-    load_targets<LANES>(y, first, x);
-    load_targets<LANES>(y + 3 * n, first, u);
-    for (const Octet &part : u) square.add_product(part, part);
-    const auto add = [&](int64_t j, const Octet &mass, const Octet &start) {
-        const Octet dx = Octet(y[3 * j]) - x[0], dy = Octet(y[3 * j + 1]) - x[1], dz = Octet(y[3 * j + 2]) - x[2];
-        potential.add_product(mass, over_root(squares(dx, dy, dz, start)));
-    };
-    for (int64_t j = first + skip + 1; j < first + LANES; ++j) {
-        // Not the body itself, nor those after it in the block, which meet this one as a source.
-        const Octet done = LANES_FROM(j - first);
-        add(j, multiply_add(Octet(-gm[j]), done, Octet(gm[j])), done);
-    }
-    for (int64_t j = first + LANES; j < n; ++j) add(j, gm[j], 0.0);
-    return carried_fold(energy_of(Octet::load(gm + first) * LANES_FROM(skip), square, potential));
-}
-
 template <class T>
 inline T energy_of_few(const T *y, const T *gm, int64_t n) {
     using std::sqrt;
@@ -609,26 +684,35 @@ inline T energy_of_few(const T *y, const T *gm, int64_t n) {
     return 0.5 * kinetic - potential;
 }
 
-// G times the energy. The blocks' energies are added in one order, whatever threads find them.
-inline double energy_sum(const double *y, const double *gm, int64_t n) {
-    if (n < 8) return energy_of_few(y, gm, n);
-    const int64_t blocks = (n + 7) / 8, parts = (blocks + 3) / 4;
-    const auto energy = [&](int64_t block) {
-        const int64_t first = std::min(8 * block, n - 8);
-        return energy_block(y, gm, n, first, 8 * block - first);
-    };
-    double total = 0.0;
-    if (n < MANY) {
-        for (int64_t block = 0; block < blocks; ++block) total += energy(block);
-        return total;
-    }
-    std::vector<double> energies(blocks);
-    share(parts, [&](int64_t k) {  // the first blocks have most pairs, and the last parts begin first
-        for (int64_t block = 4 * (parts - 1 - k); block < std::min(4 * (parts - k), blocks); ++block)
-            energies[block] = energy(block);
-    });
-    for (const double one : energies) total += one;
+// The energy of many bodies: that of the first ones, and of the others in blocks, which are added in one order, whatever threads
+// find them.
+inline double total_energy(const double *q, const double *v, const double *gm, int64_t first, const double *energies,
+                           int64_t blocks) {
+    double total = energy_in_blocks(q, v, gm, first);
+    for (int64_t k = 0; k < blocks; ++k) total += energies[k];
     return total;
+}
+
+// G times the energy.
+inline double energy_sum(const double *y, const double *gm, int64_t n) {
+    const double *v = y + 3 * n;
+    if (n < 8) return energy_of_few(y, gm, n);
+    if (n < MANY) return energy_in_blocks(y, v, gm, n);
+    const int64_t first = first_ones(n), blocks = (n - first) / LANES, parts = (blocks + 3) / 4;
+    std::vector<double> energies(blocks);
+    share(parts, [&](int64_t k) {  // the last blocks have most pairs, and the last parts begin first
+        for (int64_t block = 4 * k; block < std::min(4 * k + 4, blocks); ++block)
+            energies[block] = energy_with_earlier(y, v, gm, first + LANES * block);
+    });
+    return total_energy(y, v, gm, first, energies.data(), blocks);
+}
+
+// Computes the accelerations of `accelerate`, bit for bit, for MANY bodies or more. Returns what `energy_sum` does, bit for bit.
+inline double accelerate_with_energy(const double *y, const double *gm, int64_t n, double *out) {
+    const double *v = y + 3 * n;
+    const PairRows<Also::ENERGY> rows{.q = y, .v = v, .gm = gm, .n = n, .out = out};
+    rows.fill();
+    return total_energy(y, v, gm, rows.first, rows.energies.get(), rows.blocks);
 }
 
 // Returns the energy of body i with its later partners, for eight members. The bodies' energies are added in the order
@@ -660,6 +744,12 @@ inline Carried energy_of_some(const Octet *y, const Octet *gm, int64_t n, int64_
 inline Octet energy_sum(const Octet *y, const Octet *gm, int64_t n) {
     if (n < 8) return energy_of_few(y, gm, n);
     Octet total = 0.0;
+    if (n >= MANY) {
+        one_by_one(y, 6 * n, gm, n, &total, 1, [n](const double *state, const double *mass, double *energy) {
+            *energy = energy_sum(state, mass, n);
+        });
+        return total;
+    }
     const auto block = [&](int64_t first, int64_t skip) {
         const Carried sum = energy_of_some(y, gm, n, first, skip, 0, 1);
         total += sum.total + sum.carry;
