@@ -7,7 +7,19 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.integrate import OdeSolver
 
-from ..engine.data import HAVE_NODES, LAST_RANK, LENGTH, NEWEST, NOT_FINITE, TIME, TIME_NEW, TOO_SMALL, UNSTABLE, Work
+from ..engine.data import (
+    BY_VELOCITY,
+    HAVE_NODES,
+    LAST_RANK,
+    LENGTH,
+    NEWEST,
+    NOT_FINITE,
+    TIME,
+    TIME_NEW,
+    TOO_SMALL,
+    UNSTABLE,
+    Work,
+)
 from .invariants import InvariantSet
 from .runs import Run
 
@@ -38,6 +50,12 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
         return OdeSolver.TOO_SMALL_STEP
     if status == UNSTABLE:
         return _unstable(run)
+    if status == BY_VELOCITY:
+        return (
+            f"at t={clock[TIME]:.10g} the accelerations in {run.called} depend on the velocity, and a Nystrom method "
+            "does not integrate such equations; the states of the last 8 steps or so may be wrong. Use a Runge-Kutta "
+            "method such as EIPDOP853, or EIPGJ12 with small steps"
+        )
     message = projection_failure(run.invariants, run.work, clock[TIME_NEW])
     return f"{message}. Use a shorter step or tighter tolerances, or correct fun or grad of the invariant"
 

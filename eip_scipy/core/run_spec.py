@@ -65,6 +65,9 @@ class RunSpec:
         See `Run`.
     columns : Columns, optional
         Columns of derivatives that follow the state; `stepping` and `projection` are for the state without them.
+    sees_velocity : bool
+        For methods for q'' = a: whether a comes from a function that is called with velocities too, on which it may
+        come to depend during the run.
     """
 
     name: str
@@ -83,6 +86,7 @@ class RunSpec:
     called: str = "fun"
     left_out: str = ""
     columns: Columns | None = None
+    sees_velocity: bool = True
 
     def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
         """Return the run that starts at the state y0, after a check of the options, the functions and the invariants.
@@ -120,7 +124,8 @@ class RunSpec:
             f0 = self.rhs(t0, y0) if f0 is None else f0
             if self.is_known:
                 return self.method, f0
-            return steppers.checked(self.method, self.rhs, Start(t0, y0, f0, 0.0), self.name, self.hint), f0
+            start = Start(t0, y0, f0, 0.0)
+            return steppers.checked(self.method, self.rhs, start, self.name, self.hint, self.sees_velocity), f0
 
     def attach_history(self, run: Run, start: Start) -> None:
         """Give a run with a multistep method its history, which begins at `start`."""
@@ -161,7 +166,7 @@ class RunSpec:
         if columns is not None:
             options, sigma = widened(options, sigma, columns, invariants.start_gradients)
         invariants.kinds = options.kinds
-        arrays = steppers.arrays(method)
+        arrays = steppers.seeing(steppers.arrays(method), self.sees_velocity)
         carried, blocks = options.balances.place, options.groups.start.size - 1
         work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, blocks, carried.size)
         work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients

@@ -752,6 +752,12 @@ class EIPRKN8(EIPSolver):
     For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. `integrate`
     also takes the acceleration alone, as ``acceleration=``. Options: see `EIPSolver`. Dense output is
     as accurate as the steps and takes five more evaluations in each step in which a state is asked for.
+
+    Notes
+    -----
+    Accelerations must not depend on velocities. With `fun` this is checked at the start, where it raises ValueError,
+    and in about every eighth step, with two evaluations: a run in which they come to depend on them ends there with
+    status -1.
     """
 
     TABLEAU = RKN86
@@ -764,6 +770,10 @@ class EIPRKN12(EIPSolver):
     also takes the acceleration alone, as ``acceleration=``. Options: see `EIPSolver`; use ``every="auto"`` with small
     steps.
     Dense output is as accurate as the steps and takes 15 more evaluations in each step in which a state is asked for.
+
+    Notes
+    -----
+    Accelerations must not depend on velocities, see `EIPRKN8`.
     """
 
     TABLEAU = RKN1210
@@ -784,7 +794,8 @@ class EIPGJ12(EIPSolver):
 
     Notes
     -----
-    The first states come from `EIPRKN12` (from DOP853 where accelerations depend on velocities), with the same step.
+    The first states come from `EIPRKN12` with the same step; if `fun` is given, they come from DOP853 in four steps for
+    each step, because such accelerations may depend on velocities, at the start or later.
     The corrections of the projection are added to the sums of accelerations that give positions and velocities.
     `integrate` returns states in the middle of the history of accelerations: for order p, the state after a step is
     returned when p / 2 further steps have been made, or all steps up to the end of the interval. solve_ivp returns the

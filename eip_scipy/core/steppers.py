@@ -25,7 +25,7 @@ from ..methods.runge_kutta import DOP853, Tableau
 from .driven import Driven, Stepper
 from .one_step import OneStep
 
-__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "rated"]
+__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "rated", "seeing"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -82,6 +82,7 @@ def _(method: Tableau) -> Method:
         e_v=none,
         e_low=method.e_low.copy(),
         nystrom=False,
+        sees_velocity=False,
         fsal=method.fsal,
         paired=method.paired,
         exponent=_exponent(method),
@@ -109,6 +110,7 @@ def _(method: NystromTableau) -> Method:
         e_v=e_v,
         e_low=np.zeros(s + 1),
         nystrom=True,
+        sees_velocity=False,
         fsal=bool(e[-1] != 0.0 or e_v[-1] != 0.0),
         paired=False,
         exponent=_exponent(method),
@@ -120,6 +122,13 @@ def _exponent(method: Tableau | NystromTableau) -> float:
 
 
 # Balances.
+
+
+def seeing(coefficients: Any, sees_velocity: bool) -> Any:
+    """Return what `arrays` has returned, with a note whether accelerations come from a function that takes velocities."""
+    if isinstance(coefficients, Method) and coefficients.nystrom:
+        return coefficients._replace(sees_velocity=sees_velocity)
+    return coefficients
 
 
 @singledispatch
@@ -223,11 +232,12 @@ def _(method: GaussJackson, brief: bool) -> Form:
 
 
 @singledispatch
-def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> Any:
+def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str], sees_velocity: bool) -> Any:
     """Return the method after a check of the equations.
 
-    The attribute `velocities` of a `GaussJackson` method is set: it is True if the accelerations depend on velocities.
-    If the equations must be of second order, `rhs` is evaluated once more, with other velocities.
+    The attribute `velocities` of a `GaussJackson` method is set to `sees_velocity`: accelerations that do not depend on
+    velocities at the start may do so later, as with drag that acts in a part of an orbit. If the equations must be of
+    second order, `rhs` is evaluated once more, with other velocities.
 
     Parameters
     ----------
@@ -239,6 +249,8 @@ def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[
         Name of the solver class, for messages.
     hint : callable
         ``hint()`` returns further advice for the message if the equations are of another kind.
+    sees_velocity : bool
+        Whether the accelerations come from a function that is called with velocities too.
 
     Raises
     ------
@@ -249,7 +261,9 @@ def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[
 
 
 @checked.register
-def _(method: NystromTableau, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> NystromTableau:
+def _(
+    method: NystromTableau, rhs: Derivative, start: Any, name: str, hint: Callable[[], str], sees_velocity: bool
+) -> NystromTableau:
     if depends_on_velocity(rhs, start, name, hint):
         raise ValueError(
             f"{name} integrates q'' = a(t, q), but the accelerations in fun depend on the velocity; use a Runge-Kutta "
@@ -259,8 +273,11 @@ def _(method: NystromTableau, rhs: Derivative, start: Any, name: str, hint: Call
 
 
 @checked.register
-def _(method: GaussJackson, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> GaussJackson:
-    return replace(method, velocities=depends_on_velocity(rhs, start, name, hint))
+def _(
+    method: GaussJackson, rhs: Derivative, start: Any, name: str, hint: Callable[[], str], sees_velocity: bool
+) -> GaussJackson:
+    depends_on_velocity(rhs, start, name, hint)  # raises an exception if the state is not (q, v)
+    return replace(method, velocities=sees_velocity)
 
 
 def check_halves(n: int) -> None:

@@ -12,6 +12,7 @@ TOO_SMALL: int = 3
 POSTPONED: int = 4
 UNSTABLE: int = 5
 NEAR_SINGULAR: int = 6
+BY_VELOCITY: int = 7
 PAUSE: int = 10
 FULL: int = 11
 ENDED: int = 12
@@ -512,6 +513,7 @@ class Method(NamedTuple):
     nystrom: bool
     fsal: bool
     paired: bool
+    sees_velocity: bool
     multistep: Multistep | None = ...
 
 class Grouping(NamedTuple):

@@ -41,5 +41,5 @@ def no_columns(values: int) -> Columns:
 
 NO_METHOD = Method(
     A=np.zeros((0, 0)), b=_none, b_low=_none, b_v=_none, b_v_low=_none, c=_none, e=_none, e_v=_none, e_low=_none,
-    nystrom=False, fsal=False, paired=False, exponent=0.0,
+    nystrom=False, sees_velocity=False, fsal=False, paired=False, exponent=0.0,
 )  # fmt: skip

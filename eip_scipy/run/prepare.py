@@ -412,6 +412,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         hint=partial(_second_order_hint, given),
         called=system.name,
         left_out=system.left_out,
+        sees_velocity=system.name == "fun" and (problem is None or problem.acc is None),
     )
 
 

@@ -153,6 +153,18 @@ def test_an_event_with_a_kink(depth):
     np.testing.assert_allclose(inside, expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize(
+    "event",
+    [lambda t, y: y[0] ** 3, lambda t, y: y[0] ** 5, lambda t, y: np.sign(y[0]) * y[0] ** 2],
+    ids=["cube", "fifth power", "signed square"],
+)
+@pytest.mark.parametrize("steps", [{"h": 0.01}, {"rtol": 1e-10, "atol": 1e-12}])
+def test_zeros_of_high_multiplicity(event, steps):
+    """Brent's method takes more than a hundred steps there."""
+    run = integrate(lambda t, y: [y[1], -y[0]], (0, 10), [1.0, 0.0], method=EIPDOP853, events=event, **steps)
+    np.testing.assert_allclose(run.t_events[0], np.pi * (np.arange(3) + 0.5), rtol=0, atol=1e-9)
+
+
 def test_a_search_that_finds_nothing_does_not_warn():
     """Halfway through these steps no state has the energy of both ends; nothing there is asked for."""
     run = integrate(

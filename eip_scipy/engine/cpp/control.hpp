@@ -17,12 +17,14 @@ constexpr int64_t AUTO_SPACING = 5;
 
 // The stages and their sum, y_hat.
 template <class AnyRun>
-inline void make_stages(const AnyRun &run, const Step &step) {
+inline Code make_stages(const AnyRun &run, const Step &step) {
+    Code status = OK;
     if (run.method.nystrom)
-        rkn_stages(run, step);
+        status = rkn_stages(run, step);
     else if (!made_with_rates(run, step))
         rk_stages(run, step);
     run.work.counters[NFEV] += run.method.stages - 1;
+    return status;
 }
 
 // Return whether the derivative at y_hat serves the projection only, and another one follows.
@@ -79,7 +81,8 @@ inline void look_back_and_compare(const AnyRun &run, const Step &step) {
 
 template <class AnyRun>
 inline Code raw_step(const AnyRun &run, const Step &step) {
-    make_stages(run, step);
+    const Code status = make_stages(run, step);
+    if (status != OK) return status;
     const bool finite = all_finite(run.work.y_hat, run.work.m);
     if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
     if (has_state_alone(run)) [[unlikely]]
@@ -192,7 +195,7 @@ template <class AnyRun>
 //
 // A failed projection shortens the step, at most MAX_RETRIES times in a row; the first end next to a singular position
 // does, too, because a step from elsewhere may cross it. Returns OK, NOT_FINITE, FAILED_PROJECTION or
-// TOO_SMALL; of a multistep method UNSTABLE too.
+// TOO_SMALL; of a multistep method UNSTABLE and of a Nystrom method BY_VELOCITY too.
 template <class AnyRun>
 inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
     if (run.method.multistep) return next_states(OneState{of_any_length(run), y_new}, span, clock, k, k + 1, y, y_new);
@@ -218,6 +221,8 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         avoids_singular = avoids_singular && !last && SHORTENED * h_abs >= least;
         const Step step{t, clock[TIME_NEW], clock[LENGTH], y, y_new, is_projected(run, k, last), last, avoids_singular};
         status = any_raw_step(run, step);
+        if (status == BY_VELOCITY) [[unlikely]]
+            return status;
         const double norm = adaptive ? w.norm[0] : 0.0;
         if (status == OK && !std::isfinite(norm)) status = NOT_FINITE;
         if (status == OK && norm < 1.0) {

@@ -15,8 +15,8 @@ namespace eip {
     constexpr const char *NAME##_NAMES = #__VA_ARGS__
 
 // Codes of a step; from PAUSE on those of the loops.
-EIP_ENUM(Code, OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE, NEAR_SINGULAR, PAUSE = 10, FULL,
-         ENDED, DOUBTFUL);
+EIP_ENUM(Code, OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE, NEAR_SINGULAR, BY_VELOCITY,
+         PAUSE = 10, FULL, ENDED, DOUBTFUL);
 
 EIP_ENUM(Direction, NEW, OLD, MIDPOINT);
 EIP_ENUM(Metric, EUCLIDEAN, BY_ERROR, GIVEN);
@@ -166,6 +166,7 @@ struct Method {
     const double *A, *b, *b_low, *b_v, *b_v_low, *c, *e, *e_v, *e_low;
     int64_t n_e, n_e_v, n_e_low;
     bool nystrom, fsal, paired;
+    bool sees_velocity;  // whether the accelerations of a Nystrom method come from a function that takes velocities too
     double exponent;
     const Multistep *multistep;  // whose first states the tableau makes, else null
 };
@@ -184,7 +185,7 @@ void fields(Method &m, Visit &visit) {
     visit("e", m.e, Bound{m.n_e});
     visit("e_v", m.e_v, Bound{m.n_e_v});
     visit("e_low", m.e_low, Bound{m.n_e_low});
-    each(visit, "nystrom", m.nystrom, "fsal", m.fsal, "paired", m.paired);
+    each(visit, "nystrom", m.nystrom, "fsal", m.fsal, "paired", m.paired, "sees_velocity", m.sees_velocity);
     visit.in_python("multistep", "Multistep | None", true);
 }
 

@@ -10,8 +10,8 @@ namespace eip {
 constexpr double ROOT_TOLERANCE = 4.0 * EPS;  // of the step's length, and relative to the time
 constexpr int MAX_ROOT_STEPS = 100;
 
-// A root of f between a and b, where its values fa and fb differ in sign; NaN where f is, or without convergence. Brent's
-// method, each operation as in scipy.optimize.brentq. `length` is that of the step, whatever the unit of time: SciPy's
+// A root of f between a and b, where its values fa and fb differ in sign; NaN where f is. Brent's method, each operation as in
+// scipy.optimize.brentq, and bisection where that does not converge, as at a zero of high multiplicity. `length` is that of the step, whatever the unit of time: SciPy's
 // absolute tolerance of 9e-16 would be all of a step of 1e-15.
 template <class Function>
 inline double root_between(double length, double a, double fa, double b, double fb, Function f) {
@@ -56,7 +56,14 @@ inline double root_between(double length, double a, double fa, double b, double 
         f_best = f(best);
         if (std::isnan(f_best)) return f_best;
     }
-    return NOT_A_NUMBER;
+    if (std::signbit(f_before) != std::signbit(f_best)) other = before;
+    while (std::abs(other - best) >= ROOT_TOLERANCE * (length + std::abs(best))) {
+        const double middle = best + (other - best) / 2.0, value = f(middle);
+        if (std::isnan(value)) return value;
+        if (value == 0.0) return middle;
+        (std::signbit(value) == std::signbit(f_best) ? best : other) = middle;
+    }
+    return best;
 }
 
 }  // namespace eip

@@ -230,9 +230,9 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
     int64_t before[N_COUNTERS];
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), before);
     Eight::Run all = eight.run();
-    make_stages(all, step);
+    const bool stay_together = make_stages(all, step) == OK;
     const bool sampled = look_back(all, step);
-    Mask alive = alive_of(eight), leave, rough{};
+    Mask alive = stay_together ? alive_of(eight) : Mask{}, leave, rough{};
     if (sampled) [[unlikely]]
         rough = alive & is_rough(largest_error_share(step.h, eight.y, o, w), w.figures(0));
     alive = alive & !rough;
@@ -244,7 +244,7 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
         leave = alive & !all_finite(w.y_hat, w.m);
     }
     bool returned[LANES] = {};
-    leave = leave | rough;
+    leave = stay_together ? leave | rough : alive_of(eight);
     if (any(leave))
         for (int64_t lane = 0; lane < LANES; ++lane)
             if (leave.lane(lane))

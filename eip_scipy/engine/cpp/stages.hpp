@@ -64,13 +64,37 @@ inline bool made_with_rates(const RunOf<W, System> &run, const Step &step) {
     return true;
 }
 
-// Stages keep v, which the accelerations do not see.
+// About once in this number of steps a Nystrom method checks whether accelerations depend on velocities at the present state.
+constexpr int64_t VELOCITY_EACH = 8;
+
+// Returns whether the accelerations at y = (q, v) are others with other velocities. Only the number of evaluations says how many
+// steps have been made.
 template <class AnyRun>
-inline void rkn_stages(const AnyRun &run, const Step &step) {
+[[gnu::cold, gnu::noinline]] inline bool depends_on_velocity(const AnyRun &run, double t, const double *y) {
+    const auto &w = run.work;
+    const int64_t half = w.m / 2;
+    copy(y, w.stage, w.m);
+    run.system.rhs_of_scratch(w, t, w.stage, w.row(1));
+    for (int64_t i = half; i < w.m; ++i) w.stage[i] = 1.5 * y[i] + 1.0;
+    copy(y, w.stage, half);
+    run.system.rhs_of_scratch(w, t, w.stage, w.f_point);
+    w.counters[NFEV] += 2;
+    for (int64_t i = half; i < w.m; ++i) {
+        const double a = w.row(1)[i], b = w.f_point[i];
+        if (a != b && !(std::isnan(a) && std::isnan(b))) return true;
+    }
+    return false;
+}
+
+// Stages keep v, which the accelerations must not see: BY_VELOCITY if they are found to do.
+template <class AnyRun>
+inline Code rkn_stages(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const auto &w = run.work;
     const int64_t half = w.m / 2;
     const double *accelerations = w.K + half;
+    if (m.sees_velocity && w.counters[NFEV] / m.stages % VELOCITY_EACH == 0) [[unlikely]]
+        if (depends_on_velocity(run, step.t, step.y)) return BY_VELOCITY;
     copy(step.y + half, w.stage + half, half);
     for (int64_t i = 1; i < m.stages; ++i) {
         nystrom_position(step.y, step.h, m.c[i], {m.A + i * m.columns, accelerations, i, w.m}, w.stage, half);
@@ -78,10 +102,11 @@ inline void rkn_stages(const AnyRun &run, const Step &step) {
     }
     if (run.options.compensated) {
         compensated_nystrom(step.y, step.h, m, w);
-        return;
+        return OK;
     }
     nystrom_position(step.y, step.h, 1.0, {m.b, accelerations, m.stages, w.m}, w.y_hat, half);
     combine(step.y + half, step.h, {m.b_v, accelerations, m.stages, w.m}, w.y_hat + half, half);
+    return OK;
 }
 
 }  // namespace eip

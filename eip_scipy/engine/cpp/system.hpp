@@ -38,7 +38,7 @@ class Functions {
 
 struct Step;
 
-// What one pass over the functions has found at the raw result of a step beside the derivative: nothing, the value of one
+// The quantities that are known at the raw result of a step when its derivative has been computed: none, the value of one
 // invariant, which is System::energy, or values and gradients of all.
 enum class Known { NOTHING, ENERGY, ALL };
 
@@ -153,8 +153,8 @@ struct System {
         copy(f + w.m / 2, a, w.m / 2);
     }
 
-    // The derivative at the raw result of a step that is to be projected, and what the same pass finds besides: `together` or
-    // `with_energy` is set.
+    // Computes the derivative at the raw result of a step that will be projected, and the quantities that the same pass gives:
+    // `together` or `with_energy` is set.
     template <class W>
     void evaluate_for_projection(const W &w, double t, const double *y, double *out) {
         if (together) {

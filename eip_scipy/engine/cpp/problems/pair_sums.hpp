@@ -9,8 +9,8 @@
 // The energy, in which large terms nearly cancel, is summed with the rounding errors carried along: what a projection
 // cannot see it cannot correct.
 //
-// From MANY bodies on every pair is taken once, for both bodies, and threads share the rows of pairs (PairRows). The energy of so
-// many can come with the accelerations, in a third of the time that it takes alone, with the same bits.
+// From MANY bodies on every pair is taken once, for both bodies, and threads share the rows of pairs (PairRows). The energy of
+// MANY bodies can be computed together with the accelerations, which takes half as long as alone, with the same bits.
 //
 // With APART the accelerations come with a second sum, of all pulls but those between a body and the first one, for motion about
 // the first body: what is there before its pull is added, which is the last one in its stream, and the reaction in its place.
@@ -438,10 +438,10 @@ inline double energy_in_blocks(const double *q, const double *v, const double *g
 constexpr int64_t MANY = 128;
 constexpr int64_t TILE = 32;  // sources whose reactions stay in the fastest cache
 
-// Number of the first of so many bodies, which are special in all sums.
+// Number of the first bodies of n, MANY or more: their pulls are the last terms of all sums.
 inline int64_t first_ones(int64_t n) { return LANES + n % LANES; }
 
-// What is found in addition to the accelerations: the pulls except those of the first body, or the energy.
+// Results in addition to the accelerations: none, the pulls except those of the first body, or the energy.
 enum class Also { NOTHING, PULLS, ENERGY };
 
 // Accelerations of many bodies. The targets, in blocks of eight, form rows. A row takes its pairs with all bodies before
