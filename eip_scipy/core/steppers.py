@@ -125,7 +125,7 @@ def _exponent(method: Tableau | NystromTableau) -> float:
 
 
 def seeing(coefficients: Any, sees_velocity: bool) -> Any:
-    """Return what `arrays` has returned, with a note whether accelerations come from a function that takes velocities."""
+    """Return what `arrays` has returned, noting whether accelerations come from a function of velocities too."""
     if isinstance(coefficients, Method) and coefficients.nystrom:
         return coefficients._replace(sees_velocity=sees_velocity)
     return coefficients

@@ -9,11 +9,13 @@ from systems import SQUARE, VOLTERRA, lotka_volterra, oscillator
 
 from eip_scipy import (
     EIPDOP853,
+    EIPGJ14,
     EIPRK1,
     EIPRK2,
     EIPRK3,
     EIPRK4,
     EIPRK5,
+    EIPRKN12,
     Diagnostics,
     Invariant,
     ProjectionWarning,
@@ -102,6 +104,32 @@ def test_circular_kepler_for_long(metric, eccentricity):
     assert run.status == 0
     assert (run.max_defect <= 6 * EPS).all()
     assert np.hypot(*run.y[:2, -1]) == pytest.approx(1.0, abs=1.1 * eccentricity + 1e-6)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("eccentricity", [1e-2, 1e-4, 1e-6, 3e-8])
+@pytest.mark.parametrize(
+    ("method", "steps", "allowed"), [(EIPRKN12, 24, 5e-12), (EIPGJ14, 90, 1e-12), (EIPDOP853, 100, 1e-11)]
+)
+def test_nearly_parallel_gradients_do_not_amplify_rounding(method, steps, allowed, eccentricity):
+    """What H and L know of the direction in which their gradients differ was divided by the sine of the angle."""
+    problem = kepler(eccentricity, 0.0)
+    run = integrate(problem, (0, 200 * np.pi), method=method, h=2 * np.pi / steps)
+    assert run.trusted
+    assert np.abs(run.y[:, -1] - problem.y0).max() < allowed
+    assert (run.max_defect <= 8 * EPS).all()
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("eccentricity", [1e-3, 1e-5, 1e-7, 0.0])
+@pytest.mark.parametrize("symplectic", [False, True])
+def test_derivatives_of_nearly_circular_orbits(symplectic, eccentricity):
+    problem = kepler(eccentricity, 0.0)
+    options = {"method": EIPDOP853, "variations": "state"}
+    truth = integrate(problem, (0, 20 * np.pi), h=2 * np.pi / 400, invariants=(), **options).stm[-1]
+    run = integrate(problem, (0, 20 * np.pi), h=2 * np.pi / 40, symplectic=symplectic, **options)
+    assert run.trusted
+    assert np.abs(run.stm[-1] - truth).max() < 3e-10 * np.abs(truth).max()
 
 
 # Equilibria and saddles: the gradient of H vanishes.

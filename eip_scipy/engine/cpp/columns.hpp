@@ -138,7 +138,8 @@ template <class AnyRun>
     take_column(columns, -1, w.sigma, scratch);
     weigh_packed_rows(o, w, scratch);
     const Matrix rows{w.Q, w.l, n, w.m};
-    const int64_t rank = factor(rows, w.inverse_norms, corner(w.R, w.l, w), w.pivots);
+    const Matrix R = corner(w.R, w.l, w);
+    const int64_t rank = before_parallel(R, w.pivots, factor(rows, w.inverse_norms, R, w.pivots));
     ++w.counters[NLU];
     if (rank > 0) {
         find_corrections(o, w, rank, rows, scratch);

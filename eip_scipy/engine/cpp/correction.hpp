@@ -152,7 +152,9 @@ inline auto *limits(const Options &o, const W &w) {
     return o.balance_groups.count > 0 ? w.g : w.before;
 }
 
-// The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
+// The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal. Gradients that are
+// nearly parallel are given their whole defects, also those inside the dead bands: 0 in the place of one would disagree with
+// the other.
 template <class W>
 [[gnu::always_inline]] inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
     if (o.balance_groups.count > 0) [[unlikely]]
@@ -167,7 +169,7 @@ template <class W>
     if (rows != w.Q) weigh_rows(o.frame, w, w.Q);
     const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     w.counters[TRIED_INDEPENDENT] = clearly_independent(R, w.pivots, rank);
-    least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+    least_norm(w.before, w.inverse_norms, R, w.pivots, rank, w.mu, w.band, EPS * o.per_band);
     if (rank >= 0) move_along(o, w, w.Q, out);
     return rank;
 }

@@ -12,6 +12,9 @@ constexpr double RANK_TOLERANCE = 1.4901161193847656e-08;  // sqrt(EPS)
 constexpr double REORTHOGONALISE = 0.05;
 // Rows of length 1 of which less than this is left without their components along others are nearly dependent.
 constexpr double NEARLY_DEPENDENT = 1e-4;
+// Columns of derivatives are not corrected along a row of which less than this is left: the gradients, at a state that has
+// errors, do not say more about that direction than the steps.
+constexpr double PARALLEL = 1e-2;
 
 // Rows of a matrix, `stride` values from one to the next.
 template <class Value>
@@ -81,14 +84,28 @@ inline int64_t clearly_independent(const Matrix &R, const int64_t *pivots, int64
     return count;
 }
 
-// Coefficients mu of the rows that `factor` left, of the least-norm x with row_i . x = -g_i; 0 beyond the rank.
+// Return the number of the first directions that `factor` chose before one of a row that is nearly parallel to them.
+inline int64_t before_parallel(const Matrix &R, const int64_t *pivots, int64_t rank) {
+    for (int64_t k = 0; k < rank; ++k)
+        if (R(k, pivots[k]) * PARALLEL > 1.0) return k;
+    return rank;
+}
+
+// Coefficients mu of the rows that `factor` left, of the least-norm x with row_i . x = -g_i; 0 beyond the rank. With `sizes`, g_i
+// is known to noise * sizes[i]: a row that is nearly parallel to those before it gets a direction of its own only where they
+// leave more of its g than that. Otherwise x would be rounding errors, divided by the sine of the angle.
 inline void least_norm(const double *g, const double *inverse_norms, const Matrix &R, const int64_t *pivots,
-                       int64_t rank, double *mu) {
+                       int64_t rank, double *mu, const double *sizes = nullptr, double noise = 0.0) {
     fill(mu, 0.0, R.rows);
     for (int64_t k = 0; k < rank; ++k) {
         const int64_t row = pivots[k];
         double value = -g[row] * inverse_norms[row];
         for (int64_t q = 0; q < k; ++q) value -= R(q, row) * mu[pivots[q]];
+        if (sizes && R(k, row) * REORTHOGONALISE > 1.0) {
+            double size = sizes[row] * inverse_norms[row];
+            for (int64_t q = 0; q < k; ++q) size += std::abs(R(q, row)) * sizes[pivots[q]] * inverse_norms[pivots[q]];
+            if (std::abs(value) <= noise * size) continue;
+        }
         mu[row] = value * R(k, row);
     }
 }

@@ -12,13 +12,14 @@ namespace eip {
     eight.take(eights.sigma, lane, w.sigma, w.m);
     eight.take(eights.y_hat, lane, w.y_hat, w.m);
     eight.take(eights.G, lane, w.G, w.l * w.m);
-    eight.take(eights.g, lane, w.g, w.l);
+    eight.take(eights.before, lane, w.before, w.l);
+    eight.take(eights.band, lane, w.band, w.l);
     weigh_rows(o.frame, w, w.Q);
     const Matrix R = corner(w.R, w.l, w);
     const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     eight.rank[lane] = std::max<int64_t>(rank, 0);
     if (rank >= 0) {
-        least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+        least_norm(w.before, w.inverse_norms, R, w.pivots, rank, w.mu, w.band, EPS * o.per_band);
         move_along(o, w, w.Q, w.stage);
     } else {
         for (double *out : {w.move, w.stage}) fill(out, NOT_A_NUMBER, w.m);
