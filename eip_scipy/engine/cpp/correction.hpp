@@ -62,11 +62,16 @@ template <class Value, class W>
     const int64_t m = w.m;
     const bool framed = o.frame.rows > 0;
     in_blocks(out, m, [&]<class Part, int COUNT>(int64_t first) {
+        constexpr int64_t LENGTH = sizeof(Part) / sizeof(Value);
+        Part sums[COUNT];
+        for (int c = 0; c < COUNT; ++c) sums[c] = spread<Part>(w.mu[0]) * load_as<Part>(Q + first + c * LENGTH);
+        for (int64_t k = 1; k < w.l; ++k) {
+            const Part mu = spread<Part>(w.mu[k]);
+            for (int c = 0; c < COUNT; ++c) sums[c] = sums[c] + mu * load_as<Part>(Q + k * m + first + c * LENGTH);
+        }
         for (int c = 0; c < COUNT; ++c) {
-            const int64_t j = first + c * static_cast<int64_t>(sizeof(Part) / sizeof(Value));
-            Part x = spread<Part>(w.mu[0]) * load_as<Part>(Q + j);
-            for (int64_t k = 1; k < w.l; ++k) x = x + spread<Part>(w.mu[k]) * load_as<Part>(Q + k * m + j);
-            x = load_as<Part>(w.sigma + j) * x;
+            const int64_t j = first + c * LENGTH;
+            const Part x = load_as<Part>(w.sigma + j) * sums[c];
             store_as(x, framed ? out + j : w.move + j);
             if (!framed) store_as(load_as<Part>(w.y_hat + j) + x, out + j);
         }
@@ -152,26 +157,31 @@ inline auto *limits(const Options &o, const W &w) {
     return o.balance_groups.count > 0 ? w.g : w.before;
 }
 
-// The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal. Gradients that are
-// nearly parallel are given their whole defects, also those inside the dead bands: 0 in the place of one would disagree with
-// the other.
+// The first Newton step by `factor`. Gradients that are nearly parallel are given their whole defects, also those inside the dead
+// bands: 0 in the place of one would disagree with the other.
 template <class W>
-[[gnu::always_inline]] inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
-    if (o.balance_groups.count > 0) [[unlikely]]
-        return move_in_groups(o, w, out);
+[[gnu::noinline]] inline int64_t factored_move(const Options &o, const W &w, double *out) {
     const Matrix R = corner(w.R, w.l, w);
-    double *rows = more ? nullptr : weighed_gradients(o, w);
-    if (rows && solve_gram(rows_of(rows, w), w.g, R, w.mu)) {
-        move_along(o, w, rows, out);
-        w.counters[TRIED_INDEPENDENT] = w.l;
-        return w.l;
-    }
-    if (rows != w.Q) weigh_rows(o.frame, w, w.Q);
     const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     w.counters[TRIED_INDEPENDENT] = clearly_independent(R, w.pivots, rank);
     least_norm(w.before, w.inverse_norms, R, w.pivots, rank, w.mu, w.band, EPS * o.per_band);
     if (rank >= 0) move_along(o, w, w.Q, out);
     return rank;
+}
+
+// The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
+template <class W>
+[[gnu::always_inline]] inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
+    if (o.balance_groups.count > 0) [[unlikely]]
+        return move_in_groups(o, w, out);
+    double *rows = more ? nullptr : weighed_gradients(o, w);
+    if (rows && solve_gram(rows_of(rows, w), w.g, corner(w.R, w.l, w), w.mu)) {
+        move_along(o, w, rows, out);
+        w.counters[TRIED_INDEPENDENT] = w.l;
+        return w.l;
+    }
+    if (rows != w.Q) weigh_rows(o.frame, w, w.Q);
+    return factored_move(o, w, out);
 }
 
 // Add to w.mu the Newton step of (B . Q) step = -g, on the rows that the first factorisation chose.
