@@ -231,6 +231,63 @@ def test_what_depends_on_time():
     assert names(trap, [1.0, 0.0, 0.0, 1.0], degree=4) == ["y0*y3 - y1*y2"]
 
 
+DRIVEN = {
+    "force": lambda t, y: np.array([y[1], -y[0] + np.sin(2 * t)]),
+    "force alone": lambda t, y: np.array([y[1], -t]),
+    "stiffness": lambda t, y: np.array([y[1], -y[0] * t]),
+    "all of it": lambda t, y: np.array([t * y[1], -(t**2)]),
+    "weak and all of it": lambda t, y: 1e-12 * np.array([y[1], -y[0] + t]) * t,
+    "field after a while": lambda t, y: np.array([y[1], -y[0] + (t > 30.0)]),
+    "all of it after a while": lambda t, y: np.array([y[1], y[0] ** 2]) * (t > 1e6),
+}
+
+
+@pytest.mark.parametrize("start", [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+@pytest.mark.parametrize("drive", DRIVEN)
+def test_what_is_at_rest_when_the_drive_begins(drive, start):
+    """At time 0 the state does not move from some of these starts, or all states conserve a quantity."""
+    assert names(DRIVEN[drive], start) == []
+
+
+def test_what_is_conserved_from_rest():
+    def ramped(t, y):
+        return np.array([y[2], y[3], 0.1 * t, 0.0])
+
+    assert names(ramped, [0.0, 0.0, 0.0, 0.0]) == ["y3"]
+    assert names(lambda t, y: np.array([y[1], -y[0]]), [0.0, 0.0]) == ["y0**2 + y1**2"]
+    assert names(lambda t, y: np.array([y[1], -y[0]]) * t, [0.0, 1.0]) == ["y0**2 + y1**2"]
+
+
+def test_an_equilibrium_that_states_nearby_leave():
+    """Neither the points around the start nor its own trajectory show that y1 moves."""
+
+    def f(t, y):
+        return np.array([y[0], float(abs(y[0]) > 4.0)])
+
+    for seed in range(3):
+        assert names(f, [0.0, 1.0], seed=seed) == []
+
+
+def test_a_term_that_is_infinite_at_the_start():
+    """The sum with log(y1) is infinite along the trajectory from the start, and not conserved where y1 > 5."""
+
+    def f(t, y):
+        return np.array([1.0 + (y[1] > 5.0), y[1]])
+
+    for seed in range(3):
+        assert names(f, [1.0, 0.0], terms={"log(y1)": log_of(1)}, seed=seed) == []
+    assert names(lambda t, y: np.array([1.0, y[1]]), [1.0, 0.0], terms={"log(y1)": log_of(1)}) == ["y0 - log(y1)"]
+
+
+def test_a_drive_at_rest_near_the_start_only():
+    """States far from the start have no derivative, and those near it move only after time 0."""
+
+    def f(t, y):
+        return np.array([y[1], -1.0]) * t + 0 * np.sqrt(0.01 - y[0] ** 2 - y[1] ** 2)
+
+    assert names(f, [0.0, 0.0], degree=1) == []
+
+
 def vanishing(power, damping=0.0):
     """y'' = -y^power: all terms of the energy's rate are 0 where y is."""
     return lambda t, y: np.array([y[1], -(y[0] ** power) - damping * y[1]])
@@ -458,12 +515,38 @@ def test_functions_that_are_defined_near_the_start_only():
 
 
 def test_functions_that_are_defined_nowhere():
+    """Even where `fun` is defined at the start itself."""
+
     def f(t, y):
+        if y.tolist() == [1.0, 2.0]:
+            return np.array([1.0, 0.0])
         raise ZeroDivisionError("nowhere")
 
     with pytest.raises(ValueError, match="finite at fewer than 25 % of the random points around y0") as found:
         find_invariants(f, [1.0, 2.0])
     assert isinstance(found.value.__cause__, ZeroDivisionError)
+    with pytest.raises(ValueError, match=r"fun\(t, y0\) raised ZeroDivisionError, expected finite") as found:
+        find_invariants(f, [1.0, 1.0])
+    assert isinstance(found.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize("value", [[np.nan, 1.0], [np.inf, 1.0], [np.nan, np.nan]])
+def test_functions_that_are_not_finite_at_the_start(value):
+    with pytest.raises(ValueError, match=r"fun\(t, y0\) is .*(nan|inf).*, expected finite numbers. Choose another y0"):
+        find_invariants(lambda t, y: value, [1.0, 0.0])
+    with pytest.raises(ValueError, match=r"fun\(t, y0\) is .*nan"), np.errstate(all="ignore"):
+        find_invariants(kepler, [0.0, 0.0, 0.0, 1.0])
+
+
+def test_functions_that_end_soon():
+    """Half of the points are at the first time, and the trajectory ends where the function does."""
+
+    def until(end, drive=0.0):
+        return lambda t, y: np.array([y[1], -y[0] + drive * t]) if t <= end else np.full(2, np.nan)
+
+    for start in ([1.0, 0.0], [0.0, 0.0]):
+        assert names(until(1e-3), start) == ["y0**2 + y1**2"]
+        assert names(until(1e-3, 1.0), start) == []
 
 
 @pytest.mark.parametrize(

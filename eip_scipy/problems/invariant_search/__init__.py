@@ -36,15 +36,17 @@ def find_invariants(
 
     The rate of a sum of monomials is linear in its coefficients. Therefore the coefficients of an invariant are a null
     vector of the matrix of rates at random points. Each combination that is found is tested at new points and times,
-    and along a trajectory.
+    and along a trajectory: that from `y0`, or from a point nearby if `y0` is an equilibrium or a term is
+    not finite there.
 
     Parameters
     ----------
     fun : callable or Problem
         ``fun(t, y) -> (n,)``, for real states.
     y0 : array_like, shape (n,)
-        A state. Random points are drawn around it, at distances of about the sizes of its components. If `fun` or a
-        term raises an error or is not finite at too many points, points nearer to the state are drawn.
+        A state at which `fun` is finite. Random points are drawn around it, at distances of about the sizes of its
+        components. If `fun` or a term raises an error or is not finite at too many points, points nearer to the state
+        are drawn.
     degree : int, optional
         Largest degree of the polynomials.
     terms : sequence or mapping, optional
@@ -52,7 +54,8 @@ def find_invariants(
         ``grad(y) -> (n,)``, or both functions of (t, y) that do not depend on t. Their names are those of the
         functions, or the keys of a mapping of names to pairs.
     t : float, optional
-        First time at which `fun` may be called. The trajectory starts at this time.
+        First time at which `fun` may be called. The trajectory starts at this time. The points are at this time and at
+        later ones, up to about 1000 times the time in which the state moves by its own size.
     rtol : float, optional
         Largest rate of a returned invariant at each new point, relative to the sum of the absolute values of the terms
         ``dI/dy_i dy_i/dt``. In addition the rate must be below 0.001 `rtol` relative to the sum of the absolute values
@@ -71,7 +74,7 @@ def find_invariants(
     Raises
     ------
     ValueError
-        If an argument is wrong, or `fun` or a term is finite at too few points.
+        If an argument is wrong, `fun` is not finite at (t, y0), or `fun` or a term is finite at too few points.
 
     Notes
     -----

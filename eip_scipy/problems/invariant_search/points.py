@@ -16,6 +16,12 @@ Array = np.ndarray
 
 SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01)  # of the points, in units of the components' sizes
 STEPS = 200
+# Largest time of the points in units of `tau`: what drives a system may be much slower than its motion.
+LATEST = 1000.0
+# A trajectory that moves by less than this part of the components' sizes tests nothing.
+AT_REST = 1e-3
+# Times after `t`, in any unit, at which a system is looked at that does not move at `t` from any state.
+LATER = 10.0 ** np.arange(-9, 19)
 
 
 class Sample(NamedTuple):
@@ -39,7 +45,13 @@ class Surroundings:
 
     `terms` are the given functions, each a `Term`: invariants are searched among sums of multiples of monomials of the
     state and of these functions. `scale` (n,) holds the sizes of the components of the state, `tau` is a time in which
-    the state moves by its own size, and `trajectory` (m, n) holds states on the trajectory that starts at y0.
+    the state moves by its own size, and `trajectory` (m, n) holds states on the trajectory that starts at y0, or nearby
+    if that from y0 tests nothing.
+
+    Raises
+    ------
+    ValueError
+        If the vector field is not finite at y0.
     """
 
     def __init__(self, fun: Callable[..., Any], y0: Array, terms: Sequence[Term], t: float, seed: int) -> None:
@@ -77,16 +89,59 @@ class Surroundings:
 
     def _look_around(self) -> None:
         """Set `scale`, the sizes of the components, and `tau`, a time in which the state moves by its own size."""
+        first = self._slope(self.t, self.y0)
+        if not np.isfinite(first).all():
+            found = f"is {first}" if self.failure is None else f"raised {type(self.failure).__name__}"
+            raise ValueError(
+                f"find_invariants: fun(t, y0) {found}, expected finite numbers. Choose another y0 or t."
+            ) from self.failure
         here, self.scale, self.tau = self.y0, np.abs(self.y0), 0.0
         for _ in range(3):  # a component may start to move only where others have moved
-            f = np.abs(self._slope(self.t, here))
-            f[~np.isfinite(f)] = 0.0
+            f = self._speeds(self.t, here)
             if f.any():  # a start near a fixed point is slow, and its surroundings are not
                 tau = float(np.max(self.scale, initial=0.0) or 1.0) / float(np.max(f))
                 self.tau = min(self.tau or tau, tau)
             self.scale = np.maximum(self.scale, self.tau * f)
             here = self.y0 + 0.1 * self.scale * self.rng.standard_normal(self.y0.size)
         self.scale[self.scale == 0.0] = np.max(self.scale) or 1.0
+        if self.tau == 0.0:
+            self.tau = self._time_of_a_start_at_rest()
+
+    def _speeds(self, t: float, y: Array) -> Array:
+        """Return the absolute values of the derivative (n,), with 0 for those that are not finite."""
+        f = np.abs(self._slope(t, y))
+        f[~np.isfinite(f)] = 0.0
+        return f
+
+    def _time_of_a_start_at_rest(self) -> float:
+        """Return a time in which states around y0 move by their size, if the states near y0 do not move at `t`.
+
+        All components are displaced. If that does not move them, later times are tried; if nothing moves, return 0.
+        """
+        if speed := self._speed_around(self.t):
+            return 1.0 / speed
+        tau = 0.0
+        for later in LATER.tolist():
+            if speed := self._speed_around(self.t + later):
+                tau = later
+            if later * speed >= 1.0:
+                break
+        return tau
+
+    def _speed_around(self, t: float) -> float:
+        y = self._near(t)
+        return float(np.max(self._speeds(t, y) / self.scale))
+
+    def _near(self, t: float) -> Array:
+        """Return a random state near y0 at which all functions are finite at `t`; y0 if none is found."""
+        for spread in SPREADS:
+            y = self.y0 + spread * self.scale * self.rng.standard_normal(self.y0.size)
+            if self._is_defined(t, y):
+                return y
+        return self.y0
+
+    def _is_defined(self, t: float, y: Array) -> bool:
+        return bool(np.isfinite(self._slope(t, y)).all() and np.isfinite(self.term_gradients(y)).all())
 
     def sample(self, wanted: int, basis: Sequence[Monomial]) -> Sample:
         """Return `wanted` random points, with the rates of monomials and of the given functions (`terms`) there.
@@ -102,8 +157,7 @@ class Surroundings:
             points, slopes, gradients = [], [], []
             for k in range(4 * wanted):
                 y = self.y0 + spread * self.scale * self.rng.standard_normal(self.y0.size)
-                # A quantity that depends on time must be conserved at all times.
-                t = self.t + self.tau * self.rng.random() * (k % 2)
+                t = self.t + self.tau * self._later(k)
                 f, g = self._slope(t, y), self.term_gradients(y)
                 if np.isfinite(f).all() and np.isfinite(g).all():
                     points.append(y / self.scale)
@@ -116,10 +170,30 @@ class Surroundings:
             f"distances of {SPREADS[-1]} times the sizes of the components. Choose another y0 or t."
         ) from self.failure
 
+    def _later(self, k: int) -> float:
+        """Return the time of point `k` after `t`, in units of `tau`: 0, a number below 1, or one up to `LATEST`.
+
+        A quantity must be conserved at all times. Half of the points are at `t`, because `fun` may be undefined later.
+        """
+        part = float(self.rng.random())
+        return part if k % 4 == 1 else LATEST**part if k % 4 == 3 else 0.0
+
     def _follow(self) -> Array:
-        """Return states (m, n) on the trajectory from y0: those of at most 200 steps, within the time 3 `tau`."""
-        solver = DOP853(self._slope, self.t, self.y0, self.t + 3 * self.tau, rtol=1e-12, atol=1e-16 * self.scale)
-        states = [self.y0]
+        """Return states (m, n) on a trajectory.
+
+        It starts at y0. If y0 is an equilibrium or a given function is not finite there, the trajectory would test
+        nothing, and one from a random point nearby is returned.
+        """
+        if self._is_defined(self.t, self.y0):
+            states = self._states_from(self.y0)
+            if np.any(np.abs(states - self.y0) > AT_REST * self.scale):
+                return states
+        return self._states_from(self._near(self.t))
+
+    def _states_from(self, start: Array) -> Array:
+        """Return the states (m, n) of at most 200 steps from `start`, within the time 3 `tau`."""
+        solver = DOP853(self._slope, self.t, start, self.t + 3 * self.tau, rtol=1e-12, atol=1e-16 * self.scale)
+        states = [start]
         while solver.status == "running" and len(states) <= STEPS:
             solver.step()
             if solver.status != "failed":
