@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import scipy
 from scipy.integrate import BDF, DenseOutput, OdeSolver, Radau
+from scipy.sparse import issparse
 
 from ..engine.data import NFEV, NJEV, NLU, Work
+from ..engine.native import BUILD
 from ..methods.orders import Ordered
 
 if TYPE_CHECKING:
@@ -108,6 +110,8 @@ class Stepper:
     method : Driven
     solver : OdeSolver
         The solver of SciPy; None before the first step.
+    not_finite_at : float or None
+        A time at which the right-hand side had a value that is not finite in the last step, or None.
     b, c, exponent, multistep
         Attributes of a tableau that the engine reads. The array work.K has one row more than `b` has entries.
     """
@@ -119,6 +123,7 @@ class Stepper:
         self.method = method
         self.b = self.c = np.zeros(method.weights.shape[1] - 1)
         self.solver: Any = None
+        self.not_finite_at: float | None = None
         self._make: Callable[[], OdeSolver]
         self._before: dict[str, Any] = {}
         self._counted = dict.fromkeys(COUNTERS, 0)
@@ -142,7 +147,10 @@ class Stepper:
         known = [f]  # the solver's first call asks for this derivative
 
         def fun(t: float, y: Array) -> Array:
-            return known.pop() if known else rhs(t, y)
+            found = known.pop() if known else rhs(t, y)
+            if not BUILD.are_finite(found.view(float)):
+                self.not_finite_at = t
+            return found
 
         make: Any = self.method.solver
         self.solver, self._make = None, partial(
@@ -168,8 +176,24 @@ class Stepper:
                 f"EIP{self.method.name} uses attributes of scipy.integrate.{self.method.name} that SciPy "
                 f"{scipy.__version__} does not have: {', '.join(lacking)}. Use another version of SciPy."
             )
+        self._keep_finite(solver)
         self._watch(solver)
         return solver
+
+    def _keep_finite(self, solver: Any) -> None:
+        """Let the solver keep its last Jacobian where a new one is not finite, because `fun` is not.
+
+        The factorisation of such a Jacobian would raise an error. With the last one the iteration fails, and the step
+        is shortened.
+        """
+        jac = solver.jac
+
+        def finite(*args: Any) -> Any:
+            found = jac(*args)
+            return found if np.isfinite(found.data if issparse(found) else found).all() else solver.J
+
+        if jac is not None:
+            solver.jac = finite
 
     def fill(self, w: Work, t: float, y: Array, again: bool) -> tuple[float, float] | None:
         """Make a step from (t, y), and write the state, its error estimate and the interpolant to the buffers `w`.
@@ -178,6 +202,7 @@ class Stepper:
         function returns the time at the end of the step and the length of the next step, or None if the solver of SciPy
         fails because the step would become too short.
         """
+        self.not_finite_at = None
         if self.solver is None:
             self.solver = self._made()
         solver = self.solver

@@ -47,7 +47,8 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     if status == NOT_FINITE:
         return _not_finite(run, clock[TIME], clock[LENGTH])
     if status == TOO_SMALL:
-        return OdeSolver.TOO_SMALL_STEP
+        at = run.method.not_finite_at if run.tableau.drives else None
+        return OdeSolver.TOO_SMALL_STEP if at is None else f"{run.called} returned a non-finite value at t={at:.10g}"
     if status == UNSTABLE:
         return _unstable(run)
     if status == BY_VELOCITY:

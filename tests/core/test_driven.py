@@ -385,3 +385,55 @@ def test_values_that_are_not_finite_end_the_run(method):
     sol = scipy.integrate.solve_ivp(lambda t, y: y * np.nan, (0, 1), [1.0], method=method, jac=[[1.0]])
     assert sol.status == -1
     assert "non-finite value at t=0" in sol.message
+
+
+def stopping(t, y):
+    return np.array([y[1], -y[0] * (np.nan if t > 1 else 1)])
+
+
+def leaving(t, y):
+    return np.array([1.0, np.sqrt(1 - y[0] ** 2)])  # y[0] = t, and the slopes beyond 1 are not finite
+
+
+def leaving_jac(t, y):
+    return np.array([[0.0, 0.0], [-y[0] / np.sqrt(1 - y[0] ** 2), 0.0]])
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("fun", "options"),
+    [
+        (stopping, {}),
+        (leaving, {}),
+        (leaving, {"jac": leaving_jac}),
+        (leaving, {"jac": lambda t, y: csc_matrix(leaving_jac(t, y))}),
+    ],
+    ids=["time", "state", "jac", "sparse"],
+)
+def test_a_derivative_that_becomes_nan_ends_the_run(method, fun, options):
+    options = {"method": method, "rtol": 1e-5, **options}
+    sol = solve_ivp(fun, (0, 5), [0.0, 0.5], **options)
+    run = integrate(fun, (0, 5), [0.0, 0.5], save_every=1, **options)
+    for found in (sol, run):
+        assert found.status == -1
+        assert not found.trusted
+        assert found.message.startswith("fun returned a non-finite value at t=1")
+        assert found.t.size > 10
+        assert found.t[-1] == pytest.approx(1.0)
+        assert np.isfinite(found.y).all()
+    members = ensemble(fun, (0, 5), [[0.0, 0.5]], **options)
+    assert members.status.tolist() == [-1]
+    assert "non-finite value at t=1" in members.message[0]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_errors_of_the_right_hand_side_are_raised(method):
+    def fun(t, y):
+        if t > 1:
+            raise ValueError("array must not contain infs or NaNs")
+        return -y
+
+    with pytest.raises(ValueError, match="array must not contain") as info:
+        integrate(fun, (0, 5), [1.0], method=method)
+    assert info.value.partial.t[-1] > 0.1
