@@ -140,7 +140,7 @@ def _integer(name: str, what: str, value: Any, least: int = 1) -> int:
 
 
 def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
-    """Return the value of a user's function at t as an array (n,).
+    """Return the value of a user's function at t as an array (n,); for n = 1 the value may be a number.
 
     `came` is the beginning of the error messages, such as "fun returned"; `dtype` is that of the state.
 
@@ -162,6 +162,8 @@ def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.nd
         raise ValueError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.") from None
     if a.dtype.kind not in "fiubc":
         raise TypeError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.")
+    if n == 1 and a.shape == ():
+        a = a.reshape(1)
     if a.shape != (n,):
         raise ValueError(f"{came} shape {a.shape}, expected ({n},), at t={t:.10g}.")
     if a.dtype.kind == "c" and dtype.kind != "c":

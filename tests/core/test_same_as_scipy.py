@@ -9,7 +9,7 @@ from numba import njit
 from scipy.integrate import DOP853, RK23, RK45, solve_ivp
 from systems import jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient, jit_orbit, orbit, pericentre
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, Diagnostics, Invariant, eip_method, integrate
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, Invariant, eip_method, integrate
 from eip_scipy.problems import kepler
 
 EPS = np.finfo(float).eps
@@ -207,6 +207,32 @@ def test_buffer_that_fun_reuses(name, method):
     _, t_span, y0 = CASES["Kepler e=.6"]
     ours = solve_ivp(reusing, t_span, y0, method=method)
     assert_same(ours, solve_ivp(orbit, t_span, y0, method=SCIPY[name]), level(name, method))
+
+
+@pairs
+@pytest.mark.parametrize("value", [lambda x: -x, lambda x: np.array(-x), lambda x: -float(x), lambda x: -1j * x])
+def test_a_number_as_the_derivative_of_one_component(name, method, value):
+    y0 = [1.0 + 0j] if np.iscomplexobj(value(1.0)) else [1.0]
+    ours, theirs = both(method, name, lambda t, y: value(y[0]), (0.0, 2.0), y0)
+    assert_same(ours, theirs, level(name, method))
+    if not np.iscomplexobj(y0):
+        run = integrate(lambda t, y: value(y[0]), (0.0, 2.0), y0, method=method, save_every=1, rtol=1e-3)
+        np.testing.assert_allclose(run.y[0], np.exp(-run.t), rtol=0, atol=2e-3)
+
+
+def test_a_number_for_two_components_is_refused():
+    with pytest.raises(ValueError, match=r"fun returned shape \(\), expected \(2,\)"):
+        solve_ivp(lambda t, y: -y[0], (0, 1), [1.0, 2.0], method=EIPRK45)
+
+
+def test_a_number_as_the_acceleration_of_one_component():
+    for method, options in ((EIPRK4, {"h": 0.1}), (EIPRKN12, {"h": 0.1, "variations": "state"})):
+        one, two = (
+            integrate(acceleration=a, t_span=(0, 1), y0=[1.0, 0.0], method=method, **options)
+            for a in (lambda t, q: -q[0], lambda t, q: -q)
+        )
+        np.testing.assert_array_equal(one.y, two.y)
+    np.testing.assert_array_equal(one.stm, two.stm)
 
 
 @pairs
