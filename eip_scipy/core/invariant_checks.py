@@ -46,6 +46,9 @@ BLUR, BLURRED = 4.0, 3
 # The rounding of a rate, in roundings of the largest derivatives of the same kind. Accelerations that come from a
 # system of linear equations, such as those of constrained bodies, have errors of tens of roundings.
 RATE_ROUNDINGS = 100.0
+# Length of difference steps along the flow, in steps or in times in which the state moves by its size, and the error of
+# such differences, in roundings of the terms of an invariant.
+FLOW_SHARE, FLOW_ROUNDINGS = 1e-3, 20.0
 # One-sided differences of order 6: weights of the values at 0, 1, ... 6 steps.
 ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
@@ -351,13 +354,23 @@ def _complaints_of_rates(
 ) -> Iterator[Complaint]:
     """Yield a `Complaint` about quantities that change, and one about those that are kept only if constraints hold.
 
+    Before these there is one for each quantity that changes only by the rate that its gradient gives.
+
     `wrong` (l,) is a mask of all these quantities. Each text first names the one with the largest relative rate.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
+    by_values, misled = _misled_rates(known, at, found, wrong)
     conditional: list[int] = []
     plain: list[int] = []
     for k in (int(k) for k in order if wrong[k]):
+        if misled[k]:
+            text = (
+                f"gradient of invariant {known.names[k]!r} is wrong: at t={at.t:.6g} the invariant changes at the rate "
+                f"{found.rate[k]:.3g} by grad and {by_values[k]:.3g} by differences of its values"
+            )
+            yield Complaint(False, text, "Correct grad, or omit it to have it computed")
+            continue
         free = rhs is not None and found.in_time[k] == 0
         kept = free and rhs is not None and is_kept_on_a_surface(known, k, ~found.wrong, at.t, at.y, at.f, rhs)
         (conditional if kept else plain).append(k)
@@ -367,6 +380,33 @@ def _complaints_of_rates(
             text = words(known.names[those[0]], at.t, found.rate[those[0]], found.terms[those[0]])
             text += f"; the same holds for {listed(others)}" if others else ""
             yield Complaint(False, text, advice, those is conditional)
+
+
+def _misled_rates(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array) -> tuple[Array, Array]:
+    """Return rates of change (l,) from values along the flow, and a mask of the rates that gradients have made wrong.
+
+    Small errors of a gradient, which `_wrong_gradients` allows, still make a rate that exceeds its rounding. `wrong`
+    (l,) is the mask of the rates in question. Only gradients of the user are considered.
+    """
+    given = wrong & ~np.array(known.computed, bool)
+    moving, size = np.abs(at.f).max(), np.abs(at.y).max()
+    if not given.any() or not (moving > 0 and size > 0):
+        return np.full(known.size, np.nan), np.zeros(known.size, bool)
+    length = FLOW_SHARE * min(at.tau, size / moving)
+
+    def along(step: float) -> Array:
+        total = np.zeros(known.size)
+        for multiple, weight in DIFFERENCE_WEIGHTS:
+            shift = multiple * step * at.f
+            total += weight * (known.values(at.t, at.y + shift) - known.values(at.t, at.y - shift))
+        return total / step
+
+    slopes = along(length)
+    terms = known.sizes_of_terms(at.y, at.G, at.here) + known.norm_products(at.G, at.span)
+    errors = np.abs(slopes - along(0.5 * length)) + FLOW_ROUNDINGS * EPS * terms / length
+    by_values = found.in_time * moving + slopes
+    misled = np.abs(found.rate - by_values) > 0.5 * np.abs(found.rate)
+    return by_values, given & misled & (errors < 0.1 * np.abs(found.rate))
 
 
 def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array) -> Complaint:

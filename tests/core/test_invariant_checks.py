@@ -558,3 +558,41 @@ def test_a_constraint_that_is_nearly_met_is_not_taken_for_single_precision():
     assert (here.astype(np.float32) == here).all()
     at = invariant_checks._Samples(0.0, y, f, 1e-3, y, np.eye(2), known.gradients(0.0, y, f), here, ends)
     assert not list(invariant_checks._single_precision(known, at))
+
+
+# Gradients that are slightly wrong.
+
+
+def slightly(grad, error):
+    return lambda t, y: grad(t, y) * np.array([1.0 + error, 1.0])
+
+
+@pytest.mark.parametrize("error", [1e-4, 1e-5, 1e-7])
+@pytest.mark.parametrize("late", [False, True])
+def test_a_gradient_that_is_slightly_wrong_is_named_as_the_cause(error, late):
+    def grad(t, y):
+        return slightly(energy_gradient, error if t > 1 or not late else 0.0)(t, y)
+
+    item = Invariant(energy, grad, name="H")
+    run, texts = said(lambda: integrate(pendulum, (0, 5), [1.0, 0.5], method=EIPRK4, h=0.01, invariants=item))
+    assert run.success
+    assert not run.trusted
+    for text in (run.message, *texts):
+        assert "gradient of invariant 'H' is wrong" in text
+        assert "not an invariant" not in text
+    assert texts
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_a_correct_gradient_of_no_invariant_is_not_accused(offset):
+    # With an offset the values have few digits, so that their differences do not show the change.
+    def damped(t, y):
+        return pendulum(t, y) - 1e-5 * np.array([0.0, y[1]])
+
+    item = Invariant(lambda t, y: energy(t, y) + offset, energy_gradient, name="H")
+    run, texts = said(lambda: integrate(damped, (0, 5), [1.0, 0.5], method=EIPRK4, h=0.01, invariants=item))
+    assert not run.trusted
+    assert texts
+    for text in (run.message, *texts):
+        assert "'H' is not an invariant of this system" in text
+        assert "is wrong" not in text
