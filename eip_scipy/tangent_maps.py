@@ -48,6 +48,13 @@ HALVINGS = 8
 # How far products of two multipliers may be from 1 for the multipliers to be shown in pairs; the unit pair of a
 # Hamiltonian system carries the square root of the rounding.
 PAIRED = 1e-3
+# A start whose motion |f| T is at most this many times the closure, or at most `STILL` times its size, does not move.
+NEAR_CLOSURE, STILL = 10, 1e-12
+# Shares of an interval at which a function is called to see whether it depends on t; differences above these shares of
+# its size count. A period of the forcing may be given with seven digits.
+BETWEEN = (0.382, 0.618)
+TINY = np.finfo(float).tiny
+DEPENDS, REPEATS = 1e-10, 1e-6
 # Options of `integrate` that these functions set themselves.
 OWN = ("variations", "dense_output", "t_eval", "checkpoint", "checkpoint_every", "resume")
 
@@ -160,16 +167,17 @@ class PeriodicOrbit:
     closure : float
         Largest component of ``|y(period) - y0|``, relative to the largest component of ``|y0|``.
     flow_residual : float
-        ``|M f - f| / (|M| |f|)`` with the derivative f at the start, in the 2-norm: 0 for an exact M.
+        ``|M f - f| / (|M| |f|)`` with the derivative f at the start, in the 2-norm: 0 for an exact M; nan if f is 0.
     invariant_residual : float
         Largest value of ``|g M - g| / (|g| |M|)`` for the gradients g of the invariants at `y0`, in the 2-norm: 0 for
         an exact M; nan without invariants.
     iterations : int
         Number of corrections.
     success : bool
-        Whether `closure` is at most `tol`.
+        Whether `closure` is at most `tol`, and the state moves: an equilibrium and a period that shrank to 0 close too,
+        but are not periodic orbits.
     message : str
-        A description of the closure.
+        A description of the closure, or of what was found instead of an orbit.
     run : IntegrationResult
         The run over one period from `y0`.
     """
@@ -351,10 +359,15 @@ def lyapunov_spectrum(
 
 
 def _ends(start: Prepared) -> tuple[float, float]:
-    """Return the start and the end of the interval of a run; raise ValueError if the end is infinite."""
+    """Return the start and the end of the interval of a run; raise ValueError if it is infinite or has no length."""
     span = start.schedule.span
     if not np.isfinite(span.t_bound):
         raise ValueError("t_span must be a finite interval: lyapunov_spectrum and megno need a run with an end.")
+    if span.t_bound == span.t0:
+        raise ValueError(
+            "t_span must be an interval with two different ends, because lyapunov_spectrum and megno compute rates of "
+            f"growth, but both ends are {span.t0:g}. Pass another end."
+        )
     return float(span.t0), float(span.t_bound)
 
 
@@ -512,7 +525,8 @@ def periodic_orbit(
     Raises
     ------
     ValueError, TypeError
-        If a value is wrong or an option is one that the function sets itself; also the errors of `integrate`.
+        If a value is wrong or an option is one that the function sets itself, or if the equations depend on t and
+        `period` is not fixed or is not their period; also the errors of `integrate`.
     RuntimeError
         If a run fails.
 
@@ -551,6 +565,8 @@ def periodic_orbit(
     share = 0.5 if odd.any() else 1.0
     shoot = _Shooting(fun, {**options, "dense_output": False}, odd, share)
     reached = shoot(y, T)
+    for state in (y, reached.run.y[:, -1].copy()):
+        _require_period(start, state, T, bool(free[n]))
     iterations = 0
     while iterations < max_iterations and reached.size > 0:
         move, better = reached.correction(free), None
@@ -566,7 +582,7 @@ def periodic_orbit(
         iterations += 1
         y, T, reached = better.y0, better.period, better
     full = reached if share == 1.0 else _Shooting(fun, options, np.zeros(n, bool), 1.0)(y, T)
-    return full.result(iterations, tol)
+    return full.result(iterations, tol, float(period))
 
 
 def _component(item: Any, names: Sequence[str]) -> int | None:
@@ -586,6 +602,32 @@ def _place(item: Any, names: Sequence[str]) -> int:
             f"{', '.join(names)}."
         )
     return place
+
+
+def _require_period(start: Prepared, y: Array, T: float, free: bool) -> None:
+    """Raise ValueError if the equations depend on t, unless the period is not `free` and they have the period T.
+
+    `start` is a run that has not made its first step. Its function is called for the state y and different times.
+    """
+
+    def change(t: float, later: float) -> float:
+        before, after = start.system.derivative(t, y), start.system.derivative(later, y)
+        return float(np.abs(after - before).max() / max(np.abs(before).max(), np.abs(after).max(), TINY))
+
+    name = start.system.name
+    if free:
+        later = max((share * T for share in BETWEEN), key=lambda t: change(0.0, t))
+        if change(0.0, later) > DEPENDS:
+            raise ValueError(
+                f"fixed: the equations depend on t, because {name} differs between t = 0 and t = {later:.6g} for the "
+                'same state. Pass the period of the forcing as period, and "period" in fixed.'
+            )
+    # A force that jumps at t = 0 is compared once more at another time.
+    elif change(0.0, T) > REPEATS and change(BETWEEN[0] * T, BETWEEN[0] * T + T) > REPEATS:
+        raise ValueError(
+            f"period = {T:.10g} is not a period of the equations, because {name} differs between t = 0 and t = {T:.6g} "
+            "for the same state. Pass the period of the forcing."
+        )
 
 
 def _odd(symmetry: Any, y: Array) -> Array:
@@ -646,8 +688,13 @@ class _Reached:
 
     @property
     def size(self) -> float:
-        """Return the largest component of the residual, relative to the largest component of the start."""
-        return float(np.abs(self.residual).max() / np.abs(self.y0).max())
+        """Return the largest component of the residual, relative to the largest component of the start.
+
+        It is 0 if the residual is 0, also for a start at 0, and inf if only the start is 0.
+        """
+        with np.errstate(divide="ignore"):
+            largest = np.abs(self.residual).max()
+            return float(largest / np.abs(self.y0).max()) if largest else 0.0
 
     def begun_at(self, y: Array) -> Prepared:
         """Return the run that starts at a state, before its first step; it holds the derivative at that state."""
@@ -666,26 +713,52 @@ class _Reached:
         move[free] = np.linalg.lstsq(rows[:, free], -self.residual, rcond=RANK)[0]
         return move
 
-    def result(self, iterations: int, tol: float) -> PeriodicOrbit:
-        """Return the result, with the multipliers and residuals of the state-transition matrix."""
+    def instead(self, start: Prepared, guess: float) -> str:
+        """Return a text on what was found instead of an orbit if the state does not move, and "" if it moves.
+
+        `start` is the run from `y0` before its first step, and `guess` is the first guess of the period.
+        """
+        still = max(NEAR_CLOSURE * self.size, STILL) * np.abs(self.y0).max()
+        # On an orbit of a system with forcing the derivative may be 0 at one time.
+        times = (0.0, *(share * self.period for share in BETWEEN))
+        speed = max(np.abs(start.system.derivative(t, self.y0)).max() for t in times)
+        if speed * self.period > still:
+            return ""
+        if speed * guess > still:
+            found = f"the period shrank from {guess:.6g} to {self.period:.1e}, in which the state hardly moves"
+        else:
+            found = "the corrections lead to an equilibrium, at which the state does not move"
+        return (
+            f"no periodic orbit was found: {found}; pass a y0 and a period that are closer to an orbit, or a component "
+            'or "period" in fixed'
+        )
+
+    def result(self, iterations: int, tol: float, guess: float) -> PeriodicOrbit:
+        """Return the result, with the multipliers and residuals of the state-transition matrix.
+
+        `guess` is the first guess of the period.
+        """
         M = self.run.stm[-1]
-        start = self.begun_at(self.y0).run
+        begun = self.begun_at(self.y0)
+        start = begun.run
         f, G = start.start.f, start.invariants.gradients(0.0, self.y0, start.start.f)
         size = np.linalg.norm(M, 2)
         invariants = [np.linalg.norm(g @ M - g) / (np.linalg.norm(g) * size) for g in G if g.any()]
         closed = self.size <= tol
         found = "the orbit closes" if closed else "the orbit does not close within tol"
+        instead = self.instead(begun, guess) if closed else ""
         return PeriodicOrbit(
             y0=self.y0,
             period=self.period,
             monodromy=M,
             multipliers=_in_pairs(np.linalg.eigvals(M)),
             closure=self.size,
-            flow_residual=float(np.linalg.norm(M @ f - f) / (size * np.linalg.norm(f))),
+            flow_residual=float(np.linalg.norm(M @ f - f) / (size * np.linalg.norm(f))) if f.any() else np.nan,
             invariant_residual=float(max(invariants, default=np.nan)),
             iterations=iterations,
-            success=closed,
-            message=f"{found}: |y(period) - y0| is {self.size:.1e} of the size of y0 ({iterations} iterations)",
+            success=closed and not instead,
+            message=instead
+            or f"{found}: |y(period) - y0| is {self.size:.1e} of the size of y0 ({iterations} iterations)",
             run=self.run,
         )
 

@@ -630,6 +630,59 @@ def test_no_orbit():
     assert "closes" not in orbit.message
 
 
+DOP = {"method": EIPDOP853, "h": 0.05}
+
+
+def test_a_period_that_shrinks_to_0_is_a_failure(pendulum):
+    """The rotating pendulum does not close, and after no time everything does."""
+    orbit = periodic_orbit(pendulum, [0.0, 3.0], 2.4, **DOP)
+    assert orbit.period < 1e-10
+    assert not orbit.success
+    assert "the period shrank from 2.4 to" in orbit.message
+
+
+@pytest.mark.parametrize(
+    ("y0", "options"), [([3.1, 0.1], {}), ([3.0, 0.0], {"symmetry": [1, -1]}), ([0.0, 0.0], {})], ids=str
+)
+def test_an_equilibrium_is_a_failure(pendulum, y0, options):
+    orbit = periodic_orbit(pendulum, y0, 2.4, **options, **DOP)
+    assert abs(np.sin(orbit.y0[0])) < 1e-12
+    assert not orbit.success
+    assert "the corrections lead to an equilibrium" in orbit.message
+
+
+def test_small_orbits_far_from_0_are_orbits():
+    """The motion is 1e-8 of the size of the state."""
+    orbit = periodic_orbit(lambda t, y: np.array([y[1], -np.sin(y[0] - 1000)]), [1000 + 1e-5, 0.0], 6.3, fixed=[0],
+                           method=EIPDOP853, h=0.05)  # fmt: skip
+    assert orbit.success
+    assert orbit.period == pytest.approx(2 * np.pi, abs=1e-8)
+
+
+def forced(t, y):
+    return np.array([-y[0] + np.cos(t) + 1])
+
+
+def test_a_forced_system_needs_its_period():
+    with pytest.raises(ValueError, match=r'the equations depend on t, because fun differs .* and "period" in fixed'):
+        periodic_orbit(forced, [1.4], PERIOD, **DOP)
+    with pytest.raises(ValueError, match=r"period = 6 is not a period of the equations.*period of the forcing"):
+        periodic_orbit(forced, [1.4], 6.0, fixed=["period"], **DOP)
+    orbit = periodic_orbit(forced, [1.4], PERIOD, fixed=["period"], **DOP)
+    assert orbit.success
+    assert orbit.y0 == pytest.approx([1.5])
+
+
+def test_forces_that_jump_or_rest_at_the_start():
+    """sign(sin(t)) differs between 0 and the period as a float; a derivative of 0 at one time is not an equilibrium."""
+    jump = periodic_orbit(lambda t, y: np.array([-y[0] + np.sign(np.sin(t))]), [0.1], PERIOD, fixed=["period"],
+                          method=EIPRK4, h=0.05)  # fmt: skip
+    assert jump.success
+    rest = periodic_orbit(lambda t, y: np.array([np.sin(t)]), [1.0], PERIOD, fixed=["period"], **DOP)
+    assert rest.success
+    assert np.isnan(rest.flow_residual)
+
+
 # Fits.
 
 FINE = {"method": EIPDOP853, "rtol": 1e-11, "atol": 1e-11}
@@ -694,6 +747,8 @@ def test_fit_of_state_and_parameter(pendulum):
         (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, count=3), ValueError, "2 components"),
         (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, count=0), ValueError, "count"),
         (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, every=-1), ValueError, "every"),
+        (lambda p: lyapunov_spectrum(p, (0, 0), [0, 1], method=EIPRK4, h=0.1), ValueError, "two different ends"),
+        (lambda p: megno(p, (2, 2), [0, 1], method=EIPRK4, h=0.1), ValueError, "two different ends"),
         (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, variations="state"), TypeError, "variations"),
         (lambda p: megno(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, deviation=[0, 0]), ValueError, "deviation"),
         (lambda p: megno(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, deviation="x"), ValueError, "deviation"),
