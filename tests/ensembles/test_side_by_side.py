@@ -264,7 +264,7 @@ def all_that_octets_do(t, y, out):
     out[5] = abs(a) ** 1.3 + a**2 - b**3
     out[6] = 1
     out[6] += b
-    out[7] = math.log1p(abs(a)) - math.pow(abs(b), 0.5)
+    out[7] = math.log1p(abs(a)) - math.copysign(math.pow(abs(b), 0.5), a)
 
 
 @pytest.mark.slow

@@ -628,6 +628,7 @@ def test_what_is_no_invariant_is_refused(H, invariants, says):
         (lambda: equations(["y"], "x y"), ValueError, "1 derivatives for the 2 components"),
         (lambda: equations({"x": "y", "y": "-x"}, "x z"), ValueError, "f has derivatives of x, y, but y is x, z"),
         (lambda: equations({"x": "y", "y": "-z"}), ValueError, "contains z, which is neither"),
+        (lambda: hamiltonian("p**2/2 + sign(q - 1)"), ValueError, "function that jumps where q - 1 is 0"),
     ],
 )
 def test_wrong_arguments(call, kind, says):
@@ -657,8 +658,45 @@ def test_a_start_and_an_interval_are_for_the_run():
 # --- functions: jitted or not, in ensembles, in other processes ---
 
 
+def test_cube_roots_are_real():
+    problem = hamiltonian("p**2/2 + 3*cbrt(q)**4/4 + q*cbrt(2*q)", name="root")
+    for q in (-8.0, -0.3, 0.0, 0.7):
+        root, two = np.cbrt(q), np.cbrt(2.0)
+        force = -(root + 4 / 3 * two * root)
+        y, out = np.array([q, 0.5]), np.empty(4)
+        assert problem.fun(0.0, y) == pytest.approx([0.5, force], rel=1e-14, abs=1e-300)
+        (energy,) = problem.invariants
+        assert energy.fun(0.0, y) == pytest.approx(0.125 + (0.75 + two) * root**4, rel=1e-14)
+        gradient = np.empty(2)
+        energy.grad(0.0, y, gradient)
+        assert gradient == pytest.approx([-force, 0.5], rel=1e-14, abs=1e-300)
+        if q:
+            problem.variational(())(0.0, np.array([*y, 1.0, 0.0]), out)
+            assert out[3] == pytest.approx(-(1 + 4 / 3 * two) / 3 / root**2, rel=1e-14)
+    run = integrate(problem, (0, 10), [-1.0, 0.0], method=EIPDOP853, rtol=1e-9, atol=1e-9, save_every=1)
+    assert run.success
+    assert run.y[0].max() > 0.9
+    assert repr(pickle.loads(pickle.dumps(problem))) == repr(problem)
+
+
+@pytest.mark.parametrize(
+    ("text", "root"),
+    [("cbrt(-8)", "-2"), ("cbrt(-x)", "-cbrt(x)"), ("cbrt(x)**3", "x"), ("cbrt(x**2 + 1)", "(x**2 + 1)**(1/3)"),
+     ("cbrt(-16*x)/cbrt(-2*x)", "2")],
+)  # fmt: skip
+def test_algebra_of_cube_roots(text, root):
+    assert str(as_expression("x", text)) == root
+
+
+def test_roots_are_kept_for_both_signs():
+    kept = {"E": "y**2/2 + 3*cbrt(x)**4/4", "F": "cbrt(y**2/2 + 3*cbrt(x)**4/4 - 1)"}
+    assert equations({"x": "y", "y": "-cbrt(x)"}, invariants=kept).checks == dict.fromkeys(kept, "symbolically")
+    with pytest.raises(ValueError, match="not an invariant"):
+        equations({"x": "y", "y": "-cbrt(x)"}, invariants={"E": "y**2/2 + 3*abs(x)*cbrt(x)/4"})
+
+
 def test_without_numba(monkeypatch):
-    H = "(px**2 + py**2)/2 + log(x) + atan2(y, x) + sqrt(1 + y**2) + abs(y) + max(x, y) + cbrt(x)"
+    H = "(px**2 + py**2)/2 + log(x) + atan2(y, x) + sqrt(1 + y**2) + abs(y) + max(x, y) + cbrt(x) + y*cbrt(y)"
     y = np.array([1.2, -0.4, 0.3, 0.1])
     compiled = hamiltonian(H, name="one")
     from eip_scipy.core import jitted as module

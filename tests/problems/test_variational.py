@@ -119,12 +119,49 @@ def test_expressions_are_written_when_they_are_asked_for(monkeypatch):
 
 def test_expressions_that_have_no_derivative():
     problem = equations({"x": "y", "y": "sign(x)"}, params={"a": 1.0})
-    with pytest.raises(ValueError, match=r"derivative of y contains sign\(x\), which jumps"):
+    with pytest.raises(ValueError, match="the derivative of y jumps where x is 0"):
         problem.variational(())
     with pytest.raises(ValueError, match="no parameter 1; expected indices of"):
         problem.variational((1,))
     with pytest.raises(ValueError, match="no parameter -1"):
         problem.variational((-1,))
+
+
+BRANCHES = {  # forces that are continuous where the functions change their branches
+    "abs": lambda: hamiltonian("p**2/2 + abs(q)**3"),
+    "max": lambda: hamiltonian("p**2/2 + max(q - k, 0)**4 + min(q, 0)**2", params={"k": 0.3}),
+    "sign": lambda: hamiltonian("p**2/2 + sign(q)*q**2/2 + sign(2*q - 1)*(q - 0.5)**2"),
+    "of a function": lambda: hamiltonian("p**2/2 + sign(sin(q))*sin(q)**3"),
+    "of a product": lambda: hamiltonian("(p**2 + q**2)/2 + abs(p*q)**3"),
+    "of time": lambda: equations({"x": "y", "y": "-x + sign(sin(t))"}),
+}
+
+
+@pytest.mark.parametrize("name", BRANCHES)
+def test_continuous_forces_with_branches_have_derivatives(name):
+    """States are away from the branches, where differences of order 8 would not have their order."""
+    problem, rng = BRANCHES[name](), np.random.default_rng(4)
+    for y in ([0.9, 0.4], [-0.8, 0.7], [0.7, -0.5]):
+        assert_variational(problem, np.array(y), rng, tuple(range(len(problem.system.parameters))), rtol=1e-6)
+
+
+@pytest.mark.parametrize("H", ["abs(q)", "max(q, 0)", "max(q, p)**3", "sign(q)*q", "sign(q)*abs(q)", "sign(q)**3*q"])
+def test_forces_that_jump_have_none(H):
+    with pytest.raises(
+        ValueError, match=r"the derivative of [qp] jumps where .* is 0, or is not seen to be continuous"
+    ):
+        hamiltonian(f"p**2/2 + {H}").variational(())
+
+
+def test_derivatives_of_a_run_through_branches():
+    """The force has a kink at q = 0.5, through which the run passes."""
+    problem = hamiltonian("p**2/2 + q**2/2 + max(q - 0.5, 0)**2 + sign(q)*q**2/4")
+    options = {"method": EIPDOP853, "h": 0.002}
+    run = integrate(problem, (0, 5), [1.0, 0.2], variations="state", **options)
+    step = 1e-6
+    for k, unit in enumerate(step * np.eye(2)):
+        ends = [integrate(problem, (0, 5), [1.0, 0.2] + side * unit, **options).y[:, -1] for side in (1, -1)]
+        assert run.stm[-1][:, k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
 
 
 @pytest.mark.needs_jit

@@ -23,6 +23,8 @@ from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, lower_cast, models, register_model
 
+from ...core.numba_addresses import refuse_addresses
+
 __all__ = ["OCTET"]
 
 LANES = 8
@@ -41,6 +43,7 @@ class Octet(types.Type):  # emits LLVM
 
 
 OCTET = Octet()
+refuse_addresses(OCTET, "vectors of eight members")
 
 
 @register_model(Octet)
@@ -107,6 +110,7 @@ _define(operator.pos, 1, lambda builder, a: a)
 _define(abs, 1, _intrinsic("fabs"))
 _define(math.fabs, 1, _intrinsic("fabs"))
 _define(math.sqrt, 1, _intrinsic("sqrt"))
+_define(math.copysign, 2, _intrinsic("copysign"))
 
 
 def _larger(builder: Any, a: Any, b: Any) -> Any:  # emits LLVM

@@ -17,19 +17,21 @@ from typing import Any
 import sympy
 from sympy.core.function import AppliedUndef
 
+from .cube_root import cbrt
 from .sizes import TooLargeError, require_constant, require_function, require_power, require_product, require_sum
 
 __all__ = ["as_expression", "as_names", "symbol"]
 
 TIME = sympy.Symbol("t")  # the time in dynamicsymbols
 ONE_ARGUMENT = (
-    "sqrt", "cbrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh",
+    "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh",
     "atanh", "erf", "sign",
 )  # fmt: skip
 FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     **{name: (getattr(sympy, name), 1) for name in ONE_ARGUMENT},
     **{name.replace("a", "arc", 1): (getattr(sympy, name), 1) for name in ONE_ARGUMENT if name.startswith("a")},
     "ln": (sympy.log, 1),
+    "cbrt": (cbrt, 1),
     "abs": (sympy.Abs, 1),
     "atan2": (sympy.atan2, 2),
     "arctan2": (sympy.atan2, 2),

@@ -20,6 +20,7 @@ import numpy as np
 import sympy
 
 from ...core.jitted import compilable, is_jitted, jitted
+from .cube_root import cbrt, with_powers_of_roots
 
 __all__ = ["Arguments", "function", "variational"]
 
@@ -46,12 +47,17 @@ RECIPROCALS: dict[Any, str] = {sympy.sec: "cos", sympy.csc: "sin", sympy.cot: "t
 COMPARISONS: dict[Any, type[ast.cmpop]] = {
     sympy.Lt: ast.Lt, sympy.Le: ast.LtE, sympy.Gt: ast.Gt, sympy.Ge: ast.GtE, sympy.Eq: ast.Eq, sympy.Ne: ast.NotEq,
 }  # fmt: skip
-OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf, sympy.Piecewise, *RECIPROCALS)
+OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf, cbrt, sympy.Piecewise, *RECIPROCALS)
+ROOTS = ("sqrt", "copysign")  # functions of roots, which have these names in both libraries
 COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "range", "ValueError")} | {"erf": math.erf}
-COMPILED = {name: getattr(math, name) for name in ("sqrt", *(name for name, _ in CALLS.values()))} | COMMON
+COMPILED = {name: getattr(math, name) for name in (*ROOTS, *(name for name, _ in CALLS.values()))} | COMMON
 # Functions for runs without Numba. They are NumPy's because those of math raise an error outside their domain, while
 # the NaN of NumPy's functions shortens the step.
-INTERPRETED = {name: getattr(np, of_numpy) for name, of_numpy in CALLS.values()} | {"sqrt": np.sqrt} | COMMON
+INTERPRETED = (
+    {name: getattr(np, of_numpy) for name, of_numpy in CALLS.values()}
+    | {name: getattr(np, name) for name in ROOTS}
+    | COMMON
+)
 LARGEST_PRODUCT = 64  # largest exponent of a power that is computed by multiplications
 
 
@@ -287,7 +293,8 @@ class Writer:
 
         Common subexpressions are computed once.
         """
-        common, reduced = sympy.cse(expressions, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
+        written = [with_powers_of_roots(item) for item in expressions]
+        common, reduced = sympy.cse(written, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
         for name, expression in common:
             self.known[name] = self.value(expression)
         return [self.value(expression) for expression in reduced]
@@ -319,6 +326,11 @@ class Writer:
         raise self._unknown(expression)
 
     def _unknown(self, expression: Any) -> ValueError:
+        if isinstance(expression, sympy.DiracDelta):
+            return ValueError(
+                f"{self.what}: it is the derivative of a function that jumps where {expression.args[0]} is 0. Use a "
+                "continuous function, such as abs, max or min, or write the equations with `equations`."
+            )
         allowed = ", ".join(sorted(item.__name__ for item in (*CALLS, *OTHERS)))
         kind = type(expression).__name__
         return ValueError(f"{self.what}: {kind} in {expression} is not supported. Supported are {allowed}.")
@@ -398,6 +410,10 @@ class Writer:
         match expression:
             case sympy.Abs():
                 return self._function("abs", *arguments)
+            case cbrt():
+                size = self._function("abs", *arguments)
+                root = self._binary(size, ast.Pow(), ast.Constant(value=1 / 3))
+                return self._function("copysign", root, *arguments)
             case sympy.erf():
                 return self._function("erf", *arguments)
             case sympy.Max() | sympy.Min():

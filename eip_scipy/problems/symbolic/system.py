@@ -19,6 +19,7 @@ from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_jitted
 from ...core.problem import Deferred, Problem, bind
 from .brackets import NotKeptError, how_kept, vanishes
+from .jumps import slope
 from .manifold import Manifold
 from .pairs import paired
 from .parser import as_expression, as_names, symbol
@@ -321,7 +322,7 @@ def _with_perturbation(
         quantity = as_expression(f"balance {label!r}", item, declared | set(names))
         _require_known(f"balance {label!r}", quantity, known)
         how_kept(label, quantity, variables, rates, parameters)  # checked without the perturbation
-        rate = sympy.Add(*(sympy.diff(quantity, y) * f for y, f in zip(variables, added, strict=True)))
+        rate = sympy.Add(*(slope(quantity, y) * f for y, f in zip(variables, added, strict=True)))
         slow.append((label, quantity, rate))
     return tuple(a + b for a, b in zip(rates, added, strict=True)), tuple(slow)
 
@@ -364,8 +365,8 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
     names = as_names("q and p", (*q, *p))
 
     def flow(H: Any) -> tuple[Any, ...]:
-        forward = [sympy.diff(H, symbol(item)) for item in p]
-        return (*forward, *(-sympy.diff(H, symbol(item)) for item in q))
+        forward = [slope(H, symbol(item)) for item in p]
+        return (*forward, *(-slope(H, symbol(item)) for item in q))
 
     return names, flow, tuple(zip(q, p, strict=True))
 
@@ -390,7 +391,7 @@ def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, An
             raise ValueError(f"hamiltonian: poisson must be antisymmetric, but [{i}][{j}] + [{j}][{i}] = {total}.")
 
     def flow(H: Any) -> tuple[Any, ...]:
-        return tuple(B * sympy.Matrix([sympy.diff(H, symbol(item)) for item in names]))
+        return tuple(B * sympy.Matrix([slope(H, symbol(item)) for item in names]))
 
     return names, flow, ()
 
@@ -527,7 +528,7 @@ def _functions(system: System) -> Functions:
     rhs = function("derivative", system.rates, arguments, in_place=True)
 
     def value_and_gradient(name: str, quantity: Any) -> tuple[Callable[..., float], Callable[..., None]]:
-        gradient = [sympy.diff(quantity, variable) for variable in system.variables]
+        gradient = [slope(quantity, variable) for variable in system.variables]
         value = function(f"invariant {name}", [quantity], arguments, in_place=False)
         return value, function(f"gradient of {name}", gradient, arguments, in_place=True)
 
@@ -599,16 +600,16 @@ def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., N
 
 @lru_cache(maxsize=64)
 def _with_columns(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
-    for name, rate in zip(system.components, system.rates, strict=True):
-        if jumps := rate.atoms(sympy.sign, sympy.Heaviside):  # abs, max and min are continuous
-            raise ValueError(
-                f"variational: the derivative of {name} contains {_cut(min(jumps, key=str))}, which jumps; at a jump "
-                "derivatives of the state do not follow from derivatives of the equations. Use a smooth expression."
-            )
-
     def nonzero(by: Any) -> dict[int, Any]:
-        found = ((i, sympy.diff(rate, by)) for i, rate in enumerate(system.rates))
-        return {i: item for i, item in found if item != 0}
+        found = {i: slope(rate, by) for i, rate in enumerate(system.rates)}
+        for i, item in found.items():
+            if impulses := sorted(item.atoms(sympy.DiracDelta), key=str):
+                raise ValueError(
+                    f"variational: the derivative of {system.components[i]} jumps where {_cut(impulses[0].args[0])} is "
+                    "0, or is not seen to be continuous there; at a jump derivatives of the state do not follow from "
+                    "derivatives of the equations. Use a continuous expression."
+                )
+        return {i: item for i, item in found.items() if item != 0}
 
     columns = [nonzero(variable) for variable in system.variables]
     jacobian = {(i, j): item for j, column in enumerate(columns) for i, item in column.items()}
