@@ -201,6 +201,27 @@ def refused(match, *args, error=ValueError, **options):
         mechanism(*(args or ([1, 1], [0, -G], length)), **given)
 
 
+def test_mass_matrices_are_symmetric():
+    refused(r"entries \[0, 1\] and \[1, 0\] are 0.05 and 0.* only the diagonal", [[1, 0.05], [0, 1]], [0, -G])
+    refused("mass must be a symmetric matrix", untraceable(lambda q: np.array([[1, q[0]], [0, 1]])), [0, -G])
+    rounded = np.array([[1.0, 0.1 * 3], [0.3, 1.0]])
+    assert rounded[0, 1] != rounded[1, 0]
+    mechanism(rounded, [0, -G], q0=[1, 0], u0=[0, 0])
+
+
+@pytest.mark.parametrize("masses", [[1, -1e-9], [-1, -1], [[0, 1], [1, 0]]], ids=str)
+def test_masses_are_positive(masses):
+    refused("mass must be positive for motions that the constraints allow", masses, [0, -G])
+
+
+def test_masses_are_positive_for_motions_that_are_allowed():
+    """On the circle, at (1, 0), only the second component moves; massless coordinates may follow others."""
+    refused(r"u M u / 2 is -0.5 for u1 = 0, u2 = 1. Correct", [1, -1], [0, -G], length)
+    mechanism([-0.5, 1], [0, -G], lambda t, q: [q[0] - 1], q0=[1, 0], u0=[0, 0])
+    mechanism([1, 0], [0, -G], lambda t, q: [q[0] - q[1]], q0=[1, 1], u0=[0.5, 0.5])
+    mechanism([1e3, 1e-3, 0], [0, -G, 0], lambda t, q: [q[1] - q[2]], q0=[1, 1, 1], u0=[0.5, 0.5, 0.5])
+
+
 def test_what_is_wrong_is_said():
     refused('violates the constraint "g1\'": it is 0.5', u0=[0.5, 0])
     refused("violates the constraint 'rod': it is 1.5", q0=[2, 0], constraint_names="rod")

@@ -23,6 +23,8 @@ __all__ = ["RANK_TOLERANCE", "mechanism"]
 RANK_TOLERANCE = 1e-5
 # Bound for the rounding of functions that are linear in the speeds, relative to their values.
 LINEAR = 1e-9
+# Bound for the rounding of mass matrices, relative to their entries, and of kinetic energies, relative to their terms.
+ROUNDING = 1e-9
 
 
 def mechanism(
@@ -59,7 +61,8 @@ def mechanism(
     Parameters
     ----------
     mass : array_like or callable
-        The mass matrix M, (n, n) or its diagonal (n,), or ``mass(q)``.
+        The mass matrix M, (n, n) or its diagonal (n,), or ``mass(q)``. It must be symmetric, and positive for motions
+        that the constraints allow; massless parts may have zeros in it.
     forces : array_like or callable
         The generalised forces F, (n,), or ``forces(t, q, u)``: all terms of the equations except M u' and the forces
         of the constraints.
@@ -107,7 +110,8 @@ def mechanism(
     ------
     ValueError
         If shapes do not fit, a function that must be linear in u is not, the start does not meet the constraints, the
-        mass matrix is singular for motions that the constraints allow, or a given derivative or power is wrong.
+        mass matrix is not symmetric, it is not positive for motions that the constraints allow, or a given derivative
+        or power is wrong.
 
     Notes
     -----
@@ -136,6 +140,7 @@ def mechanism(
     q = _given_state("q0", q0, coordinates)
     u = _given_state("u0", u0, speeds)
     _require_shapes(given, t, q, u)
+    _require_symmetric(np.asarray(given.mass(q), float))
     m = 0 if given.constraints is None else len(given.constraints(t, q))
     k = 0 if given.velocity_constraints is None else len(given.velocity_constraints(t, q, u))
     _require_linear(given, t, q, u)
@@ -146,6 +151,7 @@ def mechanism(
         name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
     )
     _require_derivatives(given, parts, names, t, problem.y0)
+    _require_positive(parts, names, t, problem.y0, rank_tolerance)
     return problem
 
 
@@ -249,6 +255,43 @@ def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
         if given.constraints is None:
             raise TypeError("mechanism: jacobian is given without constraints; give both, or omit jacobian.")
         require("jacobian", given.jacobian(t, q), (len(given.constraints(t, q)), q.size))
+
+
+def _require_symmetric(M: np.ndarray) -> None:
+    """Raise ValueError if the mass matrix M is not symmetric."""
+    wrong = np.abs(M - M.T)
+    if (wrong > ROUNDING * np.abs(M).max(initial=0.0)).any():
+        i, j = np.unravel_index(np.argmax(wrong), M.shape)
+        raise ValueError(
+            f"mechanism: mass must be a symmetric matrix, but at the start its entries [{i}, {j}] and [{j}, {i}] are "
+            f"{M[i, j]:.6g} and {M[j, i]:.6g}. Correct one of them, or give only the diagonal of a diagonal matrix."
+        )
+
+
+def _require_positive(parts: Parts, names: Names, t: float, y: np.ndarray, tolerance: float) -> None:
+    """Raise ValueError if the kinetic energy u M u / 2 is negative at the start for speeds that the constraints allow.
+
+    Directions of speeds count as allowed up to `tolerance`, the ``rank_tolerance`` of the problem.
+    """
+    n, rows = len(names.speeds), len(names.velocities)
+    matrices = np.empty(Sizes(len(names.coordinates), n, rows).matrices + len(names.coordinates))
+    plain(parts.fill)(t, y, matrices)
+    M, G = matrices[: n * n].reshape(n, n), matrices[n * n + n :][: rows * n].reshape(rows, n)
+    sizes = np.linalg.norm(G, axis=1, keepdims=True)
+    _, found, directions = np.linalg.svd(G / np.where(sizes > 0, sizes, 1.0))
+    allowed = directions[np.count_nonzero(found > tolerance) :].T if rows else np.eye(n)
+    energies = np.diag(allowed.T @ M @ allowed)
+    # In these units the signs do not depend on those of the masses.
+    allowed = allowed / np.sqrt(np.where(energies != 0, np.abs(energies), 1.0))
+    speeds = allowed @ np.linalg.eigh(allowed.T @ M @ allowed)[1]
+    for u in speeds.T:
+        if u @ M @ u < -ROUNDING * (np.abs(u) @ np.abs(M) @ np.abs(u)):
+            u = u / u[np.argmax(np.abs(u))]
+            shown_speeds = ", ".join(f"{name} = {value:.3g}" for name, value in zip(names.speeds, u, strict=True))
+            raise ValueError(
+                "mechanism: mass must be positive for motions that the constraints allow, but at the start the kinetic "
+                f"energy u M u / 2 is {u @ M @ u / 2:.3g} for {shown_speeds}. Correct the signs of the masses."
+            )
 
 
 def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> None:
