@@ -17,6 +17,7 @@ from numba import njit, types
 from numba.extending import is_jitted, overload
 
 from .dual_numbers import Dual
+from .numba_addresses import refuse_addresses
 
 __all__ = ["for_duals", "inside"]
 
@@ -44,25 +45,29 @@ def for_duals(fun: Any, dual: Dual) -> Any:
     """
     by_name = _array_functions(dual)
     others = {id(getattr(np, name)): function for name, function in by_name.items()}
-    return _replaced(fun, others | {id(np): _NumPy(by_name)})
+    return _replaced(fun, others | {id(np): _NumPy(by_name)}, dual)
 
 
-def _replaced(item: Any, others: dict[int, Any]) -> Any:
+def _replaced(item: Any, others: dict[int, Any], dual: Dual) -> Any:
     """Return the replacement of a global or closure variable in a copied function, or the variable if there is none.
 
-    `others` maps the id of each object to its replacement. Copies of jitted functions are added to it.
+    `others` maps the id of each object to its replacement. Copies of jitted functions are added to it. A function with
+    an attribute ``for_duals(dual)`` is replaced by what this attribute returns.
     """
     if id(item) in others or not is_jitted(item):
         return others.get(id(item), item)
     source = item.py_func
+    if (own := getattr(source, "for_duals", None)) is not None:
+        others[id(item)] = own(dual)
+        return others[id(item)]
     names, cells = source.__globals__.copy(), [python_types.CellType() for _ in source.__closure__ or ()]
     copied = python_types.FunctionType(source.__code__, names, source.__name__, source.__defaults__, tuple(cells))
     others[id(item)] = inside(copied, **{name: item.targetoptions[name] for name in KEPT if name in item.targetoptions})
     # The copy is registered before its names are replaced, because a function may call itself.
     for name in _names(source.__code__) & names.keys():
-        names[name] = _replaced(names[name], others)
+        names[name] = _replaced(names[name], others, dual)
     for cell, known in zip(cells, source.__closure__ or (), strict=True):
-        cell.cell_contents = _replaced(known.cell_contents, others)
+        cell.cell_contents = _replaced(known.cell_contents, others, dual)
     return others[id(item)]
 
 
@@ -108,6 +113,7 @@ def _array_functions(dual: Dual) -> dict[str, Callable[..., Any]]:
 
         return filled if _of_floats(dtype) else lambda shape, dtype=float: np.ones(shape, dtype)
 
+    refuse_addresses(dual, "dual numbers")
     return {"empty": empty, "zeros": zeros, "ones": ones, "array": array, "cross": cross}
 
 

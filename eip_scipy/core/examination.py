@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from .invariant_checks import complaints
 from .invariants import InvariantSet, copied
 from .resolution import runge_kutta_step
 
-__all__ = ["Examiner", "is_check_due", "steps_to_check"]
+__all__ = ["Examiner", "is_check_due", "steps_to_check", "unless_refused"]
 
 # Number of steps before the first check of the invariants, and the factor from one check to the next.
 FIRST_CHECK = SPACING = 10
@@ -113,11 +114,16 @@ class Examiner:
         """
         known = copied(self.invariants)
         known.functions = _Guarded(known.functions)
-        try:
-            with np.errstate(all="ignore"):
-                return look(self, known, _guarded(rhs), *args)
-        except _RefusedError:
-            return None
+        return unless_refused(partial(look, self, known), rhs, *args)
+
+
+def unless_refused(look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
+    """Return ``look(rhs, *args)``; None if the right-hand side raises an exception in it, except MemoryError."""
+    try:
+        with np.errstate(all="ignore"):
+            return look(_guarded(rhs), *args)
+    except _RefusedError:
+        return None
 
 
 class _RefusedError(Exception):

@@ -179,7 +179,7 @@ class RunSpec:
         trust = Trust(invariants.names, work.trust)
         return Run(
             start, start, self.stepping, method, arrays, options, work, invariants, identity, trust, self.called,
-            self.left_out,
+            self.left_out, columns if columns is not None and columns.by_jvp and projection.check else None,
         )  # fmt: skip
 
     def _check(self, run: Run, invariants_too: bool) -> None:
@@ -195,7 +195,8 @@ class RunSpec:
         if self.projection.project_initial:
             t0, y0, _, tau = run.begin
             moved = projected_start(run, self.rhs)
-            run.moved = _moved(y0, moved, run.invariants.floors)
+            compared = y0, moved, run.invariants.floors
+            run.moved = _moved(*(compared if self.columns is None else map(self.columns.own, compared)))
             run.start = Start(t0, moved, self.rhs(t0, moved), tau)
         violation = run.invariants.start_violation(*run.start[:3])
         if violation:

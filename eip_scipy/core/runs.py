@@ -14,13 +14,14 @@ from ..engine.data import BY_ERROR, EXAMINED, NO_BALANCES, NO_METHOD, NOTHING, R
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from .callers import users_level
-from .examination import Derivative, Examiner, is_check_due
+from .examination import Derivative, Examiner, is_check_due, unless_refused
 from .invariant_checks import listed
 from .invariants import InvariantSet
 from .options import Options
 from .resolution import unresolved
 from .results import Diagnostics, slowness
 from .stepping import AnyMethod, Stepping
+from .variations import Columns, wrong_product
 
 __all__ = ["Counted", "Run", "Start"]
 
@@ -58,8 +59,10 @@ class Run:
         Name of the argument that gave the right-hand side.
     left_out : str
         A possible cause of NaN in the value of the right-hand side, for messages; "" if none is known.
-    looked : int
-        The step at which the invariants were checked last.
+    compared : Columns, optional
+        Columns of derivatives whose products with the Jacobian are compared with differences during the run.
+    looked, looked_at_products : int
+        The steps at which the invariants, and these products, were checked last.
     warned_of_balances : bool
         Whether there was a warning of balances that change too fast.
     moved : str
@@ -78,7 +81,9 @@ class Run:
     trust: Trust
     called: str = "fun"
     left_out: str = ""
+    compared: Columns | None = None
     looked: int = -1
+    looked_at_products: int = -1
     moved: str = ""
     warned_of_balances: bool = False
 
@@ -145,11 +150,26 @@ class Run:
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
         """Examine a run after `steps` steps, or at its end (`ended`), and return True if it must be reported as faulty.
 
-        Steps that the engine has marked as suspicious are examined. The invariants are checked after 10, 100, 1000, ...
-        steps, at the end, and if the corrections are too large, to find the reason. `rhs` returns a new array.
+        Steps that the engine has marked as suspicious are examined. The invariants, and products of the Jacobian by a
+        function of the user, are checked after 10, 100, 1000, ... steps, at the end, and the invariants also if the
+        corrections are too large, to find the reason. `rhs` returns a new array.
         """
-        if not self.options.watched or self.trust.failed:
+        if self.trust.failed:
             return False  # a failure has its own message
+        due = ended or is_check_due(steps)
+        if due and steps != self.looked_at_products and not self.trust.doubts:
+            self.looked_at_products = steps
+            if (wrong := self.wrong_product(rhs, t, y)) is not None:
+                self.trust.doubts.append(wrong)
+                return True
+        return self.options.watched and self._look_at_invariants(steps, ended, t, y, rhs)
+
+    def wrong_product(self, rhs: Derivative, t: float, y: np.ndarray) -> str | None:
+        """Return a sentence about a wrong product of the user's `jvp` at a state of the run, or None."""
+        return None if self.compared is None else unless_refused(partial(wrong_product, self.compared), rhs, t, y)
+
+    def _look_at_invariants(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
+        """Examine the invariants, as described in `look`."""
         if ended:
             self._warn_of_fast_balances()
         suspect = self.work.suspect

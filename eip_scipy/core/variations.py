@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import OdeSolution
 
-from ..engine.data import EUCLIDEAN, GIVEN
+from ..engine.data import EPS, EUCLIDEAN, GIVEN
 from ..engine.data import Columns as KeptColumns
-from ..engine.native import LibraryFunction
+from ..engine.native import BUILD, LibraryFunction
 from .arguments import scalars
 from .blocks import INDEX
-from .gradients import NumericalGradient, difference_gradient, typical_sizes
+from .dual_checks import wrong_duals
+from .gradients import NumericalGradient, difference_gradient, random_directions, typical_sizes
 from .inputs import filled, reals, require_arguments, shown
 from .invariants import Invariant
 from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
@@ -32,6 +33,7 @@ __all__ = [
     "require_tableau",
     "right_hand_side",
     "widened",
+    "wrong_product",
 ]
 
 Array = np.ndarray
@@ -40,8 +42,15 @@ STATE = "state"
 AGREES = 1e-6
 # Bound for a jvp of the user, which is larger because the right-hand side may not be smooth.
 WRONG = 1e-3
-SHIFT = 332  # binary digits of a complex step, relative to its direction
+# Distance of the state, in units of its components, at which a jvp that differs from differences is compared again.
+BESIDE = 1e-6
+COMPLEX_STEP = 2.0**-332  # a power of two, so that the product has no other error than the rounding of the function
 LEAST = 1e-3  # size for differences of a parameter that is 0
+# Lengths of the differences with which a complex step is compared where the engine finds it wrong, and the distance, in
+# roundings, of the states from which the rounding of these differences is estimated.
+LENGTHS = (1e-5, 1e-7, 1e-9)
+BLUR = 4.0
+TINY = 1e-150  # least size of a component: the product of it and a complex step does not underflow
 
 
 class OfState(NamedTuple):
@@ -75,6 +84,9 @@ class Columns:
     in_halves : bool
         Whether the wide state has all positions first and then all velocities, as Nystrom methods need it; otherwise
         one column follows the other.
+    by_jvp : bool
+        Whether the products with the Jacobian come from the user's `jvp`, which is compared with differences during
+        the run.
     """
 
     values: Array
@@ -82,6 +94,7 @@ class Columns:
     is_transition: bool
     symplectic: bool
     in_halves: bool = False
+    by_jvp: bool = False
 
     @property
     def n(self) -> int:
@@ -339,6 +352,7 @@ class Variations:
                 "orbit; omit the balances in this run."
             )
         rhs, source = products
+        columns = replace(columns, by_jvp=source == "jvp")
         compiled = _has_address(rhs) and not in_python
         items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
         return cls(columns, rhs, items, tuple(invariants), source)
@@ -412,16 +426,20 @@ def _of_columns_in_order(
             from .jitted_columns import rhs_by_products
 
             return rhs_by_products(fun, form, jvp, n, columns.count), "jvp"
-        return _interpreted(columns, fun, form, y0, lambda t, y, dy, dp: jvp(t, y, dy, *extra)), "jvp"
+        return _interpreted(columns, fun, form, y0, _by_jvp(jvp, n, y0.dtype)), "jvp"
+    why: str | None = "it is not compiled by Numba"
     if is_jitted(fun) and not jit_is_off() and scalars(extra) is not None:
         from .jitted_columns import rhs_by_duals
 
         try:
             rhs = rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
+            way = _direction(y0, len(parameters))
+            why = wrong_duals(columns, rhs, _derivative(fun, form, y0), t0, y0, way, extra)
+        except NotCompilableError as error:
+            why = str(error)
+        if why is None:
             return rhs, "dual numbers"
-        except NotCompilableError:  # a complex step may work
-            pass
-    return _by_complex_steps(columns, fun, form, t0, y0, extra), "complex steps"
+    return _by_complex_steps(columns, fun, form, t0, y0, extra, why), "complex steps"
 
 
 def _require_products(
@@ -509,12 +527,20 @@ def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
             fun(t, state, found, *extra)
         else:
             found = np.asarray(fun(t, state, *extra))
+            if found.shape == () and n - half == 1:
+                found = found.reshape(1)
         return np.concatenate([y[half:], found]) if half else found
 
     return derivative
 
 
-def _interpreted(columns: Columns, fun: Any, form: str, y0: Array, product: Callable[..., Array]) -> Callable[..., Any]:
+def _interpreted(
+    columns: Columns, fun: Any, form: str, y0: Array, products: Callable[[float, Array, Array, tuple], Array]
+) -> Callable[..., Any]:
+    """Return the right-hand side of a wide state in which one column follows the other, for calls from Python.
+
+    ``products(t, y, M, extra)`` returns the products (k, n) of the Jacobian and the k rows of M (k, n + p).
+    """
     derivative, n, size = _derivative(fun, form, y0), columns.n, columns.size
 
     def rhs(t: float, Y: Array, out: Array, *arguments: Any) -> None:
@@ -522,30 +548,40 @@ def _interpreted(columns: Columns, fun: Any, form: str, y0: Array, product: Call
         y = blocks[0, :n]
         found[:, n:] = 0.0
         found[0, :n] = as_derivative(derivative(t, y, arguments), n, y0.dtype, t, "fun")
-        for column, slope in zip(blocks[1:], found[1:], strict=True):
-            slope[:n] = as_derivative(product(t, y.copy(), column[:n].copy(), column[n:].copy()), n, y0.dtype, t, "jvp")
+        found[1:, :n] = products(t, y, blocks[1:], arguments)
 
     return rhs
 
 
-def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple) -> Callable[..., Any]:
+def _by_jvp(jvp: Callable[..., Any], n: int, dtype: np.dtype) -> Callable[[float, Array, Array, tuple], Array]:
+    """Return the `products` of `_interpreted` by the user's `jvp`."""
+
+    def products(t: float, y: Array, M: Array, extra: tuple) -> Array:
+        found = (jvp(t, y.copy(), row[:n].copy(), *extra) for row in M)
+        return np.array([as_derivative(value, n, dtype, t, "jvp") for value in found])
+
+    return products
+
+
+def _by_complex_steps(
+    columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, why: str | None
+) -> Callable[..., Any]:
+    """Return the right-hand side of the wide state with products by complex steps.
+
+    Raises
+    ------
+    ValueError
+        If complex steps are wrong at the start. The message contains `why`, the reason why there are no other products.
+    """
     derivative, places = _derivative(fun, form, y0), list(columns.parameters)
-
-    def product(t: float, y: Array, dy: Array, dp: Array) -> Array:
-        size = max(np.abs(dy).max(initial=0.0), np.abs(dp).max(initial=0.0))
-        if size == 0.0:
-            return np.zeros(y.size)
-        # The step is a power of two, so that the bits of the product do not depend on the length of the direction.
-        step, arguments = 2.0 ** -(SHIFT + np.frexp(size)[1]), extra
-        if places:
-            params = extra[0].astype(complex)
-            params[places] += 1j * step * dp
-            arguments = (params,)
-        return derivative(t, y + 1j * step * dy, arguments).imag / step
-
+    products = _ComplexSteps(derivative, y0, places)
     dy, dp = _direction(y0, len(places))
     try:
-        good = _agree(product(t0, y0, dy, dp), _difference(derivative, t0, y0, dy, dp, places, extra), AGREES)
+        good = _agree(
+            products.by_complex_step(t0, y0, np.concatenate([dy, dp])[None], extra)[0],
+            _difference(derivative, t0, y0, dy, dp, places, extra),
+            AGREES,
+        )
     except MemoryError:
         raise
     except Exception:  # a function may raise any error for complex numbers
@@ -553,10 +589,118 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
     if not good:
         raise ValueError(
             "variations: the derivatives of the right-hand side cannot be computed: it does not belong to a problem "
-            "with derivatives, is not jitted by Numba, and does not support complex steps. Give jvp=..., a function "
+            f"with derivatives, {why}, and it does not support complex steps. Give jvp=..., a function "
             "jvp(t, y, dy) that returns the product of the Jacobian with dy."
         )
-    return _interpreted(columns, fun, form, y0, product)
+    return _interpreted(columns, fun, form, y0, products)
+
+
+def _unless_error(function: Callable[..., Any], *args: Any) -> Any:
+    """Return ``function(*args)``; None if it raises an exception other than MemoryError.
+
+    A function of the user may raise any exception for complex numbers, and at states that the run does not visit.
+    """
+    try:
+        return function(*args)
+    except MemoryError:
+        raise
+    except Exception:
+        return None
+
+
+class _ComplexSteps:
+    """Products of the Jacobian and columns: by complex steps if they are correct, otherwise by differences of order 6.
+
+    A complex step is wrong if the function uses an absolute value, a norm or a real part, perhaps only in a part of its
+    domain. Therefore the products at each state are compared with a difference along one combination of the columns, as
+    in `NumericalGradient`. The choice depends on the wide state only, so that a resumed run makes the same steps.
+
+    Parameters
+    ----------
+    derivative : callable
+        ``derivative(t, y, extra) -> (n,)``, for real and complex states.
+    y0 : ndarray, shape (n,)
+        State at the start.
+    places : list of int
+        Indices in the run's parameters to which the last p components of a column belong.
+    """
+
+    def __init__(self, derivative: Callable[..., Array], y0: Array, places: list[int]) -> None:
+        self._derivative, self._places = derivative, places
+        self._floors = typical_sizes(y0, np.zeros_like(y0), 0.0)
+
+    def __call__(self, t: float, y: Array, M: Array, extra: tuple) -> Array:
+        """Return the products (k, n) of the Jacobian at (t, y) and the rows of M (k, n + p)."""
+        rows, sizes = self._scaled(y, M, extra)
+        with np.errstate(all="ignore"):  # the function may not be defined at states that the run does not visit
+            found = self._checked(t, y, rows, extra)
+        if found is None:
+            k = len(rows)
+            found = difference_gradient(lambda s: self._along(t, s, y, rows, extra), np.zeros(k), np.ones(k))
+        return found.T * sizes
+
+    def by_complex_step(self, t: float, y: Array, M: Array, extra: tuple) -> Array:
+        """Return the products by complex steps alone."""
+        rows, sizes = self._scaled(y, M, extra)
+        return self._unchecked(t, y, rows, extra).T * sizes
+
+    def _unchecked(self, t: float, y: Array, rows: Array, extra: tuple) -> Array:
+        at_rest = np.zeros(len(rows))
+        return BUILD.gradients.complex_step(self._along, t, at_rest, (y, rows, extra), COMPLEX_STEP)
+
+    def _checked(self, t: float, y: Array, rows: Array, extra: tuple) -> Array | None:
+        """Return the products (n, k) with the scaled rows by complex steps; None if they disagree with differences."""
+        k = len(rows)
+        way = random_directions(k, False)[-1]
+        found = _unless_error(
+            BUILD.gradients.checked_complex_step,
+            self._along, t, np.zeros(k), (y, rows, extra), COMPLEX_STEP, way, np.ones(k),
+        )  # fmt: skip
+        if found is not None:
+            return found
+        # The engine's comparison allows for the rounding of the values, but not for that of terms that cancel in them.
+        found = _unless_error(self._unchecked, t, y, rows, extra)
+        wrong = found is None or _unless_error(self._is_wrong, found, way, t, y, rows, extra)
+        return None if wrong else found
+
+    def _is_wrong(self, found: Array, way: Array, t: float, y: Array, rows: Array, extra: tuple) -> bool:
+        """Return True if the products `found` (n, k) differ from all differences along `way`, by more than rounding.
+
+        The rounding is estimated from the derivative at states that differ by a few roundings. Differences that are not
+        finite do not show that the products are wrong.
+        """
+        along, terms = found @ way, np.abs(found) @ np.abs(way)
+        here = self._derivative(t, y, extra)
+        blurred = [y + BLUR * EPS * np.abs(y) * d for d in (*random_directions(y.size, False), -1.0)]
+        rounding = BLUR * np.max([np.abs(self._derivative(t, state, extra) - here) for state in blurred], axis=0)
+        for length in LENGTHS:
+            above, below = (self._along(t, side * length * way, y, rows, extra) for side in (1, -1))
+            allowed = AGREES * terms + (rounding + EPS * np.abs(here)) / length
+            if not (np.abs((above - below) / (2 * length) - along) > allowed).any():
+                return False
+        return True
+
+    def _scaled(self, y: Array, M: Array, extra: tuple) -> tuple[Array, Array]:
+        """Return the rows of M, divided by powers of two so that they have about the size of the state, and these.
+
+        A division by a power of two has no rounding, so that the products have the bits of those of M.
+        """
+        scale = np.maximum(np.abs(y) + self._floors, TINY)
+        if self._places:
+            own = np.abs(extra[0][self._places])
+            scale = np.concatenate([scale, np.where(own > 0, own, LEAST)])
+        with np.errstate(over="ignore"):  # columns that grow without bound end the run later, with a message
+            sizes = 2.0 ** (np.frexp((np.abs(M) / scale).max(axis=1))[1][:, None] - 1)
+        return M / sizes, sizes
+
+    def _along(self, t: float, shares: Array, y: Array, rows: Array, extra: tuple) -> Array:
+        """Return the derivative at the state, and the parameters, shifted by ``shares @ rows``."""
+        shift, n = shares @ rows, y.size
+        if self._places:
+            params = extra[0].astype(shift.dtype)
+            params[self._places] += shift[n:]
+            extra = (params,)
+        return self._derivative(t, y + shift[:n], extra)
 
 
 def _difference(
@@ -575,6 +719,37 @@ def _difference(
         return derivative(t, y + s[0] * dy, (params,))
 
     return np.asarray(difference_gradient(along, np.zeros(1), np.full(1, 1e-2)))[..., 0]
+
+
+def wrong_product(columns: Columns, rhs: Callable[[float, Array], Array], t: float, wide: Array) -> str | None:
+    """Return a sentence about a wrong product of the Jacobian at the state in `wide`; None if none is found.
+
+    `rhs` is the right-hand side of the wide state. The state moves along a random direction, which also takes the
+    place of the columns. Close to a kink neither the product nor the difference need be wrong, so that a product counts
+    as wrong only if it is so at a state close by, too.
+    """
+    own, order = wide.copy(), columns.order
+    dy = _direction(own[order[0]], 0)[0]
+    own[order[1:]] = dy
+    texts = []
+    for share in (0.0, BESIDE):
+        own[order[0]] = y = wide[order[0]] + share * dy
+
+        def moved(s: Array, y: Array = y) -> Array:
+            own[order[0]] = y + s[0] * dy
+            return rhs(t, own)[order[0]]
+
+        found = rhs(t, own)[order[1]]
+        right = difference_gradient(moved, np.zeros(1), np.full(1, 1e-2))[..., 0]
+        if not (np.isfinite(found).all() and np.isfinite(right).all()) or _agree(found, right, WRONG):
+            return None
+        k = int(np.argmax(np.abs(found - right)))
+        texts.append(
+            f"jvp is not the Jacobian of the right-hand side times dy at t={t:.6g}: along a test direction, component "
+            f"{k} is {found[k]:.6g} by jvp and {right[k]:.6g} by differences of fun, a difference of "
+            f"{abs(found[k] - right[k]):.2g}; correct jvp"
+        )
+    return texts[0]
 
 
 class _WideInvariant:

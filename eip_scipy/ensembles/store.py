@@ -19,7 +19,7 @@ from ..core.inputs import shown
 from .happened import Flat, flattened, unflattened
 from .saving import expanded, shortened
 from .statistics import Statistics
-from .tasks import COMPARED, LISTS, NOT_RUN, Members
+from .tasks import AT_ENDS, COMPARED, LISTS, NOT_RUN, Members
 
 __all__ = ["CheckpointStore", "Store", "ZarrStore", "location", "require_same_functions"]
 
@@ -47,6 +47,7 @@ FILLED = {"message": "", "status": NOT_RUN}
 CODECS = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-bytes", "vlen-utf8", "zstd"}
 SAME = 1e-9
 EVENTS_IN_A_FILE = 4096
+OPTIONAL = {"known_events"}  # arrays that groups of earlier versions do not have
 # Writing a checkpoint takes at most 5 % of the time.
 LEAST_RATIO = 19.0
 
@@ -91,7 +92,9 @@ class _Store:
         checkpoint.require_same(self.path, there.get("settings"), here["settings"])
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
-            raise _other_functions(self.path, f"at the start (stored: {one[:4]}, now: {other[:4]})")
+            raise _other_functions(
+                self.path, "fun or an invariant", f"at the start (stored: {one[:4]}, now: {other[:4]})"
+            )
         if missing:
             raise CheckpointError(
                 f"{self.path!r} is not an ensemble of eip_scipy, or was written by an earlier version of eip_scipy: "
@@ -101,24 +104,27 @@ class _Store:
 
 
 def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
-    """Compare the values of f and of the invariants at the end of a member of the last finished chunk.
+    """Compare the values of f, of the invariants and of the events at the end of a member of the last finished chunk.
 
     `there` are the stored values, `here` those of the present functions, and `sizes` the sizes relative to which they
-    are compared, see `Plan.known_by`. `first` is the number of the first member of the chunk.
+    are compared, see `Plan.known_by`. `first` is the number of the first member of the chunk. Values that are not
+    stored are not compared: earlier versions stored none of the events, which are the last in `here`.
 
     Raises
     ------
     CheckpointError
         If a value differs by more than `SAME` times its size, which allows for rounding errors on another machine.
     """
+    here, sizes = here[: there.size], sizes[: there.size]
     if there.size and not (there.shape == here.shape and bool(np.all(np.abs(there - here) <= SAME * sizes))):
-        raise _other_functions(path, f"at the end of a member from number {first} on")
+        what = "fun, an invariant or an event"
+        raise _other_functions(path, what, f"at the end of a member from number {first} on")
 
 
-def _other_functions(path: str, where: str) -> CheckpointError:
+def _other_functions(path: str, what: str, where: str) -> CheckpointError:
     return CheckpointError(
-        f"{path!r} belongs to another ensemble: fun or an invariant had other values {where}. Resume with the "
-        "functions of that run, or use another place."
+        f"{path!r} belongs to another ensemble: {what} had other values {where}. Resume with the functions of that "
+        "run, or use another place."
     )
 
 
@@ -175,7 +181,8 @@ class ZarrStore(_Store):
                 self._lock = Lock(self.path)
             try:
                 self._label = self._open(zarr, identity, times, resume)
-                missing = np.flatnonzero(self._arrays["status"][:] == NOT_RUN)
+                with self._being_read("the status of the members"):
+                    missing = np.flatnonzero(self._arrays["status"][:] == NOT_RUN)
             except BaseException:
                 self.close()
                 raise
@@ -227,8 +234,8 @@ class ZarrStore(_Store):
             if not isinstance(found, dict):
                 raise ValueError(f"its attribute {LABEL!r} is {shown(found)}, not a mapping")
             layout = self._layout(times)
-            self._require_same(found, identity, [name for name in layout if name not in group])
-            self._arrays = {name: self._plain(name, group[name], how) for name, how in layout.items()}
+            self._require_same(found, identity, [name for name in layout if name not in group and name not in OPTIONAL])
+            self._arrays = {name: self._plain(name, group[name], how) for name, how in layout.items() if name in group}
         except (KeyError, TypeError, ValueError, OSError) as error:  # Zarr raises TypeError for codecs in a wrong order
             old = self._lock is not None and os.path.exists(f"{self._place}/.zgroup")
             why = "it is a Zarr group of format 2, whose metadata may name code to run" if old else error
@@ -310,16 +317,51 @@ class ZarrStore(_Store):
             array("event_y", state, ("happened", "component"), (n,), 0, EVENTS_IN_A_FILE)
         # Values by which the functions of a chunk are identified.
         width = COMPARED + self._empty.target.shape[1]
-        array("known_by", float, ("chunk", "value"), (width,), -(-self._members // self._chunk), 1)
+        chunks = -(-self._members // self._chunk)
+        array("known_by", float, ("chunk", "value"), (width,), chunks, 1)
+        if self._events:
+            array("known_events", float, ("chunk", "event_value"), (AT_ENDS * self._events,), chunks, 1)
         return layout
 
     def read(self, first: int, last: int) -> Members:
-        """Return the results of members `first` to `last` - 1."""
-        found = {field: self._arrays[name][first:last] for name, (field, _) in ARRAYS.items() if name in self._arrays}
-        found = {field: _as_stored(value) for field, value in found.items()}
+        """Return the results of members `first` to `last` - 1; raise CheckpointError if they are damaged."""
+        names = [name for name in ARRAYS if name in self._arrays]
+        with self._being_read(f"the results of the members {first} to {last - 1}"):
+            found: dict[str, Any] = {ARRAYS[name][0]: _as_stored(self._arrays[name][first:last]) for name in names}
+            happened = unflattened(self._flat(first, last))
         found["message"] = [str(text) for text in found["message"]]
         none = Members.empty(last - first, found["y"].shape[1], found["y"].dtype, found["target"].shape[1], 0)
-        return none._replace(**found, happened=unflattened(self._flat(first, last)))
+        members = none._replace(**found, happened=happened)
+        self._require_states(first, members)
+        return members
+
+    def _require_states(self, first: int, members: Members) -> None:
+        """Raise CheckpointError if states of a member that did not fail are missing; `first` is the first member.
+
+        Zarr reads a lost file as NaN. A member that an event ended may have NaN in all rows of saved states.
+        """
+        lost = (members.status >= 0) & np.isnan(members.y).any(axis=1)
+        if members.saved.shape[1]:
+            lost |= (members.status == 0) & np.isnan(members.saved[:, 0]).any(axis=1)
+        if lost.any():
+            k = first + int(np.argmax(lost))
+            raise CheckpointError(
+                f"{self.path!r} is damaged: member {k} is marked as finished, but its states are missing. Restore a "
+                "copy of the group, or use another place for a new ensemble."
+            )
+
+    @contextmanager
+    def _being_read(self, what: str) -> Iterator[None]:
+        """Replace an error inside the block, which reads `what`, by a CheckpointError."""
+        try:
+            yield
+        except MemoryError:
+            raise
+        except Exception as error:  # codecs raise errors of many kinds for files that are cut or overwritten
+            raise CheckpointError(
+                f"{self.path!r} is damaged: {what} cannot be read: {error}. Restore a copy of the group, or use "
+                "another place for a new ensemble."
+            ) from error
 
     def _flat(self, first: int, last: int) -> Flat:
         """Return the events of members `first` to `last` - 1, which are stored after those of preceding members."""
@@ -341,11 +383,13 @@ class ZarrStore(_Store):
                 self._arrays[name][begin:end] = values
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return the values of f and of the invariants stored with the chunk that starts at member `first`.
+        """Return the values of f, the invariants and the events stored with the chunk that starts at member `first`.
 
         A resumed call compares them with those of its own functions. The array may be empty.
         """
-        row = self._arrays["known_by"][first // self._chunk]
+        names = [name for name in ("known_by", "known_events") if name in self._arrays]
+        with self._being_read(f"the values of the functions in chunk {first // self._chunk}"):
+            row = np.concatenate([self._arrays[name][first // self._chunk] for name in names])
         return row[~np.isnan(row)]
 
     def write(
@@ -353,14 +397,17 @@ class ZarrStore(_Store):
     ) -> None:
         """Write the results of a chunk that starts at member `first`.
 
-        `known_by` are the values of f and of the invariants with which a resumed call compares those of its own
-        functions. `whole` and `statistics` are not used.
+        `known_by` are the values of f, the invariants and the events with which a resumed call compares those of its
+        own functions. `whole` and `statistics` are not used.
         """
         self._require_own()
         with self._written():
             if self._events:
                 self._write_events(first, members)
-            self._arrays["known_by"][first // self._chunk, : known_by.size] = known_by
+            others = max(0, known_by.size - AT_ENDS * self._events)
+            self._arrays["known_by"][first // self._chunk, :others] = known_by[:others]
+            if known_by.size and "known_events" in self._arrays:
+                self._arrays["known_events"][first // self._chunk] = known_by[others:]
             for name, (field, _) in ARRAYS.items():
                 if name in self._arrays:
                     self._arrays[name][first : first + len(members.t)] = _as_stored(getattr(members, field))
@@ -422,7 +469,7 @@ class CheckpointStore(_Store):
         return Members(**arrays, message=message, happened=unflattened(flat)[first:last])
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return the values of f and of the invariants stored with the last chunk; `first` is not used.
+        """Return the values of f, the invariants and the events stored with the last chunk; `first` is not used.
 
         A resumed call compares them with those of its own functions. The array may be empty.
         """
@@ -434,7 +481,7 @@ class CheckpointStore(_Store):
         """Record that the chunk that starts at member `first` is finished; write the file if it is time to do so.
 
         `whole` holds the results of all members, and `statistics` are those of the finished members. `known_by` are the
-        values of f and of the invariants with which a resumed call compares those of its own functions.
+        values of f, the invariants and the events with which a resumed call compares those of its own functions.
         """
         self._waiting = first + len(members.t), known_by, whole, statistics
         since = time.perf_counter() - self._written

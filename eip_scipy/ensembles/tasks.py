@@ -31,7 +31,18 @@ from .happened import Happened, happened
 from .own_times import OwnTimes
 from .side_by_side import need_compiling, octet_functions, why_one_by_one
 
-__all__ = ["COMPARED", "FAILED", "LISTS", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
+__all__ = [
+    "AT_ENDS",
+    "COMPARED",
+    "FAILED",
+    "LISTS",
+    "NOT_RUN",
+    "Members",
+    "Plan",
+    "StoppedError",
+    "Task",
+    "run_members",
+]
 
 FAILED, NOT_RUN = -1, -2
 # Number of steps in the first call of the engine, and the target duration of a call.
@@ -43,6 +54,7 @@ BY_MEMBER = (
 )
 LEAST_WORK = 3e7  # floats times steps, one or two seconds: compiling functions for eight members takes as long
 COMPARED = 16
+AT_ENDS = 2  # values of an event by which it is recognised: at the start and at the end of a member
 LISTS = "message", "happened"  # fields of Members that are lists; the others are arrays
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 SHARED = OwnTimes()
@@ -269,11 +281,12 @@ class Plan:
         return {"settings": settings, "start": self._start_values}
 
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
-        """Return values of f and of the invariants at the end of the first member that did not fail, and their sizes.
+        """Return values of the functions at the end of the first member that did not fail, and their sizes.
 
-        There are at most `COMPARED` components of f, and all invariants. The size of a component is the largest one of
-        f, and that of an invariant is the size of its terms. A resumed ensemble compares its functions by these values.
-        Both arrays are empty if all members failed, or a value cannot be evaluated or is not finite.
+        There are at most `COMPARED` components of f, all invariants, and all events, both at the start of this member
+        and at its end. The size of a component is the largest one of f, that of an invariant is the size of its terms,
+        and that of an event is given by `Events.sizes`. A resumed ensemble compares its functions by these values. Both
+        arrays are empty if all members failed, or a value cannot be evaluated or is not finite.
         """
         nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
         if not ended.size:
@@ -284,11 +297,13 @@ class Plan:
             ready = self._prepared(y0s[k], params[k])
             f, invariants = ready.system.derivative(t, y.copy()), ready.run.invariants
             values, sizes = invariants.values(t, y), invariants.term_sizes(t, y, f)
+            events = _of_events(ready, t, y, f)
         except Exception:
             return nothing, nothing
         f = f.view(float)
         some = f[np.linspace(0, f.size - 1, min(f.size, COMPARED)).astype(int)]
-        found = np.append(some, values), np.append(np.full(some.size, np.abs(f).max()), sizes)
+        sizes = np.concatenate([np.full(some.size, np.abs(f).max()), sizes, events[1]])
+        found = np.concatenate([some, values, events[0]]), sizes
         return found if np.isfinite(found).all() else (nothing, nothing)
 
     @contextmanager
@@ -304,6 +319,21 @@ class Plan:
             mine = Sweeper(Loop(self.task.prepared(request.y0, request.params), Keeper()), self.task.members)
         yield mine
         self._idle.append(mine)
+
+
+def _of_events(ready: Prepared, t: float, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values of a member's events, at its start and then at its end (t, y), and their sizes.
+
+    `f` is the derivative at the end. Values that are not finite are replaced by 0.
+    """
+    events, begin = ready.system.events, ready.run.begin
+    step = ready.run.start.tau * ready.schedule.span.sign  # into the interval: beyond it events need not be defined
+    places = (begin.t, begin.y, begin.f, step), (t, y, f, -step)
+    values, sizes = (
+        np.nan_to_num(np.concatenate(found), posinf=0.0, neginf=0.0)
+        for found in ([events.values(*place[:2]) for place in places], [events.sizes(*place) for place in places])
+    )
+    return values, sizes
 
 
 def saved_times(schedule: Schedule) -> np.ndarray:
@@ -595,12 +625,12 @@ class Sweeper:
     def _examine(self, each: data.Members, out: Members) -> None:
         """Examine the steps that the engine has marked as suspicious, and check the invariants at the ends of members.
 
-        The invariants are checked at the ends of the members that did not fail, in their order, up to the first member
-        at which nothing is found.
+        The invariants, and the products of the user's `jvp`, are checked at the ends of the members that did not fail,
+        in their order, up to the first member at which nothing is found.
         """
         run = self.loop.driver.run
         arrived = np.flatnonzero(out.status >= 0)
-        if not run.options.watched or not arrived.size:
+        if not (run.options.watched or run.compared is not None) or not arrived.size:
             return
         suspected, at_ends = suspects(each.figures, each.suspects), True
         for k in arrived.tolist():
@@ -611,7 +641,8 @@ class Sweeper:
             examiner = replace(run.examiner, tau=float(each.first_steps[k]), figures=each.figures[k], largest=0.0)
             found = examiner.examine(each.suspects[k], derivative) if suspected[k] else None
             if at_ends:
-                at_end = examiner.complaint(derivative, float(out.t[k]), out.y[k])
+                end = derivative, float(out.t[k]), out.y[k]
+                at_end = run.wrong_product(*end) or (examiner.complaint(*end) if run.options.watched else None)
                 found, at_ends = found or at_end, at_end is not None
             self._judge(k, each, out, [found] if found else [])
 

@@ -118,6 +118,25 @@ class Events:
         for k in range(len(self.functions)):
             values[k] = self._value(k, t, y.copy())
 
+    def values(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Return the values of all events at (t, y)."""
+        values = np.empty(len(self.functions))
+        self.fill(t, y, values)
+        return values
+
+    def sizes(self, t: float, y: np.ndarray, f: np.ndarray, step: float) -> np.ndarray:
+        """Return the sizes of the events' values at (t, y), relative to which rounding errors are small.
+
+        A size is the absolute value plus its change in a step along the derivative `f`, because the value of an event
+        that happens near (t, y) may be smaller than the terms that cancel in it.
+        """
+        here = self.values(t, y)
+        try:
+            change = np.abs(self.values(t + step, y + step * f) - here)
+        except Exception:  # an event need not be defined in that state
+            change = np.zeros_like(here)
+        return np.abs(here) + np.where(np.isfinite(change), change, 0.0)
+
     def leave(self, t: float, y: np.ndarray, f: np.ndarray, step: float, values: np.ndarray) -> None:
         """Replace the value of each event that happened at the start (t, y) of a continued run by a slightly later one.
 

@@ -253,7 +253,7 @@ class Loop:
                     "needs. Omit checkpoint, or save the last state of a run and start another run from it."
                 )
             identity = prepared.identity(run.begin.y, system.parameters)
-            keeper.identify(identity, run, system.derivative, *run.begin[:3])
+            keeper.identify(identity, run, system.derivative, system.events)
         wanted = request.compiled if compiled is None else compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
@@ -266,7 +266,7 @@ class Loop:
                 keeps_steps=request.dense_output,
                 max_bytes=request.max_bytes,
             )
-        keeper.begin(self.driver, self.events)
+        keeper.begin(self.driver)
         self._slowed = wanted is None and _slowed_by_invariants(system.fun, functions, run)
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK

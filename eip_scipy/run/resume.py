@@ -54,18 +54,16 @@ class Keeper:
         settings: dict[str, Any],
         run: Run,
         derivative: Callable[[float, np.ndarray], np.ndarray],
-        t0: float,
-        y0: np.ndarray,
-        f0: np.ndarray,
+        events: Events,
     ) -> None:
         """Record what identifies the run, before anything is compiled: its settings and functions.
 
-        `derivative` is the right-hand side, and `f0` its value at the start (t0, y0). A run that is resumed must agree
-        with its file, otherwise CheckpointError is raised.
+        `derivative` is the right-hand side, and `events` are those of the run. A run that is resumed must agree with
+        its file, otherwise CheckpointError is raised.
         """
 
-    def begin(self, driver: Any, events: Events) -> None:
-        """Store the driver, whose buffers hold the start, and the events; if a run is resumed, fill the buffers."""
+    def begin(self, driver: Any) -> None:
+        """Store the driver, whose buffers hold the start; if a run is resumed, fill the buffers and the events."""
 
     def keep(self) -> None:
         """Store a snapshot or write the file if it is due; called between two chunks of steps."""
@@ -197,14 +195,12 @@ class _FileKeeper(Keeper):
         settings: dict[str, Any],
         run: Run,
         derivative: Callable[[float, np.ndarray], np.ndarray],
-        t0: float,
-        y0: np.ndarray,
-        f0: np.ndarray,
+        events: Events,
     ) -> None:
         self._settings, self._names, self._derivative = settings, run.invariants.names, derivative
-        rates = run.invariants.balances.given(t0, y0, f0)
-        self._start = {"start_f": f0, "start_values": run.invariants.start_values}
-        self._start |= {"start_rates": rates} if rates.size else {}
+        self._events = events
+        t0, y0, f0 = run.begin[:3]
+        self._start = self._known_by("start", run, t0, y0, f0, run.invariants.start_values)
         if self._read is None:
             return
         header, arrays = self._read
@@ -213,16 +209,25 @@ class _FileKeeper(Keeper):
         self._require_fitting(arrays, {"y": y0, "clock": np.zeros(NEXT_LENGTH + 1)})
         if "state_f" in arrays:
             t, y = float(arrays["clock"][TIME]), arrays["y"]
-            here = self._known_by(run, t, y)
+            here = self._known_by_at(run, t, y)
             self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it was saved,")
         checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
 
-    def _known_by(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the values at (t, y) that identify the functions: the derivative, invariants and rates of balances."""
-        f = self._derivative(t, y.copy())
-        rates = run.invariants.balances.given(t, y, f)
-        known_by = {"state_f": f, "state_values": run.invariants.values(t, y)}
-        return known_by | ({"state_rates": rates} if rates.size else {})
+    def _known_by_at(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the values at the state y of the run at t that identify the functions."""
+        return self._known_by("state", run, t, y, self._derivative(t, y.copy()), run.invariants.values(t, y))
+
+    def _known_by(
+        self, where: str, run: Run, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Return the values at (t, y) that identify the functions, by the names of their arrays in the file.
+
+        They are the derivative `f`, the `values` of the invariants, the rates of balances, and the values of events.
+        The names begin with `where`.
+        """
+        known_by = {f"{where}_f": f, f"{where}_values": values}
+        further = {"rates": run.invariants.balances.given(t, y, f), "events": self._events.values(t, y)}
+        return known_by | {f"{where}_{name}": found for name, found in further.items() if found.size}
 
     def _require_same_functions(
         self,
@@ -233,17 +238,12 @@ class _FileKeeper(Keeper):
         y: np.ndarray,
         where: str,
     ) -> None:
+        # Earlier versions stored no values of events.
+        known_by = {name: a for name, a in known_by.items() if name in arrays or not name.endswith("_events")}
         self._require_fitting(arrays, known_by)
-        f, _, *rates = known_by.values()
-        labels = ["fun"] * f.size + [f"invariant {name!r}" for name in self._names]
-        labels += [f"rate of balance {self._names[place]!r}" for place in run.invariants.balances.given_places]
         there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
         with np.errstate(invalid="ignore"):
-            sizes = np.append(np.full(f.size, np.abs(f).max(initial=0.0)), run.invariants.term_sizes(t, y, f))
-            # Rates may be much smaller than the terms that cancel in them.
-            terms = np.abs(run.invariants.gradients(t, y, f)) @ np.abs(f)
-            own = LEAST_OF_RATES * terms[run.invariants.balances.given_places]
-            sizes = np.concatenate([sizes, *(own + np.abs(rate) for rate in rates)])
+            labels, sizes = self._described(run, known_by, t, y)
             same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
         if not same.all():
             k = int(np.flatnonzero(~same)[0])
@@ -251,6 +251,28 @@ class _FileKeeper(Keeper):
                 f"the checkpoint {self._name!r} belongs to another run: {labels[k]} was {there[k]:.12g} {where} "
                 f"and is {here[k]:.12g} now. Resume with the functions of that run, or use another file for a new run."
             )
+
+    def _described(
+        self, run: Run, known_by: dict[str, np.ndarray], t: float, y: np.ndarray
+    ) -> tuple[list[str], np.ndarray]:
+        """Return a name of the function and a size for each of the values at (t, y) in `known_by`.
+
+        Values are compared relative to their sizes.
+        """
+        parts = {name.partition("_")[2]: values for name, values in known_by.items()}
+        f, places = parts["f"], run.invariants.balances.given_places
+        labels = ["fun"] * f.size + [f"invariant {name!r}" for name in self._names]
+        sizes = [np.full(f.size, np.abs(f).max(initial=0.0)), run.invariants.term_sizes(t, y, f)]
+        if "rates" in parts:  # which may be much smaller than the terms that cancel in them
+            labels += [f"rate of balance {self._names[place]!r}" for place in places]
+            terms = np.abs(run.invariants.gradients(t, y, f)) @ np.abs(f)
+            sizes.append(LEAST_OF_RATES * terms[places] + np.abs(parts["rates"]))
+        if "events" in parts:
+            labels += [f"event {k}" for k in range(parts["events"].size)]
+            # The step stays in the interval, because the events need not be defined beyond its ends.
+            step = run.start.tau * run.stepping.span.sign * (1 if t == run.begin.t else -1)
+            sizes.append(self._events.sizes(t, y, f, step))
+        return labels, np.concatenate(sizes)
 
     def _require_fitting(self, arrays: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
         for name, a in expected.items():
@@ -261,8 +283,8 @@ class _FileKeeper(Keeper):
                     f"{self._name!r} is not a checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
                 )
 
-    def begin(self, driver: Any, events: Events) -> None:
-        self._driver, self._events = driver, events
+    def begin(self, driver: Any) -> None:
+        self._driver = driver
         found, self._read = self._read, None
         if found is not None:
             self._restore(*found)
@@ -336,7 +358,7 @@ class _FileKeeper(Keeper):
         """
         arrays = self._snapshot.arrays
         try:
-            return self._known_by(self._driver.run, float(arrays["clock"][TIME]), arrays["y"])
+            return self._known_by_at(self._driver.run, float(arrays["clock"][TIME]), arrays["y"])
         except Exception:  # a function may raise again what has ended the run; the checkpoint is written all the same
             return {}
 

@@ -855,6 +855,52 @@ def test_what_is_no_store_is_named(tmp_path):
         stored(out=path, resume=True)
 
 
+@pytest.mark.parametrize("array", ["y", "states"])
+@pytest.mark.parametrize("how", ["lost", "cut", "overwritten"])
+def test_a_damaged_file_of_finished_members(how, array, tmp_path):
+    """Name the members whose states cannot be read."""
+    pytest.importorskip("zarr", reason="needs zarr")
+    path = tmp_path / "run.zarr"
+    stored(out=path)
+    chunk = path / array / "c" / "/".join("200" if array == "states" else "20")
+    if how == "lost":
+        chunk.unlink()
+    else:
+        chunk.write_bytes(chunk.read_bytes()[:10] if how == "cut" else b"something else" * 20)
+    says = "member 6 is marked as finished, but its states are missing"
+    if how != "lost":
+        says = "the results of the members 6 to 8 cannot be read: "
+    with pytest.raises(CheckpointError, match=rf"run\.zarr' is damaged: {says}.*\. Restore a copy of the group, or"):
+        stored(out=path, resume=True)
+
+
+def test_a_damaged_file_of_the_status(tmp_path):
+    """Name what cannot be read; a lost file makes its members run again."""
+    pytest.importorskip("zarr", reason="needs zarr")
+    path = tmp_path / "run.zarr"
+    whole = stored(out=path)
+    chunk = path / "status" / "c" / "2"
+    chunk.write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"run\.zarr' is damaged: the status of the members cannot be read"):
+        stored(out=path, resume=True)
+    chunk.unlink()
+    same(whole, stored(out=path, resume=True))
+
+
+def test_members_that_end_before_their_first_saved_state(tmp_path):
+    """Their rows are NaN, and nothing is missing."""
+    pytest.importorskip("zarr", reason="needs zarr")
+
+    def early(t, y):
+        return t - 0.2
+
+    early.terminal = True
+    options = {"out": tmp_path / "run.zarr", "events": early, "save_every": None, "t_eval": [0.5, 1.0]}
+    whole = stored(**options)
+    assert (whole.status == 1).sum() == 10
+    same(whole, stored(resume=True, **options))
+
+
 def test_checkpoints_in_time(tmp_path):
     """Each chunk, where the seconds are over; and a file in use is whole."""
     path, seen = tmp_path / "kept", []

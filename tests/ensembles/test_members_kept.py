@@ -304,6 +304,47 @@ def test_a_store_without_what_is_kept_now(where, tmp_path):
         ensemble(PROBLEM, SPAN, STARTS, resume=True, **options)
 
 
+@pytest.mark.parametrize("where", ["out", "checkpoint"])
+@pytest.mark.parametrize("span", [SPAN, SPAN[::-1]])
+def test_other_events_are_not_mixed(where, span, tmp_path):
+    """They are recognised at both ends of a member, also where a value is not finite."""
+    pytest.importorskip("zarr")
+    options = STEPS | {"chunk": 8, where: tmp_path / "store"}
+
+    def nowhere(t, y, params):
+        return 0.5 if t == span[0] else np.nan
+
+    def at_first(t, y, params):
+        return y[1] + (t == span[0])
+
+    def at_last(t, y, params):
+        return y[1] + (t == span[1])
+
+    ensemble(PROBLEM, span, STARTS, events=[crossing, nowhere], callback=lambda part: part.first == 8, **options)
+    says = "fun, an invariant or an event had other values at the end of a member from number 8 on"
+    for events in ([nowhere, crossing], [at_first, nowhere], [at_last, nowhere]):
+        with pytest.raises(CheckpointError, match=says):
+            ensemble(PROBLEM, span, STARTS, events=events, resume=True, **options)
+    again = ensemble(PROBLEM, span, STARTS, events=[crossing, nowhere], resume=True, **options)
+    assert (again.status >= 0).sum() == len(STARTS) - 1
+
+
+@pytest.mark.parametrize("where", ["out", "checkpoint"])
+def test_a_store_without_values_of_events(where, tmp_path):
+    """Continue what an earlier version has written."""
+    options = STEPS | {"chunk": 8, "events": EVENTS, where: tmp_path / "store"}
+    whole = ensemble(PROBLEM, SPAN, STARTS, **STEPS, events=EVENTS, chunk=8)
+    ensemble(PROBLEM, SPAN, STARTS, callback=lambda part: part.first == 8, **options)
+    if where == "out":
+        group = pytest.importorskip("zarr").open_group(str(tmp_path / "store"), mode="r+")
+        del group["known_events"]
+    else:
+        header, arrays = checkpoint.read(tmp_path / "store")
+        arrays["known_by"] = arrays["known_by"][: -2 * len(EVENTS)]
+        checkpoint.write(tmp_path / "store", header, arrays)
+    assert_same_fields(whole, ensemble(PROBLEM, SPAN, STARTS, resume=True, **options))
+
+
 def test_datasets_hold_the_invariants():
     pytest.importorskip("xarray")
     run = ensemble(PROBLEM, SPAN, STARTS, save_every=50, **STEPS)

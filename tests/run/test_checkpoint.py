@@ -646,6 +646,56 @@ def test_another_function_is_seen_by_its_value_at_the_start(old_run):
         integrate(orbit, SPAN, Y0, **options | {"invariants": [other, L]})
 
 
+def test_another_event_is_seen_by_its_values(tmp_path):
+    path = tmp_path / "run"
+    options = FIXED | {"checkpoint": path, "resume": True}
+
+    def far(t, y):
+        return np.hypot(y[0], y[1]) - 1.0
+
+    def later(t, y):
+        return y[1] if t == 0 else y[0]
+
+    integrate(orbit, SPAN, Y0, events=[crossing, far], **options)
+    with pytest.raises(CheckpointError, match=r"belongs to another run: event 1 was -0.6 at the start and is 0 now"):
+        integrate(orbit, SPAN, Y0, events=[crossing, crossing], **options)
+    with pytest.raises(CheckpointError, match=r"event 0 was \S+ at t = 6, where it was saved, and is \S+ now\. Resume"):
+        integrate(orbit, SPAN, Y0, events=[later, far], **options)
+    assert integrate(orbit, SPAN, Y0, events=[crossing, far], **options).status == 0
+
+
+def test_events_may_differ_by_rounding(tmp_path):
+    """At the start and at the end the values are rounding errors, and one event is not defined beyond the end."""
+    path = tmp_path / "run"
+    options = FIXED | {"checkpoint": path, "resume": True}
+    end = integrate(orbit, SPAN, Y0, **FIXED).y[:, -1]
+
+    def events(rounding):
+        def at_the_start(t, y):
+            return np.hypot(y[0], y[1]) - 0.4 + rounding
+
+        def at_the_end(t, y):
+            if not 0 <= t <= SPAN[1]:
+                raise ValueError("outside")
+            return y[0] - end[0] + rounding
+
+        return [at_the_start, at_the_end]
+
+    integrate(orbit, SPAN, Y0, events=events(1e-16), **options)
+    assert integrate(orbit, SPAN, Y0, events=events(-2e-16), **options).status == 0
+    with pytest.raises(CheckpointError, match=r"event 0 was .* at the start"):
+        integrate(orbit, SPAN, Y0, events=events(1e-9), **options)
+
+
+def test_a_file_without_values_of_events(tmp_path):
+    """Earlier versions wrote such files."""
+    path = tmp_path / "run"
+    options = FIXED | {"checkpoint": path, "resume": True, "events": [crossing, falling]}
+    whole = integrate(orbit, SPAN, Y0, **options)
+    rewritten(path, lambda h, a: [a.pop("start_events"), a.pop("state_events")])
+    same(whole, integrate(orbit, SPAN, Y0, **options))
+
+
 @pytest.mark.usefixtures("fine")
 def test_functions_may_differ_by_rounding(tmp_path, monkeypatch):
     """The run continues, as on another processor, and its targets remain unchanged."""

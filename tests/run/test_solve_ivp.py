@@ -275,6 +275,13 @@ def test_a_start_that_was_moved_is_reported(solve):
     assert near.diagnostics.moved == ""
 
 
+def test_only_components_of_the_state_are_counted_as_moved():
+    """Derivatives of the state, which a run carries behind it, are not components of y0."""
+    given = {"args": (K,), "invariants": TARGET, "project_initial": True, "method": EIPRK45, "variations": "state"}
+    run = integrate(spring, (0, 1), [1.0, 0.0], **given)
+    assert run.diagnostics.moved.startswith("project_initial moved 1 of 2 components of y0, most of all y0[0], from 1")
+
+
 def test_events_are_evaluated_at_the_projected_start():
     """An event between the given start and the projected one does not happen."""
     sol = solve_ivp(

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.jitted import compiled_like, is_jitted
+from ...core.jitted import compilable, compiled_like, is_compiled, is_jitted, jitted
 from ...engine.native import BUILD
 
-__all__ = ["Motion", "Sizes", "motion", "plain", "vector"]
+__all__ = ["Motion", "Sizes", "changed", "motion", "new_floats", "new_like", "plain", "solve", "vector"]
 
 SOLVE = ctypes.CFUNCTYPE(
     ctypes.c_int64, ctypes.c_void_p, *[ctypes.c_int64] * 2, ctypes.c_double, *[ctypes.c_void_p] * 2
@@ -63,6 +63,69 @@ def plain(function: Any) -> Callable[..., Any]:
     return function.py_func if is_jitted(function) else function
 
 
+def solve(matrices, n, m, tolerance, accelerations, multipliers):
+    """Fill `accelerations` (n,) and `multipliers` (m,) with the solution of M u' + G^T lambda = F, G u' = -gamma.
+
+    `matrices` begins with M, F, G and gamma, arrays of floats by rows, and `tolerance` is that of `motion`. Return the
+    rank of G, or a negative number: `SINGULAR`, `NOT_FINITE`, or another one if there was too little memory.
+    """
+    return SOLVE(matrices.ctypes.data, n, m, tolerance, accelerations.ctypes.data, multipliers.ctypes.data)
+
+
+def changed(matrices, changes, n, m, tolerance, solution, found):
+    """Fill `found` with the derivatives (u', lambda) of `solution`, and return the output of `solve`.
+
+    `changes` are the derivatives of `matrices`, the argument of `solve`. The differentiated equations are
+    M du' + G^T dlambda = dF - dM u' - dG^T lambda and G du' = -dgamma - dG u'. They have the same matrices M and G.
+    """
+    (u, multipliers), F, G, gamma = solution, n * n, n * n + n, n * n + n + m * n
+    work = matrices.copy()
+    for i in range(n):
+        work[F + i] = changes[F + i]
+        for j in range(n):
+            work[F + i] -= changes[i * n + j] * u[j]
+        for k in range(m):
+            work[F + i] -= changes[G + k * n + i] * multipliers[k]
+    for k in range(m):
+        work[gamma + k] = changes[gamma + k]
+        for j in range(n):
+            work[gamma + k] += changes[G + k * n + j] * u[j]
+    return SOLVE(work.ctypes.data, n, m, tolerance, found[0].ctypes.data, found[1].ctypes.data)
+
+
+def _solve_any(matrices, n, m, tolerance, accelerations, multipliers):
+    """Call `solve` for floats, or for complex numbers whose imaginary parts are derivatives (complex steps)."""
+    if matrices.dtype.kind == "f":
+        return solve(matrices, n, m, tolerance, accelerations, multipliers)
+    values = np.ascontiguousarray(matrices.real)
+    solution, found = ((np.empty(n), np.empty(m)) for _ in range(2))
+    rank = solve(values, n, m, tolerance, *solution)
+    changed(values, matrices.imag, n, m, tolerance, solution, found)
+    for out, value, change in zip((accelerations, multipliers), solution, found, strict=True):
+        out[:] = value + 1j * change
+    return rank
+
+
+def new_floats(size, like):
+    """Return a new array of floats, so that no function is compiled for complex states, which C code would misread."""
+    return np.empty(size)
+
+
+def new_like(size, like):
+    """Return a new array with the dtype of the array `like`: for complex steps, that of complex numbers."""
+    return np.empty(size, like.dtype)
+
+
+def _solve_duals(dual: Any) -> Callable[..., int]:
+    """Return `solve` for arrays of numbers of the type `dual`, for compiled code."""
+    from .duals import solve_duals  # which loads Numba
+
+    return solve_duals(dual)
+
+
+solve.for_duals = _solve_duals  # type: ignore[attr-defined]
+
+
 @lru_cache(maxsize=64)
 def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
     """Return the functions of the motion that satisfies M u' + G^T lambda = F and G u' = -gamma.
@@ -77,13 +140,15 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
     """
     nq, n, m = sizes
     matrices = sizes.matrices
+    compiles = is_compiled(fill)
+    solve_now, new = (jitted(compilable(item)) for item in (solve, new_floats)) if compiles else (_solve_any, new_like)
 
     def solved(t, y, rates, accelerations, multipliers, *params):
-        work = np.empty(matrices + nq)
+        work = new(matrices + nq, rates)
         fill(t, y, work, *params)
         for k in range(nq):  # assignments to slices take Numba seconds to compile
             rates[k] = work[matrices + k]
-        rank = SOLVE(work.ctypes.data, n, m, tolerance, accelerations.ctypes.data, multipliers.ctypes.data)
+        rank = solve_now(work, n, m, tolerance, accelerations, multipliers)
         if rank == SINGULAR:
             raise ValueError(SINGULAR_MASS)
         if rank < NOT_FINITE:
@@ -93,7 +158,7 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
     fast = compiled_like(solved, fill)
 
     def rhs(t, y, out, *params):
-        accelerations, multipliers = np.empty(n), np.empty(m)
+        accelerations, multipliers = new(n, out), new(m, out)
         fast(t, y, out, accelerations, multipliers, *params)
         for k in range(n):
             out[nq + k] = accelerations[k]

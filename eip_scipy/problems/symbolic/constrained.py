@@ -6,12 +6,11 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import numpy as np
 import sympy
 
-from ...core.jitted import compiled_like
+from ...core.jitted import compilable, compiled_like, is_compiled, jitted
 from ..multibody.energies import Energy
-from ..multibody.motion import Sizes
+from ..multibody.motion import Sizes, new_floats, new_like
 from ..multibody.outputs import Outputs
 from ..multibody.parts import Parts
 from .parser import symbol
@@ -213,8 +212,11 @@ def _with_inputs(
 
 
 def _with_input(fill: Callable[..., None], function: Callable[..., float], n: int) -> Callable[..., None]:
+    compiles = is_compiled(fill) and is_compiled(function)
+    new = jitted(compilable(new_floats)) if compiles else new_like
+
     def wider(t, y, out, *params):
-        state = np.empty(y.size + 1)
+        state = new(y.size + 1, y)
         for k in range(y.size):
             state[k] = y[k]
         state[y.size] = function(t, y[:n])

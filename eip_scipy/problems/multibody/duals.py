@@ -1,0 +1,49 @@
+"""Derivatives of the accelerations of a constrained system with dual numbers; imported only for compiled functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ...core.dual_arrays import inside
+from ...core.dual_numbers import put_slope, seed, slope, value_of
+from .motion import changed, solve
+
+__all__ = ["solve_duals"]
+
+_solve, _changed = inside(solve), inside(changed)
+
+
+@cache
+def solve_duals(dual: Any) -> Callable[..., int]:
+    """Return the function `solve` of `motion` for arrays of numbers of the type `dual`.
+
+    The library's solver takes addresses of floats. It solves the equations for the values, and the differentiated
+    equations for each direction.
+    """
+    lanes = dual.lanes
+
+    def solved(matrices, n, m, tolerance, accelerations, multipliers):
+        values, changes = np.empty(matrices.size), np.empty(matrices.size)
+        for k in range(matrices.size):
+            values[k] = value_of(matrices[k])
+        solution, found = (np.empty(n), np.empty(m)), (np.empty(n), np.empty(m))
+        rank = _solve(values, n, m, tolerance, solution[0], solution[1])
+        for i in range(n):
+            accelerations[i] = seed(dual, solution[0][i], -1)
+        for k in range(m):
+            multipliers[k] = seed(dual, solution[1][k], -1)
+        for lane in range(lanes):
+            for k in range(matrices.size):
+                changes[k] = slope(matrices[k], lane)
+            _changed(values, changes, n, m, tolerance, solution, found)
+            for i in range(n):
+                accelerations[i] = put_slope(accelerations[i], lane, found[0][i])
+            for k in range(m):
+                multipliers[k] = put_slope(multipliers[k], lane, found[1][k])
+        return rank
+
+    return inside(solved)

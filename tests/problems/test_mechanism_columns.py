@@ -1,0 +1,218 @@
+"""Tangent maps of mechanisms: against closed forms, differences of the flow, and the same pendulum as an equation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy
+from numba import njit
+from scipy.special import ellipe, ellipk
+from sympy.physics import mechanics as me
+
+from eip_scipy import EIPDOP853, ensemble, integrate
+from eip_scipy.problems import mechanics, mechanism
+from eip_scipy.tangent_maps import TrajectoryFit, lyapunov_spectrum, megno, periodic_orbit
+
+G = 9.81
+SPAN = (0.0, 1.0)
+OPTIONS = {"method": EIPDOP853, "h": 0.02}
+TIGHT = {"method": EIPDOP853, "rtol": 1e-12, "atol": 1e-12}
+
+
+def pendulum(angle=1.0, **options):
+    return mechanism([1.0], lambda t, q, u: [-G * np.sin(q[0])], q0=[angle], u0=[0], t_span=SPAN, **options)
+
+
+def double_pendulum():
+    def mass(q):
+        return [[2.0, np.cos(q[0] - q[1])], [np.cos(q[0] - q[1]), 1.0]]
+
+    def forces(t, q, u):
+        sine = np.sin(q[0] - q[1])
+        return [-(u[1] ** 2) * sine - 2 * G * np.sin(q[0]), u[0] ** 2 * sine - G * np.sin(q[1])]
+
+    return mechanism(mass, forces, q0=[1, 0.5], u0=[0, 0.2], t_span=SPAN)
+
+
+def driven():
+    def forces(t, q, u):
+        return [-q[0] - 0.1 * q[1] ** 2, -q[1] - 0.2 * q[0] * q[1] - 0.1 * u[1], -(q[2] ** 3) + np.sin(t) * q[0]]
+
+    problem = mechanism([1, 2, 3], forces, q0=[1, 0.5, 0.3], u0=[0, 0.1, 0], t_span=SPAN)
+    return replace(problem, invariants=())  # derivatives are not carried together with balances
+
+
+def circle(t, q):
+    return [(q[0] ** 2 + q[1] ** 2 - 1) / 2]
+
+
+def twice(t, q):
+    return [(q[0] ** 2 + q[1] ** 2 - 1) / 2, np.sqrt(q[0] ** 2 + q[1] ** 2) - 1]
+
+
+def moving(t, q):
+    return [((q[0] - np.sin(t)) ** 2 + q[1] ** 2 - 1) / 2]
+
+
+def sphere(t, q):
+    return [(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 - 1) / 2]
+
+
+def skate():
+    return mechanism(
+        [1, 1, 0.5], lambda t, q, u: [0, G * 0.1, 0], q0=[0, 0, 0.3], u0=[np.cos(0.3), np.sin(0.3), 0.7], t_span=SPAN,
+        velocity_constraints=lambda t, q, u: [u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])],
+    )  # fmt: skip
+
+
+SYSTEMS = {
+    "1, free": pendulum,
+    "1, other speed": lambda: pendulum(kinematics=lambda t, q, u: u * (1 + q[0] ** 2)),
+    "2, free": double_pendulum,
+    "2, circle": lambda: mechanism([1, 1], [0, -G], circle, q0=[1, 0], u0=[0, 0.5], t_span=SPAN),
+    "2, circle twice": lambda: mechanism([1, 1], [0, -G], twice, q0=[1, 0], u0=[0, 0.5], t_span=SPAN),
+    "2, moving circle": lambda: mechanism([1, 1], [0, -G], moving, q0=[1, 0], u0=[1, 0], t_span=SPAN),
+    "3, free": driven,
+    "3, sphere": lambda: mechanism([1, 1, 1], [0, 0, -G], sphere, q0=[1, 0, 0], u0=[0, 0.5, 0.3], t_span=SPAN),
+    "3, skate": skate,
+}
+
+
+def along_constraints(problem):
+    """Return orthonormal directions (n, k) that keep the constraints at the start."""
+    y, n = problem.y0, problem.y0.size
+    if not problem.constraints:
+        return np.eye(n)
+    (item,) = problem.constraints
+    gradient = np.zeros((item.size, n))
+    getattr(item.gradient, "py_func", item.gradient)(0.0, y, gradient, *item.args)
+    _, sizes, rows = np.linalg.svd(gradient)
+    return rows[np.sum(sizes > 1e-9) :].T
+
+
+def flow_differences(problem, directions, step=1e-4):
+    """Return the derivatives (n, k) of the state at the end along `directions`, by differences of order 4."""
+
+    def last(shift):
+        # A moved start misses the constraints by the square of the step.
+        return integrate(problem, y0=problem.y0 + shift, project_initial=True, **OPTIONS).y[:, -1]
+
+    found = []
+    for d in step * directions.T:
+        found.append((8 * (last(d) - last(-d)) - (last(2 * d) - last(-2 * d))) / (12 * step))
+    return np.array(found).T
+
+
+FAST = ("1, free", "2, circle twice", "3, sphere")  # the others take seconds to compile, too
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SYSTEMS]
+)
+def test_columns_are_differences_of_the_flow(name):
+    problem = SYSTEMS[name]()
+    run, plain = integrate(problem, variations="state", **OPTIONS), integrate(problem, **OPTIONS)
+    assert run.trusted
+    assert plain.trusted
+    np.testing.assert_array_equal(run.y, plain.y)
+    directions = along_constraints(problem)
+    expected = flow_differences(problem, directions)
+    np.testing.assert_allclose(run.stm[-1] @ directions, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.needs_jit
+def test_columns_of_compiled_mechanisms_have_the_accuracy_of_complex_steps():
+    problem = replace(SYSTEMS["3, sphere"](), invariants=())
+    run = integrate(problem, variations="state", **OPTIONS)
+    assert run.columns["source"] == "dual numbers"
+    interpreted = problem.motion.rhs  # accepts complex states
+
+    def fun(t, y):
+        out = np.empty_like(y)
+        interpreted(t, y, out)
+        return out
+
+    other = integrate(fun, SPAN, problem.y0, variations="state", **OPTIONS)
+    assert other.columns["source"] == "complex steps"
+    np.testing.assert_allclose(run.stm[-1], other.stm[-1], rtol=0, atol=1e-13 * np.abs(other.stm[-1]).max())
+
+
+def period_and_slope(angle, omega):
+    """Return the period of a pendulum that is released at `angle`, and its derivative by the angle."""
+    m, K = np.sin(angle / 2) ** 2, ellipk(np.sin(angle / 2) ** 2)
+    slope = (ellipe(m) - (1 - m) * K) / (2 * m * (1 - m)) * np.sin(angle) / 2
+    return 4 * K / omega, 4 * slope / omega
+
+
+def test_matrix_of_a_pendulum_after_its_period():
+    period, slope = period_and_slope(1.0, np.sqrt(G))
+    run = integrate(pendulum(), t_span=(0, period), variations="state", **TIGHT)
+    assert run.trusted
+    np.testing.assert_allclose(run.y[:, -1], [1, 0], atol=1e-10)
+    # A change of the angle changes the phase after the period by that of the period. The other column is the flow.
+    np.testing.assert_allclose(run.stm[-1], [[1, 0], [slope * G * np.sin(1.0), 1]], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_by_parameters_of_a_model():
+    x, v = me.dynamicsymbols("x v")
+    m, k = sympy.symbols("m k")
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    P.set_vel(N, v * N.x)
+    model = me.KanesMethod(N, [x], [v], kd_eqs=[x.diff() - v])
+    model.kanes_equations([me.Particle("A", P, m)], [(P, -k * sympy.sin(x) * N.x)])
+    problem = mechanics(model, {m: 2, k: 3}, {x: 1}, {v: 0}, t_span=SPAN)
+    period = period_and_slope(1.0, np.sqrt(1.5))[0]
+    run = integrate(problem, t_span=(0, period), variations=["state", "k", "m"], **TIGHT)
+    assert run.trusted
+    # The period is proportional to (m / k)^(1/2).
+    pull = 1.5 * np.sin(1.0)
+    expected = [[0, 0], [-period / 6 * pull, period / 4 * pull]]
+    np.testing.assert_allclose(run.sensitivities[-1], expected, atol=1e-9)
+
+
+@njit
+def equation(t, y):
+    return np.array([y[1], -G * np.sin(y[0])])
+
+
+@pytest.mark.slow_without_jit
+def test_tangent_maps_are_those_of_the_equation():
+    problem, start = pendulum(), [1.0, 0.0]
+    period = period_and_slope(1.0, np.sqrt(G))[0]
+    orbit = periodic_orbit(problem, start, 2.2, fixed=[0, 1], **TIGHT)
+    assert orbit.period == pytest.approx(period, rel=1e-10)
+    np.testing.assert_allclose(orbit.multipliers, 1, atol=1e-4)  # a double root
+    both = [(problem, ()), (equation, (start,))]
+    kept = {"invariants": problem.invariants}
+    one, two = (lyapunov_spectrum(fun, (0, 20), *y0, **OPTIONS, **kept).exponents for fun, y0 in both)
+    np.testing.assert_allclose(one, two, rtol=1e-6)
+    one, two = (megno(fun, (0, 20), *y0, **OPTIONS, **kept).megno for fun, y0 in both)
+    assert one == pytest.approx(two, rel=1e-6)
+
+
+def test_fit_of_a_mechanism():
+    problem, times = pendulum(), np.linspace(0, 1, 5)
+    fit = TrajectoryFit(problem, times, np.zeros((2, 5)), free=["state"], **TIGHT)
+    x, step = fit.x0, 1e-5
+    expected = [(fit.residuals(x + d) - fit.residuals(x - d)) / (2 * step) for d in step * np.eye(2)]
+    np.testing.assert_allclose(fit.jacobian(x), np.transpose(expected), atol=1e-8)
+
+
+def test_functions_that_branch_give_columns_too():
+    branching = mechanism(
+        [1.0], lambda t, q, u: [-G * np.sin(q[0]) if np.real(q[0]) > -9 else 0.0], q0=[1], u0=[0], t_span=SPAN
+    )
+    assert "not converted" in repr(branching)
+    found, right = (integrate(problem, variations="state", **TIGHT) for problem in (branching, pendulum()))
+    assert found.columns["source"] == "complex steps"
+    assert found.trusted
+    np.testing.assert_allclose(found.stm[-1], right.stm[-1], atol=1e-10)
+
+
+def test_members_have_the_columns_of_their_runs():
+    problem = SYSTEMS["2, circle"]()
+    starts = np.array([[1.0, 0, 0, 0], [0.6, -0.8, 0, 0]])
+    members = ensemble(problem, SPAN, starts, variations="state", **OPTIONS)
+    for y0, columns in zip(starts, members.variations, strict=True):
+        np.testing.assert_array_equal(columns, integrate(problem, SPAN, y0, variations="state", **OPTIONS).stm[-1])
