@@ -17,13 +17,13 @@ __all__ = ["wrong_duals"]
 Array = np.ndarray
 # Largest difference between values with dual numbers and without, in units of their size and of their differences.
 ROUNDED = 1e-6
-# The same for derivatives and differences. It is larger because differences are less accurate.
+# Largest difference between derivatives and their approximations by differences, in the same units.
 CLOSE = 1e-3
 # Lengths of differences in units of the state, and their rounding in units of the largest value.
 LENGTHS = 10.0 ** -np.arange(2, 13)
 NOISE = 1e-12
 # Distance, in units of the state, of the second state at which they are compared.
-BESIDE = 1e-6
+NEARBY = 1e-6
 
 
 def wrong_duals(
@@ -40,7 +40,7 @@ def wrong_duals(
     ``derivative(t, y, extra)`` returns the derivative (n,) of the state, and `extra` are the run's further arguments.
     `way` is a direction: dy, which has the size of the state y0, and dp, which has the size 1, for the parameters by
     which derivatives are taken. Each component of the values and products of `rhs` is compared with the value of
-    `derivative`, and its differences along the direction, at the start and beside it. At a kink or a jump neither need
+    `derivative`, and its differences along the direction, at the start and near it. At a kink or a jump neither need
     be wrong, so that a component counts as wrong only if it is so at both states.
     """
     as_derivative(derivative(t0, y0, extra), y0.size, y0.dtype, t0, "fun")  # an error of fun has its own message
@@ -50,7 +50,7 @@ def wrong_duals(
     if places:
         sizes = np.abs(extra[0][places])
         way = way[0], way[1] * np.where(sizes > 0, sizes, 1.0)
-    for share in (0.0, BESIDE):
+    for share in (0.0, NEARBY):
         y = y0 + share * way[0]
         own, slopes = _secants(derivative, t0, y, way, places, extra)
         try:

@@ -112,7 +112,7 @@ def test_circular_kepler_for_long(metric, eccentricity):
     ("method", "steps", "allowed"), [(EIPRKN12, 24, 5e-12), (EIPGJ14, 90, 1e-12), (EIPDOP853, 100, 1e-11)]
 )
 def test_nearly_parallel_gradients_do_not_amplify_rounding(method, steps, allowed, eccentricity):
-    """What H and L know of the direction in which their gradients differ was divided by the sine of the angle."""
+    """The rounding errors of the defects were divided by the sine of the angle between the gradients."""
     problem = kepler(eccentricity, 0.0)
     run = integrate(problem, (0, 200 * np.pi), method=method, h=2 * np.pi / steps)
     assert run.trusted
