@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engine.data import AUTO, N_NODE_PLACES, Multistep
-from ..methods.multistep import GaussJackson, damping_limit, stability_limit, weights
+from ..methods.multistep import GaussJackson, longest_stable, stability_limit, weights
 from .runs import Run, Start
 from .stepping import Stepping
 
@@ -108,12 +108,13 @@ def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, chec
             "longer steps, such as EIPRKN12."
         )
     if method.velocities:
-        strongest, limit = _largest_damping(system), damping_limit(method.order)
-        if check and not h * strongest <= limit:
+        strongest = _largest_damping(system)
+        part = longest_stable(method.order, corrects, h * fastest, h * strongest) if check and strongest > 0.0 else 1.0
+        if part < 1.0:
             raise ValueError(
                 f"{name}: h = {h:g} is not stable, because the derivative of the accelerations with respect to the "
                 f"velocity is too large: its largest eigenvalue at the start has the size {strongest:.4g}. Take h <= "
-                f"{limit / strongest:.3g}, or a Runge-Kutta method such as EIPDOP853."
+                f"{part * h:.3g}, or a Runge-Kutta method such as EIPDOP853."
             )
     width = 2 if y0.dtype.kind == "c" else 1
     places = np.flatnonzero(corrected)

@@ -13,7 +13,15 @@ import numpy as np
 
 from .orders import Ordered
 
-__all__ = ["GaussJackson", "Weights", "damping_limit", "interpolation_weights", "stability_limit", "weights"]
+__all__ = [
+    "GaussJackson",
+    "Weights",
+    "damping_limit",
+    "interpolation_weights",
+    "longest_stable",
+    "stability_limit",
+    "weights",
+]
 
 LEAST_ORDER, LARGEST_ORDER = 4, 16
 # Order of the difference that has the shape of the errors and is still far above rounding at small steps.
@@ -274,26 +282,65 @@ def interpolation_weights(order: int) -> np.ndarray:
 
 
 @cache
+def _step_weights(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the weights of a_n, a_(n-1), ... in differences of what the method predicts, newest first.
+
+    They are those of the second difference of the position, over h^2; of the second difference of the position that is
+    corrected minus the predicted one, by the newest node and by the others; and of the first difference of the
+    velocity, over h.
+    """
+    P, V, D = (
+        np.array([float(c) for c in weights])
+        for weights in (position_weights(-1, order), velocity_weights(-1, order), correction_weights(order))
+    )
+    positions, velocities = np.convolve(P, [1.0, -2.0, 1.0]), np.convolve(V, [1.0, -1.0])
+    positions[0] += 1.0
+    velocities[0] += 1.0
+    return positions, D[:1], np.convolve(np.append(0.0, D[1:]), [1.0, -2.0, 1.0]), velocities
+
+
+def _growth(order: int, corrected: bool, square: float, damping: complex) -> float:
+    """Return the largest growth of a mode in a step, for h^2 q'' = -square q - damping h v.
+
+    It is the largest modulus of a root of the characteristic polynomial, including the roots of the solution.
+    """
+    positions, newest, others, velocities = _step_weights(order)
+    predicted = square * positions + damping * np.convolve(velocities, [1.0, -1.0])
+    polynomial = np.zeros(order + 3, complex)
+    polynomial[:3] += [1.0, -2.0, 1.0]
+    polynomial[1:] += (1.0 - square * newest[0]) * predicted if corrected else predicted
+    if corrected:
+        polynomial += square * others
+    return float(np.abs(np.roots(polynomial)).max())
+
+
+def longest_stable(order: int, corrected: bool, fast: float, damped: float) -> float:
+    """Return the largest part of a step h, at most 1, with which a method is stable.
+
+    Parameters
+    ----------
+    order, corrected : int, bool
+        As those of `GaussJackson`.
+    fast : float
+        h omega, for q'' = -omega^2 q.
+    damped : float
+        h c, for the additional term -c v (friction) or i c v (rotation).
+    """
+
+    def stable(part: float) -> bool:
+        square = (part * fast) ** 2
+        return all(_growth(order, corrected, square, part * w) <= 1.0 + GROWTH for w in (damped, 1j * damped))
+
+    return 1.0 if stable(1.0) else _largest(stable, 1.0)
+
+
+@cache
 def damping_limit(order: int) -> float:
     """Return the largest h c for which the method is stable for q'' = -c v (friction) and q'' = i c v (rotation).
 
     Velocities are predicted as in Adams-Bashforth methods.
     """
-    P = np.array([float(c) for c in velocity_weights(-1, order)])
-    # a_(n+1) = -c v^p_(n+1), whose first difference is that of h (s_n + sum_j P_j a_(n-j)).
-    predicted = np.convolve(P, [1.0, -1.0])
-    predicted[0] += 1.0
-
-    def stable(x: float) -> bool:
-        def largest(z: complex) -> float:
-            polynomial = np.zeros(order + 2, complex)
-            polynomial[:2] += [1.0, -1.0]
-            polynomial[1:] += z * predicted
-            return float(np.abs(np.roots(polynomial)).max())
-
-        return max(largest(x), largest(1j * x)) <= 1.0 + GROWTH
-
-    return _largest(stable)
+    return _largest(lambda x: max(_growth(order, False, 0.0, w) for w in (x, 1j * x)) <= 1.0 + GROWTH)
 
 
 @cache
@@ -303,29 +350,11 @@ def stability_limit(order: int, corrected: bool) -> float:
     `corrected` is that of `GaussJackson`. The method is called stable if no root of the characteristic polynomial has a
     modulus above 1 + `GROWTH`, including the two roots of the solution.
     """
-    P = np.array([float(c) for c in position_weights(-1, order)])
-    D = np.array([float(c) for c in correction_weights(order)]) if corrected else np.zeros(order + 1)
-    second = np.array([1.0, -2.0, 1.0])
-    # The predicted position's second difference: a_n and that of sum_j P_j a_(n-j); one entry a step, newest first.
-    predicted = np.convolve(P, second)
-    predicted[0] += 1.0
-
-    def stable(x: float) -> bool:
-        z = x * x
-        polynomial = np.zeros(order + 3)
-        polynomial[:3] += second
-        polynomial[1 : 1 + predicted.size] += z * (1.0 - z * D[0]) * predicted
-        rest = D.copy()
-        rest[0] = 0.0
-        change = z * np.convolve(rest, second)
-        polynomial[: change.size] += change
-        return bool(np.abs(np.roots(polynomial)).max() <= 1.0 + GROWTH)
-
-    return _largest(stable)
+    return _largest(lambda x: _growth(order, corrected, x * x, 0.0) <= 1.0 + GROWTH)
 
 
-def _largest(stable: Callable[[float], bool]) -> float:
-    low, high = 0.0, 2.0
+def _largest(stable: Callable[[float], bool], high: float = 2.0) -> float:
+    low = 0.0
     while high - low > 1e-6 * high:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stable(middle) else (low, middle)

@@ -363,7 +363,7 @@ def test_velocities_are_found_in_solve_ivp():
         errors.append(np.abs(solution.y[0] - exact).max())
     assert 8 < np.log(errors[0] / errors[1]) / np.log(0.1 / 0.08) < 12
     with pytest.raises(
-        ValueError, match=r"with respect to the velocity is too large: .* 0\.1\. Take h <= 0\.00887, or"
+        ValueError, match=r"with respect to the velocity is too large: .* 0\.1\. Take h <= 0\.00872, or"
     ):
         solve_ivp(damped, (0, 20), [1.0, 0.0], method=EIPGJ12, h=0.05)
 

@@ -1,16 +1,19 @@
 """The coefficients of Gauss-Jackson's methods, and the limits of their stability."""
 
+import math
 from fractions import Fraction
 from math import comb
 
 import numpy as np
 import pytest
 
-from eip_scipy import eip_method
+from eip_scipy import EIPGJ12, eip_method, integrate
 from eip_scipy.methods import GaussJackson
 from eip_scipy.methods.multistep import (
     correction_weights,
+    damping_limit,
     interpolation_weights,
+    longest_stable,
     position_series,
     position_weights,
     stability_limit,
@@ -134,6 +137,26 @@ def test_stability_limit(order, corrected):
     limit = stability_limit(order, corrected)
     assert amplitude(order, corrected, 0.97 * limit) < 2
     assert amplitude(order, corrected, 1.3 * limit) > (1e3 if order >= 10 else 1.05)
+
+
+def test_stability_with_weak_damping():
+    """A step within the limits for both alone may be unstable, as the error of a damped oscillator shows."""
+    fast, damped = 0.05, 5e-4
+    assert fast < stability_limit(12, False)
+    assert damped < damping_limit(12)
+    part = longest_stable(12, False, fast, damped)
+    assert 0.5 < part < 1.0
+    assert longest_stable(12, False, 0.9 * part * fast, 0.9 * part * damped) == 1.0
+
+    def fun(t, y):
+        return np.array([y[1], -y[0] - 0.01 * y[1]])
+
+    with pytest.raises(ValueError, match=r"h = 0.05 is not stable, .* Take h <= 0\.0[34]"):
+        integrate(fun, (0, 50), [1.0, 0.0], method=EIPGJ12, h=fast)
+    run = integrate(fun, (0, 50), [1.0, 0.0], method=EIPGJ12, h=0.95 * part * fast)
+    omega = math.sqrt(1 - 0.005**2)
+    exact = math.exp(-0.25) * (math.cos(50 * omega) + 0.005 / omega * math.sin(50 * omega))
+    assert abs(run.y[0, -1] - exact) < 1e-13
 
 
 def test_limits_fall_with_the_order():
