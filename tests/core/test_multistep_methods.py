@@ -424,6 +424,15 @@ def test_nystrom_methods_end_where_accelerations_come_to_depend_on_velocities(fu
         assert "depend on the velocity" in members.message[0]
 
 
+def test_a_function_that_is_not_defined_for_other_velocities_does_not_depend_on_them():
+    def fun(t, y):
+        return [y[1], -y[0] if abs(y[1]) < 1 + 1e-9 else np.nan]
+
+    run = integrate(fun, (0, 20), [1.0, 0.0], method=EIPRKN12, h=0.05)
+    assert run.success
+    assert abs(run.y[0, -1] - np.cos(20)) < 1e-12
+
+
 def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
     """The step is refused at the start, from the orbits or from the accelerations alone."""
     problem = solar_system(years=10)

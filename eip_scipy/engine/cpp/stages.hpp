@@ -66,22 +66,24 @@ inline bool made_with_rates(const RunOf<W, System> &run, const Step &step) {
 
 // About once in this number of steps a Nystrom method checks whether accelerations depend on velocities at the present state.
 constexpr int64_t VELOCITY_EACH = 8;
+constexpr double VELOCITY_SHIFT = 0x1p-6;  // change of the velocities in this check, relative to the largest
 
-// Returns whether the accelerations at y = (q, v) are others with other velocities. Only the number of evaluations says how many
-// steps have been made.
+// Returns whether the accelerations at y = (q, v) are others with velocities that differ a little, so that a function is hardly asked
+// where it is not defined. Only the number of evaluations says how many steps have been made.
 template <class AnyRun>
 [[gnu::cold, gnu::noinline]] inline bool depends_on_velocity(const AnyRun &run, double t, const double *y) {
     const auto &w = run.work;
     const int64_t half = w.m / 2;
+    const double fastest = largest_abs(y + half, half), shift = VELOCITY_SHIFT * (fastest > 0.0 ? fastest : 1.0);
     copy(y, w.stage, w.m);
     run.system.rhs_of_scratch(w, t, w.stage, w.row(1));
-    for (int64_t i = half; i < w.m; ++i) w.stage[i] = 1.5 * y[i] + 1.0;
     copy(y, w.stage, half);
+    for (int64_t i = half; i < w.m; ++i) w.stage[i] = y[i] + shift;
     run.system.rhs_of_scratch(w, t, w.stage, w.f_point);
     w.counters[NFEV] += 2;
     for (int64_t i = half; i < w.m; ++i) {
-        const double a = w.row(1)[i], b = w.f_point[i];
-        if (a != b && !(std::isnan(a) && std::isnan(b))) return true;
+        const double here = w.row(1)[i], there = w.f_point[i];
+        if (here != there && std::isfinite(here) && std::isfinite(there)) return true;
     }
     return false;
 }
