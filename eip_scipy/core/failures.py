@@ -54,7 +54,7 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     if status == BY_VELOCITY:
         return (
             f"at t={clock[TIME]:.10g} the accelerations in {run.called} depend on the velocity, and a Nystrom method "
-            "does not integrate such equations; the states of the last 8 steps or so may be wrong. Use a Runge-Kutta "
+            "does not integrate such equations; the states of the last 4 steps or so may be wrong. Use a Runge-Kutta "
             "method such as EIPDOP853, or EIPGJ12 with small steps"
         )
     message = projection_failure(run.invariants, run.work, clock[TIME_NEW])
@@ -66,10 +66,13 @@ def _unstable(run: Run) -> str:
     history = run.method.multistep
     assert history is not None  # only multistep methods return this code
     t = history.t0 + int(history.place[NEWEST]) * history.h
+    others = "EIPRKN12 if there are close encounters or forces that jump"
+    if history.uses_v:
+        others = "EIPDOP853 if there are close encounters, forces that jump, or strong forces that depend on velocities"
     return (
         f"the step is too long, or the motion not smooth, at t={t:.10g}: with h={abs(history.h):g} the differences "
         f"of order {history.predict_q.size} of the accelerations are not small compared with the accelerations. "
-        "Use a shorter step, or a one-step method such as EIPRKN12 if there are close encounters or forces that jump"
+        f"Use a shorter step, or a one-step method such as {others}"
     )
 
 

@@ -756,8 +756,8 @@ class EIPRKN8(EIPSolver):
     Notes
     -----
     Accelerations must not depend on velocities. With `fun` this is checked at the start, where it raises ValueError,
-    and in about every eighth step, with two evaluations: a run in which they come to depend on them ends there with
-    status -1.
+    and in about every fourth step, with two evaluations: a run in which they come to depend on them ends there with
+    status -1. A force that acts for fewer steps can be missed.
     """
 
     TABLEAU = RKN86

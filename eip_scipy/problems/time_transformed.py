@@ -35,10 +35,10 @@ def centre_time(y, params):
 def pair_time(y, params):
     """Return (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2), a smooth time scale of the closest pair of N bodies.
 
-    `y` begins with the N positions in space, and `params` holds the N values Gm_i.
+    `y` holds the N positions and the N velocities in space, and `params` begins with the N values Gm_i.
     """
     rate2 = 0.0
-    for i in range(params.size):
+    for i in range(y.size // 6):
         for j in range(i):
             x, y_, z = y[3 * i] - y[3 * j], y[3 * i + 1] - y[3 * j + 1], y[3 * i + 2] - y[3 * j + 2]
             r2 = x * x + y_ * y_ + z * z

@@ -23,6 +23,7 @@ from eip_scipy.problems import (
     pythagorean,
     reaches,
     solar_data,
+    solar_system,
     time_transformed,
 )
 from eip_scipy.problems.gravity.scenes import FIGURE_EIGHT_PERIOD
@@ -191,6 +192,16 @@ def test_transformed_problem_has_the_same_invariants(make, g):
         np.testing.assert_array_equal(before, after)
     for item in other.invariants:
         assert check_gradient(item, 0.0, y, fun=other.fun) < 1e-6
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("forces", [(), "j2", "1pn"])
+def test_fictitious_time_of_problems_whose_parameters_are_more_than_the_masses(forces):
+    problem = solar_system(years=1, forces=forces)
+    run = integrate(time_transformed(problem, 1e6), method=EIPDOP853, h=0.05, events=reaches(1.0))
+    assert run.success
+    truth = integrate(problem, method=EIPDOP853, h=1 / 400)
+    np.testing.assert_allclose(run.y[:-1, -1], truth.y[:, -1], rtol=0, atol=1e-9)
 
 
 @pytest.mark.needs_jit

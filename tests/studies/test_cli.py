@@ -433,6 +433,8 @@ def test_a_file_that_cannot_be_written_at_the_end_leaves_the_table(tmp_path, cap
         (["solar-system", "--years", "0"], "--years: expected a positive number"),
         (["solar-system", "--years", "inf"], "--years: expected a positive number"),
         (["solar-system", "--h", "nan"], "--h: expected a positive number"),
+        (["study", "growth", "--years", "0"], "--years: expected a positive number"),
+        (["study", "growth", "--years", "0.1"], "--years must be at least 1, where the reference begins, got 0.1"),
         (["solar-system", "--years", "1", "--h", "2"], "`h` exceeds bounds"),
         (["solar-system", "--h", "1e-20"], "`h` is too small"),
         (["solar-system", "--method", "EIPRK9"], "'EIPRK9' (choose from"),

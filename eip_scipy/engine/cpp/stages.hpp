@@ -65,7 +65,7 @@ inline bool made_with_rates(const RunOf<W, System> &run, const Step &step) {
 }
 
 // About once in this number of steps a Nystrom method checks whether accelerations depend on velocities at the present state.
-constexpr int64_t VELOCITY_EACH = 8;
+constexpr int64_t VELOCITY_EACH = 4;
 constexpr double VELOCITY_SHIFT = 0x1p-6;  // change of the velocities in this check, relative to the largest
 
 // Returns whether the accelerations at y = (q, v) are others with velocities that differ a little, so that a function is hardly asked

@@ -20,7 +20,8 @@ from eip_scipy import EIPGJ14, EIPRKN12, integrate
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import load, reference_states
 
-from ..report import needed, table
+from ..long_runs import positive
+from ..report import UsageError, needed, table
 from ..solar.runs import orbits_kept
 from ..study import Figures, Measurement, Rows, Session, option
 from .orbits import ORDERS, rebound_states, reordered
@@ -96,11 +97,16 @@ class Growth(Measurement[Found]):
     """Command ``eip-scipy study growth``."""
 
     writes_files = True
-    years: float = option(10_000.0, "length of the runs in Julian years (default: %(default)s)", type=float)
+    years: float = option(10_000.0, "length of the runs in Julian years (default: %(default)s)", type=positive)
 
     def measure(self, session: Session) -> Found:
         needed("eip_scipy.integrations.rebound")  # checked before runs that take minutes
-        known = {t: y for t, y in reference_states().items() if t <= self.years}
+        reference = reference_states()
+        known = {t: y for t, y in reference.items() if t <= self.years}
+        if not known:
+            raise UsageError(
+                f"--years must be at least {min(reference):g}, where the reference begins, got {self.years:g}"
+            )
         times, truth = np.array(list(known)), np.array(list(known.values())).T
         problem = solar_system(years=times[-1])
         seconds, states = {}, {}

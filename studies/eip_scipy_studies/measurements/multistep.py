@@ -1,4 +1,4 @@
-"""``eip-scipy study multistep``: EIPGJ14 and EIPGJ12, one evaluation a step, against EIPRKN12 and other packages.
+"""``eip-scipy study multistep``: Gauss-Jackson methods, one evaluation a step, against EIPRKN12 and other packages.
 
 1. Ten bodies, Newton, 1000 years: each method runs once in each of six orientations of the axes (the original one and
    five random ones), in turns. Errors of position [AU] against the packaged reference state: Mercury's, the least and
@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRKN12, integrate
+from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRKN12, eip_method, integrate
+from eip_scipy.methods import GaussJackson
 from eip_scipy.problems import Problem, kepler, solar_system
 from eip_scipy.problems.gravity.solar_data import reference_states
 
@@ -38,7 +39,8 @@ __all__ = ["Multistep"]
 ROTATIONS = 6
 REPEATS = 200  # for runs of milliseconds
 END, WANTED = 600.0, 1e-9
-OURS = ("EIPGJ14", "EIPGJ12", "EIPRKN12")
+OURS = ("EIP_GJ16", "EIPGJ14", "EIPGJ12", "EIPRKN12")
+EIP_GJ16 = eip_method(GaussJackson(order=16, corrected=True))
 Table = dict[str, Row]
 
 
@@ -85,6 +87,8 @@ def thousand_years(quick: bool) -> Table:
 
     def methods(turned: Problem, turn: int) -> Methods:
         return {
+            **yearly("EIP_GJ16", by_us(turned, EIP_GJ16), 300, 325, 350),
+            **yearly("EIP_GJ16, every=100", by_us(turned, EIP_GJ16, every=100), 330, 350),
             **yearly("EIPGJ14", by_us(turned, EIPGJ14), 260, 300, 350, 405, 440, 500, 600, 768),
             **yearly("EIPGJ12", by_us(turned, EIPGJ12), 592),
             **yearly("EIPRKN12", by_us(turned, EIPRKN12, every=10, compensated=True), 44, 64),
