@@ -1,6 +1,7 @@
 """Charged particles: fields against the paper's formulas in 30 digits, invariants, observables, user-defined fields."""
 
 import math
+import re
 from dataclasses import replace
 
 import mpmath as mp
@@ -356,6 +357,76 @@ def test_differences_take_the_fields_length():
     x = np.array([0.3, -0.2, 0.5]) * small
     jacobian = np.array(field.functions.jacobian(0.0, *x))
     assert jacobian[0, 2] == pytest.approx(x[1] / small * math.sin(0.5), rel=1e-11)
+
+
+def start_of_differences(field, position):
+    return charged_particle(field, position, [0.0, 0.1, 0.0], t_span=(0.0, 1.0))
+
+
+def wiggler(x, y, z):
+    return 0.0, math.sin(100 * x) / 100, 0.0
+
+
+def narrow(x, y, z):
+    """Return a vector potential that underflows to 0 within the default step."""
+    around = math.exp(-(x * x + y * y) / 1e-12)
+    return -around * y, around * x, 0.0
+
+
+@pytest.mark.parametrize("form", ["canonical", "velocity"])
+def test_a_length_that_does_not_fit_is_told(form):
+    """In SI units at 1 au the default step is lost in rounding; the length in the warning gives the exact helix."""
+    place, B, charge, mass, speed = 1.5e11, 5e-9, 1.602e-19, 1.6726e-27, 3e7
+    omega = charge * B / mass
+    field = ParticleField(lambda x, y, z: (-B * y / 2, B * x / 2, 0.0), axisymmetric=True)
+    end = 20 * 2 * math.pi / omega
+    start, velocity = [place, 0, 0], [0, 0.8 * speed, 0.6 * speed]
+    options = {"t_span": (0.0, end), "h": end / 1200, "mass": mass, "charge": charge, "form": form}
+    with pytest.warns(UserWarning, match="length=1 does not fit the field at .* relative error of 0.00") as told:
+        charged_particle(field, start, velocity, **options)
+    assert len(told) == 1
+    assert told[0].filename == __file__
+    named = float(re.search(r"set length=(\S+) ", str(told[0].message))[1])
+    problem = charged_particle(replace(field, length=named), start, velocity, **options)
+    run = integrate(problem, method=EIPDOP853)
+    exact = [place, 0.0, 0.6 * speed * end]
+    np.testing.assert_allclose(run.y[:3, -1], exact, rtol=0, atol=1e-5 * 0.8 * speed / omega)
+    assert run.max_defect[0] < 1e-10 * abs(run.target[0])
+
+
+@pytest.mark.parametrize(
+    ("field", "position", "words"),
+    [
+        (ParticleField(wiggler), [1e-3, 0.0, 0.0], "vector_potential .* give jacobian or magnetic"),
+        (ParticleField(narrow), [1e-7, 1e-7, 0.0], "vector_potential have a relative error of 1,"),
+        (ParticleField(constant_a), [1e17, 1.0, 0.0], "vector_potential have a relative error of 1,"),
+        (
+            ParticleField(constant_a, potential=lambda x, y, z: math.sin(80 * x)),
+            [1.0, 0.0, 0.0],
+            "potential .* give electric",
+        ),
+    ],
+)
+def test_lengths_too_long_or_too_short(field, position, words):
+    with pytest.warns(UserWarning, match=words) as told:
+        start_of_differences(field, position)
+    named = float(re.search(r"set length=(\S+) ", str(told[0].message))[1])
+    assert start_of_differences(replace(field, length=named), position).invariants
+
+
+@pytest.mark.parametrize(
+    ("vector_potential", "position"),
+    [
+        (constant_a, [1e6, 2e5, -3e5]),
+        (lambda x, y, z: (1.0, 2.0, 3.0), [1.0, 2.0, 3.0]),  # no field
+        (lambda x, y, z: (2 * x * y, x * x, 0.0), [1.1, 0.2, 0.3]),  # no field
+        (lambda x, y, z: (0.0, 0.0, x * x - y * y), [0.0, 1e-12, 0.0]),  # almost none where the particle starts
+        (lambda x, y, z: (-math.log(math.cosh(z)), 1e3, 0.0), [0.0, 0.0, 1e-9]),
+        (lambda x, y, z: (y * math.sqrt(x), 0.0, 0.0), [0.03, 1.0, 0.0]),  # defined in a half of space only
+    ],
+)
+def test_a_length_that_fits_is_not_told(vector_potential, position):
+    assert start_of_differences(ParticleField(vector_potential), position).invariants
 
 
 @pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
