@@ -39,7 +39,7 @@ inline void evaluate_raw(const AnyRun &run, const Step &step) {
         auto &system = run.system;
         system.at_raw = Known::NOTHING;
         if (step.project && (system.together || system.with_energy))
-            return system.evaluate_for_projection(w, step.t_new, w.y_hat, w.last());
+            return system.evaluate_for_projection(w, w.y_hat, w.last());
         if (!is_for_projection(run.options, step)) return system.rhs_of_whole(w, step.t_new, w.y_hat, w.last());
     }
     run.system.rhs(w, step.t_new, w.y_hat, w.last());

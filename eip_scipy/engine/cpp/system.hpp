@@ -156,7 +156,7 @@ struct System {
     // Computes the derivative at the raw result of a step that will be projected, and the quantities that the same pass gives:
     // `together` or `with_energy` is set.
     template <class W>
-    void evaluate_for_projection(const W &w, double t, const double *y, double *out) {
+    void evaluate_for_projection(const W &w, const double *y, double *out) {
         if (together) {
             together->all(y, out, w.values, w.G, params);
             at_raw = Known::ALL;
