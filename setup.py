@@ -37,7 +37,8 @@ INCLUDED = [NANOBIND / "include", NANOBIND / "ext" / "robin_map" / "include", NU
 # out are about Python's own interface.
 FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
 FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
-EVERY, V3, QUICK, OLD = [*COMPILER.every], [*COMPILER.v3], "-O1", "-O1"
+EVERY, V3, QUICK = [*COMPILER.every], [*COMPILER.v3], "-O1"
+OLD = "-Os" if TARGET.system == "win32" else "-O1"  # the wheels of Windows are the largest
 # Not our headers: without warnings. The library handles Python's objects under several types.
 OTHERS = [f"-isystem{path}" for path in INCLUDED]
 if TARGET.stable:
