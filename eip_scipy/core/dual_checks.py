@@ -12,7 +12,7 @@ from .states import as_derivative
 if TYPE_CHECKING:
     from .variations import Columns
 
-__all__ = ["wrong_duals"]
+__all__ = ["shifted", "wrong_duals"]
 
 Array = np.ndarray
 # Largest difference between values with dual numbers and without, in units of their size and of their differences.
@@ -105,16 +105,11 @@ def _secants(
 
     They have k lengths, because none suits all functions. Where the function raises an exception, they are NaN.
     """
-    dy, dp = way
+    direction = np.concatenate(way)
 
     def at(s: float) -> Array:
-        arguments = extra
-        if places:
-            params = extra[0].copy()
-            params[places] += s * dp
-            arguments = (params,)
         try:
-            return derivative(t, y + s * dy, arguments)
+            return shifted(derivative, t, y, s * direction, places, extra)
         except MemoryError:
             raise
         except Exception:  # the run does not visit this state
@@ -122,3 +117,17 @@ def _secants(
 
     with np.errstate(all="ignore"):
         return at(0.0), np.array([(at(s) - at(-s)) / (2.0 * s) for s in LENGTHS])
+
+
+def shifted(
+    derivative: Callable[..., Array], t: float, y: Array, shift: Array, places: list[int], extra: tuple
+) -> Array:
+    """Return ``derivative(t, y, extra)`` for a state (n,) and parameters that are shifted by `shift` (n + p,).
+
+    `places` are the indices in the run's parameters to which the last p components of `shift` belong.
+    """
+    if places:
+        params = extra[0].astype(shift.dtype)
+        params[places] += shift[y.size :]
+        extra = (params,)
+    return derivative(t, y + shift[: y.size], extra)

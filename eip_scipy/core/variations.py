@@ -16,7 +16,7 @@ from ..engine.data import Columns as KeptColumns
 from ..engine.native import BUILD, LibraryFunction
 from .arguments import scalars
 from .blocks import INDEX
-from .dual_checks import wrong_duals
+from .dual_checks import shifted, wrong_duals
 from .gradients import NumericalGradient, difference_gradient, random_directions, typical_sizes
 from .inputs import filled, reals, require_arguments, shown
 from .invariants import Invariant
@@ -571,7 +571,7 @@ def _by_complex_steps(
     Raises
     ------
     ValueError
-        If complex steps are wrong at the start. The message contains `why`, the reason why there are no other products.
+        If complex steps are wrong at the start. The message contains `why`, the reason why products are not compiled.
     """
     derivative, places = _derivative(fun, form, y0), list(columns.parameters)
     products = _ComplexSteps(derivative, y0, places)
@@ -695,12 +695,7 @@ class _ComplexSteps:
 
     def _along(self, t: float, shares: Array, y: Array, rows: Array, extra: tuple) -> Array:
         """Return the derivative at the state, and the parameters, shifted by ``shares @ rows``."""
-        shift, n = shares @ rows, y.size
-        if self._places:
-            params = extra[0].astype(shift.dtype)
-            params[self._places] += shift[n:]
-            extra = (params,)
-        return self._derivative(t, y + shift[:n], extra)
+        return shifted(self._derivative, t, y, shares @ rows, self._places, extra)
 
 
 def _difference(
@@ -710,13 +705,10 @@ def _difference(
 
     `places` are the indices in the run's parameters to which the components of dp belong.
     """
+    direction = np.concatenate([dy, dp])
 
     def along(s: Array) -> Array:
-        if not places:
-            return derivative(t, y + s[0] * dy, extra)
-        params = extra[0].copy()
-        params[places] += s[0] * dp
-        return derivative(t, y + s[0] * dy, (params,))
+        return shifted(derivative, t, y, s[0] * direction, places, extra)
 
     return np.asarray(difference_gradient(along, np.zeros(1), np.full(1, 1e-2)))[..., 0]
 
