@@ -24,14 +24,8 @@ BY_NAME = (
 class AccelerationField:
     """First-order right-hand side ``f(t, y[, *args]) = (v, a)`` of y = (q, v), made from an acceleration.
 
-    `integrate` and the functions built on it call the acceleration itself. The object can be pickled if the
-    acceleration can.
-
-    Parameters
-    ----------
-    acceleration : callable
-        ``acceleration(t, q, *args) -> (n/2,)``, or ``acceleration(t, q, out, *args)`` with `in_place`.
-    in_place : bool, optional
+    This is ``acceleration(t, q, *args) -> (n/2,)``, or ``acceleration(t, q, out, *args)`` with `in_place`. `integrate`
+    and the functions built on it call the acceleration itself. The object can be pickled if the acceleration can.
     """
 
     def __init__(self, acceleration: Callable[..., Any], in_place: bool = False) -> None:
@@ -52,15 +46,9 @@ class AccelerationField:
 def named_accelerations(
     method: str, fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray
 ) -> Iterator[None]:
-    """Run the body of a ``with`` statement, and explain its error if `fun` is an acceleration, not a right-hand side.
+    """Run the body of a ``with`` statement, and raise a ValueError for its error if `fun` is an acceleration.
 
-    The body calls `fun` for the first time. `method` is the name of the method, and `extra` are further arguments of
-    `fun`.
-
-    Raises
-    ------
-    ValueError
-        If the body fails and `fun` is an acceleration. The message names the argument for accelerations.
+    The body calls `fun` for the first time. `method` is the method's name, and `extra` are further arguments of `fun`.
     """
     try:
         yield
@@ -80,15 +68,6 @@ def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, .
     The function is called with y, and then with q in place of y. Numba functions are called as Python code, and C
     functions with y only, because compiled code could read or write beyond the end of a shorter array. For the same
     reason q is passed as the first half of an array as long as y.
-
-    Parameters
-    ----------
-    fun : callable
-    in_place : bool
-    extra : tuple
-        Further arguments of `fun`.
-    t : float
-    y : ndarray, shape (n,)
     """
     code = getattr(fun, "py_func", fun)
     sizes = (y.size,) if isinstance(fun, PointerFunction) else (y.size, y.size // 2)
@@ -108,10 +87,7 @@ def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: n
 
 
 def _fills(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
-    """Return True if `fun` fills the first `count` components of its argument out with finite numbers, and no others.
-
-    Return False also if `fun` raises an exception.
-    """
+    """Return True if `fun` raises no error and fills the first `count` entries of out, and no others, with numbers."""
     out = np.full_like(state, np.nan)
     try:
         with np.errstate(all="ignore"):

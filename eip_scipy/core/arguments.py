@@ -26,13 +26,7 @@ class Packed(NamedTuple):
 
 
 def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
-    """Return the last arguments of the functions of a run as a tuple: `args`, ``(params,)``, or () if both are None.
-
-    Raises
-    ------
-    TypeError
-        If both are given, if `args` cannot be unpacked or contains a unit, or if `params` are not numbers.
-    """
+    """Return the last arguments of the functions of a run as a tuple: `args`, ``(params,)``, or () if both are None."""
     if args is None:
         return () if params is None else (parameter_values(params).reshape(-1),)
     if params is not None:
@@ -63,10 +57,7 @@ def parameter_values(params: Any) -> np.ndarray:
 
 
 def scalars(extra: tuple[Any, ...]) -> str | None:
-    """Return the types of the numbers in `extra`, see `Packed`; "" for one array or no arguments.
-
-    Return None if `extra` contains anything else, which only Python can pass.
-    """
+    """Return the types of the numbers in `extra`, see `Packed`; "" for an array or none; None for anything else."""
     if _is_array(extra):
         return ""
     types = [_type(item) for item in extra]
@@ -74,10 +65,7 @@ def scalars(extra: tuple[Any, ...]) -> str | None:
 
 
 def floats(extra: tuple[Any, ...]) -> np.ndarray:
-    """Return further arguments, one array or some numbers, as an array of floats for native functions.
-
-    The array is empty if there are no arguments, or if one of them can only be passed by Python, see `scalars`.
-    """
+    """Return further arguments as an array of floats for native functions; it is empty if only Python can pass them."""
     if _is_array(extra):
         return np.asarray(extra[0])
     return np.array(extra if scalars(extra) else (), float)

@@ -20,10 +20,7 @@ N_LEFT = 7
 
 
 class Settings(NamedTuple):
-    """The values, after the last step, of the attributes of a solver that a user may set between two steps.
-
-    An attribute whose value is not the same object any more has been set since then.
-    """
+    """Attributes of a solver, after the last step, that a user may set; one that is another object now has been set."""
 
     t: float
     y: np.ndarray
@@ -50,15 +47,7 @@ def is_state(y: np.ndarray, kept: bytes | np.ndarray) -> bool:
 
 
 def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
-    """Return a state or a derivative that the user has set, as a new array of the size and type of `like`.
-
-    Raises
-    ------
-    TypeError
-        If `value` does not hold numbers.
-    ValueError
-        If `value` has another shape than `like`, is not finite, or is complex although `like` is real.
-    """
+    """Return a state or a derivative that the user has set, checked, as a new array of the size and type of `like`."""
     found = initial_state(value, name)
     if found.shape != like.shape:
         raise ValueError(f"`{name}` was set to an array of {found.size} components; this solver has {like.size}.")
@@ -71,15 +60,9 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
 
 
 def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: int) -> Stepping:
-    """Return the step control for the next steps of a solver, made from its present attributes.
+    """Return the step control for the next steps of a solver, made from its present attributes, after checks.
 
     `was` contains the values of the attributes after the last step. `stacklevel` is that of warnings.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an attribute has a wrong value, if `h` was set on a solver with adaptive steps, or if `h_abs` or `max_step`
-        was set on a solver with a fixed step.
     """
     _check_kind_of_steps(solver, was)
     t, t_bound, sign = (
@@ -105,10 +88,7 @@ def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: 
 
 
 def _check_kind_of_steps(solver: Any, was: Settings) -> None:
-    """Raise ValueError if `h` or `h_abs` was set to a value that the fixed or adaptive steps of the solver cannot use.
-
-    `was` contains the values of the attributes after the last step.
-    """
+    """Raise ValueError if `h` or `h_abs` was set to a value that the fixed or adaptive steps cannot use."""
     if (solver.h is None) != (was.h is None):
         kind = "adaptive steps" if was.h is None else f"the fixed step h = {was.h:g}"
         raise ValueError(f"`h` was set to {shown(solver.h)} on a solver with {kind}; start a new solver.")

@@ -16,16 +16,7 @@ INDEX = np.uint64
 
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
-    """Return the option ``blocks`` as groups of floats of a state of n components, each of which has `width` floats.
-
-    Raises
-    ------
-    TypeError
-        If a value has a unit.
-    ValueError
-        If the size of the blocks is not positive or does not divide n, a block is not a list of indices, or two blocks
-        overlap.
-    """
+    """Return the checked option ``blocks`` as groups of floats of a state of n components of `width` floats each."""
     refuse_units(blocks=blocks)
     if blocks is None:
         return _consecutive(1, n, width)

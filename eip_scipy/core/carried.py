@@ -29,10 +29,7 @@ def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
 
 
 def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
-    """Return the value of a function at t as an array, after a check that it is real and has the shape `expected`.
-
-    `what` names the function in messages. With ``expected=None`` any shape is accepted.
-    """
+    """Return the value of the function `what` at t as an array; raise an error if it is not real or not `expected`."""
     if isinstance(value, float) and not expected:
         return np.array(float(value))
     refuse_units(**{f"{what} returned": value})
@@ -67,30 +64,14 @@ def time_shift(tau: float, adaptive: bool, t_span: tuple[float, float]) -> float
 class Carried:
     """The balances among the invariants of a run.
 
-    Parameters
-    ----------
-    items : sequence of Invariant
-        All invariants of the run.
-    labels : sequence of str
-        Names of the items in messages.
-    starts : sequence of int
-        Index of the first value of each item among all values, and at the end the number of values.
-    shapes : sequence of tuple
-        Shapes of the values of each item.
-    extra : tuple
-        Further arguments of the run. In each call they follow the item's own arguments.
+    `items`, `labels` and `shapes` are all invariants of the run, their names, and the shapes of their values. `starts`
+    are the indices of their first values among all values, and at the end the number of values. In each call the run's
+    further arguments, `extra`, follow the item's own.
 
-    Attributes
-    ----------
-    items : dict of int to Invariant
-        The balances, by their indices among all items. After `compile_rates` a jitted balance without a given rate has
-        a compiled rate, if its function can be compiled for dual numbers.
-    places : ndarray of int64, shape (b,)
-        Indices of the balances' values among all values.
-    most_slowness : ndarray, shape (b,)
-        For each value of a balance, the bound for `Diagnostics.slowness` above which a run warns.
-    mask : ndarray of bool, shape (l,)
-        True for the values of balances.
+    The attribute `items` maps the index of each balance among all items to the balance. After `compile_rates` a jitted
+    balance without a given rate has a compiled rate, if its function can be compiled for dual numbers. `places` (b,)
+    are the indices of the balances' values among all values, and `mask` (l,) is True for them. `most_slowness` (b,) are
+    the bounds for `Diagnostics.slowness` above which a run warns.
     """
 
     def __init__(
@@ -155,11 +136,9 @@ class Carried:
         return self.known(t, y, f)[self.given_places]
 
     def rates(self, low: float, high: float, shift: float, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the `Rates` of the balances for the engine.
+        """Return the `Rates` for the engine, with the compiled `functions` or, by default, the user's in Python.
 
-        `functions` holds the compiled rate of each balance, or None for a balance without a rate; by default the engine
-        calls the user's functions from Python. `low` and `high` are the ends of the run's interval, and `shift` comes
-        from `time_shift`.
+        `low` and `high` are the ends of the run's interval, and `shift` comes from `time_shift`.
         """
         items = tuple((k, self._starts[k + 1] - self._starts[k]) for k in self.items)
         return Rates(items, tuple(map(self._call, self.items) if functions is None else functions), low, high, shift)

@@ -24,12 +24,7 @@ LEAST_ORDER = 2  # of dense output
 def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str, Any]:
     """Return, for a method, the attributes of SciPy's RungeKutta classes by name; NotImplemented for those it lacks.
 
-    Parameters
-    ----------
-    method : Tableau, NystromTableau, GaussJackson, OneStep or Driven
-    scipy_class : type or None
-        SciPy's class with the coefficients of `method`, whose attributes are returned as they are; None if SciPy has no
-        such class.
+    If SciPy has a class with the coefficients of the method, `scipy_class`, its attributes are returned as they are.
     """
     if scipy_class is not None:
         return {name: getattr(scipy_class, name, NotImplemented) for name in NAMES}
@@ -51,16 +46,7 @@ def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str,
 
 
 def tableau_of(solver: type[OdeSolver]) -> Tableau:
-    """Return a tableau with the coefficients of a solver class of another package, without its step control.
-
-    Raises
-    ------
-    TypeError
-        If the class has no coefficients of an explicit Runge-Kutta method, or if its steps or its error estimate do not
-        follow from the coefficients alone.
-    ValueError
-        If the coefficients or the dense output violate an order condition.
-    """
+    """Return a tableau with the coefficients of a solver class of another package, without its step control."""
     name = solver.__name__
     A, b, c = (_array(solver, attribute) for attribute in "ABC")
     order = getattr(solver, "order", None)
@@ -135,13 +121,7 @@ def _own_functions(solver: type[OdeSolver], base: type[OdeSolver]) -> list[str]:
 
 
 def _check_dense_output(tableau: Tableau, P: np.ndarray) -> None:
-    """Check that the dense output `P` gives the step's result at its end, and has order `LEAST_ORDER` inside it.
-
-    Raises
-    ------
-    ValueError
-        If one of these conditions is violated.
-    """
+    """Raise ValueError unless `P` gives the step's result at its end, and has order `LEAST_ORDER` inside it."""
     if max(_misses(tableau, P)) > np.sqrt(FLOAT_TOLERANCE):
         raise ValueError(
             f"eip_method: the dense output P of {tableau.name} does not belong to its steps. Each row of P must sum "

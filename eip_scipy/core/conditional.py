@@ -31,11 +31,10 @@ VANISHES, UNSEEN = 0.05, 1e-8
 
 
 def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Derivative) -> Array | None:
-    """Move y by Newton's method towards the targets of all invariants, and return the best state.
+    """Move y by Newton's method towards the targets of all invariants; return None if y itself is the best state.
 
     The best state is the one whose largest residual, relative to the terms of the invariant concerned, is smallest.
-    Each Newton step is the shortest one in units of `span`. The function returns None if y itself is the best state,
-    for instance because all invariants have their target values there.
+    Each Newton step is the shortest one in units of `span`.
     """
     state, best, nearest = y, np.inf, None
     weights = np.repeat(span, state.view(float).size // span.size)
@@ -68,20 +67,11 @@ def is_kept_on_a_surface(
     function also returns False, without a search, if more than `MOST_COMPONENTS` floats of the state are nonzero or
     change.
 
-    Parameters
-    ----------
-    known : InvariantSet
-    k : int
-    held : ndarray of bool, shape (l,)
-        Mask of the invariants that the system keeps. The first search is limited to states where, to first order,
-        these invariants have the same values as at y. Without this limit a nearby state that violates a constraint a
-        little could be found, at which the violation cancels the effect of friction, and the result would be wrong.
-        If this search finds no surface, all states are searched. A state then counts only if one of these invariants
-        is not 0 at y and is smaller there by the factor `CONVERGED`, which shows that y violates a constraint.
-    t : float
-    y, f : ndarray, shape (n,)
-        A state and its derivative there.
-    rhs : callable
+    `held` (l,) is a mask of the invariants that the system keeps. The first search is limited to states where, to first
+    order, these invariants have the same values as at y. Without this limit a nearby state that violates a constraint a
+    little could be found, at which the violation cancels the effect of friction, and the result would be wrong. If this
+    search finds no surface, all states are searched. A state then counts only if one of these invariants is not 0 at y
+    and is smaller there by the factor `CONVERGED`, which shows that y violates a constraint.
     """
     size, moved_by = np.abs(y).max(), np.abs(f).max()
     # How far the components move while the state moves by its own size: more than in a step.
@@ -130,10 +120,9 @@ class _Rate:
         return found
 
     def root(self, G: Array) -> Array | None:
-        """Return the floats of a nearby state at which the rate vanishes, or None.
+        """Return the floats of a state nearby at which the rate vanishes, by Newton's method, or None.
 
-        Newton's method moves only in directions in which invariants with the gradients G do not change. The function
-        returns None if the method does not find such a state, or finds it far away.
+        Newton's method moves only in directions in which invariants with the gradients G do not change.
         """
         floats, first = self.floats, self(self.floats)
         value = first
@@ -162,8 +151,7 @@ class _Rate:
     def _newton_step(self, slope: Array, value: float, G: Array) -> Array | None:
         """Return the shortest move (m,), in units of the weights, that makes ``value + slope @ move`` 0, or None.
 
-        The move leaves the invariants with the gradients G unchanged, to first order. The result is None if there is
-        no such move.
+        To first order, the move leaves the invariants with the gradients G unchanged.
         """
         rows = np.vstack([slope, G.view(float) * self.weights])
         lengths = np.linalg.norm(rows, axis=1)

@@ -34,7 +34,7 @@ MOST_ROOTS, ROOT_NUMBERS = 1024, 2**17
 
 
 class Interpolants:
-    """Interpolants of a run, created and evaluated by its engine.
+    """Interpolants of a run, created and evaluated by its engine, whose dense output is switched on.
 
     If the run does not project each step, the states after unprojected steps are returned as projected copies.
     Interpolated states are projected too, onto levels of the invariants between those at the two ends of the step. The
@@ -43,16 +43,8 @@ class Interpolants:
     exactly. The change of balances between the ends is interpolated in the same way as the state, and is added to their
     levels.
 
-    Parameters
-    ----------
-    run : Run
-    engine : Engine
-        Engine of the run, for which dense output is switched on.
-    events : int
-        Number of event functions whose roots the engine's loop looks for.
-    errors : callable
-        ``errors()`` returns a context manager that replaces the engine's error in a compiled function by the user's
-        exception, such as `Driver.own_errors`.
+    The engine's loop looks for the roots of `events` functions. ``errors()`` returns a context manager that replaces
+    the engine's error in a compiled function by the user's exception, such as `Driver.own_errors`.
     """
 
     def __init__(
@@ -160,10 +152,7 @@ def _record(run: Run, events: int) -> Dense:
 
 
 class ExactEnds(AtRealTimes):
-    """A dense output that returns exactly the states at both ends of the step, without the rounding of interpolants.
-
-    `inner` is the dense output that is evaluated in between, and `y_old` and `y` are the states at the two ends.
-    """
+    """Dense output of `inner` that returns exactly the states `y_old` and `y` at the ends, without rounding."""
 
     def __init__(self, inner: DenseOutput, y_old: Array, y: Array) -> None:
         super().__init__(inner.t_old, inner.t)
@@ -244,9 +233,7 @@ class _AtRest(AtRealTimes):
 
 
 def solution(interpolants: Interpolants, pieces: Array, t_end: float, y_end: Array) -> OdeSolution:
-    """Return the dense output over a run from the interpolants of its steps, `pieces` (m, floats).
-
-    `t_end` and `y_end` are the time and the state at the end of the run.
+    """Return the dense output over a run, which ends at (t_end, y_end), from the interpolants of its steps (m, floats).
 
     If an event ended the run at the beginning of a step, the dense output extends to the end of that step.
     """

@@ -56,24 +56,11 @@ class Jacobian(NamedTuple):
 
 
 class Driven(Ordered):
-    """A method whose steps are made by a solver of SciPy; it takes the place of a tableau.
+    """A method whose steps are made by SciPy's class `solver`; it takes the place of a tableau.
 
-    Parameters
-    ----------
-    solver : type
-        The class of SciPy's solver.
-    stepper : type
-        The subclass of `Stepper` that accesses the private attributes of this solver.
-    order, error_estimator_order : int
-    takes_complex : bool
-        Whether the solver accepts complex states.
-    polynomials : ndarray, shape (k, k)
-        Coefficients of the interpolant in x = (t - t_old) / h: entry (p, j) is the coefficient of x^(p + 1) that
-        multiplies the j-th row that `Stepper._describe` fills.
-
-    Attributes
-    ----------
-    name : str
+    `stepper` is the subclass of `Stepper` that accesses the private attributes of this solver. Entry (p, j) of
+    `polynomials` (k, k) is the coefficient of x^(p + 1), x = (t - t_old) / h, in the interpolant, which multiplies the
+    j-th row that `Stepper._describe` fills.
     """
 
     in_python = True
@@ -105,15 +92,9 @@ class Driven(Ordered):
 class Stepper:
     """Maker of the steps of one run, by a solver of SciPy that is created in the first step.
 
-    Attributes
-    ----------
-    method : Driven
-    solver : OdeSolver
-        The solver of SciPy; None before the first step.
-    not_finite_at : float or None
-        A time at which the right-hand side had a value that is not finite in the last step, or None.
-    b, c, exponent, multistep
-        Attributes of a tableau that the engine reads. The array work.K has one row more than `b` has entries.
+    `solver` is the solver of SciPy, None before the first step. `not_finite_at` is a time at which the right-hand side
+    had a value that is not finite in the last step, or None. `b`, `c`, `exponent` and `multistep` are attributes of a
+    tableau that the engine reads. The array work.K has one row more than `b` has entries.
     """
 
     multistep = None
@@ -129,13 +110,7 @@ class Stepper:
         self._counted = dict.fromkeys(COUNTERS, 0)
 
     def begin(self, rhs: Derivative, start: Any, stepping: Stepping, jacobian: Jacobian | None) -> None:
-        """Prepare the steps of a run; `start` consists of t, y, f and the length of the first step.
-
-        Raises
-        ------
-        ValueError
-            If `rtol` differs between components, or the state is complex and SciPy's solver accepts real states only.
-        """
+        """Prepare the steps of a run; `start` consists of t, y, f and the length of the first step."""
         (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
         if y.dtype.kind == "c" and not self.method.takes_complex:
             raise ValueError(
@@ -160,13 +135,7 @@ class Stepper:
         )  # fmt: skip
 
     def _made(self) -> Any:
-        """Make and return SciPy's solver, without counting the evaluations of its Jacobian at the start.
-
-        Raises
-        ------
-        NotImplementedError
-            If the installed version of SciPy lacks an attribute in `PRIVATE`.
-        """
+        """Make and return SciPy's solver, without counting the evaluations of its Jacobian at the start."""
         solver = self._make()
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)

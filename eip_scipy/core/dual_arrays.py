@@ -39,10 +39,7 @@ class _NumPy(python_types.ModuleType):
 
 
 def for_duals(fun: Any, dual: Dual) -> Any:
-    """Return a copy of a jitted function, and of the functions that it calls, in which new arrays hold duals.
-
-    `dual` is the Numba type of these dual numbers.
-    """
+    """Return a copy of a jitted function, and of those that it calls, in which new arrays hold numbers of `dual`."""
     by_name = _array_functions(dual)
     others = {id(getattr(np, name)): function for name, function in by_name.items()}
     return _replaced(fun, others | {id(np): _NumPy(by_name)}, dual)

@@ -101,9 +101,9 @@ def _products_of(
 def _secants(
     derivative: Callable[..., Array], t: float, y: Array, way: tuple[Array, Array], places: list[int], extra: tuple
 ) -> tuple[Array, Array]:
-    """Return the value (n,) of ``derivative(t, y, extra)``, and central differences (k, n) along `way`.
+    """Return the value (n,) of ``derivative(t, y, extra)``, and central differences (k, n) along `way`, of k lengths.
 
-    They have k lengths, because none suits all functions. Where the function raises an exception, they are NaN.
+    No one length suits all functions. Where the function raises an exception, the differences are NaN.
     """
     direction = np.concatenate(way)
 

@@ -65,19 +65,10 @@ def is_check_due(steps: int) -> bool:
 class Examiner:
     """Examiner of the states of a run.
 
-    Attributes
-    ----------
-    invariants : InvariantSet
-    tau : float
-        The length of a step.
-    figures : ndarray, shape (l, N_FIGURES)
-        Numbers about the projections of the run, a row for each invariant, see `engine.trust`. The examiner also stores
-        rates of change there.
-    resolution : callable
-        ``resolution(rhs, t, h, y, end_of_run)``: the function `resolution.unresolved` for the method and the blocks of
-        components of this run.
-    largest : float
-        The largest correction of the run, in local errors, when a large correction was last examined; 0 before.
+    `tau` is the length of a step. `figures` (l, N_FIGURES) are numbers about the projections of the run, see
+    `engine.trust`; rates of change are also stored there. ``resolution(rhs, t, h, y, end_of_run)`` is `unresolved` for
+    the method and the blocks of this run. `largest` is the largest correction, in local errors, when a large correction
+    was last examined.
     """
 
     invariants: InvariantSet
@@ -93,7 +84,7 @@ class Examiner:
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
         """Return a sentence about what is wrong in the step that the engine suspects, or None.
 
-        `suspect` is the engine's record of that step. It is cleared, so that the engine may record another step.
+        `suspect`, the engine's record of that step, is cleared, so that the engine may record another step.
         """
         reason, t_old, t_new = suspect[REASON], float(suspect[SUSPECT_FROM]), float(suspect[SUSPECT_TO])
         suspect[REASON] = NOTHING
@@ -109,8 +100,7 @@ class Examiner:
     def _unless_refused(self, look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
         """Return the result of the examination `look`; None if a function of the user raises an exception in it.
 
-        The examined states are near those of the run, but the run does not visit them. Therefore an exception at such a
-        state says nothing about the run.
+        The run does not visit the examined states. Therefore an exception there says nothing about the run.
         """
         known = copied(self.invariants)
         known.functions = _Guarded(known.functions)
@@ -157,11 +147,11 @@ def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
 def _complaint(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, y: Array, on_manifold: bool
 ) -> str | None:
-    """Return the text of the first of the `complaints` at a state, or None, and note rates of change.
+    """Return the text of the first of the `complaints` at a state, or None, and note rates in ``examiner.figures``.
 
-    Rates of change are written to ``examiner.figures``. `known` is a copy of the examiner's invariants whose functions
-    raise `_RefusedError`. Without `on_manifold`, complaints about invariants that depend on other invariants are
-    ignored. A state whose derivative is not finite is not examined.
+    `known` is a copy of the examiner's invariants whose functions raise `_RefusedError`. Without `on_manifold`,
+    complaints about invariants that depend on other invariants are ignored. A state whose derivative is not finite is
+    not examined.
     """
     f = rhs(t, y)
     if not BUILD.are_finite(f.view(float)):
@@ -193,7 +183,6 @@ def _along_chord(
     The states examined in the step are on the straight line between its `ends`, those before it on the trajectory. The
     `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing is
     examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
-    `times` are the times of `ends`, and `known` is as for `_complaint`.
     """
     largest = float(examiner.figures[:, NU].max(initial=0.0))
     if largest < GROWTH * examiner.largest:
@@ -211,10 +200,7 @@ def _along_chord(
 def _on_the_way(
     examiner: Examiner, known: InvariantSet, rhs: Derivative, start: tuple[float, Array], h: float, steps: int
 ) -> str | None:
-    """Return a sentence about what is wrong on the trajectory that led to `start`, a time and a state, or None.
-
-    The trajectory is followed backwards for about `steps` steps of length h. `known` is as for `_complaint`.
-    """
+    """Return a sentence about what is wrong in about `steps` steps of length h that led to `start`, or None."""
     (t, y), part = start, h / BACK
     begin = known.t_span[0]
     # More than `steps` steps of length h are followed, because earlier steps may have been longer.

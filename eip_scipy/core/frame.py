@@ -23,15 +23,9 @@ NO_FRAME = FrameRows(np.zeros((2, 1), INDEX), np.zeros(0, INDEX), np.zeros(0), n
 
 
 def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
-    """Return the frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1.
+    """Return the frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1, after checks.
 
     The rows act on the floats of the state, `width` of which represent a component: 2 for a complex state, else 1.
-
-    Raises
-    ------
-    ValueError
-        If the shapes disagree, C or S is not numeric, C S is singular or not finite, or C or S is complex for a real
-        state.
     """
     if frame is None:
         return NO_FRAME
@@ -63,10 +57,7 @@ def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width:
 
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
-    """Return a mask (l,) of the gradients, the rows of G (l, n), that are linear combinations of rows of C.
-
-    The frame removes corrections along such gradients.
-    """
+    """Return a mask (l,) of gradients, rows of G, that combine rows of C: the frame removes corrections along them."""
     return np.array(BUILD.spanned(frame, G, SPANNED), bool)
 
 
@@ -96,10 +87,9 @@ def _real_form(a: np.ndarray) -> np.ndarray:
 
 
 def _by_bodies(a: np.ndarray) -> np.ndarray:
-    """Return the weights of bodies in a matrix of linear constraints.
+    """Return the weights (k, b) of bodies if the rows of `a` (3 k, 3 k b) are sums over bodies, else an empty array.
 
-    Return the weights (k, b) if the rows of `a` (3 k, 3 k b) are weighted sums of x, y and z over the b bodies of one
-    of k groups, else an empty array of shape (0, 0).
+    Such rows are weighted sums of x, y and z over the b bodies of one of k groups.
     """
     groups = a.shape[0] // 3
     if groups == 0 or a.shape[1] % (3 * groups):

@@ -36,20 +36,9 @@ class NumericalGradient:
     domain. Therefore each gradient by complex steps is compared with a difference along one direction. The choice
     depends on the state only, so that a resumed run makes the same steps.
 
-    Parameters
-    ----------
-    fun : callable
-        ``fun(t, y, *args)``, the invariant's function.
-    args : tuple
-        The invariant's own arguments. Those of the run follow them in each call.
-    takes_complex : bool
-        False for functions that cannot be called with complex states.
-    t, y
-        Time and state at the start.
-    floors : ndarray, shape (n,)
-        Sizes that are added to those of the components in the lengths of difference steps, see `typical_sizes`.
-    extra : tuple
-        The run's arguments.
+    ``fun(t, y, *args, *extra)`` is the invariant's function, with its own arguments and those of the run;
+    `takes_complex` is False if it cannot be called with complex states. `t` and `y` are the start. `floors` (n,) are
+    added to the sizes of the components in the lengths of difference steps, see `typical_sizes`.
     """
 
     def __init__(
@@ -85,7 +74,7 @@ class NumericalGradient:
     def _takes_complex_steps(self, t: float, y: Array, extra: tuple) -> bool:
         """Return True if the function accepts complex states and is analytic near the start.
 
-        The test states are near y, because derivatives of abs(y_k) and similar terms may happen to vanish at y itself.
+        At y itself derivatives of abs(y_k) and similar terms may happen to vanish.
         """
         real = self._fun(t, y, extra)
         try:
@@ -109,12 +98,11 @@ class NumericalGradient:
 
 
 def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
-    """Return the gradient (..., n) of value(y) by central differences of order 6.
+    """Return the gradient (..., n) of value(y) by central differences of order 6, with the bits of differences.hpp.
 
-    The shift of y_k is a fixed multiple of ``abs(y[k]) + floor[k]``, rounded to a power of two. If
-    differences of order 4 disagree, as near a singularity that is closer than the state's size, the shifts are
-    shortened until both orders agree. If they never agree, the shift with the best agreement is used. The engine's
-    differences (engine/cpp/differences.hpp) have the same bits.
+    The shift of y_k is a fixed multiple of ``abs(y[k]) + floor[k]``, rounded to a power of two. If differences of order
+    4 disagree, as near a singularity that is closer than the state's size, the shifts are shortened until both orders
+    agree. If they never agree, the shift with the best agreement is used.
     """
 
     def along(k: int, unit: complex) -> Any:
@@ -138,9 +126,9 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
 
 
 def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: complex) -> tuple[Array, float]:
-    """Return the differences of order 6 for y_k, not yet divided by the shift, and the disagreement with order 4.
+    """Return the differences of order 6 for y_k, not divided by the shift, and their largest disagreement with order 4.
 
-    The disagreement is the largest one among the values, as a multiple of what is allowed.
+    The disagreement is a multiple of what is allowed.
     """
     sums, lower, largest = np.zeros(()), np.zeros(()), np.zeros(())
     for (multiple, weight), lower_weight in zip(DIFFERENCE_WEIGHTS, LOWER_WEIGHTS, strict=True):
@@ -170,10 +158,7 @@ def typical_sizes(y: Array, f: Array, tau: float) -> Array:
 
 @lru_cache
 def random_directions(n: int, is_complex: bool) -> Array:
-    """Return two random directions (2, n), which are the same in each run.
-
-    They are cached, because it takes long to make a generator of random numbers.
-    """
+    """Return two random directions (2, n), the same in each run; they are cached, because making them takes long."""
     rng = np.random.default_rng(20220)
     parts = rng.standard_normal((2, 2 if is_complex else 1, n))
     return parts[:, 0] + 1j * parts[:, 1] if is_complex else parts[:, 0]

@@ -33,15 +33,7 @@ def shown(value: Any) -> str:
 def refuse_units(**arguments: Any) -> None:
     """Raise TypeError for values with a unit and for dates, because NumPy would silently drop the unit.
 
-    Parameters
-    ----------
-    **arguments
-        Values, with the names of the user's arguments; items of lists and tuples are checked too.
-
-    Raises
-    ------
-    TypeError
-        If a value is a date or a duration, or a quantity or time of astropy, pint, unyt or a similar package.
+    The keywords are the names of the user's arguments. Items of lists, tuples and object arrays are checked too.
     """
     for name, value in arguments.items():
         if is_plain(value):
@@ -107,15 +99,7 @@ def reals(value: Any) -> np.ndarray | None:
 
 
 def real_array(name: str, value: Any, error: type[Exception] = ValueError) -> np.ndarray:
-    """Return a value as a new array of floats.
-
-    Raises
-    ------
-    TypeError
-        If a value has a unit.
-    ValueError
-        If a value is not a real number; `error` replaces this type of exception.
-    """
+    """Return a value as a new array of floats; raise `error` if it is not real, and TypeError if it has a unit."""
     refuse_units(**{name: value})
     found = reals(value)
     if found is None:
@@ -153,11 +137,8 @@ def flag(name: str, value: Any) -> bool:
 def require_arguments(fun: Callable[..., Any], given: Sequence[str], what: str, advice: str) -> None:
     """Raise a TypeError that explains a failed call if `fun` does not accept arguments with the names `given`.
 
-    Raises
-    ------
-    TypeError
-        If the arguments do not match. The message says with which arguments `what`, the name of the function, is
-        called, and ends with `advice`, or with advice about the time if only the time is missing.
+    The message says with which arguments `what`, the name of the function, is called, and ends with `advice`, or with
+    advice about the time if only the time is missing.
     """
     try:
         signature = inspect.signature(fun)
@@ -185,14 +166,9 @@ def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool
 def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any, what: str, t: float) -> np.ndarray:
     """Return the array of this shape and type that a user's in-place function fills; before, all entries are NaN.
 
-    ``call(out)`` calls the function. Error messages contain its name, `what`, and the time `t`.
-
-    Raises
-    ------
-    TypeError
-        If the function returns anything but None or the array itself.
-    ValueError
-        If the function does not fill the whole array, or reads entries before it fills them.
+    ``call(out)`` calls the function. An error is raised if it returns anything but None or the array itself, does not
+    fill the whole array, or reads entries before it fills them. The message contains its name, `what`, and the time
+    `t`.
     """
     out, ones = np.empty(shape, dtype), np.empty(shape, dtype)
     found, other = out.view(float), ones.view(float)

@@ -61,20 +61,10 @@ MISSING = "Add that constraint to the invariants, and start on it"
 
 
 class Complaint(NamedTuple):
-    """Something that a check of the invariants has found to be wrong.
+    """Something that a check of the invariants has found to be wrong: the `text`, and the `advice` about it.
 
-    Attributes
-    ----------
-    is_error : bool
-        True if the run must not start.
-    text : str
-        Description of what is wrong.
-    advice : str
-        Consequence of the finding, or what to do about it.
-    dependent : bool
-        True if the finding is about an invariant that the system keeps only if other invariants hold.
-    category : type
-        Class of the warning at the start of a run, if the finding is not an error.
+    The run must not start if it `is_error`; otherwise there is a warning of the class `category` at the start. A
+    finding is `dependent` if it is about an invariant that the system keeps only if other invariants hold.
     """
 
     is_error: bool
@@ -113,24 +103,12 @@ def complaints(
     rhs: Derivative | None,
     evaluated: tuple[Array, Array] | None = None,
 ) -> Iterator[Complaint]:
-    """Yield a `Complaint` for everything that is wrong with the invariants at a state.
+    """Yield a `Complaint` for everything that is wrong with the invariants at a state (n,) with the derivative f.
 
     The precision of the invariants is checked first; if it is sufficient, then the gradients; and if these are correct,
-    the rates of change.
-
-    Parameters
-    ----------
-    known : InvariantSet
-    t : float
-    y, f : ndarray, shape (n,)
-        A state and its derivative there.
-    tau : float
-        The length of a step.
-    rhs : callable or None
-        ``rhs(t, y) -> (n,)``. If it is given, invariants that hold only together with others are examined at a state
-        where all of them hold.
-    evaluated : (ndarray, ndarray), optional
-        The gradients (l, n) and the values (l,) at the state.
+    the rates of change. `tau` is the length of a step. If the right-hand side `rhs` is given, invariants that hold only
+    together with others are examined at a state where all of them hold. `evaluated` are the gradients (l, n) and the
+    values (l,) at the state, if they are known.
     """
     if known.size == 0 or y.size == 0:
         return
@@ -171,10 +149,7 @@ def _blurred(at: _Samples) -> list[Array]:
 
 
 def _rounding(known: InvariantSet, at: _Samples, ways: Array) -> Array:
-    """Return the rounding errors (k, l) of the derivatives of invariants along the vectors `ways` (k, n).
-
-    They are estimated from the changes of the gradients between `at.y` and the states of `_blurred`.
-    """
+    """Return the rounding errors (k, l) of the derivatives of invariants along the vectors `ways` (k, n)."""
     blurred = [known.gradients(at.t, state, at.f) - at.G for state in _blurred(at)]
     return BLUR * np.abs(np.array(blurred)[:, None] * ways[:, None]).sum(axis=3).max(axis=0)
 
@@ -352,11 +327,10 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
 def _complaints_of_rates(
     known: InvariantSet, at: _Samples, found: _Rates, wrong: Array, rhs: Derivative | None
 ) -> Iterator[Complaint]:
-    """Yield a `Complaint` about quantities that change, and one about those that are kept only if constraints hold.
+    """Yield a `Complaint` about the quantities that change, and one about those that are kept only if constraints hold.
 
-    Before these there is one for each quantity that changes only by the rate that its gradient gives.
-
-    `wrong` (l,) is a mask of all these quantities. Each text first names the one with the largest relative rate.
+    Before these there is one for each quantity that changes only by the rate that its gradient gives. `wrong` (l,) is a
+    mask of all these quantities. Each text first names the one with the largest relative rate.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
@@ -383,10 +357,10 @@ def _complaints_of_rates(
 
 
 def _misled_rates(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array) -> tuple[Array, Array]:
-    """Return rates of change (l,) from values along the flow, and a mask of the rates that gradients have made wrong.
+    """Return rates of change (l,) from values along the flow, and a mask of those that gradients have made wrong.
 
-    Small errors of a gradient, which `_wrong_gradients` allows, still make a rate that exceeds its rounding. `wrong`
-    (l,) is the mask of the rates in question. Only gradients of the user are considered.
+    Small errors of a gradient, which `_wrong_gradients` allows, still make a rate that exceeds its rounding. Only
+    gradients of the user are considered.
     """
     given = wrong & ~np.array(known.computed, bool)
     moving, size = np.abs(at.f).max(), np.abs(at.y).max()
@@ -471,9 +445,9 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
 def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Array, tau: float) -> tuple[Array, Array]:
     """Return the partial time derivatives (l,) of the invariants and their rounding errors (l,).
 
-    `G` (l, n) and `here` (l,) are the gradients and the values of the invariants at t and y, and `tau` is the length of
-    a step. Only times inside the run's interval are used. A derivative that is unknown has the value 0 and an infinite
-    error: if the interval contains no time other than t, or if `tau` is 0, infinite, or too short to change t.
+    Only times inside the run's interval are used. A derivative that is unknown has the value 0 and an infinite error:
+    if the interval contains no time other than t, or if `tau`, the length of a step, is 0, infinite, or too short to
+    change t.
     """
     none = np.zeros(known.size)
     low, high = min(known.t_span), max(known.t_span)

@@ -36,22 +36,14 @@ LARGE = 200
 
 
 class OwnArguments:
-    """A function of an invariant that is called with the invariant's own `args` if a call omits these arguments.
-
-    Parameters
-    ----------
-    function : callable
-    args : tuple
-    first : int
-        Number of the arguments before `args`, such as time and state.
-    """
+    """A function that is called with an invariant's own `args` after the `first` arguments if a call omits them."""
 
     def __init__(self, function: Callable[..., Any], args: tuple[Any, ...], first: int) -> None:
         self.function, self.args, self.first = function, args, first
         self.__name__ = getattr(function, "__name__", type(function).__name__)
 
     def __call__(self, *given: Any) -> Any:
-        """Return the value of the function; `args` are added if exactly `first` arguments are given."""
+        """Return the value of the function."""
         return self.function(*given, *(self.args if len(given) == self.first else ()))
 
 
@@ -220,15 +212,7 @@ class JointInvariants(tuple[Invariant, ...]):
 
 
 def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
-    """Return an invariant, or a sequence of them, as a tuple; `JointInvariants` are returned unchanged.
-
-    A function f(t, y, *args) becomes ``Invariant(f)`` with the name of the function.
-
-    Raises
-    ------
-    TypeError
-        If `invariants`, or an item of a sequence, is anything else.
-    """
+    """Return invariants or functions f(t, y, *args) as a tuple of `Invariant`; `JointInvariants` stay unchanged."""
     if type(invariants) is tuple and all(isinstance(item, Invariant) for item in invariants):
         return invariants
     if isinstance(invariants, Invariant | JointInvariants):
@@ -274,7 +258,7 @@ def _of_function(fun: Callable[..., Any]) -> Invariant:
 def _apart(fun: Any, grad: Any, args: Sequence[Any]) -> tuple[Any, Any, Sequence[Any]]:
     """Return `fun`, `grad` and `args`, where one function or both come from the attributes of another invariant.
 
-    Such functions are returned without that invariant's arguments, which take the place of `args` if it is empty.
+    The arguments of that invariant take the place of `args` if it is empty.
     """
     functions = [found.function if isinstance(found, OwnArguments) else found for found in (fun, grad)]
     own = next(found.args for found in (fun, grad) if isinstance(found, OwnArguments))
@@ -314,10 +298,7 @@ def _labels(items: Sequence[Invariant]) -> list[str]:
 
 
 def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array, extra: tuple) -> Array:
-    """Return the value at the start, a number or (l_i,); `fun` is the invariant's function with its arguments bound.
-
-    `label` is the invariant's name in messages. `extra` are the run's further arguments, also for messages only.
-    """
+    """Return the value at the start, a number or (l_i,); `fun` is the invariant's function with its arguments bound."""
     try:
         value = fun(t, y.copy())
     except TypeError:
@@ -334,10 +315,7 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
 def _first_gradient(
     invariant: Invariant, gradient: Call, label: str, start: tuple[float, Array, Array], extra: tuple
 ) -> Array:
-    """Return the gradient (n,) or (l_i, n) at `start`, which holds a time, a state and its derivative.
-
-    `label` and `extra` are as for `_first_value`.
-    """
+    """Return the gradient (n,) or (l_i, n) at `start`, which holds a time, a state and its derivative."""
     t, y, f = start
     what, states = f"gradient of invariant {label!r}", (y.copy(), f.copy()) if gradient.takes_f else (y.copy(),)
 
@@ -390,21 +368,10 @@ def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple,
 class InvariantSet:
     """All invariants of a run together: sizes, names, targets, scales, and the functions that the step calls.
 
-    The values and their shapes are checked at the start state.
-
-    Parameters
-    ----------
-    invariants : Invariant, function or sequence of them
-    t0, y0, f0, tau
-        The start: time, state, derivative, and the length of a step.
-    extra : tuple
-        The run's further arguments: its `args`, or its `params` as one array.
-    tell : bool
-        If True, warn of the cost and the accuracy of gradients that are not given.
-    t_bound : float, optional
-        The end of the run. Invariants are evaluated only at times from t0 to t_bound. Default: only at t0.
-    rhs : callable, optional
-        ``rhs(t, y) -> (n,)``, the right-hand side of the system, for checks.
+    The start is the time, the state, the derivative and the length of a step. The values and their shapes are checked
+    there. `extra` are the run's further arguments. With `tell`, the cost and the accuracy of gradients that are not
+    given are warned of. Invariants are evaluated only at times from t0 to `t_bound`, by default only at t0. `rhs` is
+    the right-hand side of the system, for checks.
 
     Attributes
     ----------
@@ -477,10 +444,7 @@ class InvariantSet:
         self.balances.check(t0, y0, f0)
 
     def _names(self, sizes: list[int]) -> list[str]:
-        """Return names of the l values: an item's `value_names`, if any, else its label, with an index for arrays.
-
-        `sizes` are the numbers of values of the items.
-        """
+        """Return names of the l values: an item's `value_names`, if any, else its label, with an index for arrays."""
         return [
             (label if scalar else f"{label}[{j}]") if not item.value_names else item.value_names[j]
             for item, label, scalar, size in zip(self.items, self.labels, self.scalar, sizes, strict=True)
@@ -529,10 +493,7 @@ class InvariantSet:
                 )
 
     def _tell_of_cost(self, given: Sequence[Invariant], n: int) -> None:
-        """Warn once if a large state has invariants whose gradients are computed from their values.
-
-        `given` are the invariants as the user gave them: a jitted one among `items` has a compiled gradient by now.
-        """
+        """Warn once if a large state has invariants, as the user gave them, without a gradient."""
         slow = ", ".join(repr(label) for item, label in zip(given, self.labels, strict=True) if item.gradient is None)
         if slow and n >= LARGE:
             warnings.warn(
@@ -559,11 +520,9 @@ class InvariantSet:
         return np.where(self.balances.mask, np.nan, self.target)
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the `Rates` of the balances, for the engine.
+        """Return the `Rates` of the balances for the engine, by compiled `functions` or, by default, from Python.
 
-        `functions` contains for each balance the address of its compiled rate, a `LibraryFunction`, or None without a
-        rate of its own; by default the rates are called in Python. `adaptive` says whether `tau` is the first of
-        adaptive steps or a fixed step: the shift in time of differences for dF/dt depends on it, see `time_shift`.
+        `adaptive` says whether `tau` is the first of adaptive steps or a fixed step, see `time_shift`.
         """
         low, high = min(self.t_span), max(self.t_span)
         return self.balances.rates(low, high, time_shift(self.tau, adaptive, self.t_span), functions)
@@ -571,8 +530,8 @@ class InvariantSet:
     def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
         """Return the invariants for a run that continues this one, with the values that this run keeps as targets.
 
-        With `at_end` the new run starts at the end of the last step, and balances continue from the values that this
-        run has integrated. Otherwise it starts at another state, and balances start again from their values there.
+        With `at_end` the new run starts at the end of the last step. Otherwise balances start again from their values
+        there.
         """
         kept = list(map(copied, self.items))
         for k, item in enumerate(kept):
@@ -590,8 +549,7 @@ class InvariantSet:
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
         """Return a copy, with a compiled gradient, of a jitted invariant without one; any other invariant is unchanged.
 
-        `n` is the size of the state, and `shape` that of the invariant's value. If the gradient cannot be compiled, the
-        copy has none, and the reason is stored in `why_not` by `label`.
+        If the gradient cannot be compiled, the reason is stored in `why_not` by `label`.
         """
         numbers = scalars(self.extra)
         if not _lacks_gradient(item) or numbers is None:
@@ -606,10 +564,7 @@ class InvariantSet:
         return item
 
     def _calls(self, shapes: list[tuple[int, ...]], y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
-        """Return the functions of values, one for each item, and those of gradients, in the form that the engine calls.
-
-        `shapes` contains the shape of the values of each item.
-        """
+        """Return the functions of values, one for each item, and those of gradients, as the engine calls them."""
 
         def value(k: int) -> Call:
             label, shape = self.labels[k], shapes[k]
@@ -715,12 +670,10 @@ class InvariantSet:
             return np.where(residual == 0, 0.0, residual / allowed)
 
     def note_rates(self, figures: Array, t: float, y: Array, f: Array, G: Array, here: Array) -> None:
-        """Update the largest rates of change of the values along f in `figures`, of the shape (l, `N_FIGURES`).
+        """Update the largest rates of change along f in `figures` (l, `N_FIGURES`), which `engine.trust` judges.
 
-        The rates are relative to ``sum_k |G_k f_k|``, the size of the terms that cancel in the rate. `figures` are the
-        numbers about the projections of a run that `engine.trust` judges. `G` and `here` are the gradients and the
-        values at the state. The given rate of a balance is subtracted from its rate of change. Rates of balances
-        without a given rate are not noted.
+        The rates are relative to ``sum_k |G_k f_k|``, the size of the terms that cancel in the rate. The given rate of
+        a balance is subtracted from its rate of change. Rates of balances without a given rate are not noted.
         """
         own = None
         if self.balances.items:
@@ -744,29 +697,10 @@ class InvariantSet:
     def check(
         self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
     ) -> list[str]:
-        """Check gradients against differences along two directions, and that the system keeps the invariants.
+        """Check the invariants at the start: raise ValueError or warn, and return the texts of the warnings.
 
-        `f` is the derivative of the state, and `tau` the length of a step. `evaluated` holds the gradients and the
-        values at the state; default: they are evaluated.
-
-        Returns
-        -------
-        list of str
-            The texts of the warnings.
-
-        Raises
-        ------
-        ValueError
-            If a given gradient disagrees with differences of the invariant's values, or if these values have single
-            precision.
-
-        Warns
-        -----
-        UserWarning
-            If an invariant changes along the flow of this system, if a computed gradient is not accurate, or if the
-            right-hand side or a gradient has single precision.
-        ProjectionWarning
-            If the rate of a balance is wrong.
+        `tau` is the length of a step, and `evaluated` holds the gradients and the values at the state, if they are
+        known.
         """
         found = list(complaints(self, t, y, f, tau, self.rhs, evaluated))
         for complaint in found:

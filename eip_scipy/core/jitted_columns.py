@@ -30,13 +30,9 @@ def rhs_by_duals(
     """Return ``rhs(t, Y, out, ...)``, the in-place right-hand side of a state with columns, for a jitted `fun`.
 
     Y consists of the state (n,), the parameters with the indices `parameters`, and `columns` columns of derivatives.
-    The derivatives of `fun` are computed with dual numbers and are exact up to rounding. `form` is that of `fun`, see
-    `native_functions`. If `scalars` is not empty, `fun` takes numbers of these types instead of params, see `Packed`.
-
-    Raises
-    ------
-    NotCompilableError
-        If the function does something that dual numbers cannot.
+    The derivatives of `fun` are exact up to rounding. `form` is that of `fun`, see `native_functions`. If `scalars` is
+    not empty, `fun` takes numbers of these types instead of params, see `Packed`. Raise NotCompilableError if dual
+    numbers cannot do what `fun` does.
     """
     dual = dual_along(columns)
     lanes = dual.lanes
@@ -76,11 +72,10 @@ def rhs_by_duals(
 
 
 def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) -> Any:
-    """Return ``copied(params, Y, first)``, which returns params as numbers of the type `dual`.
+    """Return ``copied(params, Y, first)``, which returns params as dual numbers, or unchanged without `parameters`.
 
-    The derivatives of these dual numbers are entries of the columns of Y from the column `first` on. Those of
-    parameters that are not in `parameters` are 0; if `parameters` is empty, params are returned unchanged.
-    ``seeded(Y, first, i)`` returns entry i of Y as such a dual number. In Y the parameters follow the `n` entries of
+    The derivatives of those in `parameters` are entries of the columns of Y from the column `first` on; those of others
+    are 0. ``seeded(Y, first, i)`` returns entry i of Y as such a dual number; the parameters follow the `n` entries of
     the state.
     """
     if not parameters:
@@ -99,11 +94,7 @@ def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) 
 
 
 def _with_out(fun: Any, form: str, has_params: bool, one_by_one: bool) -> Any:
-    """Return ``call(t, x, out, params)``, which returns the value of `fun` at x; an in-place `fun` writes to `out`.
-
-    `form` is that of `fun`, see `native_functions`. `fun` takes the numbers in params as separate arguments if
-    `one_by_one`, else params if `has_params`.
-    """
+    """Return ``call(t, x, out, params)``, which returns the value of `fun` at x; an in-place `fun` writes to `out`."""
     if form.endswith("place"):
         if one_by_one:
             return inside(lambda t, x, out, numbers: _second(fun(t, x, out, *numbers), out))
@@ -124,10 +115,9 @@ def _second(first, second):
 
 @lru_cache(maxsize=256)
 def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
-    """Return the in-place right-hand side of a state with `columns` columns of derivatives, from a jitted `fun`.
+    """Return the in-place right-hand side of a state (n,) with `columns` columns of derivatives, from a jitted `fun`.
 
-    `form` is that of `fun`, see `native_functions`, and `n` is the size of the state without the columns. The function
-    ``jvp(t, y, dy, ...)`` returns the derivative (n,) of the right-hand side along dy.
+    `form` is that of `fun`, see `native_functions`. ``jvp(t, y, dy, ...)`` returns the derivative (n,) along dy.
     """
     taken = n // 2 if form.startswith("acceleration") else n
     offset, in_place = n - taken, form.endswith("place")
@@ -149,10 +139,7 @@ def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
 
 @lru_cache(maxsize=256)
 def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
-    """Return the in-place right-hand side of a longer state, whose entries at `places` are the state of `rhs`.
-
-    The derivatives of the other entries are 0.
-    """
+    """Return the right-hand side of a state that is that of `rhs` at `places` and constant elsewhere, in place."""
     order = np.array(places, np.int64)
 
     def in_place(t, Y, out, *extra):
@@ -172,11 +159,6 @@ def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...], parameters: tup
     """Return ``slopes(t, y, params) -> (*shape, k)``, the derivatives of a jitted invariant by k of its p parameters.
 
     `parameters` are the indices of the k parameters; `shape` is the shape of the value of the invariant.
-
-    Raises
-    ------
-    NotCompilableError
-        If the function does something that dual numbers cannot.
     """
     swapped = njit(lambda t, params, y: fun(t, y, params))
     grad = gradient_by_duals(swapped, p, shape, True)

@@ -29,13 +29,9 @@ SAYING = ("No implementation", "Cannot", "Unknown")
 def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
     """Return the gradient ``grad(t, y, out[, params])`` of a jitted invariant whose value has this `shape`.
 
-    The gradient fills `out` (*shape, n). It is computed with dual numbers and exact up to rounding. If `scalars` is not
-    empty, the gradient takes numbers of these types instead of params, ``grad(t, y, out, *numbers)``; see `Packed`.
-
-    Raises
-    ------
-    NotCompilableError
-        If the function does something that dual numbers cannot.
+    The gradient fills `out` (*shape, n), exact up to rounding. If `scalars` is not empty, it takes numbers of these
+    types instead of params, ``grad(t, y, out, *numbers)``; see `Packed`. Raise NotCompilableError if dual numbers
+    cannot do what `fun` does.
     """
     dual = dual_along(n)
     lanes = dual.lanes
@@ -54,15 +50,9 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
 
 @lru_cache(maxsize=256)
 def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
-    """Return the rate ``rate(t, y, f[, params])`` of a jitted balance whose value has this `shape`.
+    """Return the rate ``rate(t, y, f[, params])`` of a jitted balance, its derivative along (1, f) in (t, y).
 
-    The rate is the derivative of the balance along (1, f) in (t, y), exact up to rounding. If `scalars` is not empty,
-    the rate takes numbers of these types instead of params, ``rate(t, y, f, *numbers)``; see `Packed`.
-
-    Raises
-    ------
-    NotCompilableError
-        If the function does something that dual numbers cannot.
+    The arguments and the exception are those of `gradient_by_duals`.
     """
     dual = Dual(1)
     call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
@@ -78,10 +68,7 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
 
 
 def dual_along(directions: int) -> Dual:
-    """Return the smallest dual type with which derivatives along `directions` directions need the fewest calls.
-
-    The calls are those of the function that is differentiated, each along at most `LANES` directions.
-    """
+    """Return the smallest dual type with which derivatives along `directions` directions need the fewest calls."""
     passes = -(-directions // LANES)
     return Dual(-(-directions // passes))
 
@@ -114,8 +101,8 @@ def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
 def compiled_for(function: Callable[..., Any], ndim: int, has_params: bool, scalars: str) -> Any:
     """Compile ``function(t, y, a, params)`` for real states and an array `a` of `ndim` dimensions, and return it.
 
-    The compiled function takes the parameters as the user's function does: the array params, or nothing, or numbers
-    of the types `scalars`.
+    The compiled function takes the parameters as the user's does: params, or nothing, or numbers of the types
+    `scalars`.
     """
     function = inside(function)
     floats, third = (types.Array(types.float64, dimensions, "C") for dimensions in (1, ndim))
@@ -139,10 +126,7 @@ def _by_signature(function: Callable[..., Any], arguments: list[Any]) -> Any:
 
 
 def put_slopes(value, out, first, count):
-    """Write the `count` slopes of the dual `value` to columns of the gradient `out`, starting at the column `first`.
-
-    Only compiled code can call this function.
-    """
+    """Write `count` slopes of the dual `value` to columns of `out` from `first` on; for compiled code only."""
 
 
 @overload(put_slopes)

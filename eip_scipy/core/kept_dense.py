@@ -41,14 +41,8 @@ class AtRealTimes(DenseOutput):
 class KeptDenseOutput(AtRealTimes):
     """The polynomial through states of one step, in barycentric form; at both ends it returns exactly the given states.
 
-    Parameters
-    ----------
-    t_old, t : float
-        Ends of the step.
-    shares : ndarray, shape (k,)
-        Distinct times in units of the step, in increasing order: 0 is `t_old` and comes first, 1 is `t` and comes last.
-    states : ndarray, shape (k, n)
-        States at these times.
+    `shares` (k,) are the distinct times of the `states` (k, n) in units of the step, in increasing order from 0, which
+    is `t_old`, to 1, which is `t`.
     """
 
     def __init__(self, t_old: float, t: float, shares: Array, states: Array) -> None:
@@ -66,11 +60,7 @@ class KeptDenseOutput(AtRealTimes):
 
 
 def kept(t_old: float, t: float, states: Callable[[Array], Array]) -> KeptDenseOutput:
-    """Return a polynomial that approximates ``states(times) -> (n, m)`` over the step from `t_old` to `t`.
-
-    The degree is doubled, from 8 up to 64, until the error of each component is below 1e-14 of its largest value or no
-    longer halves.
-    """
+    """Return a polynomial through ``states(times) -> (n, m)`` over the step from `t_old` to `t`, see `DEGREES`."""
 
     def polynomial() -> KeptDenseOutput:
         return KeptDenseOutput(t_old, t, (times - t_old) / (t - t_old), found)

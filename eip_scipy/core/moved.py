@@ -36,22 +36,7 @@ MOVED = {  # a module: its old names, or "*" for all of them, and the modules th
 
 
 def moved_names(module: str, stacklevel: int = 2) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a module from which names have moved.
-
-    Nothing is imported before an old name is used.
-
-    Parameters
-    ----------
-    module : str
-        Full name of the module.
-    stacklevel : int
-        Stack level of the warning.
-
-    Returns
-    -------
-    callable
-        ``look_up(name)``, which returns the value from its new place and issues a DeprecationWarning.
-    """
+    """Return the ``__getattr__`` of a module from which names have moved; it imports their modules when used."""
     homes = MOVED[module]
 
     def look_up(name: str) -> Any:

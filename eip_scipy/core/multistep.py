@@ -59,13 +59,8 @@ def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Arra
 def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping, *, level: bool) -> None:
     """Check the step of a run of a multistep method, and add the history of the method to the run.
 
-    `name` is the name of the method in messages. For `level`, see `RunSpec`.
-
-    Raises
-    ------
-    ValueError
-        If the step is not stable at the start (not checked with ``check=False``); the message names a stable length.
-        Also if a run with balances has too few steps for a history.
+    `name` is the name of the method in messages. For `level`, see `RunSpec`. Raise ValueError if the step is not stable
+    at the start (not checked with ``check=False``), or if a run with balances has too few steps for a history.
     """
     method: Any = run.tableau
     assert stepping.h is not None
@@ -81,10 +76,7 @@ def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping,
 
 
 def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, check: bool) -> slice:
-    """Return the slice of the floats of the accelerations that are corrected with the Jacobian.
-
-    With `check`, raise a ValueError if the step h is not stable at the start.
-    """
+    """Return the slice of the accelerations' floats that the Jacobian corrects; `check` that the step h is stable."""
     y0 = system.start.y
     half = y0.size // 2
     plain = stability_limit(method.order, False)

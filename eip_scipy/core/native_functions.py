@@ -26,24 +26,10 @@ NO_DUALS = "a gradient is compiled only for jitted functions of real states"
 class Kind(NamedTuple):
     """Signature of a function.
 
-    Attributes
-    ----------
-    shape : tuple of int
-        Shape of the value, () for a number.
-    size : int
-        Number of components of the state that the function receives.
-    p : int
-        Length of the array params that the function receives; -1 if it receives none.
-    dtype : str
-        Type of the components of the state.
-    real : bool
-        True if the value is real even if the state is complex.
-    takes_f, in_place : bool
-        True if the user's function takes f, the derivative of the state; True if it fills an argument `out`.
-    gradient : bool
-        True if the engine calls the function with the arguments of a gradient, which include f.
-    scalars : str
-        Types of the numbers that the function takes instead of params, see `Packed`.
+    Its value has the `shape`, () for a number, and is real, even if the state is complex, if `real`. It receives `size`
+    components of the state, of the type `dtype`, and an array params of length `p`, -1 for none, or numbers of the
+    types `scalars`, see `Packed`. The user's function takes f, the derivative of the state, if `takes_f`, and fills an
+    argument `out` if `in_place`. If `gradient`, the engine calls it with the arguments of a gradient, which include f.
     """
 
     shape: tuple[int, ...]
@@ -58,10 +44,7 @@ class Kind(NamedTuple):
 
 
 class Native(NamedTuple):
-    """A function that the engine calls, and the number of floats that the function fills.
-
-    `function` is None for a gradient, or the rate of a balance, that the engine computes itself.
-    """
+    """A function that the engine calls, or None if it computes this itself, and the number of floats filled."""
 
     function: PointerFunction | Compiled | LibraryFunction | None
     floats: int
@@ -138,11 +121,9 @@ def native_functions(
 
 
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
-    """Return the function that the engine calls for `fun`, and its signature.
+    """Return the function that the engine calls for `fun`, and its signature, by default `number`, that of a number.
 
-    If the state has columns of derivatives, the attribute `of_state` of `fun` has the function of the state alone and
-    the size of the state. Without this attribute, `fun` and `number` are returned. `number` is the signature of a
-    function that returns a number.
+    If the state has columns of derivatives, the attribute `of_state` has the function of the state alone and its size.
     """
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
@@ -151,14 +132,9 @@ def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
 def function_alone(
     fun: Callable[..., Any], kind: Kind, name: str, params: np.ndarray | None, *, second_order: bool = False
 ) -> NativeFunctions:
-    """Return `NativeFunctions` with the right-hand side `fun` of the signature `kind`, without invariants and events.
+    """Return `NativeFunctions` of the signature `kind` with the right-hand side `fun`, without invariants and events.
 
     If `second_order`, `fun` returns the accelerations. `name` is the name of `fun` in messages.
-
-    Raises
-    ------
-    NotCompilableError
-        As for `native_functions`.
     """
     width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
     rhs = _native(fun, kind, name, math.prod(kind.shape) * width)
@@ -237,16 +213,11 @@ def with_rates(
 
 
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:
-    """Raise the exception of a function whose call failed in the engine.
+    """Raise the exception of a function whose call failed in the engine: of a Numba function its own, of any type.
 
-    The arguments after `functions` are those of the `FailedCallError` that the engine raised. `group` and `k` identify
-    the function: it is number `k` of the list that ``functions.owner`` has for the key `group`, such as "rhs", "inv" or
-    "grad". It was called with `t` and the arrays whose bytes are `y` and `f`, and returned `status`.
-
-    Raises
-    ------
-    RuntimeError
-        For the status of a C function; for a Numba function the exception that it raises, of any type.
+    The arguments after `functions` are those of the `FailedCallError` that the engine raised. The function is number
+    `k` of the list ``functions.owner[group]``. It was called with `t` and the arrays whose bytes are `y` and `f`, and
+    returned `status`.
     """
     function = functions.owner[group][k].function
     if isinstance(function, PointerFunction):
@@ -261,10 +232,9 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
 
 
 def _native(fun: Any, kind: Kind, name: str, floats: int, **others: Any) -> Native:
-    """Return a function as `Native`, compiled if it is a Numba function.
+    """Return a function as `Native`, compiled if it is a Numba function, of the signature `kind` with `others`.
 
-    `name` is the name of the function in messages, and `floats` the number of floats that the function fills. The
-    signature is `kind` with the fields `others`.
+    `name` is its name in messages, and `floats` the number of floats that it fills.
     """
     if isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)

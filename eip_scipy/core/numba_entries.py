@@ -20,8 +20,8 @@ WORD, ADDRESS = ir.IntType(64), ir.IntType(8).as_pointer()
 def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
     """Return `call`, of a Numba function ``fun(t, y)``, with the function's compiled code for states of type `dtype`.
 
-    Return `call` itself if there is no such code, or if the engine cannot call it. Nothing is compiled here: the code
-    exists as soon as the function has been called once with such a state.
+    Return `call` itself if there is no such code that the engine can call. Nothing is compiled here: the code exists as
+    soon as the function has been called once with such a state.
     """
     if call.args or call.takes_f or call.in_place or len(call.shape) > 2:
         return call
@@ -40,11 +40,7 @@ def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
 
 @lru_cache(maxsize=16)
 def _is_as_expected(context: Any, value: types.Type, state: types.Array) -> bool:
-    """Return True if this version of Numba passes arguments and values in the way that the engine assumes.
-
-    `context` is the target context of Numba's compiled code, `value` the Numba type of the function's value, and
-    `state` that of its argument y.
-    """
+    """Return True if this version of Numba passes the argument y, `state`, and the value as the engine assumes."""
     number = context.get_data_type(state.dtype).as_pointer()
     returned = context.get_data_type(value)
     if isinstance(value, types.Array):

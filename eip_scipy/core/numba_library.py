@@ -55,10 +55,9 @@ def _jitted(function: Any) -> Any:
 
 
 def _value_of(function: Any, fill: Any) -> Callable[..., Any]:
-    """Return ``value(t, y, f, params)``, which returns the value that `fill` writes: a number or a new array.
+    """Return ``value(t, y, f, params)``, which returns what `fill` writes for `function`: a number or a new array.
 
-    `function` is a `LibraryFunction`, and `fill` is the jitted function that `_filling` makes for it.
-    It is a number if the value of `function` has one component for states of any size and does not depend on f.
+    It is a number if the value has one component for states of any size and does not depend on f.
     """
     numbers, of_state = function.numbers, function.fills_states
 

@@ -63,15 +63,9 @@ class Compiled(NamedTuple):
 
 
 def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
-    """Compile a Numba function of the signature `kind`, and return it as a C function.
+    """Compile a Numba function of the signature `kind`, and return it as a C function, or raise NotCompilableError.
 
     `number` replaces the Numba type of the components of the state; default: the type in `kind`.
-
-    Raises
-    ------
-    NotCompilableError
-        If the function does not compile for the arguments that `integrate` documents, or returns a list, a tuple or,
-        in some branches, None.
     """
     try:
         pointer = _compile(fun, kind, number)
@@ -107,8 +101,7 @@ def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
 def _c_function(compiled: Any, kind: Kind) -> Pointer:
     """Return the pointer to a C function that calls `compiled(t, y, f, out, params)` and returns 0, or -1 if it raises.
 
-    The C function is written in LLVM's language, because Numba's `cfunc` would take twice as long to compile, and each
-    call would go through another function.
+    Numba's `cfunc` would take twice as long to compile, and each call would go through another function.
     """
     name = f"eip_scipy.{next(_serial)}"
     context = compiled.target_context

@@ -61,32 +61,13 @@ class OneStepMethod(Protocol):
 class OneStep(Ordered):
     """A user's one-step method after checks; it takes the place of a tableau and of its arrays.
 
-    Parameters
-    ----------
-    method : OneStepMethod
+    `name`, `order`, `error_estimator_order` (None without an estimate) and `evaluations` are as in `OneStepMethod`. `b`
+    and `c`, 1 and 0, are those of a tableau with a single stage at the start of the step, for code that reads the
+    stages of any method. Adaptive steps change by the power `exponent` of the norm of the error estimate.
 
-    Attributes
-    ----------
-    name, order, error_estimator_order, evaluations
-        As in `OneStepMethod`; `error_estimator_order` is None without an estimate.
-    b, c : ndarray, shape (1,)
-        The coefficients 1 and 0 of a tableau with a single stage at the start of the step, for code that reads the
-        stages of any method.
-    exponent : float
-        Power of the norm of the error estimate by which adaptive steps change: -1 / (`error_estimator_order` + 1).
-
-    Raises
-    ------
-    TypeError
-        If the object does not have the members of `OneStepMethod`, or is a class.
-    ValueError
-        If an order is not an integer >= 1, or `evaluations` is not an integer >= 0.
-
-    Notes
-    -----
     The steps do not use the right-hand side f. It is evaluated only for gradients that take f, and in a few steps to
     judge the projections. ``nfev`` counts the evaluations for gradients and, for each step that is tried, the
-    `evaluations` of the method.
+    `evaluations`.
     """
 
     in_python = True
@@ -143,13 +124,6 @@ def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.nd
     """Return the value of a user's function at t as an array (n,); for n = 1 the value may be a number.
 
     `came` is the beginning of the error messages, such as "fun returned"; `dtype` is that of the state.
-
-    Raises
-    ------
-    TypeError
-        If the value is None, is not numeric, or has a unit.
-    ValueError
-        If the shape is wrong, or the value is complex but the state is real.
     """
     if value is None:
         raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")

@@ -219,13 +219,7 @@ class ProjectionOptions:
         return own, {name: value for name, value in keywords.items() if name not in own}
 
     def settled(self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet) -> Settled:
-        """Check the options for a run with the `known` invariants.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If a value is wrong, or `method` or an invariant does not support an option.
-        """
+        """Check the options for a run with the `known` invariants."""
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
         balance_groups = _groups(known, n, width)
@@ -363,13 +357,7 @@ def _band(method: AnyMethod, compensated: bool) -> float:
 
 
 def weights(name: str, sigma: Any, n: int) -> np.ndarray:
-    """Return weights of n components, scaled so that the largest is 1.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, or weights are negative, all 0, or not finite.
-    """
+    """Return weights of n components, scaled so that the largest is 1, after checks."""
     a = real_array(name, sigma)
     if a.shape != (n,):
         raise ValueError(f"{name}: weights have shape {a.shape}, the state has {n} components.")
@@ -389,11 +377,6 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
     """Return the balances in groups that have the same components and weights; each group is projected by itself.
 
     The state has `n` components of `width` floats each: 1 if it is real, 2 if it is complex.
-
-    Raises
-    ------
-    ValueError
-        If some invariants have components and others do not, components are outside the state, or the state is complex.
     """
     lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.subspaces]
     if len(lacking) == len(known.items):

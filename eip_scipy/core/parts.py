@@ -29,13 +29,6 @@ class SolverOfParts(EIPSolver):
     The right-hand side fills a part of the derivative. An invariant returns the same number on every process, and its
     gradient returns only the components of this process's part. Only fixed steps and the Euclidean metric are
     supported.
-
-    Attributes
-    ----------
-    place : (int, int)
-        Number of this process, and number of processes.
-    known : InvariantSet
-        The run's invariants.
     """
 
     _in_parts = True
@@ -109,10 +102,7 @@ class _Coordinates:
         self._begins = False
 
     def project(self, t_old: float, t: float, last: bool, y_new: np.ndarray) -> int:
-        """Project the unprojected state of the run, write the result to `y_new`, and return the engine's status.
-
-        The step leads from `t_old` to `t`; `last` is True for the last step of the run.
-        """
+        """Project the unprojected state of the run, write the result to `y_new`, and return the engine's status."""
         self._begins = True
         status: int = self._engine.project(t_old, self._origin, t, last, self._moved)
         y_new[:] = self._at(self._moved)

@@ -59,23 +59,9 @@ class CFunctions:
 class PointerFunction:
     """A C function in a form that Python can call: ``(t, y[, f], out[, params])``, with f for gradients that use it.
 
-    Parameters
-    ----------
-    pointer : LowLevelCallable, ctypes or cffi function pointer, or CFunctions
-        The pointer. It is stored, so that its function lives as long as this object.
-    name : str
-        Name of the function in messages.
-    kind : str
-        `VALUE` or `GRADIENT`, the required signature.
-    takes_f : bool, optional
-        Whether Python passes f. The engine always passes f to a gradient; without `takes_f` Python passes NaN.
-    shape : tuple of int, optional
-        If it is given, there is no argument `out`: a new array of this shape is returned, or a float for ``()``.
-
-    Raises
-    ------
-    TypeError
-        If the pointer has another signature, or user_data.
+    The pointer is stored, so that its function lives as long as this object. `name` is its name in messages, and `kind`
+    the required signature. The engine always passes f to a gradient; without `takes_f` Python passes NaN. If `shape` is
+    given, there is no argument `out`: a new array of this shape is returned, or a float for ``()``.
     """
 
     def __init__(
@@ -99,14 +85,7 @@ class PointerFunction:
         """Call the function; return its value if `shape` is given, else None.
 
         Entries of a returned value that the function does not fill are NaN. All entries of the value are NaN if the
-        status is above 0.
-
-        Raises
-        ------
-        RuntimeError
-            If the function returns a status below 0.
-        TypeError
-            If the last arguments are neither numbers nor one array of floats.
+        status is above 0. If it is below 0, a RuntimeError is raised.
         """
         rest = list(others)
         state = np.ascontiguousarray(y, complex if np.iscomplexobj(y) else float)
@@ -151,21 +130,12 @@ def _as_params(rest: tuple[Any, ...]) -> np.ndarray | None:
 
 
 def is_pointer(fun: Any) -> bool:
-    """Return True if a function is a C function pointer.
-
-    SciPy and cffi are not imported for the test: a pointer cannot be theirs if they are not imported.
-    """
+    """Return True if a function is a C function pointer; it cannot be SciPy's or cffi's if these are not imported."""
     return isinstance(fun, (CFunctions, FROM_CTYPES)) or _is_low_level(fun) or _is_of_cffi(fun)
 
 
 def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
-    """Return a C function pointer as a `PointerFunction` with the keywords `form`; return anything else unchanged.
-
-    Raises
-    ------
-    TypeError
-        As for `PointerFunction`.
-    """
+    """Return a C function pointer as a `PointerFunction` with the keywords `form`; return anything else unchanged."""
     return PointerFunction(fun, name, kind, **form) if is_pointer(fun) else fun
 
 

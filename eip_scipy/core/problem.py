@@ -30,13 +30,7 @@ SAME_S = 1e-4
 
 
 class Deferred:
-    """A function that is created when it is first called.
-
-    Parameters
-    ----------
-    make : callable
-        ``make()`` returns the function.
-    """
+    """A function that is created, by ``make()``, when it is first called."""
 
     def __init__(self, make: Callable[[], Callable[..., Any]]) -> None:
         self._make = make
@@ -289,10 +283,7 @@ class Problem:
         return out
 
     def _named_parameters(self, given: Mapping[str, Any]) -> np.ndarray:
-        """Return the values (p,) of all parameters in the order of the problem, or (members, p) if arrays are given.
-
-        Parameters that are not given have the values of the problem.
-        """
+        """Return the values (p,) of all parameters, by default those of the problem; (members, p) for arrays."""
         known = self.parameters
         if not known:
             raise TypeError(
@@ -321,9 +312,9 @@ class Problem:
         return np.concatenate([q, v])
 
     def _own_start(self, time: Any, t0: float) -> float:
-        """Return the starting time of the problem if `time`, the date of `t0`, is the date at which the problem starts.
+        """Return the starting time of the problem if `time`, the date of `t0`, is that date; else raise ValueError.
 
-        Raise ValueError if it is another date. Return `t0` if the problem has no units, no epoch or no `t_span`.
+        Return `t0` if the problem has no units, no epoch or no `t_span`.
         """
         known = self.unit_system
         if known is None or self.epoch is None or self.t_span is None:
@@ -362,13 +353,7 @@ class Problem:
 
 
 def component_names(names: Any, n: int | None) -> tuple[str, ...]:
-    """Return the names of n components from a sequence or from text such as "x y"; any number of names if `n` is None.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the names are not strings, if their number is not `n`, or if two names are equal.
-    """
+    """Return the names of n components from a sequence or from text such as "x y"; `n` may be None for any number."""
     if isinstance(names, str):
         names = names.replace(",", " ").split()
     if not isinstance(names, Iterable):
@@ -406,8 +391,7 @@ def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
 def library_variational(function: str, names: tuple[str, ...], parameters: tuple[int, ...]) -> Callable[..., None]:
     """Return the function of `library` for a state with columns of derivatives: ``Problem.variational(parameters)``.
 
-    It is called `function`, or ``{function}_by_parameter`` if the last column is the derivative by the first parameter.
-    `names` contains the name of this parameter if `library` has that derivative; otherwise it is empty.
+    `names` contains the name of the first parameter if `library` has the derivative by it; otherwise it is empty.
     """
     if not parameters:
         return library[function]

@@ -86,7 +86,6 @@ class Diagnostics:
     ) -> None:
         """Keep the buffers of a run, from which the attributes are computed when they are read.
 
-        `counters` are the engine's counts of projections by kind. `trust` holds the findings of the checks.
         `estimated` is False if the run has no error estimate. `slow` holds the indices of the balances and the sums
         (`N_SLOW`, b) of their rates and terms.
         """
@@ -199,10 +198,7 @@ def slowness(sums: np.ndarray) -> np.ndarray:
 
 
 def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return the sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation together.
-
-    `one` are the sums of the run, and `two` are those of the continuation.
-    """
+    """Return the sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation together."""
     both = one + two
     late = [LATE_RATES, LATE_TERMS]
     kept = (one[SAMPLES] / np.maximum(both[SAMPLES], 1.0)) ** (1 / LATE_SHARE)

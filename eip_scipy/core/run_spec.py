@@ -45,16 +45,12 @@ class RunSpec:
         If `is_known`, it is the `tableau` of another run of these equations, which are not examined again.
     rhs : callable
         ``rhs(t, y) -> (n,)``, checked; it returns new arrays.
-    stepping : Stepping
-    projection : ProjectionOptions
     extra : tuple
         Further arguments of the invariants' functions, ``(params,)`` or those of ``args``.
     fun, in_place : callable, bool
-        The user's function or None, and whether it fills an argument `out`. The function is examined in case the user
-        passed an acceleration as `fun` by mistake.
+        The user's function or None, which is examined in case the user passed an acceleration as `fun` by mistake.
     jacobian : callable
-        ``jacobian()`` returns the Jacobian for a multistep method, see `SecondOrder`, or for an implicit method, see
-        `Jacobian`, or None.
+        ``jacobian()`` returns the Jacobian for a multistep method (see `SecondOrder`) or an implicit one, or None.
     frequencies : callable, optional
         ``frequencies(y0, length)`` for an interval of that length, see `Problem`.
     level : bool
@@ -66,8 +62,7 @@ class RunSpec:
     columns : Columns, optional
         Columns of derivatives that follow the state; `stepping` and `projection` are for the state without them.
     sees_velocity : bool
-        For methods for q'' = a: whether a comes from a function that is called with velocities too, on which it may
-        come to depend during the run.
+        For q'' = a: whether a comes from a function that is called with velocities too, on which it may come to depend.
     """
 
     name: str
@@ -91,15 +86,9 @@ class RunSpec:
     def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
         """Return the run that starts at the state y0, after a check of the options, the functions and the invariants.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (n,)
-        f0 : ndarray, shape (n,), optional
-            The derivative at y0. Default: it is evaluated.
-        tau : float, optional
-            Length of the first step, by default that of `stepping`.
-        check_start : bool
-            False: the invariants have been checked, and their cost reported, at the start of a similar run.
+        The derivative `f0` (n,) at y0 and the length `tau` of the first step are computed if they are None.
+        `check_start` is False if the invariants have been checked, and their cost reported, at the start of a similar
+        run.
         """
         t0 = self.stepping.span.t0
         method, f0 = self.examined(y0, f0)
@@ -139,11 +128,7 @@ class RunSpec:
         run.method.begin(self.rhs, start, self.stepping, self.jacobian())
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
-        """Return the length of the first step.
-
-        It is chosen from the state alone, without the columns of derivatives with respect to the start and the
-        parameters that may follow it.
-        """
+        """Return the length of the first step, chosen from the state alone, without columns of derivatives."""
         columns = self.columns
         if columns is None:
             return self.stepping.first(self.rhs, y0, f0, method)
@@ -183,13 +168,7 @@ class RunSpec:
         )  # fmt: skip
 
     def _check(self, run: Run, invariants_too: bool) -> None:
-        """Project the start if that is requested, and check the invariants there if `invariants_too`.
-
-        Raises
-        ------
-        ValueError
-            If the start misses a target, the projection fails, or the check finds an error.
-        """
+        """Project the start if that is requested, and check the invariants there if `invariants_too`."""
         if run.options.frame.products.size:
             run.options = run.options._replace(scales=_scales(run))
         if self.projection.project_initial:
@@ -226,13 +205,7 @@ def _scales(run: Run) -> Array:
 
 
 def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
-    """Return the start projected onto the targets, by full Newton steps in the euclidean metric.
-
-    Raises
-    ------
-    ValueError
-        If the projection fails, or the projected state misses a target.
-    """
+    """Return the start projected onto the targets, by full Newton steps in the euclidean metric."""
     t0, y0, f0, _ = run.begin
     options = run.options._replace(
         metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf

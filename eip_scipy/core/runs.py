@@ -42,19 +42,11 @@ class Run:
     Attributes
     ----------
     begin, start : Start
-        The start at which the invariants were measured, and the one of the first step, which `project_initial` may
-        have moved.
-    stepping : Stepping
-    tableau : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
-        The method as it was given.
-    method : Method, OneStep or Stepper
-        The form of the method that the engine uses for the steps.
-    options : Options
-    work : Work
-    invariants : InvariantSet
+        The start at which the invariants were measured, and that of the first step, which `project_initial` may move.
+    tableau, method : AnyMethod; Method, OneStep or Stepper
+        The method as it was given, and the form of it that the engine uses for the steps.
     identity : dict
         See `Settled`.
-    trust : Trust
     called : str
         Name of the argument that gave the right-hand side.
     left_out : str
@@ -63,8 +55,6 @@ class Run:
         Columns of derivatives whose products with the Jacobian are compared with differences during the run.
     looked, looked_at_products : int
         The steps at which the invariants, and these products, were checked last.
-    warned_of_balances : bool
-        Whether there was a warning of balances that change too fast.
     moved : str
         A sentence on how far `project_initial` has moved the start, or "".
     """
@@ -207,10 +197,7 @@ class Run:
         )
 
     def _is_doubtful(self, ended: bool) -> bool:
-        """Return True if corrections or errors show that the run is faulty.
-
-        Before the end of the run they do so only if later projections cannot make it reliable again.
-        """
+        """Return True if corrections or errors show that the run is faulty, before its end without hope of recovery."""
         return self.trust.is_sick if ended else self.trust.beyond_doubt
 
     @cached_property

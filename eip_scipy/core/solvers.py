@@ -263,11 +263,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         )
 
     def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:
-        """Start a run at a state and make its buffers.
-
-        The arguments are those of `RunSpec.build`: the state, its derivative, the length of the first step (the last
-        two are computed if they are None), and `check_start`.
-        """
+        """Start a run at a state and make its buffers; the arguments are those of `RunSpec.build`."""
         run = self._spec.build(y0, f0, tau, check_start=check)
         self._run, self._work = run, run.work
         self._spec = replace(self._spec, method=run.tableau, is_known=True)
@@ -361,10 +357,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             setattr(solver, name, getattr(self, name))
 
     def _restart(self, here: Start) -> None:
-        """Start a new run at `here`, a time and a state of which at least one was set by the user.
-
-        The counts, the largest residuals and the largest corrections are taken over from the old run.
-        """
+        """Start a new run at `here`, a time and a state set by the user; counts and the largest residuals continue."""
         old = self._run
         self._start(*here[1:], check=False)
         new, counters = self._run, self._work.counters
@@ -612,8 +605,7 @@ def _frozen(a: np.ndarray) -> np.ndarray:
 def _jacobian(method: Any, options: dict[str, Any]) -> Any:
     """Remove the options for the Jacobian from `options`, and return them in the form that the method needs.
 
-    This is a `Jacobian` for a method whose steps SciPy makes, the function ``jacobian`` or None for a multistep method,
-    and None for all others.
+    This is a `Jacobian` for a method whose steps SciPy makes, and ``jacobian`` or None for a multistep method.
     """
     if method.drives:
         return Jacobian(options.pop("jac", None), options.pop("jac_sparsity", None))
@@ -865,10 +857,7 @@ class EIPBDF(EIPSolver):
 
 
 def class_named(method: Any) -> str | None:
-    """Return the name of the EIP class for `method`, an EIP class, a solver class of SciPy, or the name of either.
-
-    The function returns None if there is no such EIP class.
-    """
+    """Return the name of the EIP class for an EIP class, a solver class of SciPy, or the name of either, or None."""
     name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
     return next((known for known in __all__ if known.upper() == name), None)
 

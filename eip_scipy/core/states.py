@@ -29,15 +29,7 @@ def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
 
 
 def states(name: str, value: Any) -> np.ndarray:
-    """Return a state, or several states, as a new float64 or complex128 array of any shape.
-
-    Raises
-    ------
-    TypeError
-        If the value does not consist of numbers, or has a unit.
-    ValueError
-        If values are masked, or rows have different lengths.
-    """
+    """Return a state, or several states, as a new float64 or complex128 array of any shape, after checks."""
     refuse_units(**{name: value})
     if np.ma.isMaskedArray(value) and np.ma.is_masked(value):
         raise ValueError(f"masked values in {name}; fill or drop them first.")

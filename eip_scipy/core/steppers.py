@@ -36,10 +36,7 @@ Derivative = Callable[[float, Array], Array]
 
 @singledispatch
 def arrays(method: Any) -> Method | OneStep | Stepper:
-    """Return a method in the form that the engine uses for its steps: coefficients, or an object that makes steps.
-
-    For a `GaussJackson` method these are the coefficients of the method that makes its first states.
-    """
+    """Return a method in the form that the engine uses for its steps: coefficients, or an object that makes steps."""
     raise TypeError(
         f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
         "OneStep or Driven."
@@ -133,13 +130,7 @@ def seeing(coefficients: Any, sees_velocity: bool) -> Any:
 
 @singledispatch
 def rated(method: Any) -> Array:
-    """Return a mask (s,) of the stages of a method at which the rate of a `Balance` is needed.
-
-    Raises
-    ------
-    ValueError
-        If the method does not support balances.
-    """
+    """Return a mask (s,) of the stages at which the rate of a `Balance` is needed; ValueError if unsupported."""
     raise ValueError(
         f"invariants: {method.name} does not carry a Balance, because it does not provide the whole state at its "
         "stages, where rates would be evaluated. Use EIPRK4, EIPDOP853, eip_method(tableau) or EIPGJ12, or omit the "
@@ -184,10 +175,7 @@ class Form(NamedTuple):
 
 @singledispatch
 def form(method: Any, brief: bool) -> Form:
-    """Return the form of the interpolants of a method.
-
-    `brief` is True if the run has too few steps for the history of a `GaussJackson` method.
-    """
+    """Return the form of a method's interpolants; a `brief` run has too few steps for a multistep history."""
     raise TypeError(
         f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
         "OneStep or Driven."
@@ -292,12 +280,7 @@ def check_halves(n: int) -> None:
 def depends_on_velocity(rhs: Derivative, start: Any, name: str, hint: Callable[[], str] = str) -> bool:
     """Return True if the accelerations of q'' = a(t, q, v), y = (q, v), depend on v at the start of a run.
 
-    The arguments are those of `checked`.
-
-    Raises
-    ------
-    ValueError
-        If the state has an odd number of components, or the first half of its derivative is not v.
+    The arguments are those of `checked`. Raise ValueError if the state is not (q, v).
     """
     t0, y0, f0, _ = start
     check_halves(y0.size)

@@ -65,16 +65,7 @@ class Stepping:
         f0: np.ndarray,
         tableau: AnyMethod,
     ) -> float:
-        """Return the length of the first step: `h`, at most the length of the interval, `first_step` or an estimate.
-
-        `f0` is the derivative at the start `y0`. The estimate uses the order of the error estimate of the method,
-        `tableau`.
-
-        Raises
-        ------
-        ValueError
-            If the length must be estimated and the error of a component has no scale.
-        """
+        """Return the length of the first step: `h`, at most the length of the interval, `first_step` or an estimate."""
         if self.h is not None:
             length = abs(self.span.t_bound - self.span.t0)
             return min(self.h, length) if length else self.h
@@ -139,14 +130,7 @@ class StepOptions:
     atol: Any = ATOL
 
     def checked(self, name: str, method: AnyMethod, t0: float, t_bound: float, n: int, *, stacklevel: int) -> Stepping:
-        """Return the step control of a run with n components; `stacklevel` is for the warning that `rtol` is too small.
-
-        Raises
-        ------
-        ValueError
-            If an option has a wrong value, `h` is combined with options of adaptive steps or with a method whose steps
-            SciPy makes, or `h` is missing and the method `name` needs fixed steps.
-        """
+        """Return the step control of a run with n components; `stacklevel` is for a warning about `rtol`."""
         h = self.h
         if h is None and method.fixed_steps_only:
             why = "takes fixed steps" if method.has_estimate else "has no error estimate"
@@ -178,15 +162,7 @@ class StepOptions:
 
 
 def interval(t_span: Any) -> tuple[float, float]:
-    """Return start and end of an interval, whose end may be infinite.
-
-    Raises
-    ------
-    TypeError
-        If a value has a unit or is a date.
-    ValueError
-        If t_span does not hold two real numbers, one of them is NaN, or the start is infinite.
-    """
+    """Return start and end of an interval, whose end may be infinite, after checks."""
     refuse_units(t_span=t_span)
     ends = reals(t_span)
     if ends is None or ends.shape != (2,):
@@ -198,15 +174,7 @@ def interval(t_span: Any) -> tuple[float, float]:
 
 
 def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return both tolerances as arrays (n,).
-
-    Raises
-    ------
-    TypeError
-        If a value has a unit.
-    ValueError
-        If a value is NaN, infinite or negative, or a shape is wrong.
-    """
+    """Return both tolerances as arrays (n,), after checks."""
     refuse_units(rtol=rtol, atol=atol)
     out = []
     for name, value in (("rtol", rtol), ("atol", atol)):
@@ -230,17 +198,10 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool = False) -> float:
-    """Return the step h as a positive float.
+    """Return the step h as a positive float, after checks.
 
-    With `may_be_longer` the step may be longer than the interval; it is then shortened, as the last step of any run.
-
-    Raises
-    ------
-    TypeError
-        If h has a unit.
-    ValueError
-        If h is not a positive number, is longer than the interval, or is below ten spacings of floating-point numbers
-        at the end of the interval that is farther from 0.
+    With `may_be_longer` the step may be longer than the interval; it is then shortened, as the last step of any run. It
+    must not be below ten spacings of floating-point numbers at the end of the interval that is farther from 0.
     """
     refuse_units(h=h)
     if not is_number(h) or not 0 < h < math.inf:
@@ -282,10 +243,7 @@ def fixed_steps(h: float, t0: float, t_bound: float) -> int:
 
 
 def saved_steps(n_steps: int, save_every: int) -> np.ndarray:
-    """Return the numbers of the steps after which a state is saved: 0 for the start, every `save_every`-th, the last.
-
-    If `save_every` is 0, only the start and the last step are saved.
-    """
+    """Return the numbers of the steps after which a state is saved: 0, every `save_every`-th if not 0, and the last."""
     return np.append(np.arange(0, n_steps, save_every or max(n_steps, 1)), n_steps)
 
 

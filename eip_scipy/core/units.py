@@ -28,17 +28,7 @@ NUMBERED = re.compile(r"(\d+(?:\.\d*)?(?:e[-+]?\d+)?) (m|s)")
 
 
 class Unit(NamedTuple):
-    """A unit of length or time.
-
-    Attributes
-    ----------
-    name : str
-        Name of a unit of astropy.
-    scale : float
-        Size of the unit, in units of `name`.
-    si : float
-        Size of the unit, in metres or seconds.
-    """
+    """A unit of length or time: `scale` times the unit `name` of astropy, or `si` metres or seconds."""
 
     name: str
     scale: float
@@ -67,26 +57,9 @@ def _unit(text: str, known: dict[str, float]) -> Unit | None:
 def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, Unit] | None) -> Any:
     """Convert a value with a unit, or a list of such values, to plain numbers in the unit length**a time**b.
 
-    Plain numbers are returned unchanged if `known` is None or the unit is that of time. Otherwise only zeros may have
-    no unit.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for messages.
-    value : object
-    powers : (int, int)
-        The exponents a and b.
-    known : (Unit, Unit) or None
-        Units of length and time; None raises an error for all values with a unit.
-
-    Raises
-    ------
-    TypeError
-        If a value has a unit but `known` is None, has a unit of another package than astropy, is a date, or lacks a
-        unit.
-    TypeError and ValueError
-        astropy's UnitConversionError, if the dimensions do not fit.
+    `name` is the name of the argument, `powers` are a and b, and `known` the units of length and time; if it is None,
+    values with a unit are refused. Plain numbers are returned unchanged if `known` is None or the unit is that of time.
+    Otherwise only zeros may have no unit.
     """
     if known is None:
         refuse_units(**{name: value})
@@ -107,11 +80,6 @@ def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch 
 
     `known` are the units of length and time, see `in_unit`. Dates are counted from `epoch`. `whose` names the owner of
     the epoch in messages.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As for `in_unit`; also TypeError for a date if `epoch` is None.
     """
     if known is None:
         refuse_units(**{name: value})
@@ -144,13 +112,6 @@ def as_epoch(name: str, value: Any) -> Epoch:
     """Return a moment as a Julian date in TDB, in two parts with this sum.
 
     The moment is a Time of astropy in any scale, a Julian date in TDB, or two numbers whose sum is such a date.
-
-    Raises
-    ------
-    TypeError
-        If the value has a unit, is a date of Python, or is not a number.
-    ValueError
-        If there is more than one moment, or the value is not finite.
     """
     if is_time(value):
         dynamic = value.tdb

@@ -56,9 +56,8 @@ TINY = 1e-150  # least size of a component: the product of it and a complex step
 class OfState(NamedTuple):
     """An invariant or event that the engine evaluates at the state, which is `n` components of the wide state.
 
-    `function` is the `Invariant` or the event of the state alone. `parameters` is the number of parameters that follow
-    the state in the wide state. If there are any, ``by_parameters(t, y, params)`` returns the derivatives of an
-    invariant with respect to them.
+    `function` is the `Invariant` or the event of the state alone. If `parameters` parameters follow the state in the
+    wide state, ``by_parameters(t, y, params)`` returns the derivatives of an invariant with respect to them.
     """
 
     n: int
@@ -74,19 +73,14 @@ class Columns:
     Attributes
     ----------
     values : ndarray, shape (n + p, k)
-        Initial columns; the last p rows belong to the parameters and are constant.
-    parameters : tuple of int
-        Indices of the run's parameters to which the last p rows belong.
-    is_transition : bool
-        Whether the first n columns are those of the state-transition matrix from the start of the first run.
-    symplectic : bool
-        Whether the state-transition matrix is kept symplectic.
+        Initial columns; the last p rows belong to the parameters with the indices `parameters` and are constant.
+    is_transition, symplectic : bool
+        Whether the first n columns are the state-transition matrix from the first start, and kept symplectic.
     in_halves : bool
         Whether the wide state has all positions first and then all velocities, as Nystrom methods need it; otherwise
         one column follows the other.
     by_jvp : bool
-        Whether the products with the Jacobian come from the user's `jvp`, which is compared with differences during
-        the run.
+        Whether the products with the Jacobian come from the user's `jvp`, which the run compares with differences.
     """
 
     values: Array
@@ -118,10 +112,7 @@ class Columns:
 
     @cached_property
     def order(self) -> Array:
-        """Return indices (1 + k, n + p) of entries of the wide state.
-
-        Row 0 is for the state and the p parameters, and row j for column j.
-        """
+        """Return indices (1 + k, n + p) in the wide state: row 0 for the state and parameters, row j for column j."""
         places = np.arange(self.size * (1 + self.count))
         if not self.in_halves:
             return places.reshape(1 + self.count, self.size)
@@ -159,13 +150,7 @@ class Columns:
 
 
 def require_tableau(method: Any) -> None:
-    """Raise an error for methods that do not support columns of derivatives.
-
-    Raises
-    ------
-    ValueError
-        If the method is neither an explicit Runge-Kutta method nor a Nystrom method.
-    """
+    """Raise ValueError for a method without a Runge-Kutta or Nystrom tableau, which carries no columns."""
     if method.TABLEAU.has_history or method.TABLEAU.in_python:
         raise ValueError(
             f"variations: {method.__name__} carries no derivatives, because its steps do not consist of stages of a "
@@ -174,16 +159,9 @@ def require_tableau(method: Any) -> None:
 
 
 def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in_halves: bool) -> Columns:
-    """Return the columns for the option `variations`; columns of an earlier run keep their values.
+    """Return the columns for the option `variations`, `asked`; `Columns` of an earlier run keep their values.
 
-    `asked` is the option, or the `Columns` of an earlier run. `params` and `names` are the values and the names of the
-    run's parameters. `in_halves` is stored in the result.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the option has a wrong value, the state is complex, the option names a parameter that the run lacks, or it
-        asks a Nystrom method for derivatives with respect to parameters.
+    `params` and `names` are the values and the names of the run's parameters.
     """
     if isinstance(asked, Columns):
         return replace(asked, in_halves=in_halves)
@@ -223,16 +201,7 @@ def _is_name(item: Any) -> bool:
 
 
 def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invariants: Sequence[Invariant]) -> Columns:
-    """Return the columns with `symplectic` set to the option of the user, `asked`, or by default to `canonical`.
-
-    `canonical` is the attribute of the problem. By default `symplectic` is False if the columns cannot be kept
-    symplectic.
-
-    Raises
-    ------
-    ValueError
-        If the option is True but the columns cannot be kept symplectic.
-    """
+    """Return the columns with `symplectic` as `asked`, by default as `canonical`, the problem's, where possible."""
     reasons = {
         "derivatives with respect to parameters or along given directions are not a state-transition matrix; use "
         'variations="state"':
@@ -258,7 +227,7 @@ def _parameter(item: Any, params: Array, names: Sequence[str]) -> int:
 
 
 def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tuple[Any, Array]:
-    """Return the options of the step and the weights (m,) of the error metric for wide states of m components.
+    """Return the options and the weights (m,) of the error metric for wide states of m components.
 
     They are made from `options` and `sigma`, which are for the state. `G` (l, m) contains the gradients of the
     invariants at the start, with respect to the wide state.
@@ -305,17 +274,9 @@ class StateSolution(OdeSolution):
 class Variations:
     """The functions of a wide state.
 
-    Attributes
-    ----------
-    columns : Columns
-    rhs : callable
-        Right-hand side in place: ``rhs(t, Y, out, *extra)``.
-    invariants : tuple of Invariant
-        The invariants as functions of the wide state.
-    given : tuple of Invariant
-        The same invariants as functions of the state, as the user gave them.
-    source : str
-        Source of the products with the Jacobian: "problem", "jvp", "dual numbers" or "complex steps".
+    `rhs` is the right-hand side in place, ``rhs(t, Y, out, *extra)``. `invariants` are functions of the wide state, and
+    `given` the same invariants as functions of the state. `source` is the source of the products with the Jacobian:
+    "problem", "jvp", "dual numbers" or "complex steps".
     """
 
     columns: Columns
@@ -338,13 +299,8 @@ class Variations:
     ) -> Variations:
         """Return the functions of a wide state, made from `products`, the output of `right_hand_side`.
 
-        `extra` contains the run's further arguments. With `in_python` the functions are called from Python,
-        and nothing is compiled.
-
-        Raises
-        ------
-        ValueError
-            If there are balances.
+        `extra` contains the run's further arguments. With `in_python` all is called from Python, and nothing is
+        compiled.
         """
         if any(item.is_balance for item in invariants):
             raise ValueError(
@@ -400,11 +356,6 @@ def right_hand_side(
     """Return the right-hand side of the wide state, in place, and the source of its products with the Jacobian.
 
     `form` is the form of `fun`, one of the names in `FORMS`. `own` is the ``variational`` of the problem, or None.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `jvp` is wrong, or no source of derivatives is available.
     """
     if columns.parameters and scalars(extra) != "":
         raise ValueError("variations: derivatives with respect to parameters need params=[...], one array of numbers.")
@@ -445,15 +396,7 @@ def _of_columns_in_order(
 def _require_products(
     columns: Columns, derivative: Callable[..., Array], jvp: Any, t0: float, y0: Array, extra: tuple
 ) -> None:
-    """Check that `jvp` is the product of the Jacobian of the right-hand side, `derivative`, and a vector.
-
-    Raises
-    ------
-    TypeError
-        If `jvp` is not callable or takes other arguments.
-    ValueError
-        If its value is wrong, or if columns are derivatives with respect to parameters.
-    """
+    """Raise an error unless `jvp` is the product of the Jacobian of the right-hand side, `derivative`, and a vector."""
     if columns.parameters:
         raise ValueError(
             "variations: derivatives with respect to parameters cannot be computed with jvp, which gives only products "
@@ -495,10 +438,7 @@ def _agree(found: Array, right: Array, bound: float) -> bool:
 
 
 def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
-    """Return a right-hand side for a state whose entries at `places` are the state of `rhs`, in this order.
-
-    The other entries of the state do not change.
-    """
+    """Return a right-hand side of a state that is that of `rhs` at `places` and constant elsewhere, in place."""
     if np.array_equal(places.ravel(), np.arange(places.size)):
         return rhs
     if is_compiled(rhs) and not jit_is_off():
@@ -566,12 +506,9 @@ def _by_jvp(jvp: Callable[..., Any], n: int, dtype: np.dtype) -> Callable[[float
 def _by_complex_steps(
     columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, why: str | None
 ) -> Callable[..., Any]:
-    """Return the right-hand side of the wide state with products by complex steps.
+    """Return the right-hand side of the wide state with products by complex steps, if they are right at the start.
 
-    Raises
-    ------
-    ValueError
-        If complex steps are wrong at the start. The message contains `why`, the reason why products are not compiled.
+    The message of the ValueError contains `why`, the reason why products are not compiled.
     """
     derivative, places = _derivative(fun, form, y0), list(columns.parameters)
     products = _ComplexSteps(derivative, y0, places)
@@ -615,14 +552,8 @@ class _ComplexSteps:
     domain. Therefore the products at each state are compared with a difference along one combination of the columns, as
     in `NumericalGradient`. The choice depends on the wide state only, so that a resumed run makes the same steps.
 
-    Parameters
-    ----------
-    derivative : callable
-        ``derivative(t, y, extra) -> (n,)``, for real and complex states.
-    y0 : ndarray, shape (n,)
-        State at the start.
-    places : list of int
-        Indices in the run's parameters to which the last p components of a column belong.
+    ``derivative(t, y, extra)`` takes real and complex states. `places` are the indices in the run's parameters to which
+    the last p components of a column belong.
     """
 
     def __init__(self, derivative: Callable[..., Array], y0: Array, places: list[int]) -> None:
@@ -701,10 +632,7 @@ class _ComplexSteps:
 def _difference(
     derivative: Callable[..., Array], t: float, y: Array, dy: Array, dp: Array, places: list[int], extra: tuple
 ) -> Array:
-    """Return the derivative (n,) of ``derivative(t, y, extra)`` along (dy, dp), by central differences of order 6.
-
-    `places` are the indices in the run's parameters to which the components of dp belong.
-    """
+    """Return the derivative (n,) along (dy, dp), dp for the parameters `places`, by differences of order 6."""
     direction = np.concatenate([dy, dp])
 
     def along(s: Array) -> Array:
@@ -716,9 +644,9 @@ def _difference(
 def wrong_product(columns: Columns, rhs: Callable[[float, Array], Array], t: float, wide: Array) -> str | None:
     """Return a sentence about a wrong product of the Jacobian at the state in `wide`; None if none is found.
 
-    `rhs` is the right-hand side of the wide state. The state moves along a random direction, which also takes the
-    place of the columns. Close to a kink neither the product nor the difference need be wrong, so that a product counts
-    as wrong only if it is so at a state close by, too.
+    `rhs` is that of the wide state. The state moves along a random direction, which also takes the place of the
+    columns. Close to a kink neither the product nor the difference need be wrong, so that a product counts as wrong
+    only if it is so at a state close by, too.
     """
     own, order = wide.copy(), columns.order
     dy = _direction(own[order[0]], 0)[0]
@@ -747,9 +675,9 @@ def wrong_product(columns: Columns, rhs: Callable[[float, Array], Array], t: flo
 class _WideInvariant:
     """An invariant as a function of the wide state, with its gradient, for calls from Python.
 
-    `shape` is the shape of the invariant's value. `parameters` are the indices of the parameters that follow the
-    state, if the invariant depends on them. ``slopes(t, y, params)`` returns the derivatives with respect to these
-    parameters; by default they are computed by differences.
+    `shape` is the shape of the invariant's value. `parameters` are the indices of the parameters that follow the state,
+    if the invariant depends on them. ``slopes(t, y, params)`` returns the derivatives with respect to these parameters;
+    by default they are computed by differences.
     """
 
     def __init__(
@@ -779,10 +707,7 @@ class _WideInvariant:
         return self.item.function(t, self.columns.own(Y), *self.item.args, *self._arguments(Y, extra))
 
     def gradient(self, t: float, Y: Array, *rest: Any) -> Array:
-        """Return the gradient (*shape, m) with respect to the wide state Y (m,).
-
-        `rest` begins with the derivative of Y if the gradient uses f.
-        """
+        """Return the gradient (*shape, m) at Y (m,); `rest` begins with the derivative of Y if the gradient uses f."""
         own, places, n = self.columns.own, self.columns.places, self.columns.n
         first: tuple[Any, ...] = (t, own(Y))
         if self.uses_f:
@@ -817,10 +742,7 @@ class _WideInvariant:
 
 
 def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple, compiled: bool) -> Invariant:
-    """Return an invariant as a function of the wide state, with a gradient.
-
-    If `compiled`, the engine calls it without Python when it can, see `OfState`.
-    """
+    """Return an invariant, with a gradient, as a function of the wide state; `compiled`: see `OfState`."""
     shape = np.shape(item.function(t0, y0.copy(), *item.args, *extra))
     parameters = columns.parameters if extra and not item.args else ()
     found = copy(item)
