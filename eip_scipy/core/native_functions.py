@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from ..engine.native import LibraryFunction, NativeFunctions
+from ..engine.native import LibraryFunction, NativeFunctions, Rates
 from .arguments import Packed
 from .invariants import InvariantSet
 from .jitted import NotCompilableError, is_jitted, jit_is_off
@@ -16,10 +16,11 @@ from .pointers import PointerFunction
 
 if TYPE_CHECKING:
     from .numba_pointers import Compiled
+    from .runs import Run
 
-__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events", "with_jacobian", "with_rates"]
+__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events"]
 
-
+OF_PRODUCT = {"real": False, "takes_f": True, "in_place": True, "gradient": True}
 NO_DUALS = "a gradient is compiled only for jitted functions of real states"
 
 
@@ -58,21 +59,13 @@ class Native(NamedTuple):
 
 
 def native_functions(
-    fun: Callable[..., Any], form: str, params: Packed | None, invariants: InvariantSet, y0: np.ndarray
+    fun: Callable[..., Any], form: str, params: Packed | None, run: Run, jacobian: Callable[..., Any] | None = None
 ) -> NativeFunctions:
-    """Return the addresses of the right-hand side, the invariants and the gradients of a run.
+    """Return the addresses of the functions of a run, except those of its events, which `with_events` adds.
 
-    `with_events`, `with_jacobian` and `with_rates` add those of other functions.
-
-    Parameters
-    ----------
-    fun : callable
-        The right-hand side, of the `form` "value", "in place", "acceleration" or "acceleration in place".
-    form : str
-    params : Packed or None
-        Last arguments of the functions, or None. The engine passes the array of `params` itself, not a copy.
-    invariants : InvariantSet
-    y0 : ndarray, shape (n,)
+    The right-hand side `fun` has the `form` "value", "in place", "acceleration" or "acceleration in place". `params`
+    are the last arguments of the functions; the engine passes their array itself, not a copy. For a multistep method,
+    ``jacobian(t, q, dq, out[, params])`` is the Jacobian times dq.
 
     Raises
     ------
@@ -81,32 +74,31 @@ def native_functions(
         Numba function of the arguments that `integrate` documents; or if an invariant has `args`, or no gradient that
         can be compiled.
     """
-    n, second_order = y0.size, form.startswith("acceleration")
-    size = n // 2 if second_order else n
-    number, width = _number(params, y0), 2 if y0.dtype.kind == "c" else 1
+    invariants, y0 = run.invariants, run.y0
+    second_order, number = form.startswith("acceleration"), _number(params, y0)
+    size = y0.size // 2 if second_order else y0.size
     of_rhs = {"shape": (size,), "size": size, "real": False, "in_place": form.endswith("place")}
-    rhs = _native(fun, number, "acceleration" if second_order else "fun", size * width, **of_rhs)
-    inv, grad, slopes = list[Native](), list[Native](), list[Native]()
+    rhs = _native(fun, number, "acceleration" if second_order else "fun", **of_rhs)
+    inv, grad, slopes, rate, product = (list[Native]() for _ in range(5))
     for k, (wide, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         item, value = _of_state(wide, number)
-        name = f"invariant {label!r}"
+        name, shape = f"invariant {label!r}", _shape(invariants, k)
         if item.args:
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
-        l_i = invariants.starts[k + 1] - invariants.starts[k]
-        shape = () if invariants.scalar[k] else (l_i,)
-        inv.append(_native(item.function, value, name, l_i, shape=shape))
-        if item.gradient is None and isinstance(item.function, PointerFunction):
-            grad.append(Native(None, l_i * n * width))
-            continue
-        if item.gradient is None:
+        inv.append(_native(item.function, value, name, shape=shape))
+        if item.gradient is None and not isinstance(item.function, PointerFunction):
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
         rows = {"shape": (*shape, value.size), "real": False, "takes_f": item.uses_f, "in_place": item.in_place}
-        size = l_i * value.size * width
-        grad.append(_native(item.gradient, value, f"gradient of {name}", size, **rows, gradient=True))
+        grad.append(_native(item.gradient, value, f"gradient of {name}", **rows, gradient=True))
         if wide.of_state is not None and wide.of_state.by_parameters is not None:
             p, slope = wide.of_state.parameters, wide.of_state.by_parameters
-            slopes.append(_native(slope, value, f"derivatives by parameters of {name}", l_i * p, shape=(*shape, p)))
-    by_differences = any(found.function is None for found in grad)
+            slopes.append(_native(slope, value, f"derivatives by parameters of {name}", shape=(*shape, p)))
+    for k, item in invariants.balances.items.items():
+        kind = {"shape": _shape(invariants, k), "takes_f": item.rate_uses_f, "gradient": True}
+        rate.append(_native(item.rate_function, number, f"rate of balance {invariants.labels[k]!r}", **kind))
+    if jacobian is not None:
+        half = y0.size // 2
+        product.append(_native(jacobian, number, "jacobian", shape=(half,), size=half, **OF_PRODUCT))
     return NativeFunctions(
         rhs=rhs.entry,
         inv=_addresses(inv),
@@ -114,10 +106,20 @@ def native_functions(
         event=(),
         params=np.zeros(0) if params is None else params.values,  # itself: an ensemble writes each member's there
         second_order=second_order,
+        jacobian=product[0].entry if product else None,
+        rates=invariants.rates(run.options.adaptive, [found.entry for found in rate]) if rate else Rates(),
         by_parameters=_addresses(slopes),
-        floors=invariants.floors if by_differences else None,
-        owner={"rhs": [rhs], "inv": inv, "grad": grad, "event": [], "by_parameters": slopes},
-    )
+        floors=invariants.floors if any(found.function is None for found in grad) else None,
+        owner={
+            "rhs": [rhs], "inv": inv, "grad": grad, "event": [], "by_parameters": slopes, "rate": rate,
+            "jacobian": product,
+        },
+    )  # fmt: skip
+
+
+def _shape(invariants: InvariantSet, k: int) -> tuple[int, ...]:
+    """Return the shape of the value of invariant k."""
+    return () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
 
 
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
@@ -136,8 +138,7 @@ def function_alone(
 
     If `second_order`, `fun` returns the accelerations. `name` is the name of `fun` in messages.
     """
-    width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
-    rhs = _native(fun, kind, name, math.prod(kind.shape) * width)
+    rhs = _native(fun, kind, name)
     return NativeFunctions(
         rhs=rhs.entry,
         inv=(),
@@ -152,64 +153,10 @@ def function_alone(
 def with_events(
     functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
-    """Return a copy of `functions` with the addresses of the events.
-
-    Raises
-    ------
-    NotCompilableError
-        As for `native_functions`.
-    """
-    if not events:
-        return functions
+    """Return a copy of `functions` with the addresses of the events, or raise NotCompilableError."""
     number = _number(params, y0)
-    event = list[Native]()
-    for k, function in enumerate(events):
-        own, kind = _of_state(function, number)
-        event.append(_native(own, kind, f"event {k}", 1))
+    event = [_native(*_of_state(function, number), f"event {k}") for k, function in enumerate(events)]
     return functions._replace(event=_addresses(event), owner=functions.owner | {"event": event})
-
-
-def with_jacobian(
-    functions: NativeFunctions, jacobian: Callable[..., Any], params: Packed | None, y0: np.ndarray
-) -> NativeFunctions:
-    """Return a copy of `functions` with the address of ``jacobian(t, q, dq, out[, params])``, the Jacobian times dq.
-
-    Raises
-    ------
-    NotCompilableError
-        As for `native_functions`.
-    """
-    half = y0.size // 2
-    kind, floats = _number(params, y0), half * (2 if y0.dtype.kind == "c" else 1)
-    product = {"shape": (half,), "size": half, "real": False, "takes_f": True, "in_place": True, "gradient": True}
-    found = _native(jacobian, kind, "jacobian", floats, **product)
-    return functions._replace(jacobian=found.entry, owner=functions.owner | {"jacobian": [found]})
-
-
-def with_rates(
-    functions: NativeFunctions, invariants: InvariantSet, params: Packed | None, y0: np.ndarray, adaptive: bool
-) -> NativeFunctions:
-    """Return a copy of `functions` with the addresses of the rates of balances.
-
-    `adaptive` says whether the steps of the run are adaptive, see `InvariantSet.rates`.
-
-    Raises
-    ------
-    NotCompilableError
-        As for `native_functions`.
-    """
-    if not invariants.balances.items:
-        return functions
-    found, number = list[Native](), _number(params, y0)
-    for k, item in invariants.balances.items.items():
-        l_i = invariants.starts[k + 1] - invariants.starts[k]
-        if item.rate_function is None:
-            found.append(Native(None, l_i))
-            continue
-        rate = {"shape": () if invariants.scalar[k] else (l_i,), "takes_f": item.rate_uses_f, "gradient": True}
-        found.append(_native(item.rate_function, number, f"rate of balance {invariants.labels[k]!r}", l_i, **rate))
-    rates = invariants.rates(adaptive, [native.entry for native in found])
-    return functions._replace(rates=rates, owner=functions.owner | {"rate": found})
 
 
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:
@@ -231,12 +178,14 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
     return Kind((), y0.size, params.values.size, y0.dtype.char, real=True, scalars=params.scalars)
 
 
-def _native(fun: Any, kind: Kind, name: str, floats: int, **others: Any) -> Native:
+def _native(fun: Any, kind: Kind, name: str, **others: Any) -> Native:
     """Return a function as `Native`, compiled if it is a Numba function, of the signature `kind` with `others`.
 
-    `name` is its name in messages, and `floats` the number of floats that it fills.
+    `name` is its name in messages. The engine computes gradients and rates that are None.
     """
-    if isinstance(fun, (PointerFunction, LibraryFunction)):
+    kind = kind._replace(**others)
+    floats = math.prod(kind.shape) * (2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1)
+    if fun is None or isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)
     if jit_is_off():
         raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
@@ -244,7 +193,7 @@ def _native(fun: Any, kind: Kind, name: str, floats: int, **others: Any) -> Nati
         raise NotCompilableError(f"{name} is not a Numba function; decorate it with @numba.njit")
     from .numba_pointers import compiled  # which loads Numba
 
-    return Native(compiled(fun, kind._replace(**others), name), floats)
+    return Native(compiled(fun, kind, name), floats)
 
 
 def _addresses(functions: list[Native]) -> tuple[tuple[int, int], ...]:

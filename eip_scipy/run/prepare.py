@@ -18,7 +18,7 @@ from ..core.inputs import count, flag, is_plain, real_array, refuse_units, requi
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
 from ..core.multistep import times
-from ..core.native_functions import native_functions, with_events, with_jacobian, with_rates
+from ..core.native_functions import native_functions, with_events
 from ..core.options import ProjectionOptions
 from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import BROUGHT, Problem, made
@@ -206,10 +206,9 @@ class System:
             if numbers is None:
                 raise NotCompilableError("args are neither numbers nor one array of floats")
             params = Packed(self.parameters, numbers) if self.extra else None
-            functions = native_functions(*self._native_form, params, run.invariants, run.y0)
-            functions = with_rates(functions, run.invariants, params, run.y0, run.options.adaptive)
-            if self._corrects(run):
-                functions = with_jacobian(functions, self.jacobian, params, run.y0)
+            functions = native_functions(
+                *self._native_form, params, run, self.jacobian if self._corrects(run) else None
+            )
         except NotCompilableError as reason:
             if wanted:
                 raise
