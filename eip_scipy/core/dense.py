@@ -12,14 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
-from ..engine.data import (
-    BY_ERROR,
-    GIVEN,
-    MOST_CROSSINGS,
-    NEW,
-    Dense,
-    Work,
-)
+from ..engine import data
+from ..engine.data import Dense, Work
 from ..engine.native import Engine
 from .kept_dense import AtRealTimes, KeptDenseOutput, kept
 from .runs import Run
@@ -125,8 +119,9 @@ def _record(run: Run, events: int) -> Dense:
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
     carried = run.invariants.balances.places.size
     options = run.options._replace(
-        metric=GIVEN, direction=NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False, limit=math.inf
-    )
+        metric=data.GIVEN, direction=data.NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False,
+        limit=math.inf, target=np.zeros(invariants),
+    )  # fmt: skip
     width = 2 if dtype.kind == "c" else 1
     return Dense(
         kind=kind,
@@ -135,8 +130,8 @@ def _record(run: Run, events: int) -> Dense:
         c=c.copy(),
         own_slopes=own_slopes,
         shows=run.shows,
-        by_travel=invariants > 0 and run.options.metric == BY_ERROR,
-        options=options._replace(target=np.zeros(invariants)),
+        by_travel=invariants > 0 and run.options.metric == data.BY_ERROR,
+        options=options,
         work=Work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1, carried),
         missed=np.zeros(2),
         waiting=np.zeros(2, np.int64),
@@ -146,8 +141,8 @@ def _record(run: Run, events: int) -> Dense:
         y=np.zeros((roots, n), dtype),
         counts=np.zeros(3, np.int64),
         left=np.zeros(events),
-        pending_event=np.zeros(MOST_CROSSINGS * events, np.int64),
-        pending_t=np.zeros(MOST_CROSSINGS * events),
+        pending_event=np.zeros(data.MOST_CROSSINGS * events, np.int64),
+        pending_t=np.zeros(data.MOST_CROSSINGS * events),
     )
 
 

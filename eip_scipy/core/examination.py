@@ -15,18 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.data import (
-    CHANGES_ALONG_FLOW,
-    LARGE_CORRECTION,
-    LARGE_ERROR,
-    N_SUSPECT,
-    NOTHING,
-    NU,
-    REASON,
-    SUSPECT_FROM,
-    SUSPECT_TO,
-    SUSPECT_WAITED,
-)
+from ..engine import data
 from ..engine.native import BUILD
 from ..methods.runge_kutta import RK4
 from .invariant_checks import complaints
@@ -86,16 +75,16 @@ class Examiner:
 
         `suspect`, the engine's record of that step, is cleared, so that the engine may record another step.
         """
-        reason, t_old, t_new = suspect[REASON], float(suspect[SUSPECT_FROM]), float(suspect[SUSPECT_TO])
-        suspect[REASON] = NOTHING
-        old, new = np.split(suspect[N_SUSPECT:].copy().view(self.invariants.dtype), 2)
-        if reason == CHANGES_ALONG_FLOW:
+        reason, t_old, t_new = suspect[data.REASON], float(suspect[data.SUSPECT_FROM]), float(suspect[data.SUSPECT_TO])
+        suspect[data.REASON] = data.NOTHING
+        old, new = np.split(suspect[data.N_SUSPECT :].copy().view(self.invariants.dtype), 2)
+        if reason == data.CHANGES_ALONG_FLOW:
             return self.complaint(rhs, t_new, new)
-        if reason == LARGE_ERROR:
+        if reason == data.LARGE_ERROR:
             return self._unless_refused(_unresolved, rhs, t_old, t_new - t_old, old)
-        if reason != LARGE_CORRECTION:
+        if reason != data.LARGE_CORRECTION:
             return None
-        return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new), int(suspect[SUSPECT_WAITED]))
+        return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new), int(suspect[data.SUSPECT_WAITED]))
 
     def _unless_refused(self, look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
         """Return the result of the examination `look`; None if a function of the user raises an exception in it.
@@ -184,7 +173,7 @@ def _along_chord(
     `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing is
     examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
     """
-    largest = float(examiner.figures[:, NU].max(initial=0.0))
+    largest = float(examiner.figures[:, data.NU].max(initial=0.0))
     if largest < GROWTH * examiner.largest:
         return None
     examiner.largest = largest

@@ -7,19 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.integrate import OdeSolver
 
-from ..engine.data import (
-    BY_VELOCITY,
-    HAVE_NODES,
-    LAST_RANK,
-    LENGTH,
-    NEWEST,
-    NOT_FINITE,
-    TIME,
-    TIME_NEW,
-    TOO_SMALL,
-    UNSTABLE,
-    Work,
-)
+from ..engine import data
+from ..engine.data import Work
 from .invariants import InvariantSet
 from .runs import Run
 
@@ -38,26 +27,26 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     because = f"; the gradient of {broken[0]!r} is not finite there" if broken else ""
     return (
         f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
-        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}{because}"
+        f"rank {int(work.counters[data.LAST_RANK])} of {invariants.size}{because}"
     )
 
 
 def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     """Return the message for a failed step, from the engine's `status` and its `clock` of times and step lengths."""
-    if status == NOT_FINITE:
-        return _not_finite(run, clock[TIME], clock[LENGTH])
-    if status == TOO_SMALL:
+    if status == data.NOT_FINITE:
+        return _not_finite(run, clock[data.TIME], clock[data.LENGTH])
+    if status == data.TOO_SMALL:
         at = run.method.not_finite_at if run.tableau.drives else None
         return OdeSolver.TOO_SMALL_STEP if at is None else f"{run.called} returned a non-finite value at t={at:.10g}"
-    if status == UNSTABLE:
+    if status == data.UNSTABLE:
         return _unstable(run)
-    if status == BY_VELOCITY:
+    if status == data.BY_VELOCITY:
         return (
-            f"at t={clock[TIME]:.10g} the accelerations in {run.called} depend on the velocity, and a Nystrom method "
-            "does not integrate such equations; the states of the last 4 steps or so may be wrong. Use a Runge-Kutta "
-            "method such as EIPDOP853, or EIPGJ12 with small steps"
+            f"at t={clock[data.TIME]:.10g} the accelerations in {run.called} depend on the velocity, and a Nystrom "
+            "method does not integrate such equations; the states of the last 4 steps or so may be wrong. Use a "
+            "Runge-Kutta method such as EIPDOP853, or EIPGJ12 with small steps"
         )
-    message = projection_failure(run.invariants, run.work, clock[TIME_NEW])
+    message = projection_failure(run.invariants, run.work, clock[data.TIME_NEW])
     return f"{message}. Use a shorter step or tighter tolerances, or correct fun or grad of the invariant"
 
 
@@ -65,7 +54,7 @@ def _unstable(run: Run) -> str:
     """Return the message for a multistep method whose history has too large differences of the accelerations."""
     history = run.method.multistep
     assert history is not None  # only multistep methods return this code
-    t = history.t0 + int(history.place[NEWEST]) * history.h
+    t = history.t0 + int(history.place[data.NEWEST]) * history.h
     others = "EIPRKN12 if there are close encounters or forces that jump"
     if history.uses_v:
         others = "EIPDOP853 if there are close encounters, forces that jump, or strong forces that depend on velocities"
@@ -80,8 +69,8 @@ def _not_finite(run: Run, t: float, h: float) -> str:
     """Return the message for a step in which a stage, the new state or the error estimate is not finite."""
     work, method = run.work, run.method
     history = method.multistep
-    if history is not None and history.place[HAVE_NODES] and not np.isfinite(work.K[1]).all():
-        return _bad_value(run, work.K[1], history.t0 + (int(history.place[NEWEST]) + 1) * history.h)
+    if history is not None and history.place[data.HAVE_NODES] and not np.isfinite(work.K[1]).all():
+        return _bad_value(run, work.K[1], history.t0 + (int(history.place[data.NEWEST]) + 1) * history.h)
     for i in range(method.b.size):
         if not np.isfinite(work.K[i]).all():
             return _bad_value(run, work.K[i], t + method.c[i] * h)

@@ -8,15 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..engine.data import (
-    CHECK_NOISE,
-    CHECK_STEP,
-    CHECK_TOLERANCE,
-    EPS,
-    INVARIANCE_TOLERANCE,
-    TIME_ROOM,
-    TIME_SHARE,
-)
+from ..engine import data
+from ..engine.data import EPS
 from ..engine.trust import ROUNDING_OF_DIFFERENCES, ProjectionWarning
 from .conditional import is_kept_on_a_surface, on_targets
 from .gradients import DIFFERENCE_WEIGHTS, random_directions
@@ -30,7 +23,7 @@ Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
 # Lengths of difference steps. Shorter ones decide if the function is not smooth over the first one.
-CHECK_STEPS = (CHECK_STEP, 6e-8, 6e-10)
+CHECK_STEPS = (data.CHECK_STEP, 6e-8, 6e-10)
 # Bounds for the error of the rate of a balance, relative to its terms. If a rate is 1e-6 of its terms, an error of 1e-3
 # of the rate is 1e-9 of the terms. Correct rates differ by 1e-16, those from numerical gradients by 1e-12.
 RATE_TOLERANCE, RATE_TOLERANCE_OF_DIFFERENCES = 1e-11, 1e-9
@@ -238,9 +231,9 @@ def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
             ends = _values_at_ends(known, at.t, at.y, at.directions, step)
         difference = (ends[0] - ends[1]) * (0.5 / step)
         sizes, moves = np.abs(ends), np.abs(ends - at.here)
-        noise = (CHECK_NOISE / step) * (EPS * np.maximum(np.maximum(sizes[0], sizes[1]), inner) + 5e-324)
+        noise = (data.CHECK_NOISE / step) * (EPS * np.maximum(np.maximum(sizes[0], sizes[1]), inner) + 5e-324)
         # At an extremum both ends move alike; their difference is then the rounding inside the invariant.
-        allowed = CHECK_TOLERANCE * (terms + (moves[0] + moves[1]) * (0.5 / step))
+        allowed = data.CHECK_TOLERANCE * (terms + (moves[0] + moves[1]) * (0.5 / step))
         agrees = ~(np.abs(difference - along) > allowed + noise)
         if step != CHECK_STEPS[0]:
             agrees &= noise <= allowed
@@ -428,7 +421,7 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     rate, terms = in_time + products.sum(axis=1).real - own, np.abs(in_time) + np.abs(products).sum(axis=1)
     noise = noise + RATE_ROUNDINGS * EPS * known.norm_products(at.G, at.f / unit)
     of_balances = np.where(known.by_values, RATE_TOLERANCE_OF_DIFFERENCES, RATE_TOLERANCE)
-    wrong = np.abs(rate) > np.where(carried, of_balances, INVARIANCE_TOLERANCE) * terms + noise
+    wrong = np.abs(rate) > np.where(carried, of_balances, data.INVARIANCE_TOLERANCE) * terms + noise
     computed = np.array(known.computed, bool) & (known.by_values | ~carried)
     if (wrong & computed).any():
         # A gradient that is computed across a kink is wrong, and so is the rate that follows from it.
@@ -460,7 +453,7 @@ def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Arr
         rounding = EPS * known.sizes_of_terms(y, G, here)
         hidden = 4 * rounding / abs(far - t)
     fixed = known.values(far, y) == here  # True for almost all invariants
-    step, centred = TIME_SHARE * tau, min(before, after) >= TIME_ROOM * TIME_SHARE * tau
+    step, centred = data.TIME_SHARE * tau, min(before, after) >= data.TIME_ROOM * data.TIME_SHARE * tau
     step = 2.0 ** (round(math.log2(step)) if centred else math.floor(math.log2(min(step, room / 6))))
     if fixed.all() and (known.values(t + side * step, y) == here).all():
         return none, hidden

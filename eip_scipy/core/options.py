@@ -7,35 +7,15 @@ keyword, and, if the step needs it, a field of `Options` in engine/cpp/data.hpp.
 from __future__ import annotations
 
 import inspect
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any, Literal, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..engine.data import (
-    AUTO,
-    BAND,
-    BAND_COMPENSATED,
-    BAND_MULTISTEP,
-    BY_ERROR,
-    DISTANT,
-    EPS,
-    EUCLIDEAN,
-    GIVEN,
-    LARGE_SHARE,
-    MIDPOINT,
-    NEW,
-    NO_BALANCES,
-    NO_GROUPS,
-    OLD,
-    Balances,
-    Groups,
-    Options,
-    no_columns,
-)
+from ..engine import data
+from ..engine.data import EPS, Options
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
 from ..methods.orders import AT_REST
 from . import steppers
@@ -55,11 +35,10 @@ __all__ = [
     "weights",
 ]
 
-DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
+DIRECTIONS = {"new": data.NEW, "old": data.OLD, "midpoint": data.MIDPOINT}
 MOST_ITERATIONS = 1000
 # One tenth of the error with respect to a given target that is allowed at the start.
 MOST_LEFT = 0.1 * TARGET_TOLERANCE
-WIDTH = 120
 # These lines of docstrings are replaced by the options with their texts, or by their names.
 WHOLE, NAMES = "{ProjectionOptions}", "{names of ProjectionOptions}"
 
@@ -92,11 +71,6 @@ class ProjectionKeywords(ProjectionDetails, total=False):
     invariants: Invariant | Callable[..., Any] | Iterable[Invariant | Callable[..., Any]]
 
 
-def _text(kind: str, text: str) -> dict[str, str]:
-    """Return the type (`kind`) and the description (`text`) of an option, which its docstrings show."""
-    return {"kind": kind, "text": " ".join(text.split())}
-
-
 class Settled(NamedTuple):
     """The options of the projection after the checks for one run.
 
@@ -111,105 +85,65 @@ class Settled(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectionOptions:
-    """The options of the projection as given by the user; `settled` checks them for a run."""
+    """The options of the projection as given by the user; `settled` checks them for a run.
 
-    invariants: Any = field(default=(), metadata=_text("Invariant or sequence of Invariant", "Invariants to keep."))
-    metric: Any = field(
-        default=None,
-        metadata=_text(
-            '{"error", "euclidean"} or array_like, shape (n,)',
-            """Weights of the components of the correction. "error" (default if the method has an error estimate)
-            minimises the correction in units of the local error of the step; "euclidean" minimises its 2-norm; an array
-            contains the weights themselves (components with larger weights move more).""",
-        ),
-    )
-    blocks: Any = field(
-        default=None,
-        metadata=_text(
-            "int or sequence of index arrays",
-            """Groups of components with a common weight in the error metric: the number of consecutive components in
-            each group, or index arrays. For positions and velocities of bodies in 3 dimensions use ``blocks=3``.
-            Default: each component has its own weight.""",
-        ),
-    )
-    frame: Any = field(
-        default=None,
-        metadata=_text(
-            "(C, S)",
-            """Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and S, of shape
-            (n, k), whose columns are the directions in which the correction is shifted so that C y stays
-            unchanged; C S must be invertible.""",
-        ),
-    )
-    direction: str = field(
-        default="new",
-        metadata=_text(
-            '{"new", "old", "midpoint"}',
-            """State at which the gradients that span the correction are evaluated: the raw result of the step
-            (default), its start, or the midpoint.""",
-        ),
-    )
-    iterations: int = field(
-        default=1,
-        metadata=_text(
-            "int",
-            "Number of Newton steps of the projection. 1 (default) gives the EIP method, more the standard projection.",
-        ),
-    )
-    every: int | str | None = field(
-        default=None,
-        metadata=_text(
-            'int or "auto"',
-            """Project every `every`-th step and the last one. "auto": project when the error estimates, added in
-            quadrature since the last projection, make an invariant more uncertain than round-off (checked at every
-            fifth step and after a projection). In between, states are returned as projected copies. Default: "auto" for
-            a multistep method and 1 for others.""",
-        ),
-    )
-    reuse_f: bool = field(
-        default=True,
-        metadata=_text(
-            "bool",
-            "If the step evaluates f at its raw result anyway, use it as the first stage of the next step.",
-        ),
-    )
-    compensated: bool | None = field(
-        default=None,
-        metadata=_text(
-            "bool",
-            """Use compensated summation for the state (for steps so small that round-off dominates). Default: True for
-            a multistep method and False for others.""",
-        ),
-    )
-    check: bool = field(
-        default=True,
-        metadata=_text(
-            "bool",
-            """True: check the invariants and their gradients at the start and again after some steps, monitor whether
-            the errors of the steps explain the corrections, and fail if a projection leaves an error as large as the
-            terms of the invariant. False: none of these.""",
-        ),
-    )
-    project_initial: bool = field(
-        default=False,
-        metadata=_text(
-            "bool",
-            """Project y0 onto given targets before the first step, by the correction with the smallest 2-norm: all
-            components have equal weights, regardless of `metric` and `blocks`, and C y of a frame stays unchanged.
-            `Diagnostics.moved` says how far y0 moved. To fix components, call `project` with ``sigma=``.""",
-        ),
-    )
+    Parameters
+    ----------
+    invariants : Invariant or sequence of Invariant, optional
+        Invariants to keep.
+    metric : {"error", "euclidean"} or array_like, shape (n,), optional
+        Weights of the components of the correction. "error" (default if the method has an error estimate) minimises the
+        correction in units of the local error of the step; "euclidean" minimises its 2-norm; an array contains the
+        weights themselves (components with larger weights move more).
+    blocks : int or sequence of index arrays, optional
+        Groups of components with a common weight in the error metric: the number of consecutive components in each
+        group, or index arrays. For positions and velocities of bodies in 3 dimensions use ``blocks=3``. Default: each
+        component has its own weight.
+    frame : (C, S), optional
+        Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and S, of shape (n, k),
+        whose columns are the directions in which the correction is shifted so that C y stays unchanged; C S must be
+        invertible.
+    direction : {"new", "old", "midpoint"}, optional
+        State at which the gradients that span the correction are evaluated: the raw result of the step (default), its
+        start, or the midpoint.
+    iterations : int, optional
+        Number of Newton steps of the projection. 1 (default) gives the EIP method, more the standard projection.
+    every : int or "auto", optional
+        Project every `every`-th step and the last one. "auto": project when the error estimates, added in quadrature
+        since the last projection, make an invariant more uncertain than round-off (checked at every fifth step and
+        after a projection). In between, states are returned as projected copies. Default: "auto" for a multistep method
+        and 1 for others.
+    reuse_f : bool, optional
+        If the step evaluates f at its raw result anyway, use it as the first stage of the next step.
+    compensated : bool, optional
+        Use compensated summation for the state (for steps so small that round-off dominates). Default: True for a
+        multistep method and False for others.
+    check : bool, optional
+        True: check the invariants and their gradients at the start and again after some steps, monitor whether the
+        errors of the steps explain the corrections, and fail if a projection leaves an error as large as the terms of
+        the invariant. False: none of these.
+    project_initial : bool, optional
+        Project y0 onto given targets before the first step, by the correction with the smallest 2-norm: all components
+        have equal weights, regardless of `metric` and `blocks`, and C y of a frame stays unchanged. `Diagnostics.moved`
+        says how far y0 moved. To fix components, call `project` with ``sigma=``.
+    """
+
+    invariants: Any = ()
+    metric: Any = None
+    blocks: Any = None
+    frame: Any = None
+    direction: str = "new"
+    iterations: int = 1
+    every: int | str | None = None
+    reuse_f: bool = True
+    compensated: bool | None = None
+    check: bool = True
+    project_initial: bool = False
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
         """Return the names of the options."""
         return tuple(cls.__dataclass_fields__)
-
-    @classmethod
-    def of(cls, keywords: Mapping[str, Any]) -> tuple[ProjectionOptions, dict[str, Any]]:
-        """Return the `ProjectionOptions` made from keywords, and the dictionary of the other keywords."""
-        own, others = cls.split(keywords)
-        return cls(**own), others
 
     @classmethod
     def split(cls, keywords: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -223,9 +157,9 @@ class ProjectionOptions:
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
         balance_groups = _groups(known, n, width)
-        if balance_groups is not NO_GROUPS:
+        if balance_groups is not data.NO_GROUPS:
             self._require_plain()
-            kind = EUCLIDEAN  # the groups have their own weights
+            kind = data.EUCLIDEAN  # the groups have their own weights
         if not isinstance(self.direction, str) or self.direction not in DIRECTIONS:
             raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {self.direction!r}.")
         if method.has_history and self.direction != "new":
@@ -240,7 +174,7 @@ class ProjectionOptions:
         if groups.size != 1 and atol.any():
             squares = np.repeat(atol, width)[groups.member] ** 2 / width
             block_atol = np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
-        check = flag("check", self.check)
+        check, far = flag("check", self.check), FAR_IN_TOLERANCES * np.max(rtol, initial=0.0)
         options = Options(
             rtol=rtol.repeat(width),
             atol=atol,
@@ -249,7 +183,7 @@ class ProjectionOptions:
             frame=frame_rows(self.frame, n, width),
             balances=_balances(method, known),
             balance_groups=balance_groups,
-            columns=no_columns(known.size),
+            columns=data.no_columns(known.size),
             target=known.target,
             scales=known.scales,
             computed=np.array(known.computed, float),
@@ -268,8 +202,8 @@ class ProjectionOptions:
             adaptive=stepping.h is None,
             per_band=1.0 / (_band(method, compensated) * EPS),
             watched=check and known.size > 0,
-            limit=(LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
-            distant=DISTANT if stepping.h is not None else _far_by_tolerances(rtol),
+            limit=(data.LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
+            distant=data.DISTANT if stepping.h is not None else float(np.clip(far, data.DISTANT, MOST_FAR)),
         )
         if _can_project_jointly(options, known):
             options = options._replace(joint=known.items)
@@ -278,7 +212,7 @@ class ProjectionOptions:
 
     def _identity(self, o: Options, sigma: np.ndarray | None, y0: np.ndarray, known: InvariantSet) -> dict[str, Any]:
         carried = [known.labels[k] for k in known.balances.items]
-        grouped = o.balance_groups is not NO_GROUPS
+        grouped = o.balance_groups is not data.NO_GROUPS
         return {
             **({"balances": carried} if carried else {}),
             **({"components": list(o.balance_groups)} if grouped else {}),
@@ -287,13 +221,13 @@ class ProjectionOptions:
             "invariants": [
                 (label, item.target, item.scale) for label, item in zip(known.labels, known.items, strict=True)
             ],
-            "metric": {EUCLIDEAN: "euclidean", BY_ERROR: "error"}.get(o.metric, sigma),
+            "metric": {data.EUCLIDEAN: "euclidean", data.BY_ERROR: "error"}.get(o.metric, sigma),
             "blocks": (o.groups.start, o.groups.member),
             # The given value, because the one in `o` comes from LAPACK, whose last bits differ between machines.
             "frame": None if self.frame is None else [np.asarray(a, y0.dtype) for a in self.frame],
             "direction": self.direction,
             "iterations": o.iterations,
-            "every": "auto" if o.every == AUTO else o.every,
+            "every": "auto" if o.every == data.AUTO else o.every,
             "reuse_f": o.reuse_f,
             "uses_f": o.uses_f,
             "project_initial": bool(self.project_initial),
@@ -323,37 +257,31 @@ class ProjectionOptions:
 
     def _every(self, method: AnyMethod) -> int:
         if self.every is None:
-            return AUTO if method.has_history else 1
+            return data.AUTO if method.has_history else 1
         if not isinstance(self.every, str):
             return count("every", self.every)
         if self.every != "auto":
             raise ValueError(f"every must be an integer >= 1 or 'auto', got {self.every!r}.")
         if not method.has_estimate:
             raise ValueError(f"every='auto' needs an error estimate, and {method.name} has none; give an integer.")
-        return AUTO
+        return data.AUTO
 
     def _metric(self, method: AnyMethod, n: int, width: int) -> tuple[int, np.ndarray | None]:
         metric = self.metric
-        if metric is None:
-            return (BY_ERROR if method.has_estimate else EUCLIDEAN), None
-        if isinstance(metric, str):
+        if isinstance(metric, str | None):
             if metric == "euclidean":
-                return EUCLIDEAN, None
-            if metric == "error":
-                return (BY_ERROR if method.has_estimate else EUCLIDEAN), None
+                return data.EUCLIDEAN, None
+            if metric in ("error", None):
+                return (data.BY_ERROR if method.has_estimate else data.EUCLIDEAN), None
             raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
-        return GIVEN, np.repeat(weights("metric", metric, n), width)
-
-
-def _far_by_tolerances(rtol: np.ndarray) -> float:
-    return float(min(max(DISTANT, FAR_IN_TOLERANCES * np.max(rtol, initial=0.0)), MOST_FAR))
+        return data.GIVEN, np.repeat(weights("metric", metric, n), width)
 
 
 def _band(method: AnyMethod, compensated: bool) -> float:
     """Return the largest residual that is not corrected, in units of the rounding error of the invariant's terms."""
     if method.has_history:  # these methods correct only a part of an error within rounding
-        return BAND_MULTISTEP
-    return BAND_COMPENSATED if compensated else BAND
+        return data.BAND_MULTISTEP
+    return data.BAND_COMPENSATED if compensated else data.BAND
 
 
 def weights(name: str, sigma: Any, n: int) -> np.ndarray:
@@ -366,21 +294,21 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
     return a / a.max()
 
 
-def _balances(method: AnyMethod, known: InvariantSet) -> Balances:
+def _balances(method: AnyMethod, known: InvariantSet) -> data.Balances:
     """Return the engine's record of the balances of a run; it is empty if `project` projects a single state."""
     if not known.balances.items or method is AT_REST:
-        return NO_BALANCES
-    return Balances(known.balances.places, steppers.rated(method))
+        return data.NO_BALANCES
+    return data.Balances(known.balances.places, steppers.rated(method))
 
 
-def _groups(known: InvariantSet, n: int, width: int) -> Groups:
+def _groups(known: InvariantSet, n: int, width: int) -> data.Groups:
     """Return the balances in groups that have the same components and weights; each group is projected by itself.
 
     The state has `n` components of `width` floats each: 1 if it is real, 2 if it is complex.
     """
     lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.subspaces]
     if len(lacking) == len(known.items):
-        return NO_GROUPS
+        return data.NO_GROUPS
     if lacking:
         raise ValueError(
             f"invariants: {lacking[0]!r} has no components, but others have. Give components to all balances or to "
@@ -402,7 +330,7 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
     directions = [(components[::size], weight[::size]) for components, weight, _ in groups.values()]
     if max(int(components.max()) for components, _, _ in groups.values()) >= n:
         raise ValueError(f"invariants: the components of a balance are outside the state, which has {n} components.")
-    return Groups(
+    return data.Groups(
         value=np.concatenate([np.array(values, np.int64) for _, _, values in groups.values()]),
         first_value=_starts([len(values) for _, _, values in groups.values()]),
         first_direction=_starts([len(components) for components, _ in directions]),
@@ -427,8 +355,8 @@ def _starts(sizes: list[int]) -> np.ndarray:
 
 def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
     """Return True if the run can project by the functions `moments` and `shift` of `JointInvariants`."""
-    plain = (options.metric, options.direction, options.iterations) == (EUCLIDEAN, NEW, 1)
-    free = options.frame.products.size == 0 and options.every != AUTO and not options.compensated
+    plain = (options.metric, options.direction, options.iterations) == (data.EUCLIDEAN, data.NEW, 1)
+    free = options.frame.products.size == 0 and options.every != data.AUTO and not options.compensated
     return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items
 
 
@@ -443,17 +371,7 @@ def takes_projection_options(documented: Documented) -> Documented:
     ]
     others = [rest] if isinstance(documented, type) else []  # solvers accept and ignore options of other solvers
     function.__signature__ = signature.replace(parameters=[*own, *options, *others])
-    if documented.__doc__:  # python -OO removes docstrings
+    if documented.__doc__ and ProjectionOptions.__doc__:  # python -OO removes docstrings
         text = documented.__doc__.replace(NAMES, ", ".join(ProjectionOptions.names()))
-        documented.__doc__ = text.replace(f"    {WHOLE}", _documentation())
+        documented.__doc__ = text.replace(WHOLE, ProjectionOptions.__doc__.partition("----------\n")[2].strip())
     return documented
-
-
-def _documentation() -> str:
-    lines = []
-    for option in fields(ProjectionOptions):
-        lines.append(f"    {option.name} : {option.metadata['kind']}, optional")
-        lines += textwrap.wrap(
-            option.metadata["text"], WIDTH, initial_indent=" " * 8, subsequent_indent=" " * 8, break_long_words=False
-        )
-    return "\n".join(lines)

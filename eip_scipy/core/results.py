@@ -6,22 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.data import (
-    ALL_RATES,
-    ALL_TERMS,
-    LATE_RATES,
-    LATE_SHARE,
-    LATE_TERMS,
-    N_COUNTERS,
-    N_FIGURES,
-    N_SLOW,
-    PROJECTIONS,
-    RANK_REDUCED,
-    REJECTED,
-    SAMPLES,
-    SKIPPED,
-    SOFTENED,
-)
+from ..engine import data
 from ..engine.trust import ProjectionWarning, Trust
 
 __all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning", "joined_sums", "slowness"]
@@ -69,8 +54,8 @@ class Diagnostics:
     """
 
     def __init__(self) -> None:
-        none, trust = np.zeros(0), Trust((), np.zeros((0, N_FIGURES)))
-        self._attach(none, none, np.zeros(1), np.zeros(N_COUNTERS, np.int64), trust, estimated=False)
+        none, trust = np.zeros(0), Trust((), np.zeros((0, data.N_FIGURES)))
+        self._attach(none, none, np.zeros(1), np.zeros(data.N_COUNTERS, np.int64), trust, estimated=False)
 
     def _attach(
         self,
@@ -97,7 +82,7 @@ class Diagnostics:
         self._counters = counters
         self._estimated = estimated
         self.moved = moved
-        self._slow = (np.zeros(0, np.int64), np.zeros((N_SLOW, 0))) if slow is None else slow
+        self._slow = (np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))) if slow is None else slow
 
     @property
     def last_defect(self) -> np.ndarray:
@@ -107,27 +92,27 @@ class Diagnostics:
     @property
     def n_projections(self) -> int:
         """Number of projections."""
-        return int(self._counters[PROJECTIONS])
+        return int(self._counters[data.PROJECTIONS])
 
     @property
     def n_skipped(self) -> int:
         """Number of projections omitted because all invariant errors were round-off."""
-        return int(self._counters[SKIPPED])
+        return int(self._counters[data.SKIPPED])
 
     @property
     def n_rank_reduced(self) -> int:
         """Number of projections of reduced rank."""
-        return int(self._counters[RANK_REDUCED])
+        return int(self._counters[data.RANK_REDUCED])
 
     @property
     def n_softened(self) -> int:
         """Number of projections with weights that are more equal than those of the error metric."""
-        return int(self._counters[SOFTENED])
+        return int(self._counters[data.SOFTENED])
 
     @property
     def n_rejected_projections(self) -> int:
         """Number of projections that failed."""
-        return int(self._counters[REJECTED])
+        return int(self._counters[data.REJECTED])
 
     @property
     def max_correction(self) -> float:
@@ -192,7 +177,7 @@ def slowness(sums: np.ndarray) -> np.ndarray:
     of an oscillator that is damped until its driving dominates. Therefore the larger of two ratios of rates to terms is
     returned: the ratio of the sums over the whole run, and that of the sums over its last part.
     """
-    rates, terms = sums[[ALL_RATES, LATE_RATES]], sums[[ALL_TERMS, LATE_TERMS]]
+    rates, terms = sums[[data.ALL_RATES, data.LATE_RATES]], sums[[data.ALL_TERMS, data.LATE_TERMS]]
     known = terms > 0
     return np.max(np.where(known, rates, np.nan) / np.where(known, terms, 1.0), axis=0)
 
@@ -200,8 +185,8 @@ def slowness(sums: np.ndarray) -> np.ndarray:
 def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     """Return the sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation together."""
     both = one + two
-    late = [LATE_RATES, LATE_TERMS]
-    kept = (one[SAMPLES] / np.maximum(both[SAMPLES], 1.0)) ** (1 / LATE_SHARE)
+    late = [data.LATE_RATES, data.LATE_TERMS]
+    kept = (one[data.SAMPLES] / np.maximum(both[data.SAMPLES], 1.0)) ** (1 / data.LATE_SHARE)
     both[late] = kept * one[late] + two[late]
     return both
 

@@ -196,7 +196,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
         jacobian = _jacobian(self.TABLEAU, options)
-        projection, extraneous = ProjectionOptions.of(options)
+        own, extraneous = ProjectionOptions.split(options)
+        projection = ProjectionOptions(**own)
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
         t0, t_bound = interval((t0, t_bound))
