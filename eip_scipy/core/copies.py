@@ -7,68 +7,48 @@ from __future__ import annotations
 
 import copy
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import Any
 
 from scipy.integrate import OdeSolver
 
-from ..engine.data import Work
 from ..engine.trust import Trust
 from . import steppers
 from .invariants import InvariantSet
 from .runs import Run
 
-__all__ = ["RunParts", "parts_of", "run_of", "scipy_values", "set_scipy_values"]
+__all__ = ["parts_of", "run_of", "scipy_values", "set_scipy_values"]
 
 BOUND = ("tableau", "work", "invariants", "trust")
 
 
-class RunParts(NamedTuple):
-    """The values and arrays from which `run_of` makes a `Run` again, apart from the invariants.
+def parts_of(run: Run) -> dict[str, Any]:
+    """Return the values and arrays, by name, from which `run_of` makes a run again, apart from the invariants.
 
-    `values` are fields of the run, `work` is a copy of its buffers, and `doubts` and `failed` are attributes of its
-    `Trust`.
-    """
-
-    values: dict[str, Any]
-    work: Work
-    doubts: list[str]
-    failed: bool
-
-
-def parts_of(run: Run) -> RunParts:
-    """Return the parts from which `run_of` makes a run again.
-
-    If a solver of SciPy makes the steps, the parts contain the attributes of that solver. A user-defined one-step
-    method is not part of them.
+    These are fields of the run, a copy of its buffers, and attributes of its `Trust`. If a solver of SciPy makes the
+    steps, the attributes of that solver are among them. A user-defined one-step method is not.
     """
     values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
     values["options"] = run.options._replace(joint=None)
     if run.tableau.in_python:
         values["method"] = run.method.state() if run.tableau.drives else None
-    return RunParts(values, copy.deepcopy(run.work), list(run.trust.doubts), run.trust.failed)
+    return values | {"work": copy.deepcopy(run.work), "doubts": list(run.trust.doubts), "failed": run.trust.failed}
 
 
-def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
+def run_of(parts: dict[str, Any], invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
     """Return a run made from its parts, with copies of their buffers.
 
-    Parameters
-    ----------
-    parts : RunParts
-    invariants : InvariantSet
-        A new set of the same invariants, made at the same start.
-    method : Tableau, NystromTableau, GaussJackson, OneStep or Driven
-    joint : bool
-        Whether the run projects `JointInvariants` with their functions `moments` and `shift`.
+    `invariants` is a new set of the same invariants, made at the same start. `joint` is True if the run projects
+    `JointInvariants` with their functions `moments` and `shift`.
     """
-    values, work = copy.deepcopy(parts.values), copy.deepcopy(parts.work)
+    values = copy.deepcopy(parts)
     if method.in_python:
         values["method"] = steppers.arrays(method)
     if joint:
         values["options"] = values["options"]._replace(joint=invariants.items)
     invariants.target = values["options"].target  # those of balances change
-    trust = Trust(invariants.names, work.trust)
-    trust.doubts, trust.failed = list(parts.doubts), parts.failed
-    return Run(**values, tableau=method, work=work, invariants=invariants, trust=trust)
+    trust = Trust(invariants.names, values["work"].trust)
+    trust.doubts, trust.failed = values.pop("doubts"), values.pop("failed")
+    return Run(**values, tableau=method, invariants=invariants, trust=trust)
 
 
 def scipy_values(solver: OdeSolver) -> dict[str, Any]:

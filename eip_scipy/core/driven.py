@@ -7,7 +7,6 @@ lists them, and a run raises an error that names those that the installed versio
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import scipy
 from scipy.integrate import BDF, DenseOutput, OdeSolver, Radau
+from scipy.linalg import invpascal
 from scipy.sparse import issparse
 
 from ..engine.data import NFEV, NJEV, NLU, Work
@@ -183,7 +183,8 @@ class Stepper:
             if not np.array_equal(y, solver.y):
                 self._move(y)
             self._before = self._kept()
-        self._bound_shifts()
+        if solver.jac_factor is not None:
+            solver.jac_factor = np.minimum(solver.jac_factor, LARGEST_SHIFT)
         solver.step()
         solver.max_step = longest
         self._count(w)
@@ -195,10 +196,6 @@ class Stepper:
         self._describe(h, w.K[1:-1])
         w.K[-1] = self._slope(w.K[1:-1])
         return float(solver.t), float(solver.h_abs)
-
-    def _bound_shifts(self) -> None:
-        if self.solver.jac_factor is not None:
-            self.solver.jac_factor = np.minimum(self.solver.jac_factor, LARGEST_SHIFT)
 
     def _count(self, w: Work) -> None:
         for name, place in COUNTERS.items():
@@ -223,11 +220,8 @@ class Stepper:
         """Return the values from which another stepper continues with the same bits; None before the first step."""
         if self.solver is None:
             return None
-        values = {
-            name: value
-            for name, value in vars(self.solver).items()
-            if isinstance(value, DenseOutput) or not callable(value)
-        }
+        own = vars(self.solver)
+        values = {name: value for name, value in own.items() if isinstance(value, DenseOutput) or not callable(value)}
         # Sparse factorisations cannot be copied; the solver makes them again.
         return values | {name: None for name in self._factors() if not isinstance(values[name], tuple)}
 
@@ -340,13 +334,8 @@ def _newton() -> Array:
     return out
 
 
-def _shifted() -> Array:
-    """Return an array whose column j contains the coefficients of 1, x, x^2, ... in (x - 1)^j."""
-    return np.array(
-        [[(-1.0) ** (j - i) * math.comb(j, i) for j in range(MOST_ORDER + 1)] for i in range(MOST_ORDER + 1)]
-    )
-
-
-NEWTON, SHIFTED = _newton(), _shifted()
+NEWTON = _newton()
+# Column j contains the coefficients of 1, x, x^2, ... in (x - 1)^j.
+SHIFTED = invpascal(MOST_ORDER + 1, "upper").astype(float)
 DRIVEN_RADAU = Driven(Radau, RadauStepper, 5, 3, np.linalg.inv(NODES[:, None] ** np.arange(1, 4)), takes_complex=False)
 DRIVEN_BDF = Driven(BDF, BDFStepper, 1, 1, np.eye(MOST_ORDER), takes_complex=True)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .gradients import unless_error
 from .states import as_derivative
 
 if TYPE_CHECKING:
@@ -108,12 +109,8 @@ def _secants(
     direction = np.concatenate(way)
 
     def at(s: float) -> Array:
-        try:
-            return shifted(derivative, t, y, s * direction, places, extra)
-        except MemoryError:
-            raise
-        except Exception:  # the run does not visit this state
-            return np.full(y.size, np.nan)
+        found: Array | None = unless_error(shifted, derivative, t, y, s * direction, places, extra)
+        return np.full(y.size, np.nan) if found is None else found
 
     with np.errstate(all="ignore"):
         return at(0.0), np.array([(at(s) - at(-s)) / (2.0 * s) for s in LENGTHS])

@@ -287,51 +287,51 @@ def _define_unary(function: Any, slope: Callable[..., Any], *names: Any) -> None
         _overload(name)(typed)
 
 
+def _of_two(function: Any, slope: Callable[..., Any], other: Callable[..., Any], x: Any, y: Any) -> Any:
+    """Return ``function(x, y)`` for scalars of the Numba types x and y, one of them a dual; None for other types.
+
+    `slope` and `other`, as functions of the two values and of that of `function`, are the derivatives by x and y.
+    """
+    if not _is_dual(x, y):
+        return None
+
+    def of_first(x, y):
+        a, b = value_of(x), value_of(y)
+        v = function(a, b)
+        return _dual(v, slope(a, b, v), x)
+
+    def of_second(x, y):
+        a, b = value_of(x), value_of(y)
+        v = function(a, b)
+        return _dual(v, other(a, b, v), y)
+
+    def of_both(x, y):
+        a, b = value_of(x), value_of(y)
+        v = function(a, b)
+        return _dual_of_two(v, slope(a, b, v), x, other(a, b, v), y)
+
+    if isinstance(x, Dual) and isinstance(y, Dual):
+        return of_both
+    return of_first if isinstance(x, Dual) else of_second
+
+
 def _define_binary(function: Any, slope: Callable[..., Any], other: Callable[..., Any], *names: Any) -> None:
     slope, other = _inner(slope), _inner(other)
 
     def typed(x, y):
-        if not _is_dual(x, y):
-            return None
-
-        def of_first(x, y):
-            a, b = value_of(x), value_of(y)
-            v = function(a, b)
-            return _dual(v, slope(a, b, v), x)
-
-        def of_second(x, y):
-            a, b = value_of(x), value_of(y)
-            v = function(a, b)
-            return _dual(v, other(a, b, v), y)
-
-        def of_both(x, y):
-            a, b = value_of(x), value_of(y)
-            v = function(a, b)
-            return _dual_of_two(v, slope(a, b, v), x, other(a, b, v), y)
-
-        if isinstance(x, Dual) and isinstance(y, Dual):
-            return of_both
-        return of_first if isinstance(x, Dual) else of_second
+        return _of_two(function, slope, other, x, y)
 
     for name in (function, *names):
         _overload(name)(typed)
 
 
-def _define_flat(function: Any, arguments: int, *names: Any) -> None:
-    """Define a function of one or two duals (`arguments`) whose derivative is 0 or undefined.
+def _define_flat(function: Any) -> None:
+    """Define a function of a dual whose derivative is 0 or undefined: it returns a plain number."""
 
-    It returns a plain number, computed from the values of the duals. `names` are other functions that are replaced by
-    `function` for duals.
-    """
-
-    def typed(x, y):
-        return (lambda x, y: function(value_of(x), value_of(y))) if _is_dual(x, y) else None
-
-    def typed_one(x):
+    def typed(x):
         return (lambda x: function(value_of(x))) if isinstance(x, Dual) else None
 
-    for name in (function, *names):
-        _overload(name)(typed if arguments == 2 else typed_one)
+    _overload(function)(typed)
 
 
 @_inner
@@ -383,23 +383,21 @@ _define_binary(math.copysign, lambda a, b, v: math.copysign(1.0, a) * math.copys
 _define_binary(max, lambda a, b, v: 1.0 if a >= b else 0.0, lambda a, b, v: 1.0 if a < b else 0.0, np.maximum, np.fmax)
 _define_binary(min, lambda a, b, v: 1.0 if a <= b else 0.0, lambda a, b, v: 1.0 if a > b else 0.0, np.minimum, np.fmin)
 
-_define_flat(operator.floordiv, 2)
-for _function in (math.floor, math.ceil, math.isnan, math.isinf, math.isfinite, np.sign, np.isnan, np.isfinite):
-    _define_flat(_function, 1)
-_define_flat(np.floor, 1)
-_define_flat(np.ceil, 1)
+FLAT: tuple[Any, ...] = (
+    math.floor, math.ceil, math.isnan, math.isinf, math.isfinite, np.sign, np.isnan, np.isfinite, np.floor, np.ceil,
+)  # fmt: skip
+for _function in FLAT:
+    _define_flat(_function)
+
+
+@_overload(operator.floordiv)
+def _floordiv(x, y):
+    return (lambda x, y: value_of(x) // value_of(y)) if _is_dual(x, y) else None
 
 
 def _power(x, y):
-    """Return a function that computes x ** y for arguments of the Numba types x and y.
-
-    Return None unless both are scalars and at least one is a dual.
-
-    Integer powers are computed by products, as Numba does for floats, and all others by ``a ** b`` of the values.
-    """
-    if not _is_dual(x, y):
-        return None
-    if isinstance(y, types.Integer):
+    """Return a function that computes x ** y as `_of_two`, integer powers by products, as Numba does for floats."""
+    if isinstance(x, Dual) and isinstance(y, types.Integer):
 
         def by_products(x, y):
             a = value_of(x)
@@ -414,24 +412,7 @@ def _power(x, y):
 
         return square if getattr(y, "literal_value", None) == 2 else by_products
 
-    def of_first(x, y):
-        a, b = value_of(x), value_of(y)
-        v = a**b
-        return _dual(v, _slope_of_power(a, b, v), x)
-
-    def of_second(x, y):
-        a, b = value_of(x), value_of(y)
-        v = a**b
-        return _dual(v, _slope_of_exponent(a, b, v), y)
-
-    def of_both(x, y):
-        a, b = value_of(x), value_of(y)
-        v = a**b
-        return _dual_of_two(v, _slope_of_power(a, b, v), x, _slope_of_exponent(a, b, v), y)
-
-    if isinstance(x, Dual) and isinstance(y, Dual):
-        return of_both
-    return of_first if isinstance(x, Dual) else of_second
+    return _of_two(operator.pow, _slope_of_power, _slope_of_exponent, x, y)
 
 
 for _function in (operator.pow, operator.ipow, math.pow, np.power):
@@ -459,10 +440,11 @@ def _define_for_arrays(function: Any) -> None:
     infer_global(function, types.Function(_Template))
 
 
+ARITHMETIC = operator.add, operator.sub, operator.mul, operator.truediv, np.add, np.subtract, np.multiply, np.divide
 ARRAY_FUNCTIONS: tuple[Any, ...] = (
-    operator.add, operator.sub, operator.mul, operator.truediv, operator.pow, operator.neg, np.add, np.subtract,
-    np.multiply, np.divide, np.power, np.negative, np.sqrt, np.square, np.abs, np.exp, np.log, np.log1p, np.expm1,
-    np.sin, np.cos, np.tan, np.sinh, np.cosh, np.tanh, np.arctan, np.hypot, np.arctan2, np.maximum, np.minimum,
+    *ARITHMETIC, operator.pow, operator.neg, np.power, np.negative, np.sqrt, np.square, np.abs, np.exp, np.log,
+    np.log1p, np.expm1, np.sin, np.cos, np.tan, np.sinh, np.cosh, np.tanh, np.arctan, np.hypot, np.arctan2, np.maximum,
+    np.minimum,
 )  # fmt: skip
 for _function in ARRAY_FUNCTIONS:
     _define_for_arrays(_function)
@@ -494,16 +476,7 @@ def _define_with_scalar(function: Any) -> None:
     _overload(function)(typed)
 
 
-for _function in (
-    operator.add,
-    operator.sub,
-    operator.mul,
-    operator.truediv,
-    np.add,
-    np.subtract,
-    np.multiply,
-    np.divide,
-):
+for _function in ARITHMETIC:
     _define_with_scalar(_function)
 
 

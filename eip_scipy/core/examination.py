@@ -81,7 +81,7 @@ class Examiner:
         if reason == data.CHANGES_ALONG_FLOW:
             return self.complaint(rhs, t_new, new)
         if reason == data.LARGE_ERROR:
-            return self._unless_refused(_unresolved, rhs, t_old, t_new - t_old, old)
+            return unless_refused(self.resolution, rhs, t_old, t_new - t_old, old, self.invariants.t_span[1])
         if reason != data.LARGE_CORRECTION:
             return None
         return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new), int(suspect[data.SUSPECT_WAITED]))
@@ -149,14 +149,6 @@ def _complaint(
     known.note_rates(examiner.figures, t, y, f, *evaluated)
     found = complaints(known, t, y, f, examiner.tau, rhs, evaluated)
     return next((one.text for one in found if on_manifold or not one.dependent), None)
-
-
-def _unresolved(examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, h: float, y: Array) -> str | None:
-    """Return a sentence on the part of the state that steps of length h from (t, y) do not resolve, or None.
-
-    `known` is as for `_complaint`.
-    """
-    return examiner.resolution(rhs, t, h, y, known.t_span[1])
 
 
 def _along_chord(

@@ -12,7 +12,7 @@ import numpy as np
 from ..engine.data import EPS
 from ..engine.native import BUILD
 
-__all__ = ["NumericalGradient", "difference_gradient", "random_directions", "typical_sizes"]
+__all__ = ["NumericalGradient", "difference_gradient", "random_directions", "typical_sizes", "unless_error"]
 
 Array = np.ndarray
 
@@ -27,6 +27,20 @@ LOWER_WEIGHTS = (2 / 3, -1 / 12, 0.0)
 # As in engine/cpp/differences.hpp.
 FIRST_SHIFT, SHORTER, MOST_SHIFTS = 5e-3, 1 / 16, 7
 DIFFER, ROUNDINGS, LEAST = 1e-8, 1e3, np.finfo(float).tiny
+
+
+def unless_error(function: Callable[..., Any], *args: Any) -> Any:
+    """Return ``function(*args)``; None if it raises an exception other than MemoryError.
+
+    A function of the user, or of a library, may raise any exception for complex numbers, and at states that the run
+    does not visit.
+    """
+    try:
+        return function(*args)
+    except MemoryError:
+        raise
+    except Exception:
+        return None
 
 
 class NumericalGradient:
@@ -52,24 +66,14 @@ class NumericalGradient:
     def __call__(self, t: float, y: Array, *extra: Any) -> Array:
         """Return the gradient (n,) at (t, y), or (l_i, n) of an invariant with l_i values."""
         if self.complex_step:
-            try:
-                found = self._by_complex_step(t, y, extra)
-            except MemoryError:
-                raise
-            except Exception:  # an error of the function itself comes again from the differences
-                found = None
-            if found is not None:
+            where = self._function, t, y, self._args + extra, COMPLEX_STEP, self._direction, self.floors
+            found: Array | None = unless_error(BUILD.gradients.checked_complex_step, *where)
+            if found is not None:  # it is None if it disagrees with a difference
                 return found
         return difference_gradient(lambda x: self._fun(t, x, extra), y, self.floors)
 
     def _fun(self, t: float, y: Array, extra: tuple) -> Array:
         return np.asarray(self._function(t, y.copy(), *self._args, *extra))
-
-    def _by_complex_step(self, t: float, y: Array, extra: tuple) -> Array | None:
-        """Return the gradient by complex steps; None if it disagrees with a difference."""
-        return BUILD.gradients.checked_complex_step(
-            self._function, t, y, self._args + extra, COMPLEX_STEP, self._direction, self.floors
-        )
 
     def _takes_complex_steps(self, t: float, y: Array, extra: tuple) -> bool:
         """Return True if the function accepts complex states and is analytic near the start.
@@ -77,17 +81,16 @@ class NumericalGradient:
         At y itself derivatives of abs(y_k) and similar terms may happen to vanish.
         """
         real = self._fun(t, y, extra)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", np.exceptions.ComplexWarning)
-                plain = self._fun(t, y.astype(complex), extra)
-                if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), real, rtol=1e-12):
-                    return False
-                return any(self._agrees_beside(t, y, extra, *trial) for trial in TRIALS)
-        except MemoryError:
-            raise
-        except Exception:  # libraries may raise any error for complex numbers
-            return False
+
+        def is_analytic() -> bool:
+            plain = self._fun(t, y.astype(complex), extra)
+            if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), real, rtol=1e-12):
+                return False
+            return any(self._agrees_beside(t, y, extra, *trial) for trial in TRIALS)
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", np.exceptions.ComplexWarning)
+            return bool(unless_error(is_analytic))
 
     def _agrees_beside(self, t: float, y: Array, extra: tuple, length: float, tolerance: float) -> bool:
         size = np.abs(y) + self.floors

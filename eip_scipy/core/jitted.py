@@ -46,9 +46,9 @@ def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
     """
     if not is_jitted(call.fun):
         return call
-    from . import numba_entries
+    from . import numba_pointers
 
-    return numba_entries.with_entry(call, dtype)
+    return numba_pointers.with_entry(call, dtype)
 
 
 def jit_is_off() -> bool:

@@ -1,4 +1,4 @@
-"""Numba functions as C function pointers for the native engine, compiled when a run begins."""
+"""Numba functions for the native engine: as C function pointers, compiled when a run begins, or as compiled before."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ import numpy as np
 from llvmlite import ir
 from numba import from_dtype, njit, types
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.errors import NumbaError
+from numba.core.errors import NumbaError, TypingError
+from numba.core.runtime import _nrt_python
+from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.np.arrayobj import populate_array
 
+from ..engine.native import Call, NumbaEntry
 from .jitted import ChangedShapeError, NotCompilableError
 from .native_functions import Kind
 
-__all__ = ["Compiled", "compiled"]
+__all__ = ["Compiled", "compiled", "refuse_addresses", "with_entry"]
 
+WORD, ADDRESS = ir.IntType(64), ir.IntType(8).as_pointer()
+MOST_DIMENSIONS = 4  # of arrays whose addresses are refused
 
 # Counter for the names of C functions.
 _serial = count()
@@ -209,3 +214,59 @@ def _put_rows(rows, out):
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] = rows[i, j]
+
+
+def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
+    """Return `call`, of a Numba function ``fun(t, y)``, with the function's compiled code for states of type `dtype`.
+
+    Return `call` itself if there is no such code that the engine can call. Nothing is compiled here: the code exists as
+    soon as the function has been called once with such a state.
+    """
+    if call.args or call.takes_f or call.in_place or len(call.shape) > 2:
+        return call
+    state = types.Array(from_dtype(dtype), 1, "C")
+    known: Any = call.fun
+    code = known.overloads.get((types.float64, state))
+    if code is None or code.objectmode:
+        return call
+    scalar = types.float64 if call.real else state.dtype
+    shown = types.Array(scalar, len(call.shape), "C") if call.shape else scalar
+    if code.fndesc.restype != shown or not _is_as_expected(code.target_context, shown, state):
+        return call
+    address = code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
+    return call._replace(entry=NumbaEntry(address, _nrt_python.c_helpers["MemInfo_release"], code))
+
+
+@lru_cache(maxsize=16)
+def _is_as_expected(context: Any, value: types.Type, state: types.Array) -> bool:
+    """Return True if this version of Numba passes the argument y, `state`, and the value as the engine assumes."""
+    number = context.get_data_type(state.dtype).as_pointer()
+    returned = context.get_data_type(value)
+    if isinstance(value, types.Array):
+        data = context.get_data_type(value.dtype).as_pointer()
+        lengths = ir.ArrayType(WORD, value.ndim)
+        if returned != ir.LiteralStructType([ADDRESS, ADDRESS, WORD, WORD, data, lengths, lengths]):
+            return False
+    elif returned != ir.DoubleType():
+        return False
+    raised = context.call_conv.get_function_type(types.none, ()).args[1]
+    array = [ADDRESS, ADDRESS, WORD, WORD, number, WORD, WORD]
+    expected = ir.FunctionType(ir.IntType(32), [returned.as_pointer(), raised, ir.DoubleType(), *array])
+    return bool(context.call_conv.get_function_type(value, (types.float64, state)) == expected)
+
+
+def refuse_addresses(kind: Any, name: str) -> None:
+    """Make the use of ``array.ctypes`` an error in functions compiled for arrays of the Numba type `kind`.
+
+    C code would read the memory of such an array as floats. `name` describes the numbers in the error.
+    """
+    for ndim in range(1, MOST_DIMENSIONS + 1):
+        addresses = types.ArrayCTypes(types.Array(kind, ndim, "C"))  # Numba has one object for all layouts
+        addresses.can_convert_to = lambda context, other: None
+
+        @infer_getattr
+        class _Refusal(AttributeTemplate):  # a template for one type replaces those for its class
+            key = addresses
+
+            def generic_resolve(self, kind: Any, attribute: str) -> None:
+                raise TypingError(f"Cannot give C code the address of an array of {name}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.data import EPS, EUCLIDEAN, NEW, Work
+from ..engine.data import EPS, EUCLIDEAN, NEW, Method, Work
 from ..engine.native import BUILD
 from ..engine.trust import Trust
 from ..methods.orders import AT_REST
@@ -151,7 +151,9 @@ class RunSpec:
         if columns is not None:
             options, sigma = widened(options, sigma, columns, invariants.start_gradients)
         invariants.kinds = options.kinds
-        arrays = steppers.seeing(steppers.arrays(method), self.sees_velocity)
+        arrays = steppers.arrays(method)
+        if isinstance(arrays, Method) and arrays.nystrom:
+            arrays = arrays._replace(sees_velocity=self.sees_velocity)
         carried, blocks = options.balances.place, options.groups.start.size - 1
         work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, blocks, carried.size)
         work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients

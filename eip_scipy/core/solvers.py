@@ -404,14 +404,14 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _revive(self, shared: dict[str, Any], copied: dict[str, Any]) -> None:
         """Restore the solver from the output of `_state`."""
-        begin, user = copied["run"].values["begin"], shared["_user_fun"]
+        begin, user = copied["run"]["begin"], shared["_user_fun"]
         vectorized = copied["attributes"]["vectorized"]
         super().__init__(user, begin.t, begin.y, begin.t + 1.0, vectorized, support_complex=True)
         if copied["replaced"]:
             self.fun = user
         self._jacobian, self._scipy = shared["_jacobian"], None
         self._bind(user, [0])
-        spec = self._specified(copied["run"].values["stepping"], shared["projection"])
+        spec = self._specified(copied["run"]["stepping"], shared["projection"])
         if self.TABLEAU.has_history:
             tableau: Any = self.TABLEAU
             spec = replace(spec, method=replace(tableau, velocities=copied["velocities"]))
@@ -426,10 +426,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
         if self.TABLEAU.drives:
             self._spec.attach_solver(self._run, begin)
-            self._run.method.resume(copied["run"].values["method"])
+            self._run.method.resume(copied["run"]["method"])
         self._work, self.f, self.h_abs = self._run.work, begin.f, 0.0
         self._drive(begins=False)
-        self._work.K[0], self._work.rates[0] = copied["run"].work.K[0], copied["run"].work.rates[-1]
+        self._work.K[0], self._work.rates[0] = copied["run"]["work"].K[0], copied["run"]["work"].rates[-1]
         if copied["clock"] is not None:
             self._schedule.clock[:] = copied["clock"]
         calls = self._calls

@@ -25,7 +25,7 @@ from ..methods.runge_kutta import DOP853, Tableau
 from .driven import Driven, Stepper
 from .one_step import OneStep
 
-__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "rated", "seeing"]
+__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "rated"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -82,7 +82,7 @@ def _(method: Tableau) -> Method:
         sees_velocity=False,
         fsal=method.fsal,
         paired=method.paired,
-        exponent=_exponent(method),
+        exponent=-1.0 / ((method.error_estimator_order or 0) + 1),
     )
 
 
@@ -110,22 +110,11 @@ def _(method: NystromTableau) -> Method:
         sees_velocity=False,
         fsal=bool(e[-1] != 0.0 or e_v[-1] != 0.0),
         paired=False,
-        exponent=_exponent(method),
+        exponent=-1.0 / ((method.error_estimator_order or 0) + 1),
     )
 
 
-def _exponent(method: Tableau | NystromTableau) -> float:
-    return -1.0 / ((method.error_estimator_order or 0) + 1)
-
-
 # Balances.
-
-
-def seeing(coefficients: Any, sees_velocity: bool) -> Any:
-    """Return what `arrays` has returned, noting whether accelerations come from a function of velocities too."""
-    if isinstance(coefficients, Method) and coefficients.nystrom:
-        return coefficients._replace(sees_velocity=sees_velocity)
-    return coefficients
 
 
 @singledispatch
@@ -176,15 +165,7 @@ class Form(NamedTuple):
 @singledispatch
 def form(method: Any, brief: bool) -> Form:
     """Return the form of a method's interpolants; a `brief` run has too few steps for a multistep history."""
-    raise TypeError(
-        f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
-        "OneStep or Driven."
-    )
-
-
-@form.register
-def _(method: OneStep, brief: bool) -> Form:
-    return Form(CUBIC, 3, own_slopes=True)
+    return Form(CUBIC, 3, own_slopes=True)  # of a user's one-step method
 
 
 @form.register
@@ -219,53 +200,25 @@ def _(method: GaussJackson, brief: bool) -> Form:
 # The equations that a method integrates.
 
 
-@singledispatch
 def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str], sees_velocity: bool) -> Any:
-    """Return the method after a check of the equations.
+    """Return the method after a check that the equations are of second order, if the method needs that.
 
-    The attribute `velocities` of a `GaussJackson` method is set to `sees_velocity`: accelerations that do not depend on
-    velocities at the start may do so later, as with drag that acts in a part of an orbit. If the equations must be of
-    second order, `rhs` is evaluated once more, with other velocities.
-
-    Parameters
-    ----------
-    method : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
-    rhs : callable
-        ``rhs(t, y) -> (n,)``.
-    start : Start
-    name : str
-        Name of the solver class, for messages.
-    hint : callable
-        ``hint()`` returns further advice for the message if the equations are of another kind.
-    sees_velocity : bool
-        Whether the accelerations come from a function that is called with velocities too.
-
-    Raises
-    ------
-    ValueError
-        If the equations are not those of the method.
+    `rhs` is then evaluated once more, with other velocities. `name` is that of the solver class, and ``hint()`` returns
+    further advice for the message. The attribute `velocities` of a `GaussJackson` method is set to `sees_velocity`,
+    whether the accelerations come from a function that is called with velocities too: accelerations that do not depend
+    on velocities at the start may do so later, as with drag that acts in a part of an orbit.
     """
-    return method
-
-
-@checked.register
-def _(
-    method: NystromTableau, rhs: Derivative, start: Any, name: str, hint: Callable[[], str], sees_velocity: bool
-) -> NystromTableau:
-    if depends_on_velocity(rhs, start, name, hint):
+    if not method.of_second_order:
+        return method
+    depends = depends_on_velocity(rhs, start, name, hint)  # raises an exception if the state is not (q, v)
+    if method.has_history:
+        return replace(method, velocities=sees_velocity)
+    if depends:
         raise ValueError(
             f"{name} integrates q'' = a(t, q), but the accelerations in fun depend on the velocity; use a Runge-Kutta "
             f"method such as EIPDOP853."
         )
     return method
-
-
-@checked.register
-def _(
-    method: GaussJackson, rhs: Derivative, start: Any, name: str, hint: Callable[[], str], sees_velocity: bool
-) -> GaussJackson:
-    depends_on_velocity(rhs, start, name, hint)  # raises an exception if the state is not (q, v)
-    return replace(method, velocities=sees_velocity)
 
 
 def check_halves(n: int) -> None:

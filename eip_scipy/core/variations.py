@@ -17,7 +17,7 @@ from ..engine.native import BUILD, LibraryFunction
 from .arguments import scalars
 from .blocks import INDEX
 from .dual_checks import shifted, wrong_duals
-from .gradients import NumericalGradient, difference_gradient, random_directions, typical_sizes
+from .gradients import NumericalGradient, difference_gradient, random_directions, typical_sizes, unless_error
 from .inputs import filled, reals, require_arguments, shown
 from .invariants import Invariant
 from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
@@ -377,7 +377,12 @@ def _of_columns_in_order(
             from .jitted_columns import rhs_by_products
 
             return rhs_by_products(fun, form, jvp, n, columns.count), "jvp"
-        return _interpreted(columns, fun, form, y0, _by_jvp(jvp, n, y0.dtype)), "jvp"
+
+        def products(t: float, y: Array, M: Array, extra: tuple) -> Array:
+            found = (jvp(t, y.copy(), row[:n].copy(), *extra) for row in M)
+            return np.array([as_derivative(value, n, y0.dtype, t, "jvp") for value in found])
+
+        return _interpreted(columns, fun, form, y0, products), "jvp"
     why: str | None = "it is not compiled by Numba"
     if is_jitted(fun) and not jit_is_off() and scalars(extra) is not None:
         from .jitted_columns import rhs_by_duals
@@ -493,16 +498,6 @@ def _interpreted(
     return rhs
 
 
-def _by_jvp(jvp: Callable[..., Any], n: int, dtype: np.dtype) -> Callable[[float, Array, Array, tuple], Array]:
-    """Return the `products` of `_interpreted` by the user's `jvp`."""
-
-    def products(t: float, y: Array, M: Array, extra: tuple) -> Array:
-        found = (jvp(t, y.copy(), row[:n].copy(), *extra) for row in M)
-        return np.array([as_derivative(value, n, dtype, t, "jvp") for value in found])
-
-    return products
-
-
 def _by_complex_steps(
     columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, why: str | None
 ) -> Callable[..., Any]:
@@ -513,36 +508,18 @@ def _by_complex_steps(
     derivative, places = _derivative(fun, form, y0), list(columns.parameters)
     products = _ComplexSteps(derivative, y0, places)
     dy, dp = _direction(y0, len(places))
-    try:
-        good = _agree(
-            products.by_complex_step(t0, y0, np.concatenate([dy, dp])[None], extra)[0],
-            _difference(derivative, t0, y0, dy, dp, places, extra),
-            AGREES,
-        )
-    except MemoryError:
-        raise
-    except Exception:  # a function may raise any error for complex numbers
-        good = False
-    if not good:
+
+    def is_good() -> bool:
+        found = products.by_complex_step(t0, y0, np.concatenate([dy, dp])[None], extra)[0]
+        return _agree(found, _difference(derivative, t0, y0, dy, dp, places, extra), AGREES)
+
+    if not unless_error(is_good):
         raise ValueError(
             "variations: the derivatives of the right-hand side cannot be computed: it does not belong to a problem "
             f"with derivatives, {why}, and it does not support complex steps. Give jvp=..., a function "
             "jvp(t, y, dy) that returns the product of the Jacobian with dy."
         )
     return _interpreted(columns, fun, form, y0, products)
-
-
-def _unless_error(function: Callable[..., Any], *args: Any) -> Any:
-    """Return ``function(*args)``; None if it raises an exception other than MemoryError.
-
-    A function of the user may raise any exception for complex numbers, and at states that the run does not visit.
-    """
-    try:
-        return function(*args)
-    except MemoryError:
-        raise
-    except Exception:
-        return None
 
 
 class _ComplexSteps:
@@ -583,15 +560,15 @@ class _ComplexSteps:
         """Return the products (n, k) with the scaled rows by complex steps; None if they disagree with differences."""
         k = len(rows)
         way = random_directions(k, False)[-1]
-        found = _unless_error(
+        found = unless_error(
             BUILD.gradients.checked_complex_step,
             self._along, t, np.zeros(k), (y, rows, extra), COMPLEX_STEP, way, np.ones(k),
         )  # fmt: skip
         if found is not None:
             return found
         # The engine's comparison allows for the rounding of the values, but not for that of terms that cancel in them.
-        found = _unless_error(self._unchecked, t, y, rows, extra)
-        wrong = found is None or _unless_error(self._is_wrong, found, way, t, y, rows, extra)
+        found = unless_error(self._unchecked, t, y, rows, extra)
+        wrong = found is None or unless_error(self._is_wrong, found, way, t, y, rows, extra)
         return None if wrong else found
 
     def _is_wrong(self, found: Array, way: Array, t: float, y: Array, rows: Array, extra: tuple) -> bool:
