@@ -49,11 +49,13 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
 def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width: int) -> FrameRows:
     C, S = (np.frombuffer(*given) for given in (given_C, given_S))
     C, M = _frame_matrices(C.reshape(-1, n), S.reshape(n, -1), width)
-    starts, index, value = _sparse_rows(np.concatenate([C, M]))
-    k = C.shape[0]
+    both, k = np.concatenate([C, M]), C.shape[0]
+    rows, index = np.nonzero(both)
+    starts = np.concatenate([[0], np.cumsum(np.count_nonzero(both, axis=1))]).astype(INDEX)
     weights = _by_bodies(C), _by_bodies(M)
     bodies = np.array(weights) if weights[0].size and weights[1].size else np.zeros((2, 0, 0))
-    return FrameRows(np.array([starts[: k + 1], starts[k:]]), index, value, np.zeros(k), bodies)
+    indices = np.array([starts[: k + 1], starts[k:]])
+    return FrameRows(indices, index.astype(INDEX), both[rows, index], np.zeros(k), bodies)
 
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
@@ -100,9 +102,3 @@ def _by_bodies(a: np.ndarray) -> np.ndarray:
     for k, axis in product(range(groups), range(3)):
         expected[k, axis, k, :, axis] = weights[k]
     return weights if np.array_equal(entries, expected) else np.zeros((0, 0))
-
-
-def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rows, index = np.nonzero(a)
-    start = np.concatenate([[0], np.cumsum(np.count_nonzero(a, axis=1))])
-    return start.astype(INDEX), index.astype(INDEX), a[rows, index]

@@ -49,6 +49,15 @@ DOUBLE = (
     "Compute it in double precision: with JAX call jax.config.update('jax_enable_x64', True), with PyTorch use tensors "
     "and parameters of torch.float64"
 )
+NO_INVARIANT = (
+    "{name!r} is not an invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, and the absolute "
+    "values of the terms of that rate sum to {terms:.3g}"
+)
+DEPENDS_ON_OTHERS = (
+    "{name!r} is kept only where its rate of change is 0, as a length is while the velocity along it is 0, but at "
+    "t={t:.6g} that rate is {rate:.3g}, and the absolute values of its terms sum to {terms:.3g}: a constraint on "
+    "which {name!r} depends is missing or not met, such as the velocity constraint that belongs to a length"
+)
 WRONG = "Projecting on it gives a wrong solution: omit it, correct it, or pass a Balance if it changes slowly"
 MISSING = "Add that constraint to the invariants, and start on it"
 
@@ -243,7 +252,7 @@ def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
     wrong &= ~(_rounding(known, at, at.directions) > np.abs(difference - along))
     # Different slopes on both sides mean a kink, where no gradient of a function can be correct.
     kink = np.abs(ends[0] + ends[1] - 2 * at.here) / step > np.abs(along) * 0.01 + noise
-    wrong &= ~(np.array(known.computed) & kink)
+    wrong &= ~(known.computed & kink)
     way = int(wrong.any(axis=1).argmax())
     for k in np.flatnonzero(wrong[way]):
         yield _wrong_gradient(known, int(k), at.t, difference[way, k], along[way, k])
@@ -328,8 +337,7 @@ def _complaints_of_rates(
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
     by_values, misled = _misled_rates(known, at, found, wrong)
-    conditional: list[int] = []
-    plain: list[int] = []
+    conditional, plain = list[int](), list[int]()
     for k in (int(k) for k in order if wrong[k]):
         if misled[k]:
             text = (
@@ -341,10 +349,11 @@ def _complaints_of_rates(
         free = rhs is not None and found.in_time[k] == 0
         kept = free and rhs is not None and is_kept_on_a_surface(known, k, ~found.wrong, at.t, at.y, at.f, rhs)
         (conditional if kept else plain).append(k)
-    for those, words, advice in ((plain, _no_invariant, WRONG), (conditional, _depends_on_others, MISSING)):
+    for those, words, advice in ((plain, NO_INVARIANT, WRONG), (conditional, DEPENDS_ON_OTHERS, MISSING)):
         if those:
             others = [known.names[k] for k in those[1:]]
-            text = words(known.names[those[0]], at.t, found.rate[those[0]], found.terms[those[0]])
+            first = those[0]
+            text = words.format(name=known.names[first], t=at.t, rate=found.rate[first], terms=found.terms[first])
             text += f"; the same holds for {listed(others)}" if others else ""
             yield Complaint(False, text, advice, those is conditional)
 
@@ -355,7 +364,7 @@ def _misled_rates(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array
     Small errors of a gradient, which `_wrong_gradients` allows, still make a rate that exceeds its rounding. Only
     gradients of the user are considered.
     """
-    given = wrong & ~np.array(known.computed, bool)
+    given = wrong & ~known.computed
     moving, size = np.abs(at.f).max(), np.abs(at.y).max()
     if not given.any() or not (moving > 0 and size > 0):
         return np.full(known.size, np.nan), np.zeros(known.size, bool)
@@ -391,21 +400,6 @@ def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wro
     return Complaint(False, text, "Correct rate, or omit it to have it computed", category=ProjectionWarning)
 
 
-def _no_invariant(name: str, t: float, rate: float, terms: float) -> str:
-    return (
-        f"{name!r} is not an invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, and the "
-        f"absolute values of the terms of that rate sum to {terms:.3g}"
-    )
-
-
-def _depends_on_others(name: str, t: float, rate: float, terms: float) -> str:
-    return (
-        f"{name!r} is kept only where its rate of change is 0, as a length is while the velocity along it is 0, but at "
-        f"t={t:.6g} that rate is {rate:.3g}, and the absolute values of its terms sum to {terms:.3g}: a constraint on "
-        f"which {name!r} depends is missing or not met, such as the velocity constraint that belongs to a length"
-    )
-
-
 def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates | None:
     """Return the rates of change at a state, or None if the state's derivative is too small to compute them."""
     # Rates are divided by the largest component of f, because they could overflow for large states otherwise.
@@ -422,7 +416,7 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     noise = noise + RATE_ROUNDINGS * EPS * known.norm_products(at.G, at.f / unit)
     of_balances = np.where(known.by_values, RATE_TOLERANCE_OF_DIFFERENCES, RATE_TOLERANCE)
     wrong = np.abs(rate) > np.where(carried, of_balances, data.INVARIANCE_TOLERANCE) * terms + noise
-    computed = np.array(known.computed, bool) & (known.by_values | ~carried)
+    computed = known.computed & (known.by_values | ~carried)
     if (wrong & computed).any():
         # A gradient that is computed across a kink is wrong, and so is the rate that follows from it.
         where = at.t, at.y, at.f, at.G, at.here

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
@@ -134,8 +135,10 @@ class Invariant:
         in_place, uses_f = flag(f"{own}: in_place", in_place), flag(f"{own}: uses_f", uses_f)
         size = None if size is None else count(f"{own}: size", size)
         what = "an invariant" if name is None else f"invariant {name!r}"
-        if isinstance(fun, OwnArguments) or isinstance(grad, OwnArguments):
-            fun, grad, args = _apart(fun, grad, args)
+        for given in (fun, grad):  # of another invariant, whose arguments take the place of `args` if it is empty
+            args = args or given.args if isinstance(given, OwnArguments) else args
+        functions: list[Any] = [item.function if isinstance(item, OwnArguments) else item for item in (fun, grad)]
+        fun, grad = functions
         fun = by_pointer(fun, what, shape=(size,) if size and size > 1 else ())
         grad = by_pointer(grad, f"gradient of {what}", GRADIENT, takes_f=uses_f)
         if not callable(fun):
@@ -213,34 +216,30 @@ class JointInvariants(tuple[Invariant, ...]):
 
 def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
     """Return invariants or functions f(t, y, *args) as a tuple of `Invariant`; `JointInvariants` stay unchanged."""
+    if isinstance(invariants, JointInvariants):
+        return invariants
     if type(invariants) is tuple and all(isinstance(item, Invariant) for item in invariants):
         return invariants
-    if isinstance(invariants, Invariant | JointInvariants):
-        return invariants if isinstance(invariants, JointInvariants) else (invariants,)
-    if _is_function(invariants):
-        return (_of_function(invariants),)
+    if isinstance(invariants, Invariant) or (callable(invariants) and not isinstance(invariants, type)):
+        return (_as_invariant(invariants),)
     try:
         items = tuple(invariants)
     except TypeError:
         raise TypeError(
             f"invariants: got {shown(invariants)}; expected an Invariant, a function f(t, y), or a sequence of them."
         ) from None
-    return tuple(_as_invariant(item) for item in items)
+    return tuple(map(_as_invariant, items))
 
 
 def _as_invariant(item: Any) -> Invariant:
     if isinstance(item, Invariant):
         return item
-    if not _is_function(item):
+    if not callable(item) or isinstance(item, type):
         raise TypeError(
             f"invariants: the sequence contains {shown(item)}; expected Invariant objects or functions f(t, y)."
         )
-    return _of_function(item)
-
-
-def _is_function(item: Any) -> bool:
-    """Return True if an item is a function, and not a class such as Invariant."""
-    return callable(item) and not isinstance(item, type)
+    name = getattr(item, "__name__", "<")
+    return Invariant(item, name=None if name.startswith("<") else name)
 
 
 def with_args(item: Invariant, args: tuple[Any, ...]) -> Invariant:
@@ -248,21 +247,6 @@ def with_args(item: Invariant, args: tuple[Any, ...]) -> Invariant:
     new: Invariant = copied(item)
     new.args = args
     return new
-
-
-def _of_function(fun: Callable[..., Any]) -> Invariant:
-    name = getattr(fun, "__name__", "<")
-    return Invariant(fun, name=None if name.startswith("<") else name)
-
-
-def _apart(fun: Any, grad: Any, args: Sequence[Any]) -> tuple[Any, Any, Sequence[Any]]:
-    """Return `fun`, `grad` and `args`, where one function or both come from the attributes of another invariant.
-
-    The arguments of that invariant take the place of `args` if it is empty.
-    """
-    functions = [found.function if isinstance(found, OwnArguments) else found for found in (fun, grad)]
-    own = next(found.args for found in (fun, grad) if isinstance(found, OwnArguments))
-    return functions[0], functions[1], args or own
 
 
 def _lacks_gradient(item: Invariant) -> bool:
@@ -336,11 +320,6 @@ def _first_gradient(
         raise
 
 
-def _for_each_value(of_items: list[bool], sizes: list[int]) -> list[bool]:
-    """Return a list in which the flag of each item is repeated as often as the item has values."""
-    return [known for known, size in zip(of_items, sizes, strict=True) for _ in range(size)]
-
-
 def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
     """Return the value of a gradient at t after checks: it has the expected shape, and is real if the state is real."""
     what = f"gradient of invariant {label!r}"
@@ -381,8 +360,8 @@ class InvariantSet:
         Groups of components that have the same unit, see `kinds_of`. None if the units are unknown.
     given : ndarray of bool, shape (l,)
         True for the values whose targets the user gave.
-    computed : list of bool
-        For each of the l values, True if its gradient is computed because none was given.
+    computed : ndarray of bool, shape (l,)
+        True for the values whose gradients are computed because none was given.
     """
 
     def __init__(
@@ -421,19 +400,18 @@ class InvariantSet:
         self.size = self.starts[-1]
         self.start_values = np.concatenate([value.ravel() for value in values]) if values else np.zeros(0)
         self.names = self._names(sizes)
-        self._require_finite(self.start_values, "not finite at y0")
+        for name, number in zip(self.names, self.start_values.tolist(), strict=True):
+            if not math.isfinite(number):
+                raise ValueError(f"invariant {name!r} is not finite at y0: it returned {number}.")
         self.scales = self._scales(sizes)
-        self.computed = _for_each_value([item.gradient is None for item in given], sizes)
+        self.computed = self._of_values([item.gradient is None for item in given])
         self.uses_f = any(item.uses_f for item in self.items)
-        self.grads = [
-            self._numerical_gradient(item, t0, y0) if item.gradient is None else item.gradient for item in self.items
-        ]
+        self.grads = [self._gradient_of(item, t0, y0) for item in self.items]
         if tell:
             self._tell_of_differences()
             self._tell_of_cost(given, y0.size)
         self.target = self._targets()
-        given_targets = [item.target is not None and not item.is_measured for item in self.items]
-        self.given = np.array(_for_each_value(given_targets, sizes), bool)
+        self.given = self._of_values([item.target is not None and not item.is_measured for item in self.items])
         self.shape, self.dtype = (self.size, y0.size), y0.dtype
         self.balances = Carried(self.items, self.labels, self.starts, shapes, extra)
         if y0.dtype == FLOAT:
@@ -459,11 +437,18 @@ class InvariantSet:
     @property
     def by_values(self) -> Array:
         """Return a mask (l,) of the values whose gradients come from differences, not from `grad` or a complex step."""
-        found = [
-            item.gradient is None and not (isinstance(grad, NumericalGradient) and grad.complex_step)
-            for item, grad in zip(self.items, self.grads, strict=True)
-        ]
-        return np.repeat(np.array(found, bool), np.diff(self.starts))
+        known = zip(self.items, self.grads, strict=True)
+        return self._of_values([item.gradient is None and not grad.complex_step for item, grad in known])
+
+    def _gradient_of(self, item: Invariant, t: float, y: Array) -> Any:
+        if item.gradient is not None:
+            return item.gradient
+        takes_complex = not isinstance(item.function, PointerFunction)
+        return NumericalGradient(item.function, item.args, takes_complex, t, y, self.floors, self.extra)
+
+    def _of_values(self, of_items: list[bool]) -> Array:
+        """Return a mask (l,) in which the flag of each item is repeated as often as the item has values."""
+        return np.repeat(np.array(of_items, bool), np.diff(self.starts))
 
     def _scales(self, sizes: list[int]) -> Array:
         scales = np.zeros(self.size)
@@ -477,10 +462,6 @@ class InvariantSet:
                 )
             scales[self.starts[k] : self.starts[k + 1]] = item.scale
         return scales
-
-    def _numerical_gradient(self, item: Invariant, t: float, y: Array) -> NumericalGradient:
-        takes_complex = not isinstance(item.function, PointerFunction)
-        return NumericalGradient(item.function, item.args, takes_complex, t, y, self.floors, self.extra)
 
     def _tell_of_differences(self) -> None:
         for grad, label in zip(self.grads, self.labels, strict=True):
@@ -515,8 +496,6 @@ class InvariantSet:
     @property
     def fixed_target(self) -> Array:
         """Return the target values (l,) of the whole run; NaN for balances, whose values change."""
-        if not self.balances.items:
-            return self.target.copy()
         return np.where(self.balances.mask, np.nan, self.target)
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
@@ -540,11 +519,8 @@ class InvariantSet:
                 continue
             item.is_measured = item.is_measured or item.target is None
             item.target = self.target[self.starts[k] : self.starts[k + 1]].copy()
-        return (
-            JointInvariants(kept, self.items.moments, self.items.shift)
-            if isinstance(self.items, JointInvariants)
-            else tuple(kept)
-        )
+        joint = self.items if isinstance(self.items, JointInvariants) else None
+        return tuple(kept) if joint is None else JointInvariants(kept, joint.moments, joint.shift)
 
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
         """Return a copy, with a compiled gradient, of a jitted invariant without one; any other invariant is unchanged.
@@ -580,19 +556,11 @@ class InvariantSet:
             def convert(found: Any, t: float) -> Array:
                 return np.array(_gradient(found, label, t, shape, y0.dtype), y0.dtype, order="C")
 
-            given = item.gradient is not None
-            arguments = item.args + self.extra if given else self.extra
-            takes_f = given and item.uses_f
+            arguments = self.extra if item.gradient is None else item.args + self.extra
+            takes_f = item.gradient is not None and item.uses_f
             return call(self.grads[k], arguments, shape, convert, takes_f=takes_f, in_place=item.in_place)
 
         return tuple(map(value, range(len(self.items)))), tuple(map(gradient, range(len(self.items))))
-
-    def _require_finite(self, values: Array, what: str) -> None:
-        if BUILD.are_finite(values):
-            return
-        for name, value in zip(self.names, values, strict=True):
-            if not np.isfinite(value):
-                raise ValueError(f"invariant {name!r} is {what}: it returned {value}.")
 
     def _targets(self) -> Array:
         target = self.start_values.copy()
@@ -622,13 +590,11 @@ class InvariantSet:
 
     def values(self, t: float, y: Array) -> Array:
         """Return the values (l,) of all invariants at (t, y)."""
-        found: Array = self.functions.values(t, y)
-        return found
+        return self.functions.values(t, y)
 
     def gradients(self, t: float, y: Array, f: Array) -> Array:
         """Return the gradients (l, n) of all values at (t, y); f is the derivative of the state."""
-        found: Array = self.functions.gradients(t, y, f)
-        return found
+        return self.functions.gradients(t, y, f)
 
     def term_sizes(self, t: float, y: Array, f: Array) -> Array:
         """Return the sizes (l,) of the terms in the invariants: ``max(|I|, |target|, sum_k |G_k y_k|, scale)``."""

@@ -13,16 +13,9 @@ import numpy as np
 from ..engine.native import Call, LibraryFunction
 
 __all__ = [
-    "ChangedShapeError",
-    "NotCompilableError",
-    "compilable",
-    "compiled_like",
-    "is_compiled",
-    "is_jitted",
-    "jit_is_off",
-    "jitted",
-    "with_entry",
-]
+    "ChangedShapeError", "NotCompilableError", "compilable", "compiled_like", "is_compiled", "is_jitted",
+    "jit_is_off", "jitted", "with_entry",
+]  # fmt: skip
 
 
 class ChangedShapeError(ValueError):

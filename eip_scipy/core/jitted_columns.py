@@ -12,12 +12,7 @@ from .dual_arrays import for_duals, inside
 from .dual_numbers import put_slope, seed, slope, value_of
 from .jitted_gradients import compiled_for, dual_along, gradient_by_duals, new_state
 
-__all__ = [
-    "parameter_gradient",
-    "rearranged",
-    "rhs_by_duals",
-    "rhs_by_products",
-]
+__all__ = ["parameter_gradient", "rearranged", "rhs_by_duals", "rhs_by_products"]
 
 # A state with columns is (y, p, first column, second column, ...): the parameters p that derivatives are taken by stand
 # behind the n components as constants, so that each column has size = n + len(p) numbers.

@@ -100,7 +100,8 @@ def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, chec
             "longer steps, such as EIPRKN12."
         )
     if method.velocities:
-        strongest = _largest_damping(system)
+        # The largest modulus of an eigenvalue of the accelerations' derivative by the velocities.
+        strongest = _largest(lambda d: _difference(system, d, slice(half, None)), y0)
         part = longest_stable(method.order, corrects, h * fastest, h * strongest) if check and strongest > 0.0 else 1.0
         if part < 1.0:
             raise ValueError(
@@ -130,12 +131,6 @@ def _largest_frequency(system: SecondOrder) -> float:
     return float(np.sqrt(max(0.0, _largest(lambda d: top * d - along(d), y) - top))) if top else 0.0
 
 
-def _largest_damping(system: SecondOrder) -> float:
-    """Return the largest modulus of an eigenvalue of the accelerations' derivative by the velocities at the start."""
-    y = system.start.y
-    return _largest(lambda d: _difference(system, d, slice(y.size // 2, None)), y)
-
-
 def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
     """Return the derivative (n/2,) of the accelerations at the start along d in `part`, positions or velocities."""
     t, y, f, _ = system.start
@@ -159,16 +154,12 @@ def _largest(product: Callable[[Array], Array], y: Array) -> float:
     return found
 
 
-def _has_groups(run: Run) -> bool:
-    return run.options.balance_groups.value.size > 0
-
-
 def _record(
     run: Run, method: GaussJackson, corrected: slice, stepping: Stepping, *, brief: bool, level: bool
 ) -> Multistep:
     order, half = method.order, run.work.err.size // 2
     pitch = -(-half // 4) * 4  # whole vectors
-    limit = stability_limit(order, method.corrected)
+    limit, grouped = stability_limit(order, method.corrected), run.options.balance_groups.value.size > 0
     return Multistep(
         **weights(order)._asdict(),
         growth=max(SMOOTH, min(SMOOTH_LOW * limit**order, 2.0 ** (order - 2))),
@@ -179,7 +170,7 @@ def _record(
         t0=stepping.span.t0,
         h=stepping.span.h,
         substeps=SUBSTEPS if method.velocities else 1,
-        spacing=run.options.every if run.options.every != AUTO else OF_GROUPS if _has_groups(run) else AUTO_SPACING,
+        spacing=run.options.every if run.options.every != AUTO else OF_GROUPS if grouped else AUTO_SPACING,
         corrected_first=corrected.start,
         corrected_count=corrected.stop - corrected.start,
         nodes=_aligned((ROWS * order, pitch)),

@@ -97,17 +97,14 @@ class OneStep(Ordered):
         result = self._one_step(float(t), y.copy(), float(h))
         w.counters[NFEV] += self.evaluations
         if self.has_estimate:
-            result, estimate = self._pair(result)
+            if not isinstance(result, tuple) or len(result) != 2:
+                raise TypeError(
+                    f"{self.name}.one_step returned {type(result).__name__}, expected the pair (y_hat, err), because "
+                    "the method has error_estimator_order; return both, or remove this attribute."
+                )
+            result, estimate = result
             w.err[:] = self._vector(estimate, "an estimate", t, y).view(float)
         w.y_hat[:] = self._vector(result, "a state", t, y)
-
-    def _pair(self, result: Any) -> tuple[Any, Any]:
-        if not isinstance(result, tuple) or len(result) != 2:
-            raise TypeError(
-                f"{self.name}.one_step returned {type(result).__name__}, expected the pair (y_hat, err), "
-                "because the method has error_estimator_order; return both, or remove this attribute."
-            )
-        return result
 
     def _vector(self, value: Any, what: str, t: float, y: np.ndarray) -> np.ndarray:
         vector = as_vector(value, y.size, y.dtype, f"{self.name}.one_step returned {what}:", t)

@@ -26,14 +26,9 @@ from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet, JointInvarian
 from .stepping import AnyMethod, Stepping
 
 __all__ = [
-    "Options",
-    "ProjectionDetails",
-    "ProjectionKeywords",
-    "ProjectionOptions",
-    "Settled",
-    "takes_projection_options",
-    "weights",
-]
+    "Options", "ProjectionDetails", "ProjectionKeywords", "ProjectionOptions", "Settled",
+    "takes_projection_options", "weights",
+]  # fmt: skip
 
 DIRECTIONS = {"new": data.NEW, "old": data.OLD, "midpoint": data.MIDPOINT}
 MOST_ITERATIONS = 1000
@@ -168,6 +163,9 @@ class ProjectionOptions:
                 "new state only; omit direction."
             )
         compensated = self._compensated(method)
+        # Multistep methods correct only a part of an error within rounding.
+        band = data.BAND_COMPENSATED if compensated else data.BAND
+        band = data.BAND_MULTISTEP if method.has_history else band
         rtol, atol = stepping.rtol, stepping.atol
         groups = blocks_of(self.blocks, n, width)
         block_atol = atol[: groups.start.size - 1].copy()
@@ -186,7 +184,7 @@ class ProjectionOptions:
             columns=data.no_columns(known.size),
             target=known.target,
             scales=known.scales,
-            computed=np.array(known.computed, float),
+            computed=known.computed.astype(float),
             # Multistep methods pass the errors instead of the targets; the remaining errors are negligible.
             most_left=np.where(known.given & (not method.has_history), MOST_LEFT, np.inf),
             kinds=groups,
@@ -200,13 +198,15 @@ class ProjectionOptions:
             uses_f=known.uses_f,
             compensated=compensated,
             adaptive=stepping.h is None,
-            per_band=1.0 / (_band(method, compensated) * EPS),
+            per_band=1.0 / (band * EPS),
             watched=check and known.size > 0,
             limit=(data.LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
             distant=data.DISTANT if stepping.h is not None else float(np.clip(far, data.DISTANT, MOST_FAR)),
         )
-        if _can_project_jointly(options, known):
-            options = options._replace(joint=known.items)
+        plain = (options.metric, options.direction, options.iterations) == (data.EUCLIDEAN, data.NEW, 1)
+        free = options.frame.products.size == 0 and options.every != data.AUTO and not compensated
+        if isinstance(known.items, JointInvariants) and plain and free and not known.balances.items:
+            options = options._replace(joint=known.items)  # the run can project by the functions `moments` and `shift`
         flag("project_initial", self.project_initial)
         return Settled(options, sigma, self._identity(options, sigma, y0, known))
 
@@ -277,13 +277,6 @@ class ProjectionOptions:
         return data.GIVEN, np.repeat(weights("metric", metric, n), width)
 
 
-def _band(method: AnyMethod, compensated: bool) -> float:
-    """Return the largest residual that is not corrected, in units of the rounding error of the invariant's terms."""
-    if method.has_history:  # these methods correct only a part of an error within rounding
-        return data.BAND_MULTISTEP
-    return data.BAND_COMPENSATED if compensated else data.BAND
-
-
 def weights(name: str, sigma: Any, n: int) -> np.ndarray:
     """Return weights of n components, scaled so that the largest is 1, after checks."""
     a = real_array(name, sigma)
@@ -351,13 +344,6 @@ def _are_of_bodies(components: np.ndarray, weight: np.ndarray) -> bool:
 
 def _starts(sizes: list[int]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-
-
-def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
-    """Return True if the run can project by the functions `moments` and `shift` of `JointInvariants`."""
-    plain = (options.metric, options.direction, options.iterations) == (data.EUCLIDEAN, data.NEW, 1)
-    free = options.frame.products.size == 0 and options.every != data.AUTO and not options.compensated
-    return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items
 
 
 def takes_projection_options(documented: Documented) -> Documented:

@@ -94,8 +94,8 @@ class PointerFunction:
             f = rest.pop(0) if self.takes_f else np.full_like(state, np.nan)
             given.append(np.ascontiguousarray(f, state.dtype))
         out = rest.pop(0) if self.shape is None else np.full(self.shape, np.nan)
-        numbers = reals(rest[0]) if len(rest) == 1 else _as_params(tuple(rest))
-        if numbers is None:
+        numbers = reals(rest[0]) if len(rest) == 1 else floats(tuple(rest))
+        if numbers is None or (len(rest) != 1 and scalars(tuple(rest)) is None):
             raise TypeError(
                 f"{self.name} is a C function pointer: its arguments after t and y are numbers or one array of floats, "
                 f"its params; it got {', '.join(map(shown, rest))}."
@@ -123,10 +123,6 @@ class PointerFunction:
     def failure(self, t: float, status: int) -> RuntimeError:
         """Return the error for a call at `t` that returned the negative `status`."""
         return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; a status below 0 ends the run.")
-
-
-def _as_params(rest: tuple[Any, ...]) -> np.ndarray | None:
-    return None if scalars(rest) is None else floats(rest)
 
 
 def is_pointer(fun: Any) -> bool:
@@ -160,16 +156,12 @@ def _checked_address(pointer: Any, name: str, kind: str) -> int:
     address = _address(pointer)
     if not address:
         raise TypeError(f"{name} is a null pointer, expected {kind}.")
-    _require_signature(pointer, name, kind)
-    return address
-
-
-def _require_signature(pointer: Any, name: str, kind: str) -> None:
     found = _signature(pointer)
-    if _normalised(found) != TYPES[kind]:
+    if re.sub(r"\bconst\b|\s", "", found) != TYPES[kind]:
         raise TypeError(f"{name} is a C function of the signature {found!r}, expected {kind}.")
     if _is_low_level(pointer) and pointer.user_data is not None:
         raise TypeError(f"{name} is a LowLevelCallable with user_data, which is not supported; pass it as params.")
+    return address
 
 
 def _signature(pointer: Any) -> str:
@@ -178,10 +170,6 @@ def _signature(pointer: Any) -> str:
     from scipy import LowLevelCallable
 
     return str((pointer if _is_low_level(pointer) else LowLevelCallable(pointer)).signature)
-
-
-def _normalised(signature: str) -> str:
-    return re.sub(r"\bconst\b|\s", "", signature)
 
 
 def _address(pointer: Any) -> int:

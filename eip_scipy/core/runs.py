@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 from ..engine.data import BY_ERROR, EXAMINED, NO_BALANCES, NO_METHOD, NOTHING, REASON, Schedule, Work
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
+from . import steppers
 from .callers import users_level
 from .examination import Derivative, Examiner, is_check_due, unless_refused
 from .invariant_checks import listed
@@ -23,7 +25,9 @@ from .results import Diagnostics, slowness
 from .stepping import AnyMethod, Stepping
 from .variations import Columns, wrong_product
 
-__all__ = ["Counted", "Run", "Start"]
+__all__ = ["Counted", "Run", "Start", "parts_of", "run_of"]
+
+BOUND = ("tableau", "work", "invariants", "trust")  # what a copy of a run makes again, or copies by itself
 
 
 class Start(NamedTuple):
@@ -97,7 +101,8 @@ class Run:
             joint=None if functions.native else self.options.joint,
             **others,
         )
-        engine, w = Engine(self.method, self.options, self.work, functions, schedule, _if_any(hooks)), self.work
+        needed = hooks if hooks != Hooks() else None
+        engine, w = Engine(self.method, self.options, self.work, functions, schedule, needed), self.work
         if self.options.watched and begins:
             t, f = schedule.span.t0, w.K[0]
             if self.start is not self.begin:  # the buffers have the values and gradients at `begin`
@@ -222,5 +227,32 @@ class Counted:
         return self._rhs(t, y).copy()
 
 
-def _if_any(hooks: Hooks) -> Hooks | None:
-    return hooks if hooks != Hooks() else None
+def parts_of(run: Run) -> dict[str, Any]:
+    """Return the values and arrays, by name, from which `run_of` makes a run again, apart from the invariants.
+
+    The new run continues with the same bits, in this process or another one. The values are fields of the run, a copy
+    of its buffers, and attributes of its `Trust`. If a solver of SciPy makes the steps, the attributes of that solver
+    are among them. A user-defined one-step method is not.
+    """
+    values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
+    values["options"] = run.options._replace(joint=None)
+    if run.tableau.in_python:
+        values["method"] = run.method.state() if run.tableau.drives else None
+    return values | {"work": copy.deepcopy(run.work), "doubts": list(run.trust.doubts), "failed": run.trust.failed}
+
+
+def run_of(parts: dict[str, Any], invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
+    """Return a run made from its parts, with copies of their buffers.
+
+    `invariants` is a new set of the same invariants, made at the same start. `joint` is True if the run projects
+    `JointInvariants` with their functions `moments` and `shift`.
+    """
+    values = copy.deepcopy(parts)
+    if method.in_python:
+        values["method"] = steppers.arrays(method)
+    if joint:
+        values["options"] = values["options"]._replace(joint=invariants.items)
+    invariants.target = values["options"].target  # those of balances change
+    trust = Trust(invariants.names, values["work"].trust)
+    trust.doubts, trust.failed = values.pop("doubts"), values.pop("failed")
+    return Run(**values, tableau=method, invariants=invariants, trust=trust)

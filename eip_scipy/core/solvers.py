@@ -26,7 +26,7 @@ from ..engine.data import (
     Work,
     bare_schedule,
 )
-from ..engine.native import Call, PythonFunctions
+from ..engine.native import Call, PythonFunctions, call
 from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
@@ -35,7 +35,6 @@ from .acceleration import BY_NAME
 from .between_steps import N_LEFT, Settings, checked_stepping, checked_vector, is_state, kept_state
 from .callers import users_level
 from .coefficients import attributes_of, is_same, tableau_of
-from .copies import parts_of, run_of, scipy_values, set_scipy_values
 from .dense import ExactEnds, Interpolants
 from .driven import DRIVEN_BDF, DRIVEN_RADAU, Driven, Jacobian
 from .examination import is_check_due
@@ -49,29 +48,15 @@ from .one_step import OneStep, OneStepMethod
 from .options import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
 from .run_spec import RunSpec
-from .runs import Run, Start
+from .runs import Run, Start, parts_of, run_of
 from .states import as_derivative, initial_state
 from .stepping import ATOL, StepOptions, Stepping, interval
 from .variations import Columns
 
 __all__ = [
-    "EIPBDF",
-    "EIPDOP853",
-    "EIPGJ12",
-    "EIPGJ14",
-    "EIPRK1",
-    "EIPRK2",
-    "EIPRK3",
-    "EIPRK4",
-    "EIPRK5",
-    "EIPRK23",
-    "EIPRK45",
-    "EIPRKN8",
-    "EIPRKN12",
-    "EIPRadau",
-    "EIPSolver",
-    "eip_method",
-]
+    "EIPBDF", "EIPDOP853", "EIPGJ12", "EIPGJ14", "EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPRK23",
+    "EIPRK45", "EIPRKN8", "EIPRKN12", "EIPRadau", "EIPSolver", "eip_method",
+]  # fmt: skip
 
 # The attributes that a step of SciPy's solver reads.
 HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
@@ -259,7 +244,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             fun=None if self.vectorized else self._user_fun,
             jacobian=lambda: moved,
             level=True,
-            hint=_by_name,
+            hint=lambda: f". If fun is the acceleration a(t, q), {BY_NAME}",
             columns=self._COLUMNS,
         )
 
@@ -286,11 +271,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._schedule.place[PENDING] = 1  # the solver shows the end of the last step
         jacobian = None
         if callable(self._jacobian):
-            jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
+            jacobian = call(self._jacobian, (), (self.n // 2,), None, takes_f=True, in_place=True)
         rates = self._run.invariants.rates(self._run.options.adaptive)
         dtype = self.y.dtype
         rhs = with_entry(self._call, dtype)
-        inv, grad = (tuple(with_entry(call, dtype) for call in group) for group in self._run.invariants.calls)
+        inv, grad = (tuple(with_entry(known, dtype) for known in group) for group in self._run.invariants.calls)
         functions = PythonFunctions(rhs, inv, grad, (), second_order=False, jacobian=jacobian, rates=rates)
         self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
 
@@ -336,7 +321,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self._spec = self._specified(stepping, self._spec.projection)
         self._take_stepping(stepping)
         if self._scipy is not None:
-            self._hand_to_scipy(self._scipy, refunctioned)
+            if refunctioned:
+                self._scipy.fun = self._derivative
+            for name in HANDED:
+                setattr(self._scipy, name, getattr(self, name))
             return
         before = self._calls[0]
         if (refunctioned or moved) and self.f is was.f:
@@ -349,13 +337,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self._work.rates[0] = np.nan if refunctioned else self._work.rates[-1]
         self._work.counters[NFEV] += self._calls[0] - before
         self._drive(begins=moved)
-
-    def _hand_to_scipy(self, solver: OdeSolver, refunctioned: bool) -> None:
-        """Copy the attributes that a step reads to SciPy's solver, and `fun` if it was set (`refunctioned`)."""
-        if refunctioned:
-            solver.fun = self._derivative
-        for name in HANDED:
-            setattr(solver, name, getattr(self, name))
 
     def _restart(self, here: Start) -> None:
         """Start a new run at `here`, a time and a state set by the user; counts and the largest residuals continue."""
@@ -398,7 +379,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             "run": parts_of(self._run),
             "joint": self._run.options.joint is not None,
             "clock": None if self._scipy is not None else self._schedule.clock,
-            "scipy": None if self._scipy is None else scipy_values(self._scipy),
+            "scipy": {name: value for name, value in vars(self._scipy).items() if not callable(value)}
+            if self._scipy is not None
+            else None,
         }
         return shared, copied
 
@@ -420,7 +403,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             fresh = partial(_copied, self._derivative)
             self._scipy = self._SCIPY(fresh, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
             self._scipy.fun = self._derivative
-            set_scipy_values(self._scipy, copied["scipy"])
+            for name, value in copied["scipy"].items():
+                if name.startswith("K"):  # the stages, which may be a view of another array
+                    getattr(self._scipy, name)[...] = value
+                else:
+                    setattr(self._scipy, name, value)
         t_bound = copied["attributes"]["t_bound"]
         invariants = InvariantSet(shared["projection"].invariants, *begin, tell=False, t_bound=t_bound)
         self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
@@ -591,11 +578,6 @@ def _copied(derivative: Callable[[float, np.ndarray], np.ndarray], t: float, y: 
     return derivative(t, y).copy()
 
 
-def _by_name() -> str:
-    """Return the end of an error message that explains how to pass an acceleration."""
-    return f". If fun is the acceleration a(t, q), {BY_NAME}"
-
-
 def _frozen(a: np.ndarray) -> np.ndarray:
     """Return a read-only copy, because a step would not notice a change in place."""
     a = a.copy()
@@ -614,11 +596,6 @@ def _jacobian(method: Any, options: dict[str, Any]) -> Any:
     if jacobian is not None and not callable(jacobian):
         raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out), got {shown(jacobian)}.")
     return jacobian
-
-
-def _never(value: Any, t: float) -> np.ndarray:
-    """Stand-in for `convert` of a `Call` that fills an array, and so has no value to convert; it is never called."""
-    raise AssertionError
 
 
 def _without_effect(names: Iterable[str]) -> str:
@@ -907,23 +884,16 @@ def eip_method(
     >>> bool(abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-8)
     True
     """
-    if isinstance(method, type) and issubclass(method, OdeSolver):
-        return _on_class(method)
     given: Any = method
+    if isinstance(given, type) and issubclass(given, OdeSolver):
+        if issubclass(given, EIPSolver):
+            return given
+        classes: tuple[Any, ...] = EIPRK23, EIPRK45, EIPDOP853, EIPRadau, EIPBDF
+        for own in classes:
+            if is_same(given, own.TABLEAU.solver if own._SCIPY is None else own._SCIPY):
+                return own
+        given = tableau_of(given)
     tableau = given if isinstance(given, (Tableau, NystromTableau, GaussJackson)) else OneStep(given)
-    members = {"TABLEAU": tableau, "_ORIGIN": method, "__doc__": f"EIP method on {tableau!r}."}
+    members = {"TABLEAU": tableau, "_ORIGIN": given, "__doc__": f"EIP method on {tableau!r}."}
     made: Any = SolverClass(f"EIP_{tableau.name}", (EIPSolver,), members)
     return made
-
-
-def _on_class(solver: type[OdeSolver]) -> type[EIPSolver]:
-    """Return the EIP class for the method of a solver class of SciPy or another package."""
-    if issubclass(solver, EIPSolver):
-        return solver
-    for own in (EIPRK23, EIPRK45, EIPDOP853):
-        if own._SCIPY is not None and is_same(solver, own._SCIPY):
-            return own
-    for implicit in (EIPRadau, EIPBDF):
-        if is_same(solver, implicit.TABLEAU.solver):
-            return implicit
-    return eip_method(tableau_of(solver))

@@ -20,16 +20,9 @@ from .inputs import is_number, reals, refuse_units, shown
 from .one_step import OneStep
 
 __all__ = [
-    "ATOL",
-    "UNBOUNDED",
-    "AnyMethod",
-    "StepOptions",
-    "Stepping",
-    "check_fixed_step",
-    "fixed_steps",
-    "interval",
+    "ATOL", "UNBOUNDED", "AnyMethod", "StepOptions", "Stepping", "check_fixed_step", "fixed_steps", "interval",
     "saved_steps",
-]
+]  # fmt: skip
 
 AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | Driven | AtRest
 UNBOUNDED = 2**62

@@ -67,7 +67,9 @@ def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, U
 
     def convert(item: Any) -> Any:
         if is_time(item):
-            raise TypeError(f"{name}: {shown(item)} is a date; expected {_expected(powers, known)}.")
+            quantity = f"quantity in units of {known[1].name}"
+            expected = f"a number, or a {quantity}" if powers == (0, 1) else "a number or a quantity"
+            raise TypeError(f"{name}: {shown(item)} is a date; expected {expected}.")
         if powers != (0, 1) and not has_unit(item) and np.any(item):
             raise TypeError(f"{name}: {shown(item)} has no unit, but others have one; give it a unit too.")
         return _converted(name, item, powers, known)
@@ -176,7 +178,3 @@ def _converted(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}: {shown(value)} is not in units of {expression}: {error}.") from None
     return number / (length.scale**a * time.scale**b)
-
-
-def _expected(powers: tuple[int, int], known: tuple[Unit, Unit]) -> str:
-    return f"a number, or a quantity in units of {known[1].name}" if powers == (0, 1) else "a number or a quantity"

@@ -25,16 +25,9 @@ from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import as_derivative
 
 __all__ = [
-    "Columns",
-    "StateSolution",
-    "Variations",
-    "asked_columns",
-    "kept_symplectic",
-    "require_tableau",
-    "right_hand_side",
-    "widened",
-    "wrong_product",
-]
+    "Columns", "StateSolution", "Variations", "asked_columns", "kept_symplectic", "require_tableau",
+    "right_hand_side", "widened", "wrong_product",
+]  # fmt: skip
 
 Array = np.ndarray
 STATE = "state"
