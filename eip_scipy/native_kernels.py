@@ -27,15 +27,9 @@ from .engine.data import Work
 from .engine.native import BUILD, Call, FailedCallError, NativeFunctions, PythonFunctions, call, working_alone
 
 __all__ = [
-    "FixedStepResult",
-    "FixedSteps",
-    "check_state",
-    "fields",
-    "refuse_units",
-    "run_in_place",
-    "run_second_order",
+    "FixedStepResult", "FixedSteps", "check_state", "fields", "refuse_units", "run_in_place", "run_second_order",
     "working_alone",
-]
+]  # fmt: skip
 
 fields = BUILD.fields
 """Functions that loop over the points of a field, see engine/cpp/comparators/fields.cpp."""
@@ -64,15 +58,6 @@ class FixedStepResult:
     nfev: int
     wall_time: float
     message: str
-
-
-def _check_span(t_span: Any) -> tuple[float, float]:
-    """Return start and end as floats; raise ValueError unless t_span holds two finite numbers."""
-    refuse_units(t_span=t_span)
-    span = reals(t_span)
-    if span is None or span.shape != (2,) or not np.isfinite(span).all():
-        raise ValueError(f"t_span must hold two finite numbers, got {shown(t_span)}")
-    return float(span[0]), float(span[1])
 
 
 def _real_vector(values: Any, name: str) -> np.ndarray:
@@ -112,7 +97,11 @@ class FixedSteps(NamedTuple):
     @classmethod
     def of(cls, t_span: Any, h: Any, save_every: Any) -> FixedSteps:
         """Check the user's arguments `t_span`, `h` and `save_every`, and return the steps that they define."""
-        t0, t_bound = _check_span(t_span)
+        refuse_units(t_span=t_span)
+        span = reals(t_span)
+        if span is None or span.shape != (2,) or not np.isfinite(span).all():
+            raise ValueError(f"t_span must hold two finite numbers, got {shown(t_span)}")
+        t0, t_bound = span.tolist()
         h = check_fixed_step(h, t0, t_bound)
         if save_every is None:
             save_every = 0
@@ -131,10 +120,7 @@ class FixedSteps(NamedTuple):
 
 
 def _message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
-    """Return the message of a run from its saved times `t` (m,) and states `ys` (m, n).
-
-    `reason` is the reason why the run was interpreted; it is empty if the run was compiled.
-    """
+    """Return the message of a run, interpreted for a `reason` if any, from its saved times (m,) and states (m, n)."""
     text = f"interpreted: {reason}" if reason else "compiled"
     finite = np.isfinite(ys).all(axis=1)
     if finite.all():
@@ -202,30 +188,22 @@ def run_second_order(
     given = None if params is None else _real_vector(params, "params")
     half = y.size // 2
     extra = () if given is None else (given,)
-    convert = _converter(half)
+
+    def convert(value: Any, t: float) -> np.ndarray:
+        # Without the checks NumPy would silently broadcast scalars or drop imaginary parts.
+        if value is None:
+            raise TypeError(f"acc returned None, expected {half} numbers")
+        if np.iscomplexobj(value):
+            raise TypeError("acc returned complex numbers, expected real ones")
+        if np.shape(value) != (half,):
+            raise ValueError(f"acc returned shape {np.shape(value)}, expected ({half},)")
+        return np.array(value, dtype=float)
+
     acc = by_pointer(acc, "acc", shape=(half,))
     convert(acc(steps.t0, y[:half].copy(), *extra), steps.t0)
     in_python = call(acc, extra, (half,), convert)
     kind = Kind((half,), half, -1 if given is None else given.size, "d")
     return _run(scheme, acc, in_python, kind, "acc", given, steps, y, second_order=True)
-
-
-def _converter(size: int) -> Callable[[Any, float], np.ndarray]:
-    """Return a function that returns a value of `acc` as an array (size,) after checks.
-
-    Without the checks NumPy would silently broadcast scalars or drop imaginary parts.
-    """
-
-    def convert(value: Any, t: float) -> np.ndarray:
-        if value is None:
-            raise TypeError(f"acc returned None, expected {size} numbers")
-        if np.iscomplexobj(value):
-            raise TypeError("acc returned complex numbers, expected real ones")
-        if np.shape(value) != (size,):
-            raise ValueError(f"acc returned shape {np.shape(value)}, expected ({size},)")
-        return np.array(value, dtype=float)
-
-    return convert
 
 
 def _run(
@@ -243,9 +221,8 @@ def _run(
 ) -> FixedStepResult:
     """Make all steps from y, which is overwritten, and return the result.
 
-    `fun` is called by its address; if it has none, `in_python` is called. `kind` is the signature of `fun`, and `name`
-    its name in messages. `second_order` is True if `fun` returns accelerations. See `run_in_place` for the other
-    arguments.
+    `fun` is called by its address; if it has none, `in_python` is called. `kind` is the signature of `fun`. With
+    `second_order` it returns accelerations. See `run_in_place` for the other arguments.
     """
     functions: NativeFunctions | PythonFunctions
     try:

@@ -71,26 +71,24 @@ def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, .
     """
     code = getattr(fun, "py_func", fun)
     sizes = (y.size,) if isinstance(fun, PointerFunction) else (y.size, y.size // 2)
-    gives = partial(_fills if in_place else _returns, code, extra, t)
+    gives = partial(_gives, code, in_place, extra, t)
     if y.size % 2 or gives(y.copy(), y.size):
         return False
     return any(gives(y.copy()[:size], y.size // 2) for size in sizes)
 
 
-def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
-    """Return True if `fun` returns an array (count,) at a state; False also if it raises an exception."""
-    try:
-        with np.errstate(all="ignore"):
-            return np.shape(fun(t, state, *extra)) == (count,)
-    except Exception:  # the function does not take these arguments
-        return False
+def _gives(
+    fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, state: np.ndarray, count: int
+) -> bool:
+    """Return True if `fun` returns an array (count,), or fills the first `count` entries of out with finite numbers.
 
-
-def _fills(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
-    """Return True if `fun` raises no error and fills the first `count` entries of out, and no others, with numbers."""
+    It must not fill the other entries. Return False also if it raises an exception.
+    """
     out = np.full_like(state, np.nan)
     try:
         with np.errstate(all="ignore"):
+            if not in_place:
+                return np.shape(fun(t, state, *extra)) == (count,)
             fun(t, state, out, *extra)
     except Exception:  # the function does not take these arguments
         return False

@@ -118,16 +118,8 @@ class Balance(Invariant):
         own: Any = rate
         if isinstance(own, OwnArguments):
             rate, args = own.function, args or own.args
-        super().__init__(
-            fun,
-            grad,
-            args=args,
-            size=size,
-            name=name,
-            scale=scale,
-            in_place=in_place,
-            uses_f=uses_f and grad is not None,
-        )
+        by_grad = uses_f and grad is not None
+        super().__init__(fun, grad, args=args, size=size, name=name, scale=scale, in_place=in_place, uses_f=by_grad)
         what = "rate of a balance" if name is None else f"rate of balance {name!r}"
         shape = (self.size,) if self.size and self.size > 1 else ()
         rate = by_pointer(rate, what, GRADIENT, takes_f=uses_f, shape=shape)

@@ -65,11 +65,7 @@ def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: 
     `was` contains the values of the attributes after the last step. `stacklevel` is that of warnings.
     """
     _check_kind_of_steps(solver, was)
-    t, t_bound, sign = (
-        _number("t", solver.t),
-        _number("t_bound", solver.t_bound),
-        _number("direction", solver.direction),
-    )
+    t, t_bound, sign = (_number(name, getattr(solver, name)) for name in ("t", "t_bound", "direction"))
     if not np.isfinite(t) or np.isnan(t_bound):
         raise ValueError(f"`t` must be finite and `t_bound` a number, got t={shown(t)} and t_bound={shown(t_bound)}.")
     if abs(sign) != 1:

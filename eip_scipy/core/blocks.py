@@ -38,7 +38,7 @@ def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
 
     The floats of a block have the same unit. Without blocks, a real state with an even number n of components is taken
     as (q, p), and the two halves are the groups, if ``f[: n // 2]`` and ``p = y[n // 2 :]`` are both zero or both
-    nonzero, and the sum of ``f[: n // 2] * sign(p)`` is not negative. Otherwise the groups are returned unchanged.
+    nonzero, and the sum of ``f[: n // 2] * sign(p)`` is not negative.
     """
     n = y.size
     if len(groups.start) - 1 < n or n % 2 or n == 0 or y.dtype.kind == "c":

@@ -85,15 +85,10 @@ class Carried:
         self._labels, self._starts, self._shapes, self._extra = labels, starts, shapes, extra
         self.items = {k: item for k, item in enumerate(items) if item.is_balance}
         self._given = {k for k, item in self.items.items() if item.rate_function is not None}
-        self.mask = np.zeros(starts[-1], bool)
-        if not self.items:
-            self.places, self.most_slowness = np.zeros(0, np.int64), np.zeros(0)
-            return
-        for k in self.items:
-            self.mask[starts[k] : starts[k + 1]] = True
+        self.mask = np.repeat(np.array([item.is_balance for item in items], bool), np.diff(starts))
         self.places = np.flatnonzero(self.mask).astype(np.int64)
-        most = [np.full(starts[k + 1] - starts[k], item.most_slowness) for k, item in self.items.items()]
-        self.most_slowness = np.concatenate(most)
+        most = np.array([item.most_slowness for item in items], float)
+        self.most_slowness = np.repeat(most, np.diff(starts))[self.places]
 
     def compile_rates(self, n: int) -> None:
         """Compile rates by dual numbers for jitted balances without a rate; the state is real and has n components."""

@@ -38,11 +38,10 @@ def wrong_duals(
 ) -> str | None:
     """Return a clause about what is wrong in `rhs`, the output of `rhs_by_duals`; None if nothing is found.
 
-    ``derivative(t, y, extra)`` returns the derivative (n,) of the state, and `extra` are the run's further arguments.
-    `way` is a direction: dy, which has the size of the state y0, and dp, which has the size 1, for the parameters by
-    which derivatives are taken. Each component of the values and products of `rhs` is compared with the value of
-    `derivative`, and its differences along the direction, at the start and near it. At a kink or a jump neither need
-    be wrong, so that a component counts as wrong only if it is so at both states.
+    ``derivative(t, y, extra)`` returns the derivative (n,) of the state. `way` is a direction: dy, of the size of the
+    state y0, and dp, of the size 1, for the parameters by which derivatives are taken. The values and products of `rhs`
+    are compared with the value of `derivative`, and its differences along the direction, at the start and near it. At a
+    kink or a jump neither need be wrong, so that a component counts as wrong only if it is so at both states.
     """
     as_derivative(derivative(t0, y0, extra), y0.size, y0.dtype, t0, "fun")  # an error of fun has its own message
     looks: list[tuple[Array, Array, Array]] = []

@@ -2,8 +2,7 @@
 
 At the start a rate or a gradient may vanish, or a function may take another branch than later. So the invariants are
 checked again after 10, 100, 1000, ... steps and at the end. Steps that the engine suspects are examined, too (`suspect`
-in engine/cpp/trust.hpp): steps in which an invariant changes along the flow, a correction is large, or the local error
-of some part of the state is large. The invariants need not show such an error.
+in engine/cpp/trust.hpp). The invariants need not show an error in them.
 """
 
 from __future__ import annotations
@@ -52,12 +51,11 @@ def is_check_due(steps: int) -> bool:
 
 @dataclass
 class Examiner:
-    """Examiner of the states of a run.
+    """Examiner of the states of a run; `tau` is the length of a step.
 
-    `tau` is the length of a step. `figures` (l, N_FIGURES) are numbers about the projections of the run, see
-    `engine.trust`; rates of change are also stored there. ``resolution(rhs, t, h, y, end_of_run)`` is `unresolved` for
-    the method and the blocks of this run. `largest` is the largest correction, in local errors, when a large correction
-    was last examined.
+    `figures` (l, N_FIGURES) are numbers about the projections of the run, see `engine.trust`; rates of change are also
+    stored there. ``resolution(rhs, t, h, y, end_of_run)`` is `unresolved` for the method and the blocks of this run.
+    `largest` is the largest correction, in local errors, when a large correction was last examined.
     """
 
     invariants: InvariantSet

@@ -77,12 +77,11 @@ class Complaint(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """A state, its derivative, and the invariants at and near the state.
+    """A state, its derivative, and the gradients `G` (l, n) and values `here` (l,) at the state.
 
     `tau` is the length of a step. `span` (n,) is |y| plus the distance that each component moves in a step, or while
-    the state changes by its own size if that is sooner. `directions` (2, n) are random vectors times `span`. `G`
-    (l, n) and `here` (l,) are the gradients and values at the state. `ends` (2, 2, l) are the values at y + s *
-    directions and y - s * directions, where s is the first of `CHECK_STEPS`.
+    the state changes by its own size if that is sooner. `directions` (2, n) are random vectors times `span`. `ends` (2,
+    2, l) are the values at y + s * directions and y - s * directions, where s is the first of `CHECK_STEPS`.
     """
 
     t: float

@@ -352,16 +352,9 @@ class InvariantSet:
     given are warned of. Invariants are evaluated only at times from t0 to `t_bound`, by default only at t0. `rhs` is
     the right-hand side of the system, for checks.
 
-    Attributes
-    ----------
-    balances : Carried
-        The balances among the invariants. Their entries of `target` are the values that the run integrates.
-    kinds : Grouping or None
-        Groups of components that have the same unit, see `kinds_of`. None if the units are unknown.
-    given : ndarray of bool, shape (l,)
-        True for the values whose targets the user gave.
-    computed : ndarray of bool, shape (l,)
-        True for the values whose gradients are computed because none was given.
+    The `target` of `balances` are the values that the run integrates. `kinds` are groups of components that have the
+    same unit, see `kinds_of`, or None. Masks (l,) of the values: the user gave the target of the `given`, and the
+    gradients of the `computed` are computed because none was given.
     """
 
     def __init__(

@@ -69,9 +69,8 @@ def rhs_by_duals(
 def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) -> Any:
     """Return ``copied(params, Y, first)``, which returns params as dual numbers, or unchanged without `parameters`.
 
-    The derivatives of those in `parameters` are entries of the columns of Y from the column `first` on; those of others
-    are 0. ``seeded(Y, first, i)`` returns entry i of Y as such a dual number; the parameters follow the `n` entries of
-    the state.
+    Their derivatives are entries of the columns of Y from the column `first` on, or 0 for other parameters. ``seeded(Y,
+    first, i)`` returns entry i of Y as such a dual number; the parameters follow the `n` entries of the state.
     """
     if not parameters:
         return inside(lambda params, Y, first: params)

@@ -33,9 +33,8 @@ DIFFERENCE = 1e-6
 class SecondOrder(NamedTuple):
     """A system q'' = a(t, q[, v]) in the form that a multistep method needs.
 
-    ``rhs(t, y) -> (n,)`` is the right-hand side of y = (q, v), and `start` is the `Start` of the run.
-    ``jacobian(t, q, dq) -> (n/2,)`` is the derivative of the accelerations along dq, or None. `frequencies` is the pair
-    (bodies, others) that ``Problem.frequencies`` returns, or None if it is not known.
+    ``rhs(t, y) -> (n,)`` is that of y = (q, v), ``jacobian(t, q, dq) -> (n/2,)`` the derivative of the accelerations
+    along dq, or None, and `frequencies` the pair (bodies, others) of ``Problem.frequencies``, or None.
     """
 
     rhs: Callable[[float, Array], Array]

@@ -65,14 +65,9 @@ def native_functions(
 
     The right-hand side `fun` has the `form` "value", "in place", "acceleration" or "acceleration in place". `params`
     are the last arguments of the functions; the engine passes their array itself, not a copy. For a multistep method,
-    ``jacobian(t, q, dq, out[, params])`` is the Jacobian times dq.
-
-    Raises
-    ------
-    NotCompilableError
-        If one of these functions is neither a function of the library's problems, nor a C function by pointer, nor a
-        Numba function of the arguments that `integrate` documents; or if an invariant has `args`, or no gradient that
-        can be compiled.
+    ``jacobian(t, q, dq, out[, params])`` is the Jacobian times dq. Raise NotCompilableError if one of these functions
+    is neither a function of the library, nor a C function by pointer, nor a Numba function of the documented arguments,
+    or if an invariant has `args`, or no gradient that can be compiled.
     """
     invariants, y0 = run.invariants, run.y0
     second_order, number = form.startswith("acceleration"), _number(params, y0)

@@ -1,7 +1,6 @@
 """The options of the projection: names, defaults, documentation, checks, and the identity of a run.
 
-All functions that project accept them as `ProjectionOptions` or as its keywords. A new option is a field here, a
-keyword, and, if the step needs it, a field of `Options` in engine/cpp/data.hpp.
+A new option is a field here, a keyword, and, if the step needs it, a field of `Options` in engine/cpp/data.hpp.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal, NamedTuple, TypedDict, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,8 +25,7 @@ from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet, JointInvarian
 from .stepping import AnyMethod, Stepping
 
 __all__ = [
-    "Options", "ProjectionDetails", "ProjectionKeywords", "ProjectionOptions", "Settled",
-    "takes_projection_options", "weights",
+    "Options", "ProjectionDetails", "ProjectionKeywords", "ProjectionOptions", "takes_projection_options", "weights",
 ]  # fmt: skip
 
 DIRECTIONS = {"new": data.NEW, "old": data.OLD, "midpoint": data.MIDPOINT}
@@ -64,18 +62,6 @@ class ProjectionKeywords(ProjectionDetails, total=False):
     """The options of the projection as keywords, with the invariants, for type checkers."""
 
     invariants: Invariant | Callable[..., Any] | Iterable[Invariant | Callable[..., Any]]
-
-
-class Settled(NamedTuple):
-    """The options of the projection after the checks for one run.
-
-    `options` are in the form that the step needs. `sigma` are the weights of the metric if the user gave an array, else
-    None. `identity` maps the name of each option that affects the bits of a run to its effective value.
-    """
-
-    options: Options
-    sigma: np.ndarray | None
-    identity: dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +133,14 @@ class ProjectionOptions:
         own = {name: value for name, value in keywords.items() if name in names}
         return own, {name: value for name, value in keywords.items() if name not in own}
 
-    def settled(self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet) -> Settled:
-        """Check the options for a run with the `known` invariants."""
+    def settled(
+        self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet
+    ) -> tuple[Options, np.ndarray | None, dict[str, Any]]:
+        """Check the options for a run with the `known` invariants, and return them in the form that the step needs.
+
+        The second item are the weights of the metric if the user gave an array, else None. The third one, the identity
+        of the run, maps the name of each option that affects the bits of a run to its effective value.
+        """
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
         balance_groups = _groups(known, n, width)
@@ -208,7 +200,7 @@ class ProjectionOptions:
         if isinstance(known.items, JointInvariants) and plain and free and not known.balances.items:
             options = options._replace(joint=known.items)  # the run can project by the functions `moments` and `shift`
         flag("project_initial", self.project_initial)
-        return Settled(options, sigma, self._identity(options, sigma, y0, known))
+        return options, sigma, self._identity(options, sigma, y0, known)
 
     def _identity(self, o: Options, sigma: np.ndarray | None, y0: np.ndarray, known: InvariantSet) -> dict[str, Any]:
         carried = [known.labels[k] for k in known.balances.items]

@@ -1,6 +1,4 @@
-"""Solvers of a state that is distributed over several processes.
-
-Each process makes the step of its part of the state, and all processes compute the projection together.
+"""Solvers of a state that is distributed over several processes, which compute the projection together.
 
 A subclass connects this module to a library for messages: it defines `place` and `gathered`.
 """

@@ -65,13 +65,7 @@ class PointerFunction:
     """
 
     def __init__(
-        self,
-        pointer: Any,
-        name: str,
-        kind: str = VALUE,
-        *,
-        takes_f: bool = False,
-        shape: tuple[int, ...] | None = None,
+        self, pointer: Any, name: str, kind: str = VALUE, *, takes_f: bool = False, shape: tuple[int, ...] | None = None
     ) -> None:
         self.pointer, self.name, self.kind = pointer, name, kind
         self.takes_f, self.shape = takes_f, shape

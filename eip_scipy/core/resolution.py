@@ -28,13 +28,7 @@ Array = np.ndarray
 
 
 def unresolved(
-    method: Any,
-    groups: Grouping,
-    rhs: Callable[[float, Array], Array],
-    t: float,
-    h: float,
-    y: Array,
-    end_of_run: float,
+    method: Any, groups: Grouping, rhs: Callable[[float, Array], Array], t: float, h: float, y: Array, end_of_run: float
 ) -> str | None:
     """Return a sentence on the part of the state that steps of length h from (t, y) do not resolve, or None.
 

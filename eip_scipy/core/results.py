@@ -155,7 +155,7 @@ class Diagnostics:
             return "Diagnostics: no invariants"
         lines = [
             f"Diagnostics: {self.n_projections} projections ({self.n_rank_reduced} of reduced rank, {self.n_softened} "
-            f"softened), {self.n_skipped} skipped (round-off), {self.n_rejected_projections} rejected",
+            f"softened), {self.n_skipped} skipped (round-off), {self.n_rejected_projections} rejected"
         ]
         width = max(len(name) for name in self.names)
         for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):

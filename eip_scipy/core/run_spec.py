@@ -37,32 +37,17 @@ Array = np.ndarray
 class RunSpec:
     """Specification of a run in numbers and functions of (t, y), which is common to all interfaces.
 
-    Attributes
-    ----------
-    name : str
-        Name of the solver class, for messages.
-    method : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
-        If `is_known`, it is the `tableau` of another run of these equations, which are not examined again.
-    rhs : callable
-        ``rhs(t, y) -> (n,)``, checked; it returns new arrays.
-    extra : tuple
-        Further arguments of the invariants' functions, ``(params,)`` or those of ``args``.
-    fun, in_place : callable, bool
-        The user's function or None, which is examined in case the user passed an acceleration as `fun` by mistake.
-    jacobian : callable
-        ``jacobian()`` returns the Jacobian for a multistep method (see `SecondOrder`) or an implicit one, or None.
-    frequencies : callable, optional
-        ``frequencies(y0, length)`` for an interval of that length, see `Problem`.
-    level : bool
-        Whether a multistep method returns the state at the newest end of its history; otherwise that in the middle.
-    hint : callable
-        ``hint()`` returns the end of a message: advice for equations that are not of second order.
-    called, left_out : str
-        See `Run`.
-    columns : Columns, optional
-        Columns of derivatives that follow the state; `stepping` and `projection` are for the state without them.
-    sees_velocity : bool
-        For q'' = a: whether a comes from a function that is called with velocities too, on which it may come to depend.
+    `name` is the solver class, for messages. If `is_known`, `method` is the `tableau` of another run of these
+    equations, which are not examined again. ``rhs(t, y) -> (n,)`` is checked and returns new arrays; `extra` are
+    further arguments of the invariants' functions. `fun` is the user's function or None, which is examined in case it
+    is an acceleration.
+
+    ``jacobian()`` returns the Jacobian for a multistep method (see `SecondOrder`) or an implicit one, or None, and
+    ``frequencies(y0, length)`` is that of `Problem`. With `level` a multistep method returns the state at the newest
+    end of its history; otherwise that in the middle. ``hint()`` returns the end of a message: advice for equations that
+    are not of second order. `columns` of derivatives follow the state; `stepping` and `projection` are for the state
+    without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with velocities too,
+    on which it may come to depend. `called` and `left_out`: see `Run`.
     """
 
     name: str

@@ -43,24 +43,12 @@ class Start(NamedTuple):
 class Run:
     """A run that `RunSpec.build` has made: everything that a driver needs, except the user's functions.
 
-    Attributes
-    ----------
-    begin, start : Start
-        The start at which the invariants were measured, and that of the first step, which `project_initial` may move.
-    tableau, method : AnyMethod; Method, OneStep or Stepper
-        The method as it was given, and the form of it that the engine uses for the steps.
-    identity : dict
-        See `Settled`.
-    called : str
-        Name of the argument that gave the right-hand side.
-    left_out : str
-        A possible cause of NaN in the value of the right-hand side, for messages; "" if none is known.
-    compared : Columns, optional
-        Columns of derivatives whose products with the Jacobian are compared with differences during the run.
-    looked, looked_at_products : int
-        The steps at which the invariants, and these products, were checked last.
-    moved : str
-        A sentence on how far `project_initial` has moved the start, or "".
+    The invariants were measured at `begin`; `start`, of the first step, may have been moved by `project_initial`, and
+    `moved` says how far. `tableau` is the method as it was given, and `method` the form of it that the engine uses for
+    the steps. `identity`: see `settled`. `called` is the argument that gave the right-hand side, and `left_out` a
+    possible cause of NaN in its value, for messages. `compared` are columns of derivatives whose products with the
+    Jacobian are compared with differences during the run. `looked` and `looked_at_products` are the steps at which the
+    invariants, and these products, were checked last.
     """
 
     begin: Start
@@ -89,9 +77,9 @@ class Run:
     def engine(
         self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
     ) -> Engine:
-        """Return the engine of the run; work.K[0] must hold the derivative at the state from which it steps.
+        """Return the engine of the run, which it continues unless it `begins`; `others` are further `Hooks`.
 
-        `begins` is False if the engine continues a run. `others` are further `Hooks`.
+        work.K[0] must hold the derivative at the state from which it steps.
         """
         in_python = self.tableau.in_python
         hooks = Hooks(

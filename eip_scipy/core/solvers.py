@@ -14,18 +14,7 @@ import numpy as np
 import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
-from ..engine.data import (
-    FOUND,
-    NEXT_LENGTH,
-    NFEV,
-    NJEV,
-    NLU,
-    OK,
-    PENDING,
-    WAITED,
-    Work,
-    bare_schedule,
-)
+from ..engine.data import FOUND, NEXT_LENGTH, NFEV, NJEV, NLU, OK, PENDING, WAITED, Work, bare_schedule
 from ..engine.native import Call, PythonFunctions, call
 from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson
@@ -355,7 +344,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run, spec = self._run, self._spec
         method, _ = spec.examined(here.y, here.f)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
-        fresh = spec.projection.settled(method, spec.stepping, run.y0, run.invariants).options
+        fresh = spec.projection.settled(method, spec.stepping, run.y0, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
         run.stepping = spec.stepping
         if method.has_history:
@@ -612,8 +601,7 @@ def _checked(
     """Return the user's right-hand side with checks of its values: as ``derivative(t, y) -> (n,)``, and as a `Call`.
 
     ``derivative`` counts its calls in ``calls[0]``, while the engine counts its own calls. Its value may be a buffer of
-    the user. `fun` gets a copy of the state, because it may keep or overwrite its argument. The common case, an array
-    of the right shape and type, is tested first.
+    the user. `fun` gets a copy of the state, because it may keep or overwrite its argument.
     """
     shape = (n,)
 
@@ -840,9 +828,7 @@ def class_named(method: Any) -> str | None:
     return next((known for known in __all__ if known.upper() == name), None)
 
 
-def eip_method(
-    method: Tableau | NystromTableau | GaussJackson | OneStepMethod | type[OdeSolver],
-) -> type[EIPSolver]:
+def eip_method(method: Tableau | NystromTableau | GaussJackson | OneStepMethod | type[OdeSolver]) -> type[EIPSolver]:
     """Return a solver class on a Runge-Kutta or Runge-Kutta-Nystrom method, or on a user-defined one-step method.
 
     Parameters

@@ -1,8 +1,6 @@
 """Differences between the families of methods in a run; no other module depends on the family of a method.
 
-Each function is written once for a family: Runge-Kutta tableaux, Nyström tableaux, Gauss-Jackson methods, one-step
-methods of a user, and solvers of SciPy. Facts that need no more than a flag are attributes of
-`eip_scipy.methods.orders.Ordered`.
+Facts that need no more than a flag are attributes of `eip_scipy.methods.orders.Ordered`.
 """
 
 from __future__ import annotations

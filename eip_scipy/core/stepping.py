@@ -52,11 +52,7 @@ class Stepping:
         return cls(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
 
     def first(
-        self,
-        rhs: Callable[[float, np.ndarray], np.ndarray],
-        y0: np.ndarray,
-        f0: np.ndarray,
-        tableau: AnyMethod,
+        self, rhs: Callable[[float, np.ndarray], np.ndarray], y0: np.ndarray, f0: np.ndarray, tableau: AnyMethod
     ) -> float:
         """Return the length of the first step: `h`, at most the length of the interval, `first_step` or an estimate."""
         if self.h is not None:

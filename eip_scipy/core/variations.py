@@ -63,17 +63,11 @@ class OfState(NamedTuple):
 class Columns:
     """The columns of derivatives of a run, at its start or where it is continued.
 
-    Attributes
-    ----------
-    values : ndarray, shape (n + p, k)
-        Initial columns; the last p rows belong to the parameters with the indices `parameters` and are constant.
-    is_transition, symplectic : bool
-        Whether the first n columns are the state-transition matrix from the first start, and kept symplectic.
-    in_halves : bool
-        Whether the wide state has all positions first and then all velocities, as Nystrom methods need it; otherwise
-        one column follows the other.
-    by_jvp : bool
-        Whether the products with the Jacobian come from the user's `jvp`, which the run compares with differences.
+    `values` (n + p, k) are the initial columns; the last p rows belong to the parameters with the indices `parameters`
+    and are constant. The first n columns are the state-transition matrix from the first start if `is_transition`, which
+    is kept symplectic if `symplectic`. The wide state has all positions first and then all velocities, as Nystrom
+    methods need it, if `in_halves`; otherwise one column follows the other. If `by_jvp`, products with the Jacobian
+    come from the user's `jvp`, which the run compares with differences.
     """
 
     values: Array
