@@ -26,7 +26,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
 from numba.np.arrayobj import populate_array
 
-__all__ = ["Dual", "directed", "put_slope", "seed", "slope", "stack_array", "value_of"]
+__all__ = ["Dual", "put_slope", "seed", "slope", "stack_array", "value_of"]
 
 PLAIN = types.Float | types.Integer
 
@@ -68,10 +68,6 @@ class _DualModel(models.PrimitiveModel):
 
 def _parts(builder: Any, pair: Any) -> tuple[Any, Any]:
     return builder.extract_value(pair, 0), builder.extract_value(pair, 1)
-
-
-def _index(k: int) -> Any:
-    return ir.Constant(ir.IntType(32), k)
 
 
 def _pair(builder: Any, value: Any, vector: Any, kind: Any = None) -> Any:
@@ -122,7 +118,7 @@ def _dual_of_two(typingctx, value, slope, x, other, y):
 
 
 def _times(builder: Any, number: Any, vector: Any) -> Any:
-    one = builder.insert_element(ir.Constant(vector.type, ir.Undefined), number, _index(0))
+    one = builder.insert_element(ir.Constant(vector.type, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
     mask = ir.Constant(ir.VectorType(ir.IntType(32), vector.type.count), [0] * vector.type.count)
     return builder.fmul(builder.shuffle_vector(one, ir.Constant(vector.type, ir.Undefined), mask), vector)
 
@@ -138,18 +134,6 @@ def seed(typingctx, kind, value, lane):
         return _pair(builder, args[1], builder.select(inside, one, ir.Constant(dual.vector, None)))
 
     return dual(kind, types.float64, types.int64), emit
-
-
-@intrinsic
-def directed(typingctx, kind, value, slope):
-    """Return the dual of `value` whose derivative is `slope` in its only lane."""
-    dual = kind.instance_type
-
-    def emit(context, builder, sig, args):
-        vector = builder.insert_element(ir.Constant(dual.vector, None), args[2], _index(0))
-        return _pair(builder, args[1], vector)
-
-    return dual(kind, types.float64, types.float64), emit
 
 
 @intrinsic

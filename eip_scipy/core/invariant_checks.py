@@ -166,9 +166,6 @@ def _rounding_of_rates(known: InvariantSet, at: _Samples, unit: float, rhs: Deri
     return found + BLUR * np.max(changes, axis=0)
 
 
-# Precision.
-
-
 def _are_single(values: Array) -> Array:
     """Return a mask of the columns of `values` (m, k) that are exact in float32 and use more than half of its bits."""
     values = np.ascontiguousarray(values, float)
@@ -225,9 +222,6 @@ def _vary_in_single(found: list[Array]) -> bool:
     return bool((_large_and_single(found) & varies).any())
 
 
-# Gradients.
-
-
 def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
     """Yield a `Complaint` for each gradient that is wrong in the first test direction in which any one is wrong."""
     along, terms = (at.directions @ at.G.conj().T).real, np.abs(at.directions) @ np.abs(at.G).T
@@ -273,9 +267,6 @@ def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, al
         f"gradient of invariant {name!r} is wrong: {where} by differences and {along:.6g} by grad",
         "Correct grad, or omit it to have it computed",
     )
-
-
-# Rates of change.
 
 
 class _Rates(NamedTuple):

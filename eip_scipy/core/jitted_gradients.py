@@ -11,7 +11,7 @@ from numba import njit, types
 from numba.extending import overload
 
 from .dual_arrays import for_duals, inside
-from .dual_numbers import Dual, directed, seed, slope, stack_array
+from .dual_numbers import Dual, put_slope, seed, slope, stack_array
 from .jitted import NotCompilableError
 
 __all__ = ["compiled_for", "dual_along", "gradient_by_duals", "new_state", "rate_by_duals"]
@@ -61,8 +61,8 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
     def along(t, y, f, params):
         x = make_state()
         for i in range(n):
-            x[i] = directed(dual, y[i], f[i])
-        return slopes(call(directed(dual, t, 1.0), x, params))
+            x[i] = put_slope(seed(dual, y[i], 1), 0, f[i])
+        return slopes(call(seed(dual, t, 0), x, params))
 
     return compiled_for(along, 1, has_params, scalars)
 

@@ -32,26 +32,14 @@ _called = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 _inlined = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
-class Pointer(NamedTuple):
-    """The address of a function, the owner of its code, and whether the function returns None in some branches."""
+class Compiled(NamedTuple):
+    """The address of a C function made from a Numba function, the owner of its code, its name, and its signature."""
 
     address: int
     library: Any
-    may_lack_value: bool = False
-
-
-class Compiled(NamedTuple):
-    """A Numba function compiled as a C function, with its name in messages and its signature."""
-
-    pointer: Pointer
     fun: Any
     name: str
     kind: Kind
-
-    @property
-    def address(self) -> int:
-        """Address of the C function."""
-        return self.pointer.address
 
     def failure(self, t: float, y: bytes, f: bytes, params: np.ndarray) -> RuntimeError:
         """Call the function again at t and y, so that its exception propagates; return an error if it raises none."""
@@ -73,20 +61,23 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
     `number` replaces the Numba type of the components of the state; default: the type in `kind`.
     """
     try:
-        pointer = _compile(fun, kind, number)
+        address, library, may_lack_value = _compile(fun, kind, number)
     except NumbaError as error:
         if any(isinstance(known.return_type, types.List | types.BaseTuple) for known in fun.nopython_signatures):
             raise NotCompilableError(f"{name} returns a list or a tuple: return np.array([...])") from error
         lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         raise NotCompilableError(f"{name} does not compile for this state: {' '.join(lines[:2])}") from error
-    if pointer.may_lack_value:
+    if may_lack_value:
         raise NotCompilableError(f"{name} returns None in some places, and a number or an array in others")
-    return Compiled(pointer, fun, name, kind)
+    return Compiled(address, library, fun, name, kind)
 
 
 @lru_cache(maxsize=256)
-def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
-    """Return the `Pointer` to a Numba function; equal functions, `kind` and `number` are compiled once in a process."""
+def _compile(fun: Any, kind: Kind, number: Any) -> tuple[int, Any, bool]:
+    """Return the address of a C function, the owner of its code, and whether it returns None in some branches.
+
+    Equal functions, `kind` and `number` are compiled once in a process.
+    """
     call = _with_all_arguments(fun, kind, _inlined)
 
     def array(scalar: Any, ndim: int) -> Any:
@@ -98,13 +89,12 @@ def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
     arguments = types.float64, state, state, out, floats
     with global_compiler_lock:
         call.compile(arguments)
-        pointer = _c_function(call.overloads[arguments], kind)
-    lacks = any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures)
-    return pointer._replace(may_lack_value=lacks)
+        address, library = _c_function(call.overloads[arguments], kind)
+    return address, library, any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures)
 
 
-def _c_function(compiled: Any, kind: Kind) -> Pointer:
-    """Return the pointer to a C function that calls `compiled(t, y, f, out, params)` and returns 0, or -1 if it raises.
+def _c_function(compiled: Any, kind: Kind) -> tuple[int, Any]:
+    """Return a C function that calls `compiled(t, y, f, out, params)` and returns 0, or -1 if it raises, and its owner.
 
     Numba's `cfunc` would take twice as long to compile, and each call would go through another function.
     """
@@ -125,7 +115,7 @@ def _c_function(compiled: Any, kind: Kind) -> Pointer:
     library.add_ir_module(module)
     library.add_linking_library(compiled.library)
     library.finalize()
-    return Pointer(library.get_pointer_to_function(name), library)
+    return library.get_pointer_to_function(name), library
 
 
 def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tuple[int, ...]) -> Any:

@@ -16,11 +16,10 @@ from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunction
 from ..engine.trust import Trust
 from . import steppers
 from .callers import users_level
-from .examination import Derivative, Examiner, is_check_due, unless_refused
+from .examination import Derivative, Examiner, is_check_due, unless_refused, unresolved
 from .invariant_checks import listed
 from .invariants import InvariantSet
 from .options import Options
-from .resolution import unresolved
 from .results import Diagnostics, slowness
 from .stepping import AnyMethod, Stepping
 from .variations import Columns, wrong_product

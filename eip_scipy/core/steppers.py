@@ -29,12 +29,12 @@ Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
 
-# The coefficients as the engine reads them: copies, because it only takes arrays that can be written to.
-
-
 @singledispatch
 def arrays(method: Any) -> Method | OneStep | Stepper:
-    """Return a method in the form that the engine uses for its steps: coefficients, or an object that makes steps."""
+    """Return a method in the form that the engine uses for its steps: coefficients, or an object that makes steps.
+
+    Coefficients are copied, because the engine only takes arrays that can be written to.
+    """
     raise TypeError(
         f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
         "OneStep or Driven."
@@ -112,9 +112,6 @@ def _(method: NystromTableau) -> Method:
     )
 
 
-# Balances.
-
-
 @singledispatch
 def rated(method: Any) -> Array:
     """Return a mask (s,) of the stages at which the rate of a `Balance` is needed; ValueError if unsupported."""
@@ -138,9 +135,6 @@ def _(method: Tableau) -> Array:
         stages |= np.any(method.P[: stages.size] != 0, axis=1)
     stages[0] = True  # interpolants need the rate at the start of a step
     return stages.astype(np.int64)
-
-
-# Interpolants.
 
 
 class Form(NamedTuple):
@@ -193,9 +187,6 @@ def _(method: GaussJackson, brief: bool) -> Form:
         return Form(HISTORY, (method.order + 1) // 2 + 2, weights)
     # The starting method makes all steps, and several for each step if accelerations depend on velocities.
     return Form(QUINTIC, 3, own_slopes=True) if method.velocities else form(RKN1210, brief)
-
-
-# The equations that a method integrates.
 
 
 def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str], sees_velocity: bool) -> Any:
