@@ -46,10 +46,7 @@ class AccelerationField:
 def named_accelerations(
     method: str, fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray
 ) -> Iterator[None]:
-    """Run the body of a ``with`` statement, and raise a ValueError for its error if `fun` is an acceleration.
-
-    The body calls `fun` for the first time. `method` is the method's name, and `extra` are further arguments of `fun`.
-    """
+    """Run the body of a ``with`` statement, which first calls `fun`; explain its error if `fun` is an acceleration."""
     try:
         yield
     except Exception as error:

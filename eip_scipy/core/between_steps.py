@@ -60,10 +60,7 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
 
 
 def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: int) -> Stepping:
-    """Return the step control for the next steps of a solver, made from its present attributes, after checks.
-
-    `was` contains the values of the attributes after the last step. `stacklevel` is that of warnings.
-    """
+    """Return the checked step control from a solver's present attributes, which were `was` after the last step."""
     _check_kind_of_steps(solver, was)
     t, t_bound, sign = (_number(name, getattr(solver, name)) for name in ("t", "t_bound", "direction"))
     if not np.isfinite(t) or np.isnan(t_bound):

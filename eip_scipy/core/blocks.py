@@ -50,10 +50,7 @@ def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
 
 
 def _consecutive(size: int, n: int, width: int) -> Grouping:
-    """Return blocks of `size` consecutive components of a state of `n` components, each of which has `width` floats.
-
-    There is no loop, because a field may have a million components.
-    """
+    """Return blocks of `size` consecutive components, without a loop, because a field may have a million of them."""
     floats = n * width
     start = np.arange(0, floats + 1, size * width, dtype=INDEX)
     return Grouping(np.arange(floats, dtype=INDEX), start, width, size * width if n else 0)

@@ -51,10 +51,7 @@ def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None
 
 
 def time_shift(tau: float, adaptive: bool, t_span: tuple[float, float]) -> float:
-    """Return the shift in time, a power of two, for differences that give dF/dt of balances; 0 for an empty interval.
-
-    `tau` is the length of the fixed step or, if `adaptive`, of the first step.
-    """
+    """Return the shift in time, a power of two, for differences that give dF/dt; 0 for an empty interval."""
     t0, length = t_span[0], abs(t_span[1] - t_span[0])
     wanted = tau * (OF_FIRST if adaptive else OF_FIXED) if 0 < tau < math.inf else math.inf
     shift = max(min(wanted, length / PARTS), ROUNDINGS * float(np.spacing(abs(t0))))
@@ -131,10 +128,7 @@ class Carried:
         return self.known(t, y, f)[self.given_places]
 
     def rates(self, low: float, high: float, shift: float, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the `Rates` for the engine, with the compiled `functions` or, by default, the user's in Python.
-
-        `low` and `high` are the ends of the run's interval, and `shift` comes from `time_shift`.
-        """
+        """Return the `Rates`, of compiled `functions` or by default the user's, in a run from `low` to `high`."""
         items = tuple((k, self._starts[k + 1] - self._starts[k]) for k in self.items)
         return Rates(items, tuple(map(self._call, self.items) if functions is None else functions), low, high, shift)
 

@@ -22,10 +22,7 @@ LEAST_ORDER = 2  # of dense output
 
 
 def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str, Any]:
-    """Return, for a method, the attributes of SciPy's RungeKutta classes by name; NotImplemented for those it lacks.
-
-    If SciPy has a class with the coefficients of the method, `scipy_class`, its attributes are returned as they are.
-    """
+    """Return a method's attributes of SciPy's RungeKutta by name, those of `scipy_class` if given."""
     if scipy_class is not None:
         return {name: getattr(scipy_class, name, NotImplemented) for name in NAMES}
     found: dict[str, Any] = dict.fromkeys(NAMES, NotImplemented)
@@ -102,10 +99,7 @@ def _floats(values: np.ndarray) -> Any:
 
 
 def _require_plain_steps(solver: type[OdeSolver]) -> None:
-    """Raise TypeError for a subclass of SciPy's RungeKutta that overrides one of the methods named in `STEP`.
-
-    A class with the error weights `E5` is accepted here, because `tableau_of` refuses it with another message.
-    """
+    """Raise TypeError if a subclass of SciPy's RungeKutta, without `E5`, has its own method of those in `STEP`."""
     base: Any = RK45.__bases__[0]
     own = _own_functions(solver, base) if issubclass(solver, base) and _array(solver, "E5") is None else []
     if own:

@@ -120,10 +120,7 @@ class _Rate:
         return found
 
     def root(self, G: Array) -> Array | None:
-        """Return the floats of a state nearby at which the rate vanishes, by Newton's method, or None.
-
-        Newton's method moves only in directions in which invariants with the gradients G do not change.
-        """
+        """Return the floats of a nearby state where the rate vanishes, along directions with G unchanged, or None."""
         floats, first = self.floats, self(self.floats)
         value = first
         for _ in range(RATE_STEPS):
@@ -149,10 +146,7 @@ class _Rate:
         return bool(abs(changes.sum()) <= share * np.abs(changes).sum())
 
     def _newton_step(self, slope: Array, value: float, G: Array) -> Array | None:
-        """Return the shortest move (m,), in units of the weights, that makes ``value + slope @ move`` 0, or None.
-
-        To first order, the move leaves the invariants with the gradients G unchanged.
-        """
+        """Return the shortest move (m,), with G unchanged, that makes ``value + slope @ move`` 0, or None."""
         rows = np.vstack([slope, G.view(float) * self.weights])
         lengths = np.linalg.norm(rows, axis=1)
         if not (0 < lengths[0] < np.inf and np.isfinite(lengths).all()):

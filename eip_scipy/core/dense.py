@@ -193,10 +193,7 @@ class ManifoldDenseOutput(AtRealTimes):
 
 
 class _Pieces(Sequence[ManifoldDenseOutput]):
-    """Sequence of the interpolants of all steps; each `ManifoldDenseOutput` is created when it is requested.
-
-    `pieces` (m, floats) holds the floats of the interpolants, a row for each step.
-    """
+    """Sequence of interpolants, made when requested from `pieces` (m, floats), whose rows are their floats."""
 
     def __init__(self, interpolants: Interpolants, pieces: Array) -> None:
         self._interpolants, self._pieces = interpolants, pieces

@@ -83,10 +83,7 @@ def _of_floats(dtype: Any) -> bool:
 
 @cache
 def _array_functions(dual: Dual) -> dict[str, Callable[..., Any]]:
-    """Return replacements of NumPy's empty, zeros, ones, array and cross, by name; only compiled code calls them.
-
-    Arrays that empty, zeros and ones return hold numbers of the type `dual` in place of floats.
-    """
+    """Return replacements of NumPy's functions by name, for compiled code, whose new arrays hold `dual` for floats."""
 
     def empty(shape, dtype=float):
         pass

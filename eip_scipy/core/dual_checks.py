@@ -101,10 +101,7 @@ def _products_of(
 def _secants(
     derivative: Callable[..., Array], t: float, y: Array, way: tuple[Array, Array], places: list[int], extra: tuple
 ) -> tuple[Array, Array]:
-    """Return the value (n,) of ``derivative(t, y, extra)``, and central differences (k, n) along `way`, of k lengths.
-
-    No one length suits all functions. Where the function raises an exception, the differences are NaN.
-    """
+    """Return the value (n,) and differences (k, n) along `way` of k lengths; they are NaN where `derivative` raises."""
     direction = np.concatenate(way)
 
     def at(s: float) -> Array:
@@ -118,10 +115,7 @@ def _secants(
 def shifted(
     derivative: Callable[..., Array], t: float, y: Array, shift: Array, places: list[int], extra: tuple
 ) -> Array:
-    """Return ``derivative(t, y, extra)`` for a state (n,) and parameters that are shifted by `shift` (n + p,).
-
-    `places` are the indices in the run's parameters to which the last p components of `shift` belong.
-    """
+    """Return ``derivative(t, y, extra)`` with y and the parameters `places` shifted by the n + p floats of `shift`."""
     if places:
         params = extra[0].astype(shift.dtype)
         params[places] += shift[y.size :]

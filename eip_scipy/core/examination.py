@@ -81,10 +81,7 @@ class Examiner:
         return self._unless_refused(_complaint, rhs, t, y, True)
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
-        """Return a sentence about what is wrong in the step that the engine suspects, or None.
-
-        `suspect`, the engine's record of that step, is cleared, so that the engine may record another step.
-        """
+        """Return a sentence about what is wrong in the step that the engine suspects, or None; clear its record."""
         reason, t_old, t_new = suspect[data.REASON], float(suspect[data.SUSPECT_FROM]), float(suspect[data.SUSPECT_TO])
         suspect[data.REASON] = data.NOTHING
         old, new = np.split(suspect[data.N_SUSPECT :].copy().view(self.invariants.dtype), 2)

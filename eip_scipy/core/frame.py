@@ -89,10 +89,7 @@ def _real_form(a: np.ndarray) -> np.ndarray:
 
 
 def _by_bodies(a: np.ndarray) -> np.ndarray:
-    """Return the weights (k, b) of bodies if the rows of `a` (3 k, 3 k b) are sums over bodies, else an empty array.
-
-    Such rows are weighted sums of x, y and z over the b bodies of one of k groups.
-    """
+    """Return the weights (k, b) if rows of `a` (3 k, 3 k b) sum x, y, z over b bodies of k groups, else no weights."""
     groups = a.shape[0] // 3
     if groups == 0 or a.shape[1] % (3 * groups):
         return np.zeros((0, 0))

@@ -30,11 +30,7 @@ DIFFER, ROUNDINGS, LEAST = 1e-8, 1e3, np.finfo(float).tiny
 
 
 def unless_error(function: Callable[..., Any], *args: Any) -> Any:
-    """Return ``function(*args)``; None if it raises an exception other than MemoryError.
-
-    A function of the user, or of a library, may raise any exception for complex numbers, and at states that the run
-    does not visit.
-    """
+    """Return ``function(*args)``, of a user's or a library's function; None if it raises any error but MemoryError."""
     try:
         return function(*args)
     except MemoryError:
@@ -76,10 +72,7 @@ class NumericalGradient:
         return np.asarray(self._function(t, y.copy(), *self._args, *extra))
 
     def _takes_complex_steps(self, t: float, y: Array, extra: tuple) -> bool:
-        """Return True if the function accepts complex states and is analytic near the start.
-
-        At y itself derivatives of abs(y_k) and similar terms may happen to vanish.
-        """
+        """Return True if the function accepts complex states and is analytic at states near the start."""
         real = self._fun(t, y, extra)
 
         def is_analytic() -> bool:
@@ -129,10 +122,7 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
 
 
 def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: complex) -> tuple[Array, float]:
-    """Return the differences of order 6 for y_k, not divided by the shift, and their largest disagreement with order 4.
-
-    The disagreement is a multiple of what is allowed.
-    """
+    """Return differences of order 6 for y_k times the shift, and their largest share of what order 4 may differ."""
     sums, lower, largest = np.zeros(()), np.zeros(()), np.zeros(())
     for (multiple, weight), lower_weight in zip(DIFFERENCE_WEIGHTS, LOWER_WEIGHTS, strict=True):
         ends = [y.copy(), y.copy()]

@@ -214,10 +214,7 @@ def _large_and_single(found: list[Array]) -> Array:
 
 
 def _vary_in_single(found: list[Array]) -> bool:
-    """Return True if a component that varies between the arrays `found` has single precision in all of them.
-
-    Components that do not vary may be in single precision on purpose.
-    """
+    """Return True if a component that varies between the arrays `found` has single precision in all of them."""
     varies = np.ptp(np.array(found).view(float), axis=0) != 0
     return bool((_large_and_single(found) & varies).any())
 

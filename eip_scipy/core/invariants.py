@@ -492,19 +492,12 @@ class InvariantSet:
         return np.where(self.balances.mask, np.nan, self.target)
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
-        """Return the `Rates` of the balances for the engine, by compiled `functions` or, by default, from Python.
-
-        `adaptive` says whether `tau` is the first of adaptive steps or a fixed step, see `time_shift`.
-        """
+        """Return the `Rates`, of compiled `functions` or from Python; `adaptive` says whether `tau` is a first step."""
         low, high = min(self.t_span), max(self.t_span)
         return self.balances.rates(low, high, time_shift(self.tau, adaptive, self.t_span), functions)
 
     def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
-        """Return the invariants for a run that continues this one, with the values that this run keeps as targets.
-
-        With `at_end` the new run starts at the end of the last step. Otherwise balances start again from their values
-        there.
-        """
+        """Return the invariants, with targets, for a run that continues this one; those of balances only `at_end`."""
         kept = list(map(copied, self.items))
         for k, item in enumerate(kept):
             if item.is_balance and not at_end:
@@ -516,10 +509,7 @@ class InvariantSet:
         return tuple(kept) if joint is None else JointInvariants(kept, joint.moments, joint.shift)
 
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
-        """Return a copy, with a compiled gradient, of a jitted invariant without one; any other invariant is unchanged.
-
-        If the gradient cannot be compiled, the reason is stored in `why_not` by `label`.
-        """
+        """Return an invariant with a compiled gradient if it can have one; if not, store the reason in `why_not`."""
         numbers = scalars(self.extra)
         if not _lacks_gradient(item) or numbers is None:
             return item
@@ -656,11 +646,7 @@ class InvariantSet:
     def check(
         self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
     ) -> list[str]:
-        """Check the invariants at the start: raise ValueError or warn, and return the texts of the warnings.
-
-        `tau` is the length of a step, and `evaluated` holds the gradients and the values at the state, if they are
-        known.
-        """
+        """Check the invariants at the start, with step `tau`: raise ValueError or warn; return the warnings' texts."""
         found = list(complaints(self, t, y, f, tau, self.rhs, evaluated))
         for complaint in found:
             if complaint.is_error:

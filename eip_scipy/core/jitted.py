@@ -33,10 +33,7 @@ def is_jitted(fun: Any) -> bool:
 
 
 def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
-    """Return `call` with the code that Numba has compiled for states of type `dtype`.
-
-    Return `call` itself if its function is not a Numba function, or if there is no such code that the engine can call.
-    """
+    """Return `call` with the code that Numba has compiled for states of `dtype`, or `call` itself if there is none."""
     if not is_jitted(call.fun):
         return call
     from . import numba_pointers

@@ -150,10 +150,7 @@ def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
 
 @lru_cache(maxsize=256)
 def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...], parameters: tuple[int, ...]) -> Any:
-    """Return ``slopes(t, y, params) -> (*shape, k)``, the derivatives of a jitted invariant by k of its p parameters.
-
-    `parameters` are the indices of the k parameters; `shape` is the shape of the value of the invariant.
-    """
+    """Return ``slopes(t, y, params) -> (*shape, k)``, derivatives of a jitted invariant by k of its p `parameters`."""
     swapped = njit(lambda t, params, y: fun(t, y, params))
     grad = gradient_by_duals(swapped, p, shape, True)
     sizes, chosen, places = (*shape, p), (*shape, len(parameters)), np.array(parameters, np.int64)

@@ -99,11 +99,7 @@ def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
 
 
 def compiled_for(function: Callable[..., Any], ndim: int, has_params: bool, scalars: str) -> Any:
-    """Compile ``function(t, y, a, params)`` for real states and an array `a` of `ndim` dimensions, and return it.
-
-    The compiled function takes the parameters as the user's does: params, or nothing, or numbers of the types
-    `scalars`.
-    """
+    """Compile ``function(t, y, a, params)`` for real states and a of `ndim` dimensions; it takes params as a user's."""
     function = inside(function)
     floats, third = (types.Array(types.float64, dimensions, "C") for dimensions in (1, ndim))
     if scalars:

@@ -118,10 +118,7 @@ def _shape(invariants: InvariantSet, k: int) -> tuple[int, ...]:
 
 
 def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
-    """Return the function that the engine calls for `fun`, and its signature, by default `number`, that of a number.
-
-    If the state has columns of derivatives, the attribute `of_state` has the function of the state alone and its size.
-    """
+    """Return what the engine calls for `fun`, the function of the state alone if there is one, and its signature."""
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
 
@@ -129,10 +126,7 @@ def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
 def function_alone(
     fun: Callable[..., Any], kind: Kind, name: str, params: np.ndarray | None, *, second_order: bool = False
 ) -> NativeFunctions:
-    """Return `NativeFunctions` of the signature `kind` with the right-hand side `fun`, without invariants and events.
-
-    If `second_order`, `fun` returns the accelerations. `name` is the name of `fun` in messages.
-    """
+    """Return `NativeFunctions` with only a right-hand side `fun` of the signature `kind`, `name` in messages."""
     rhs = _native(fun, kind, name)
     return NativeFunctions(
         rhs=rhs.entry,

@@ -150,10 +150,7 @@ def _write_back_to(values, out):
 
 @_inlined
 def _apart(values, out):
-    """Return `values`, or a copy if they share memory with `out`.
-
-    Library functions read `values` after they have begun to write to `out`.
-    """
+    """Return `values`, or a copy if they share memory with `out`, to which functions write while they read."""
     distance = out.ctypes.data - values.ctypes.data
     if -8 * out.size < distance < 8 * values.size:
         return values.copy()

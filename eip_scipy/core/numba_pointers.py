@@ -56,10 +56,7 @@ class Compiled(NamedTuple):
 
 
 def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
-    """Compile a Numba function of the signature `kind`, and return it as a C function, or raise NotCompilableError.
-
-    `number` replaces the Numba type of the components of the state; default: the type in `kind`.
-    """
+    """Compile a Numba function of the signature `kind` as a C function; `number` replaces the state's Numba type."""
     try:
         address, library, may_lack_value = _compile(fun, kind, number)
     except NumbaError as error:
@@ -160,10 +157,7 @@ def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
 
 
 def _numbers(types: str, jit: Any, k: int = 0) -> Any:
-    """Return ``numbers(params)``, a function that returns params[k:] as a tuple of numbers.
-
-    `types` has one letter for each of `params`: "d" for a float, "q" for an integer, "?" for a bool.
-    """
+    """Return ``numbers(params)``, which returns params[k:] as a tuple of numbers of the `types`, see `Packed`."""
     if k == len(types):
         return jit(lambda params: ())
     rest = _numbers(types, jit, k + 1)

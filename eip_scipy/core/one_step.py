@@ -118,10 +118,7 @@ def _integer(name: str, what: str, value: Any, least: int = 1) -> int:
 
 
 def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
-    """Return the value of a user's function at t as an array (n,); for n = 1 the value may be a number.
-
-    `came` is the beginning of the error messages, such as "fun returned"; `dtype` is that of the state.
-    """
+    """Return the value of a user's function at t as an array (n,); `came` begins messages, as "fun returned"."""
     if value is None:
         raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
     # Only the first item of a list is checked: checking all of them at every stage would take longer than the function.

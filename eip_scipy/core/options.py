@@ -155,9 +155,7 @@ class ProjectionOptions:
                 "new state only; omit direction."
             )
         compensated = self._compensated(method)
-        # Multistep methods correct only a part of an error within rounding.
         band = data.BAND_COMPENSATED if compensated else data.BAND
-        band = data.BAND_MULTISTEP if method.has_history else band
         rtol, atol = stepping.rtol, stepping.atol
         groups = blocks_of(self.blocks, n, width)
         block_atol = atol[: groups.start.size - 1].copy()
@@ -190,15 +188,14 @@ class ProjectionOptions:
             uses_f=known.uses_f,
             compensated=compensated,
             adaptive=stepping.h is None,
-            per_band=1.0 / (band * EPS),
+            # Multistep methods correct only a part of an error within rounding.
+            per_band=1.0 / ((data.BAND_MULTISTEP if method.has_history else band) * EPS),
             watched=check and known.size > 0,
             limit=(data.LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
             distant=data.DISTANT if stepping.h is not None else float(np.clip(far, data.DISTANT, MOST_FAR)),
         )
-        plain = (options.metric, options.direction, options.iterations) == (data.EUCLIDEAN, data.NEW, 1)
-        free = options.frame.products.size == 0 and options.every != data.AUTO and not compensated
-        if isinstance(known.items, JointInvariants) and plain and free and not known.balances.items:
-            options = options._replace(joint=known.items)  # the run can project by the functions `moments` and `shift`
+        if _can_project_jointly(options, known):
+            options = options._replace(joint=known.items)
         flag("project_initial", self.project_initial)
         return options, sigma, self._identity(options, sigma, y0, known)
 
@@ -287,10 +284,7 @@ def _balances(method: AnyMethod, known: InvariantSet) -> data.Balances:
 
 
 def _groups(known: InvariantSet, n: int, width: int) -> data.Groups:
-    """Return the balances in groups that have the same components and weights; each group is projected by itself.
-
-    The state has `n` components of `width` floats each: 1 if it is real, 2 if it is complex.
-    """
+    """Return the balances in groups of the same components and weights, each of which is projected by itself."""
     lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.subspaces]
     if len(lacking) == len(known.items):
         return data.NO_GROUPS
@@ -336,6 +330,13 @@ def _are_of_bodies(components: np.ndarray, weight: np.ndarray) -> bool:
 
 def _starts(sizes: list[int]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+
+def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
+    """Return True if the run can project by the functions `moments` and `shift` of `JointInvariants`."""
+    plain = (options.metric, options.direction, options.iterations) == (data.EUCLIDEAN, data.NEW, 1)
+    free = options.frame.products.size == 0 and options.every != data.AUTO and not options.compensated
+    return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items
 
 
 def takes_projection_options(documented: Documented) -> Documented:

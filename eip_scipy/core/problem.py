@@ -312,10 +312,7 @@ class Problem:
         return np.concatenate([q, v])
 
     def _own_start(self, time: Any, t0: float) -> float:
-        """Return the starting time of the problem if `time`, the date of `t0`, is that date; else raise ValueError.
-
-        Return `t0` if the problem has no units, no epoch or no `t_span`.
-        """
+        """Return the problem's starting time if `time`, the date of `t0`, is that date; t0 if it has no dates."""
         known = self.unit_system
         if known is None or self.epoch is None or self.t_span is None:
             return t0
@@ -389,10 +386,7 @@ def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
 
 
 def library_variational(function: str, names: tuple[str, ...], parameters: tuple[int, ...]) -> Callable[..., None]:
-    """Return the function of `library` for a state with columns of derivatives: ``Problem.variational(parameters)``.
-
-    `names` contains the name of the first parameter if `library` has the derivative by it; otherwise it is empty.
-    """
+    """Return `library`'s function for ``Problem.variational(parameters)``; `names`: its parameter with a derivative."""
     if not parameters:
         return library[function]
     if tuple(parameters) != (0,) or not names:

@@ -105,8 +105,8 @@ class RunSpec:
         """Give a run with a multistep method its history, which begins at `start`."""
         span = self.stepping.span
         frequencies = None if self.frequencies is None else self.frequencies(start.y, span.t_bound - span.t0)
-        seen = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
-        attach_history(run, self.name, seen, self.stepping, level=self.level)
+        system = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
+        attach_history(run, self.name, system, self.stepping, level=self.level)
 
     def attach_solver(self, run: Run, start: Start) -> None:
         """Give a run with an implicit method its solver of SciPy, which begins at `start`."""
@@ -206,10 +206,7 @@ def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
 
 
 def _moved(before: Array, after: Array, floors: Array) -> str:
-    """Return a sentence on how far the projection moved the components of the start.
-
-    It is "" if no component moved by more than `TARGET_TOLERANCE` of its size, which is at least `floors` (n,).
-    """
+    """Return a sentence on how far the projection moved the start; "" if by no more than `TARGET_TOLERANCE`."""
     share = np.abs(after - before) / np.maximum(np.abs(before), floors)
     count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0
     if not count:

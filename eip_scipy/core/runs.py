@@ -76,10 +76,7 @@ class Run:
     def engine(
         self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
     ) -> Engine:
-        """Return the engine of the run, which it continues unless it `begins`; `others` are further `Hooks`.
-
-        work.K[0] must hold the derivative at the state from which it steps.
-        """
+        """Return the engine of the run, which it `begins` or continues; work.K[0] must hold the derivative there."""
         in_python = self.tableau.in_python
         hooks = Hooks(
             one_step=partial(self.method.fill, self.work) if in_python else None,
@@ -98,10 +95,7 @@ class Run:
         return engine
 
     def projected(self, rhs: Derivative, t: float, y: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return the projection of a state, and the engine's status code; work.K[-1] must hold the derivative there.
-
-        `rhs` returns the derivative at the states of further Newton steps.
-        """
+        """Return the projection of a state, and the engine's status code; work.K[-1] must hold the derivative there."""
         derivative = Call(rhs, (), y.shape, lambda value, t: np.array(value, y.dtype))
         functions = PythonFunctions(derivative, *self.invariants.calls, (), second_order=False)
         engine = Engine(NO_METHOD, self.options._replace(joint=None, balances=NO_BALANCES), self.work, functions)

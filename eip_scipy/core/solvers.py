@@ -507,10 +507,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         return True, None
 
     def _watch(self, *, ended: bool = False) -> None:
-        """Examine the run, and warn once if it looks faulty.
-
-        The warning comes in the step that finds the fault, because the user may make no further step.
-        """
+        """Examine the run, and warn once if it looks faulty, at once, because the user may make no further step."""
         run, arrived = self._run, ended or self.t == self.t_bound
         self._noted = self._work.counters[FOUND]
         rhs = partial(_copied, self._derivative)
@@ -575,10 +572,7 @@ def _frozen(a: np.ndarray) -> np.ndarray:
 
 
 def _jacobian(method: Any, options: dict[str, Any]) -> Any:
-    """Remove the options for the Jacobian from `options`, and return them in the form that the method needs.
-
-    This is a `Jacobian` for a method whose steps SciPy makes, and ``jacobian`` or None for a multistep method.
-    """
+    """Remove the options for the Jacobian from `options`, and return them as a method that takes them needs them."""
     if method.drives:
         return Jacobian(options.pop("jac", None), options.pop("jac_sparsity", None))
     jacobian = options.pop("jacobian", None) if method.has_history else None

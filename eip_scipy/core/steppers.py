@@ -31,10 +31,7 @@ Derivative = Callable[[float, Array], Array]
 
 @singledispatch
 def arrays(method: Any) -> Method | OneStep | Stepper:
-    """Return a method in the form that the engine uses for its steps: coefficients, or an object that makes steps.
-
-    Coefficients are copied, because the engine only takes arrays that can be written to.
-    """
+    """Return a method as the engine uses it for its steps: coefficients, or an object that makes steps."""
     raise TypeError(
         f"{type(method).__name__} is not a known kind of method; expected Tableau, NystromTableau, GaussJackson, "
         "OneStep or Driven."
@@ -66,7 +63,7 @@ def _(method: GaussJackson) -> Any:
 @lru_cache(maxsize=32)
 def _(method: Tableau) -> Method:
     none = np.zeros(method.b.size)
-    return Method(
+    return Method(  # of copies, because the engine only takes arrays that can be written to
         A=method.A.copy(),
         b=method.b.copy(),
         b_low=method.b_low.copy(),
@@ -220,10 +217,7 @@ def check_halves(n: int) -> None:
 
 
 def depends_on_velocity(rhs: Derivative, start: Any, name: str, hint: Callable[[], str] = str) -> bool:
-    """Return True if the accelerations of q'' = a(t, q, v), y = (q, v), depend on v at the start of a run.
-
-    The arguments are those of `checked`. Raise ValueError if the state is not (q, v).
-    """
+    """Return True if accelerations depend on v at the start; raise ValueError if the state is not (q, v)."""
     t0, y0, f0, _ = start
     check_halves(y0.size)
     half = y0.size // 2

@@ -111,10 +111,7 @@ def apart(span: Any) -> Any:
 
 
 def as_epoch(name: str, value: Any) -> Epoch:
-    """Return a moment as a Julian date in TDB, in two parts with this sum.
-
-    The moment is a Time of astropy in any scale, a Julian date in TDB, or two numbers whose sum is such a date.
-    """
+    """Return a Time of astropy, or a Julian date in TDB as one number or two, as two numbers with this sum."""
     if is_time(value):
         dynamic = value.tdb
         value = (dynamic.jd1, dynamic.jd2)

@@ -146,10 +146,7 @@ def require_tableau(method: Any) -> None:
 
 
 def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in_halves: bool) -> Columns:
-    """Return the columns for the option `variations`, `asked`; `Columns` of an earlier run keep their values.
-
-    `params` and `names` are the values and the names of the run's parameters.
-    """
+    """Return the columns for the option `variations`, `asked`; `params` and `names` are the run's parameters."""
     if isinstance(asked, Columns):
         return replace(asked, in_halves=in_halves)
     n = y0.size
@@ -284,11 +281,7 @@ class Variations:
         *,
         in_python: bool = False,
     ) -> Variations:
-        """Return the functions of a wide state, made from `products`, the output of `right_hand_side`.
-
-        `extra` contains the run's further arguments. With `in_python` all is called from Python, and nothing is
-        compiled.
-        """
+        """Return the functions of a wide state from the output of `right_hand_side`; compiled unless `in_python`."""
         if any(item.is_balance for item in invariants):
             raise ValueError(
                 "variations: derivatives are not carried together with balances, whose values depend on the whole "
@@ -340,10 +333,7 @@ def _has_address(fun: Any) -> bool:
 def right_hand_side(
     columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, jvp: Any, own: Any = None
 ) -> tuple[Callable[..., Any], str]:
-    """Return the right-hand side of the wide state, in place, and the source of its products with the Jacobian.
-
-    `form` is the form of `fun`, one of the names in `FORMS`. `own` is the ``variational`` of the problem, or None.
-    """
+    """Return the right-hand side of the wide state, in place, and the source of its products with the Jacobian."""
     if columns.parameters and scalars(extra) != "":
         raise ValueError("variations: derivatives with respect to parameters need params=[...], one array of numbers.")
     if own is not None and jvp is None:
@@ -415,10 +405,7 @@ def _require_products(
 
 
 def _direction(y0: Array, parameters: int) -> tuple[Array, Array]:
-    """Return a random direction for a check: dy (n,) for the state, and dp (parameters,) for the parameters.
-
-    The components of dy have about the sizes of those of `y0`, and those of dp about the size 1.
-    """
+    """Return a random direction for a check: dy (n,) of about the sizes of `y0`, and dp (parameters,) of size 1."""
     rng = np.random.default_rng(0)
     dy, dp = rng.standard_normal(y0.size), rng.standard_normal(parameters)
     sizes = np.abs(y0)
@@ -469,10 +456,7 @@ def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
 def _interpreted(
     columns: Columns, fun: Any, form: str, y0: Array, products: Callable[[float, Array, Array, tuple], Array]
 ) -> Callable[..., Any]:
-    """Return the right-hand side of a wide state in which one column follows the other, for calls from Python.
-
-    ``products(t, y, M, extra)`` returns the products (k, n) of the Jacobian and the k rows of M (k, n + p).
-    """
+    """Return the right-hand side of a wide state in Python, with ``products(t, y, M, extra)`` of rows of M."""
     derivative, n, size = _derivative(fun, form, y0), columns.n, columns.size
 
     def rhs(t: float, Y: Array, out: Array, *arguments: Any) -> None:
@@ -488,10 +472,7 @@ def _interpreted(
 def _by_complex_steps(
     columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, why: str | None
 ) -> Callable[..., Any]:
-    """Return the right-hand side of the wide state with products by complex steps, if they are right at the start.
-
-    The message of the ValueError contains `why`, the reason why products are not compiled.
-    """
+    """Return the right-hand side by complex steps, or raise a ValueError that says `why` none is compiled."""
     derivative, places = _derivative(fun, form, y0), list(columns.parameters)
     products = _ComplexSteps(derivative, y0, places)
     dy, dp = _direction(y0, len(places))
@@ -576,10 +557,7 @@ class _ComplexSteps:
         return True
 
     def _scaled(self, y: Array, M: Array, extra: tuple) -> tuple[Array, Array]:
-        """Return the rows of M, divided by powers of two so that they have about the size of the state, and these.
-
-        A division by a power of two has no rounding, so that the products have the bits of those of M.
-        """
+        """Return the rows of M, divided by powers of two, without rounding, to about the state's size; and these."""
         scale = np.maximum(np.abs(y) + self._floors, TINY)
         if self._places:
             own = np.abs(extra[0][self._places])
