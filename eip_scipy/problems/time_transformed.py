@@ -149,10 +149,7 @@ def _transformed_invariant(item: Invariant) -> Invariant:
 def _transformed_functions(
     fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return the functions for value and gradient of an invariant of y as functions of s and the state (y, t).
-
-    A gradient that uses f = dy/dt gets it from dy/ds and dt/ds.
-    """
+    """Return value and gradient of an invariant of y as functions of s and the state (y, t); f is dy/ds over dt/ds."""
 
     def value(s, y, params):
         return fun(y[-1], y[:-1], params)

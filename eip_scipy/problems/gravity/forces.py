@@ -96,15 +96,7 @@ NEEDS = {
 
 
 def check_forces(forces: Any) -> tuple[str, ...]:
-    """Return the names of forces, one name or several, in the order of `FORCES`.
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown, or two of the names are kinds of relativity.
-    TypeError
-        If `forces` is neither a name nor a sequence.
-    """
+    """Return the names of forces, one name or several, in the order of `FORCES`; raise an error if they do not fit."""
     if not isinstance(forces, Iterable):
         raise TypeError(
             f"forces must be a name or a sequence of names, got {forces!r}; use () for Newton's gravitation alone."
@@ -123,10 +115,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
 def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstants | None) -> np.ndarray:
     """Return the vector of parameters: G m of all bodies, then the parameters of the forces.
 
-    Raises
-    ------
-    ValueError
-        If a constant that a force needs is missing or has a wrong value, or the first body has no mass.
+    A ValueError is raised if a constant is missing or wrong, or the first body has no mass.
     """
     known = ForceConstants() if constants is None else constants
     for force in forces:
@@ -203,7 +192,7 @@ def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> t
 def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
     """Return True if the terms in 1/c^4 that the invariants of "eih" lack are below round-off.
 
-    Their relative size is about v^2/c^2 times that of the accelerations that "eih" adds to Newton's.
+    They are about v^2/c^2 times the accelerations that "eih" adds to Newton's.
     """
     n = y0.size // 6
     newton = np.empty_like(y0)

@@ -193,10 +193,7 @@ def nbody(
 
 
 def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of the 6 n components: x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ...
-
-    If `bodies` is given, its names take the places of the numbers.
-    """
+    """Return the names of the 6 n components, x_0, y_0, ... then vx_0, ..., with `bodies` in place of the numbers."""
     names = tuple(map(str, range(n))) if bodies is None else body_names(bodies, n)
     return tuple(f"{axis}_{body}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for body in names for axis in axes)
 
@@ -226,10 +223,7 @@ def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
 
 
 def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return gm, position and velocity as arrays of shapes (N,), (N, 3) and (N, 3).
-
-    A ValueError is raised if shapes or values are wrong, and a warning is given if the speeds suggest wrong units.
-    """
+    """Return gm, position and velocity as arrays (N,), (N, 3), (N, 3); raise an error, or warn of unlikely speeds."""
     masses, q, v = (np.array(x, dtype=float) for x in (gm, position, velocity))
     n = masses.size
     if masses.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
@@ -249,10 +243,9 @@ def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndar
 
 
 def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return each body's speed relative to the body that binds it most, in units of the escape speed of this pair.
+    """Return each body's speed relative to the body that binds it most, in units of the pair's escape speed, if not 0.
 
-    Bodies whose relative speed is 0, and pairs without mass, are left out. A ValueError is raised if two bodies are at
-    the same place.
+    A ValueError is raised if two bodies are at the same place.
     """
     found = []
     for i in range(gm.size):  # one row of distances at a time, because N^2 distances may not fit in memory
@@ -286,10 +279,8 @@ def _check_speeds(ratio: np.ndarray) -> None:
 def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the `frame` (C, S) of centre of mass and momentum, with shifts of bodies proportional to their masses.
 
-    C, of shape (6, 6 N), maps a state to the position and velocity of the centre of mass. The columns of S, of shape
-    (6 N, 6), are the shifts of the state that restore C y after a correction. With shifts proportional to the masses,
-    the recoil from the correction of a planet goes to its star. `common_shift` would move the outer planets by the same
-    distance as the star.
+    C (6, 6 N) maps a state to position and velocity of the centre of mass, and the columns of S (6 N, 6) are the shifts
+    that restore it. The recoil from the correction of a planet then goes to its star.
     """
     axes = np.eye(3)
     share = gm / gm.sum()
@@ -299,10 +290,6 @@ def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the `frame` (C, S) of centre of mass and momentum, with common shifts of all bodies.
-
-    C is that of `recoil`. The columns of S, of shape (6 N, 6), move all bodies by the same distance, or change all
-    velocities by the same amount, so that positions and velocities relative to other bodies do not change.
-    """
+    """Return the `frame` (C, S) of centre of mass and momentum, whose shifts move all bodies by the same distance."""
     C, _ = recoil(gm)
     return C, np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), np.eye(3)))

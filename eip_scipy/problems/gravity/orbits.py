@@ -23,10 +23,9 @@ ENERGY = 0
 class _Orbit(NamedTuple):
     """Orbit of the body with the index `body`, or of this body together with those that move about it.
 
-    `entries` are the parameters of the orbit for the functions of the library: the energy at the start (0 until it is
-    known), the number of bodies that take part, and for each of them its index and its weight in the relative position.
-    `components` (6, k) are the indices of the components of the state that a correction moves, and `weights` (6, k) the
-    sizes of their moves relative to each other.
+    `entries` are its parameters for the library: the energy at the start (0 until it is known), the number of bodies
+    that take part, and the index of each and its weight in the relative position. A correction moves the `components`
+    (6, k) of the state by multiples of `weights` (6, k).
     """
 
     body: int
@@ -99,9 +98,8 @@ def balances_beside_frame(
 ) -> tuple[Balance, ...]:
     """Return the balances of `orbital_balances` for runs whose `frame` restores the centre of mass by a common shift.
 
-    A common shift of all bodies changes no orbit. Therefore the correction of an orbit about the heaviest body moves
-    only the body on this orbit, while a balance of `orbital_balances` also moves all other bodies in the opposite
-    direction.
+    Such a shift changes no orbit. Therefore the correction of an orbit about the heaviest body moves only the body on
+    this orbit, while a balance of `orbital_balances` also moves all other bodies in the opposite direction.
     """
     return _balances(gm, y0, quantities, bodies, newton, neutral=False)
 
@@ -144,15 +142,7 @@ def _balances(
 
 
 def chosen_quantities(given: Any) -> tuple[str, ...]:
-    """Return the quantities that `given`, a name or several names, stands for, in the order of `QUANTITIES`.
-
-    The name "kepler" stands for "energy". Repetitions are left out.
-
-    Raises
-    ------
-    ValueError
-        If a quantity is unknown.
-    """
+    """Return the quantities that a name or several names mean, in the order of `QUANTITIES`; "kepler" is "energy"."""
     names = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Iterable) else (given,)
     for name in names:
         if name not in (*QUANTITIES, "kepler"):
@@ -166,8 +156,7 @@ def chosen_quantities(given: Any) -> tuple[str, ...]:
 def centres(gm: Array, y0: Array) -> Array:
     """Return the indices (N,) of the bodies that the bodies move about at the start, -1 for the heaviest body.
 
-    Among the heavier bodies to which a body is bound and in whose Hill sphere it is, the one with the smallest sphere
-    is chosen. If there is none, the heaviest body is chosen.
+    Each moves about the heavier body with the smallest Hill sphere that it is in and bound to, or about the heaviest.
     """
     q, v = y0.reshape(2, -1, 3)
     order = np.argsort(-gm, kind="stable").tolist()
@@ -197,8 +186,7 @@ def _is_below(about: Array, body: int, top: int) -> bool:
 def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orbit:
     """Return the orbit of `body`, together with all bodies that move about it, about the body ``about[body]``.
 
-    If `neutral` is True, or `body` does not move about the heaviest body, corrections leave the centre of mass
-    unchanged: the bodies on the other side of the orbit move in the opposite direction.
+    If `neutral`, or if it is not the heaviest body, the other side moves too, so that the centre of mass stays.
     """
     centre = int(about[body])
     group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
@@ -220,11 +208,7 @@ def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orb
 def _balance(
     quantity: str, group: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str
 ) -> Balance:
-    """Return the balance of one quantity for all orbits.
-
-    Its functions are those of the `group` ("orbits" or "planets") of the library, with the parameters `entries`. The
-    function of the rate is called "group.quantity" followed by `end`. `names` are those of all bodies.
-    """
+    """Return the balance of one quantity for all orbits, by the functions "group.quantity" of the library."""
     fun, grad, rate = (library[f"{group}.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
     each = 1 if quantity == "energy" else 3
     kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)

@@ -231,10 +231,7 @@ def _arrays(entry: dict[str, Any]) -> _Arrays:
 
 
 def _with_sun(entry: dict[str, Any], as_printed: bool) -> _Arrays:
-    """Return G m, positions and velocities of the bodies of the paper's table, with the Sun added as the first body.
-
-    The units are AU and days, and the barycentre is at rest at the origin.
-    """
+    """Return G m, positions and velocities of the paper's table in AU and days, with the Sun added as first body."""
     gm, position, velocity = _arrays(entry)
     if not as_printed:
         misprint = entry["misprint"]

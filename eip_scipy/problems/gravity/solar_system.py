@@ -104,10 +104,7 @@ def _reference(references: dict[float, np.ndarray], length: float, time: float, 
 
 
 def _starts_as_references(data: SolarSystemData) -> bool:
-    """Return True if masses and states are those of the set "de440", from which the stored reference states start.
-
-    The name of the data is not compared, because it does not determine the epoch.
-    """
+    """Return True if masses and states (a name does not determine the epoch) are those of the stored references."""
     start = load("de440")
     return np.array_equal(data.gm, start.gm) and np.array_equal(data.y0, start.y0)
 

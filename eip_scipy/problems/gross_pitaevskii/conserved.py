@@ -19,10 +19,7 @@ JOINT = ("mass", "energy")
 
 
 class _Known:
-    """Energy of a state at which f = -i H psi is known, and of states near it.
-
-    At distances of about 1e-12 the energy follows from an expansion in the distance.
-    """
+    """Energy of a state at which f = -i H psi is known, and, by an expansion, of states at distances of about 1e-12."""
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
         self._gpe, self._norm = gpe, gpe.largest_frequency()
@@ -38,8 +35,8 @@ class _Known:
     def beside(self, square: float, slope: float) -> float | None:
         """Return the energy of psi + d for a small d, where psi is the state of the last `note`.
 
-        `square` is the sum of ``|d|^2`` over the grid, and `slope` that of Re(conj(H psi) d). The result is None if the
-        terms of second order and higher are not far below the rounding of the energy.
+        `square` is the sum of ``|d|^2``, and `slope` that of Re(conj(H psi) d). The result is None if terms of second
+        order and higher are not far below the rounding of the energy.
         """
         cell = self._gpe.grid.cell
         density = 3 * self._peak + 2 * (self._peak * square) ** 0.5 + 0.5 * square
@@ -52,10 +49,6 @@ class Energy:
 
     A step needs the gradient and the energy at its unprojected result, and the energy of the projected state. None of
     these needs a transform.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
     """
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
@@ -87,12 +80,6 @@ class Joint:
 
     A projection takes two passes over the field. The gradients 2 w psi and 2 w H psi = 2 w i f, with the size w of a
     cell, are never stored: their products and the energy are computed as sums over psi and f.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-    names : tuple of str
-        "mass" or "energy" or both.
     """
 
     def __init__(self, gpe: GrossPitaevskii, names: tuple[str, ...]) -> None:
@@ -102,20 +89,11 @@ class Joint:
     def moments(
         self, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray, gram: np.ndarray, terms: np.ndarray
     ) -> None:
-        """Fill the arrays that a projection needs at a state: values, products of gradients, and sizes of terms.
+        """Fill the arrays that a projection needs at the state y (n,), where f = -i H psi.
 
-        Parameters
-        ----------
-        t : float
-        y, f : ndarray, shape (n,)
-            The state, and the right-hand side f = -i H psi at this state.
-        values : ndarray, shape (l,)
-            Filled with the values of the invariants.
-        gram : ndarray, shape (l, l)
-            Filled with the inner products of the gradients.
-        terms : ndarray, shape (l,)
-            Filled with the sums of ``|G_k y_k|`` over the real components of the state, to which the rounding errors of
-            the values are proportional.
+        These are the values of the invariants (l,), the inner products of their gradients (l, l), and the sums (l,) of
+        ``|G_k y_k|`` over the real components of the state, to which the rounding errors of the values are
+        proportional.
         """
         found, w = self._known.note(y, f), self._gpe.grid.cell
         m, e = self._mass, self._energy
@@ -129,20 +107,10 @@ class Joint:
     def shift(
         self, t: float, y: np.ndarray, f: np.ndarray, mu: np.ndarray, out: np.ndarray, values: np.ndarray
     ) -> None:
-        """Move along the gradients at the state of the last `moments`, and compute the invariants at the new state.
+        """Fill `out` with ``y + sum_i mu_i G_i(y)``, and `values` with the invariants there.
 
-        Parameters
-        ----------
-        t : float
-        y, f : ndarray, shape (n,)
-            As given to `moments`.
-        mu : ndarray, shape (l,)
-            Factors of the gradients.
-        out : ndarray, shape (n,)
-            Filled with ``y + sum_i mu_i G_i(y)``.
-        values : ndarray, shape (l,)
-            Filled with the values of the invariants at `out`. The energy is computed with a transform only if the shift
-            is large.
+        y and f are those of the last `moments`, and the gradients G_i (l,) are those at y. The energy is computed with
+        a transform only if the shift is large.
         """
         gpe, w = self._gpe, self._gpe.grid.cell
         a, b = (0.0 if k is None else 2 * w * mu[k] for k in (self._mass, self._energy))

@@ -98,10 +98,7 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         return self.grid.cell * self.moments(psi, f).energy(self.beta)
 
     def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return two parts of the derivative `f` at the state `y`: -i H psi, and the terms that damping and losses add.
-
-        The term i mu psi is left out of both parts, because it changes no invariant.
-        """
+        """Return -i H psi, and what damping and losses add; i mu psi, which changes no invariant, is in neither."""
         turning = (f - (self._growth + 1j * self.mu) * y) / (1 - 1j * self.damping)
         return turning, self._growth * y - 1j * self.damping * turning
 

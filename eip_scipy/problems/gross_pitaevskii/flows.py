@@ -65,10 +65,7 @@ class LinearFlow:
 
     @staticmethod
     def _factor(gpe: GrossPitaevskii, axes: Axes, phases: list[Any]) -> tuple[Axes, list[np.ndarray]]:
-        """Return `axes`, and the factors exp(-i phase) of the modes along them, one for each of the `phases`.
-
-        The first factor is divided by the number of points along `axes`, because the transforms are not normalised.
-        """
+        """Return `axes`, and the factors exp(-i phase) of the modes along them, the first with the normalisation."""
         points = int(np.prod([gpe.grid.shape[axis] for axis in axes]))
         first, *rest = (np.exp(-1j * phase) for phase in phases)
         return axes, [first / points, *rest]

@@ -92,13 +92,7 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
 
 
 def check_radial(gpe: GrossPitaevskii) -> None:
-    """Require that the potential is equal at all grid points with the same distance from the z axis.
-
-    Raises
-    ------
-    ValueError
-        If the potential differs between such points, or the problem has one dimension.
-    """
+    """Raise ValueError unless the potential is equal at all grid points with the same distance from the z axis."""
     if gpe.grid.dim == 1:
         raise ValueError("at_rest: the problem has one dimension, without a z axis; expected two or three dimensions.")
     x, y, *_ = gpe.grid.mesh()

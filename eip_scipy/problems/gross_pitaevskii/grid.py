@@ -175,10 +175,7 @@ class Multiplier:
 
 
 def _in_strips(factor: np.ndarray) -> list[tuple[slice, np.ndarray, np.ndarray]]:
-    """Return the strips of columns into which a factor (J, K) is divided, each as its slice, its factor, and a buffer.
-
-    Strips of the same width share the buffer.
-    """
+    """Return for each strip of columns of a factor (J, K) its slice, factor and buffer, shared by equal widths."""
     strips = [slice(begin, begin + STRIP) for begin in range(0, factor.shape[1], STRIP)]
     factors = [np.ascontiguousarray(factor[:, columns]) for columns in strips]
     rooms = {part.shape: np.empty(part.shape, complex) for part in factors}

@@ -124,11 +124,7 @@ class _Descent:
         add_potential(field, self.gpe.V, 0.0, out)
 
     def run(self, tol: float, max_iterations: int, progress: Progress | None) -> GroundState:
-        """Iterate, and return the result.
-
-        The iteration ends if the residual is at most `tol`, after `max_iterations`, if `progress` returns True, or if
-        no direction descends.
-        """
+        """Iterate, and return the result, once it converged, `progress` says so, or no direction descends."""
         message, iteration = "", 0
         while not message:
             if iteration % REFRESH == 0:
@@ -199,11 +195,7 @@ class _Descent:
 
 
 def _least_energy(e: tuple[float, float, float, float, float]) -> float:
-    """Return t = tan(a) for the angle a at which sum_k e_k cos(a)^(4 - k) sin(a)^k is smallest.
-
-    The derivative of the sum with respect to a is a polynomial of degree 4 in t times cos(a)^4. It does not vanish
-    everywhere, because e_1 < 0.
-    """
+    """Return t = tan(a) for the angle a at which sum_k e_k cos(a)^(4 - k) sin(a)^k is smallest; e_1 < 0."""
     e0, e1, e2, e3, e4 = e
     roots = np.roots([-e3, 4 * e4 - 2 * e2, 3 * (e3 - e1), 2 * e2 - 4 * e0, e1])
     t = roots[np.abs(roots.imag) <= 1e-6 * np.abs(roots)].real

@@ -14,20 +14,9 @@ _native = BUILD.condensates
 
 
 class Moments(NamedTuple):
-    """Sums over the grid.
+    """Sums over the grid of ``|psi|^2``, Re(conj(psi) H psi), ``|H psi|^2`` and ``|psi|^4``.
 
-    Attributes
-    ----------
-    mass : float
-        Sum of ``|psi|^2``.
-    along : float
-        Sum of Re(conj(psi) H psi).
-    square : float
-        Sum of ``|H psi|^2``.
-    quartic : float
-        Sum of ``|psi|^4``.
-    sizes : float
-        Sum of the absolute values of the terms of `along`.
+    `sizes` is the sum of the absolute values of the terms of `along`.
     """
 
     mass: float

@@ -263,10 +263,7 @@ def _breather(x: np.ndarray, length: float, amplitude: float, velocity: float, b
 
 
 def _moving(x: np.ndarray, length: float, velocity: float, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the signed distances of points from a centre that moves around the ring, and factors for the field.
-
-    The factors exp(i phase) turn the field of a soliton at rest, taken at these distances, into that of a moving one.
-    """
+    """Return the signed distances of points from a moving centre on the ring, and factors that make a field move."""
     # The phase follows the distance, so that nothing jumps where it turns.
     s = np.remainder(x - velocity * t + length / 2, length) - length / 2
     return s, np.exp(1j * (velocity * (s + velocity * t) - 0.5 * velocity**2 * t))

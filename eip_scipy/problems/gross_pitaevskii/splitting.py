@@ -39,10 +39,7 @@ class Scheme(NamedTuple):
 
 
 def _palindrome(half: tuple[float, ...], *, odd: bool, total: float = 1.0) -> tuple[float, ...]:
-    """Return symmetric coefficients with the sum `total` from the first ones, `half`.
-
-    The missing coefficients in the middle, one if `odd` is True and otherwise two equal ones, follow from the sum.
-    """
+    """Return symmetric coefficients with the sum `total` from the first ones; those in the middle follow from it."""
     rest = total - 2 * sum(half)
     return (*half, rest, *half[::-1]) if odd else (*half, rest / 2, rest / 2, *half[::-1])
 

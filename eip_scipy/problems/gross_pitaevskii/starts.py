@@ -145,11 +145,7 @@ def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[n
 
 
 def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the points (k, 2) of a triangular lattice within the outer radius of the condensate about the z axis.
-
-    `amplitude` is the Thomas-Fermi amplitude on the grid, which is positive in the condensate and 0 outside. `rng`
-    chooses the spacing, the angle and the position of the lattice.
-    """
+    """Return the points (k, 2) of a random triangular lattice within the outer radius of the condensate."""
     x, y, *_ = gpe.grid.mesh()
     radius = sqrt(float(np.max((x**2 + y**2) * (amplitude > 0))))
     area = pi / abs(gpe.Omega) / rng.uniform(0.6, 1.2)

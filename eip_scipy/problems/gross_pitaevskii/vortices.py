@@ -94,10 +94,7 @@ def vortices(
 
 
 def core_size(gpe: GrossPitaevskii, top: float, core: float | None = None) -> list[int]:
-    """Return the numbers of points across a vortex core along x and y, odd and at least 3.
-
-    The width of the core is `core`, or else four healing lengths at the largest density `top`.
-    """
+    """Return the odd numbers of points, at least 3, across a core of the width `core` or 4 healing lengths at `top`."""
     width = core if core is not None else CORE / sqrt(2 * gpe.beta * top) if gpe.beta > 0 else 0.0
     return [max(3, ceil(width / d) | 1) for d in gpe.grid.spacing[:2]]
 
@@ -117,10 +114,7 @@ def _least_of_corners(a: np.ndarray) -> np.ndarray:
 
 
 def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: float) -> tuple[float, float]:
-    """Return x and y of the zero of the linear function that fits the field best at the four corners of a cell.
-
-    `corners` (2, 2) holds the field there. The arguments `x` and `y` are the smallest coordinates in the cell.
-    """
+    """Return x and y of the zero of the linear function that fits the field at the `corners` of a cell best."""
     u = np.array([[-0.5], [0.5]])
     middle = x + 0.5 * dx, y + 0.5 * dy
     c = corners * np.exp(-1j * Omega * (middle[0] * dy * u.T - middle[1] * dx * u))

@@ -27,11 +27,9 @@ LATER = 10.0 ** np.arange(-9, 19)
 class Sample(NamedTuple):
     """Values at m random points, one row for each point.
 
-    `points` (m, n) are z = y / scale, and `slopes` (m, n) are dz/dt divided by the sum of its absolute values. `rates`
-    (m, k) are the rates dI/dz . slopes of k functions I, one column for each: first the monomials of a basis, then the
-    given functions (`terms` of `Surroundings`). `sizes` (m, k) are the sums of the absolute values of the products in
-    the rates, ``dI/dz_i dz_i/dt``, where the derivative of a monomial is written as one product for each of its
-    factors.
+    `points` are z = y / scale, and `slopes` are dz/dt divided by the sum of its absolute values. `rates` (m, k) are the
+    rates dI/dz . slopes of k functions I: the monomials of a basis, then the given functions. `sizes` (m, k) are the
+    sums of the absolute values of the products in the rates, with one product for each factor of a monomial.
     """
 
     points: Array
@@ -43,15 +41,9 @@ class Sample(NamedTuple):
 class Surroundings:
     """The region around a state in which invariants are searched, and random points in it.
 
-    `terms` are the given functions, each a `Term`: invariants are searched among sums of multiples of monomials of the
-    state and of these functions. `scale` (n,) holds the sizes of the components of the state, `tau` is a time in which
-    the state moves by its own size, and `trajectory` (m, n) holds states on the trajectory that starts at y0, or nearby
-    if that from y0 tests nothing.
-
-    Raises
-    ------
-    ValueError
-        If the vector field is not finite at y0.
+    `terms` are the given functions. `scale` (n,) holds the sizes of the components of the state, `tau` is a time in
+    which the state moves by its own size, and `trajectory` (m, n) holds states on the trajectory from y0, or from
+    nearby if that from y0 tests nothing. A ValueError is raised if the vector field is not finite at y0.
     """
 
     def __init__(self, fun: Callable[..., Any], y0: Array, terms: Sequence[Term], t: float, seed: int) -> None:
@@ -114,10 +106,7 @@ class Surroundings:
         return f
 
     def _time_of_a_start_at_rest(self) -> float:
-        """Return a time in which states around y0 move by their size, if the states near y0 do not move at `t`.
-
-        All components are displaced. If that does not move them, later times are tried; if nothing moves, return 0.
-        """
+        """Return a time in which displaced states around y0 move by their size, at `t` or later; 0 if nothing moves."""
         if speed := self._speed_around(self.t):
             return 1.0 / speed
         tau = 0.0
@@ -144,14 +133,9 @@ class Surroundings:
         return bool(np.isfinite(self._slope(t, y)).all() and np.isfinite(self.term_gradients(y)).all())
 
     def sample(self, wanted: int, basis: Sequence[Monomial]) -> Sample:
-        """Return `wanted` random points, with the rates of monomials and of the given functions (`terms`) there.
+        """Return `wanted` random points, with the rates of the monomials `basis` and of the given functions there.
 
-        `basis` lists the monomials.
-
-        Raises
-        ------
-        ValueError
-            If the vector field, or the gradient of a given function, is finite at too few points.
+        A ValueError is raised if the vector field, or the gradient of a given function, is finite at too few points.
         """
         for spread in SPREADS:
             points, slopes, gradients = [], [], []
@@ -171,19 +155,15 @@ class Surroundings:
         ) from self.failure
 
     def _later(self, k: int) -> float:
-        """Return the time of point `k` after `t`, in units of `tau`: 0, a number below 1, or one up to `LATEST`.
+        """Return the time of point k after `t`, in units of `tau`: 0, a number below 1, or one up to `LATEST`.
 
-        A quantity must be conserved at all times. Half of the points are at `t`, because `fun` may be undefined later.
+        Half of the points are at `t`, because `fun` may be undefined later.
         """
         part = float(self.rng.random())
         return part if k % 4 == 1 else LATEST**part if k % 4 == 3 else 0.0
 
     def _follow(self) -> Array:
-        """Return states (m, n) on a trajectory.
-
-        It starts at y0. If y0 is an equilibrium or a given function is not finite there, the trajectory would test
-        nothing, and one from a random point nearby is returned.
-        """
+        """Return states (m, n) on a trajectory from y0, or from nearby if that from y0 would test nothing."""
         if self._is_defined(self.t, self.y0):
             states = self._states_from(self.y0)
             if np.any(np.abs(states - self.y0) > AT_REST * self.scale):

@@ -31,10 +31,8 @@ APART = 1e3  # the least singular value that is not 0, in units of rounding
 class Search:
     """A search for invariants, which is made when the object is created; `found` has the result.
 
-    A candidate for an invariant is represented by a row of coefficients: first those of the monomials of z = y / scale,
-    then those of the given functions (`terms` of `Surroundings`). `columns` are indices in such a row: the monomials
-    and given functions that a candidate may contain. `degree` is the largest degree of the monomials, and `rtol` the
-    tolerance of the test whether a candidate is conserved (`_is_kept`).
+    A candidate is a row of coefficients: first those of the monomials of z = y / scale, up to `degree`, then those of
+    the given functions. `columns` are indices in such a row. `rtol` is the tolerance of `_is_kept`.
     """
 
     def __init__(self, around: Surroundings, degree: int, rtol: float) -> None:
@@ -85,11 +83,7 @@ class Search:
         return len(self.basis) + len(self.terms)
 
     def _null_space(self, columns: Any) -> Array:
-        """Return rows that span the null space of the rates of the functions in `columns`.
-
-        The rows are the constant functions, and then singular vectors, those of the smallest singular values first,
-        until one is not conserved.
-        """
+        """Return the constant functions and those singular vectors, smallest values first, that are conserved."""
         # A component that does not move is conserved; relative to such columns no rounding error is small.
         still, _, rows = self._singular(columns)
         found = [self._spread(np.ones(1), [k]) for k in still]
@@ -102,12 +96,10 @@ class Search:
     def _numerical_null_space(self, columns: Any) -> Array:
         """Return the constant functions and the singular vectors of singular values that are 0 up to rounding, as rows.
 
-        There are no rows, not even those of constant functions, if no singular value is above rounding, or the smallest
-        one above rounding is less than `APART` times as large.
-
-        The rows are not tested by `_is_kept`. Because of rounding such a row contains small multiples of all columns.
-        Near points at which all terms of the invariant vanish, these multiples exceed the terms, so that the row would
-        fail the test there. An example is y1**2 + y0**4/2 near y0 = 0.
+        There are none if no singular value is above rounding, or the smallest one above is less than `APART` times as
+        large. The rows are not tested by `_is_kept`: because of rounding they contain small multiples of all columns,
+        which exceed the terms of the invariant near points at which all of these vanish, as those of y1**2 + y0**4/2
+        near y0 = 0.
         """
         still, values, rows = self._singular(columns)
         if not values.size:
@@ -120,11 +112,7 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _singular(self, columns: Any) -> tuple[Array, Array, Array]:
-        """Return the functions in `columns` that are constant, and a singular value decomposition for the others.
-
-        The constant functions are given by their indices. The decomposition is that of the rates of the others at the
-        random points: its singular values, largest first, and its right singular vectors as rows of coefficients.
-        """
+        """Return constant functions in `columns`, and the singular values and right vectors of the others' rates."""
         A, columns = self.sample.rates[:, columns], np.asarray(columns)
         weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
         still, moving = columns[weights == 0], columns[weights > 0]
@@ -134,12 +122,10 @@ class Search:
         return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
-        """Return True if a candidate I is conserved: its rate is 0 up to rounding at points that did not determine it.
+        """Return True if the rate of a candidate is 0 up to rounding at points that did not determine it.
 
-        At each of these points (`fresh`) the rate, the sum of the terms ``dI/dz_i dz_i/dt``, must satisfy two bounds:
-        `rtol` times the sum of the absolute values of these terms, and `ROUND_OFF` `rtol` times a sum that is at least
-        as large, in which the contributions of the single monomials and given functions do not cancel (the `sizes` of
-        `Sample`).
+        It must be below `rtol` times the sum of the absolute values of its terms ``dI/dz_i dz_i/dt``, and below
+        `ROUND_OFF` `rtol` times that sum without cancellation within the terms (the `sizes` of `Sample`).
         """
         rate = np.abs(self.fresh.rates @ row)
         if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
@@ -148,11 +134,7 @@ class Search:
         return bool(np.all(rate <= self.rtol * np.abs(gradients * self.fresh.slopes).sum(axis=1)))
 
     def _gradients(self, row: Array, points: Array, part: Callable[[Array], Array] = np.positive) -> Array:
-        """Return the gradients dI/dz (m, n) of a candidate I at the points z (m, n).
-
-        With ``part=np.abs`` the contributions of the monomials and given functions are replaced by their absolute
-        values.
-        """
+        """Return the gradients dI/dz (m, n) of a candidate at m points; `part` is applied to each contribution."""
         out = np.zeros_like(points)
         for k in np.flatnonzero(row[: len(self.basis)]):
             item = self.basis[k]
@@ -165,10 +147,7 @@ class Search:
         return out
 
     def _products(self, columns: list[int]) -> Iterator[Polynomial]:
-        """Yield the accepted polynomials and their products, up to the largest degree in `columns`.
-
-        Accepted invariants that contain given functions are left out.
-        """
+        """Yield the products of accepted polynomials that consist of functions in `columns`."""
         degree = max(len(self.basis[k]) for k in columns if k < len(self.basis))
         polynomials = [self._polynomial(row) for row in self.accepted if not row[len(self.basis) :].any()]
         stack: list[tuple[int, Polynomial]] = [(0, {(): 1.0})]
@@ -214,12 +193,7 @@ class Search:
         return [row / np.max(np.abs(row)) for row, _ in reduced[count_known:]]
 
     def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
-        """Return the key that sorts rows by simplicity.
-
-        The key consists of the number of nonzero coefficients; minus the number of those with the rarer sign, because
-        angular momenta are differences; the number of products of different variables; and the indices of the nonzero
-        coefficients.
-        """
+        """Return the key that sorts rows by simplicity; both signs count as simple, as in angular momenta."""
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0]).tolist()
         negative = sum(row[k] < 0 for k in support)
         mixed = sum(k < len(self.basis) and len(set(self.basis[k])) > 1 for k in support)
@@ -248,11 +222,7 @@ class Search:
         return row
 
     def _rational(self, row: Array) -> Array:
-        """Return a multiple of the row whose first nonzero coefficient is positive.
-
-        The coefficients, converted to those of functions of y, are small fractions or integers if all are close to such
-        numbers for a suitable multiple.
-        """
+        """Return a multiple of the row that begins with a positive number, of simple fractions if they are near."""
         raw = row * self.units
         raw = raw / raw[np.argmax(np.abs(row))]
         for unit in (1.0, np.min(np.abs(raw[raw != 0]))):

@@ -156,10 +156,7 @@ def mechanism(
 
 
 def _as_functions(given: Given) -> Given:
-    """Return `given` with functions in place of arrays for mass and forces.
-
-    A TypeError is raised if another item is not a function.
-    """
+    """Return `given` with functions in place of arrays; raise TypeError if another item is not a function."""
     mass, forces = given.mass, given.forces
     if not callable(mass):
         M = real_array("mass", mass)
@@ -194,10 +191,7 @@ def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
 
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
-    """Return `given`, the argument with the name `what`, as an array for the first calls of the functions.
-
-    Components that are missing from a mapping are 0.
-    """
+    """Return `given` as an array for the first calls of the functions; components missing from a mapping are 0."""
     if isinstance(given, dict):
         if names is None:
             raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")

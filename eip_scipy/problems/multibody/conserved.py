@@ -31,18 +31,8 @@ def momenta_of(
 ) -> tuple[Invariant, ...]:
     """Return the candidates that are constant and independent of the invariants in `kept` and of each other.
 
-    Parameters
-    ----------
-    candidates : sequence of Energy
-        Names, values and gradients of the momenta.
-    kept : sequence of Invariant
-        Invariants whose functions are not compiled.
-    derivative : callable
-        ``derivative(t, y)`` returns y'.
-    states : sequence of (float, ndarray)
-        Times and states that meet the constraints. If there are fewer than 3, no momenta are returned.
-    params : ndarray or None
-        Values of the parameters; None if the functions have no parameters.
+    The functions of `kept` are not compiled, and `derivative(t, y)` returns y'. If there are fewer than 3 `states`,
+    pairs (t, y) that meet the constraints, no momenta are returned.
     """
     args = () if params is None else (params,)
     found: list[Invariant] = []
@@ -65,10 +55,9 @@ def momenta_of(
 def norms_of(
     parts: Parts, names: Names, kept: Sequence[Invariant], states: Sequence[tuple], params: np.ndarray | None
 ) -> tuple[Invariant, ...]:
-    """Return the sums of squares of coordinates that are constant because of the kinematics.
+    """Return the sums of squares of coordinates, such as a quaternion's, whose sum of q q' is 0 for all speeds.
 
-    For such a set of coordinates the sum of q q' is 0 for all speeds; an example are the components of a quaternion.
-    Sums of squares that depend on the invariants in `kept` are left out.
+    Those that depend on the invariants in `kept` are left out.
     """
     t, y = states[-1]
     if _speeds_are_rates(parts, names, t, y, params):

@@ -28,10 +28,9 @@ RIGHT = 1e-6
 
 
 class Energy(NamedTuple):
-    """A quantity that may be constant: its name, and its functions of (t, y).
+    """Description of a quantity that may be constant, ``value(t, y, *params)``, and ``gradient(t, y, out, *params)``.
 
-    The functions are ``value(t, y, *params)``, ``gradient(t, y, out, *params)``, which fills `out`, and optionally the
-    rate of change ``power(t, y, *params)``.
+    `power` is the given rate of change, a function of (t, y, *params), or None.
     """
 
     description: str
@@ -49,22 +48,9 @@ def energy_of(
     """Return the energy as an `Invariant` or `Balance`, or None if it is not kept, and a description for the repr.
 
     The energy is the first candidate without a given power that is constant, otherwise the candidate that changes most
-    slowly, if its rate is small enough for a balance. It is not kept if there are fewer than 3 states.
-
-    Raises
-    ------
-    ValueError
-        If a given power is not the rate of its energy.
-
-    Parameters
-    ----------
-    candidates : sequence of Energy
-    derivative : callable
-        ``derivative(t, y)`` returns y'.
-    states : sequence of (float, ndarray)
-        Times and states that meet the constraints.
-    params : ndarray or None
-        Values of the parameters; None if the functions have no parameters.
+    slowly, if its rate is small enough for a balance. It is not kept if there are fewer than 3 `states`, times and
+    states that meet the constraints. `derivative(t, y)` returns y'. A ValueError is raised if a given power is not the
+    rate of its energy.
     """
     args = () if params is None else (params,)
     if candidates and len(states) < FEWEST:
@@ -97,10 +83,7 @@ def energy_of(
 def _require_power(
     item: Energy, rates: np.ndarray, terms: np.ndarray, states: Sequence[tuple], args: tuple[Any, ...]
 ) -> None:
-    """Raise ValueError if the power given for an energy is not its rate of change.
-
-    `rates` and `terms` are what `rates_of` returns for the other arguments.
-    """
+    """Raise ValueError if the given power is not the rate of change; `rates` and `terms` are those of `rates_of`."""
     if item.power is None:
         return
     given = np.array([float(plain(item.power)(t, y, *args)) for t, y in states])
@@ -125,7 +108,7 @@ def states_near(
     """Return times and states that meet the constraints: the start, and states near it at typical speeds.
 
     The times lie between t and `t_end`, and within the time in which the coordinates change by their size at a typical
-    speed. `derivative(t, y)` returns y', and `coordinates` is the number of coordinates in y.
+    speed.
     """
     rng = np.random.default_rng(20391)
     half = np.abs(y[:coordinates]).max(initial=0.0) or 1.0
@@ -159,10 +142,7 @@ def _nearest(y: np.ndarray, constraints: Sequence[Invariant], t: float, sizes: n
 
 
 def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> float:
-    """Return the largest speed, or the square root of the largest acceleration times the size of q if that is larger.
-
-    The size of q is that of its largest component, or 1 if all are 0.
-    """
+    """Return the largest speed, or sqrt(size of q times the largest acceleration) if larger; size of 0 counts as 1."""
     size = np.abs(q).max(initial=0.0) or 1.0
     return float(max(np.abs(u).max(initial=0.0), np.sqrt(size * np.abs(accelerations).max(initial=0.0))))
 
@@ -174,10 +154,7 @@ def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
 def rates_of(
     item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates of change (k,) of an energy at k states, and the sums (k,) of the sizes of the rates' terms.
-
-    The size of a term is its absolute value. `args` are the further arguments of the functions of the energy.
-    """
+    """Return the rates (k,) of an energy at k states, and the sums (k,) of the absolute values of the rates' terms."""
     rates, terms = np.zeros(len(states)), np.zeros(len(states))
     for k, (t, y) in enumerate(states):
         gradient = np.empty(y.size)

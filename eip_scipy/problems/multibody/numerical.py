@@ -19,11 +19,7 @@ Array = np.ndarray
 
 
 def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
-    """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none.
-
-    t, q and u are the time, coordinates and speeds at the start. `why` is the reason why the functions are not
-    converted to expressions.
-    """
+    """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none; `why` is for the repr."""
     found = _Constraints(given, names, t, q)
     nq = q.size
 
@@ -63,10 +59,7 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
 
 
 def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
-    """Return `Outputs` that call the user's functions in ``given.outputs``; None if there are no such functions.
-
-    `nq` and `n` are the numbers of coordinates and of speeds.
-    """
+    """Return `Outputs` that call the user's functions in ``given.outputs``; None if there are no such functions."""
     functions = tuple(given.outputs.values())
 
     def fill(t: float, x: Array, out: Array) -> None:
@@ -88,10 +81,7 @@ def _sizes(y: Array) -> Array:
 
 
 class _Constraints:
-    """Constraints on positions and velocities, and their derivatives.
-
-    They are made from the user's functions `given`. t and q are the time and the coordinates at the start.
-    """
+    """Constraints on positions and velocities, and their derivatives, from the user's functions."""
 
     def __init__(self, given: Given, names: Names, t: float, q: Array) -> None:
         self.given = given

@@ -20,13 +20,7 @@ class Outputs(NamedTuple):
 
 
 def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times as an array (k,) and the states as columns (n, k); `what` names the caller in messages.
-
-    Raises
-    ------
-    ValueError
-        If the numbers of times and states differ, or the states do not have n components.
-    """
+    """Return the times as an array (k,) and the states as columns (n, k); ValueError if they do not fit."""
     times, states = np.atleast_1d(np.asarray(t, float)), np.asarray(y, float)
     columns = states.reshape(len(states), -1)
     if np.ndim(t) != states.ndim - 1 or columns.shape != (n, times.size):
@@ -38,15 +32,7 @@ def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarra
 
 
 def required_outputs(what: str, outputs: Any, taken: Any) -> dict[str, Any]:
-    """Return the argument `outputs` as a dictionary after checks.
-
-    `what` names the caller in messages, and `taken` are the names of the components of the state.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `outputs` is not a mapping with strings as keys, or a key is the name of a component of the state.
-    """
+    """Return `outputs` as a dictionary; raise an error if a key is not a string, or is `taken` by a component."""
     if outputs is None:
         return {}
     if not isinstance(outputs, Mapping):

@@ -31,10 +31,8 @@ class Parts(NamedTuple):
     """The functions of which a problem is made.
 
     ``fill`` is the argument of `motion`. ``values(t, y, out, *params)`` fills `out` with the constraints on positions
-    and then those on velocities, m in total, and ``gradient`` fills it with their derivatives (m, n) with respect to
-    the state. `energies` and `momenta` are quantities that may be constant, `note` is a line for the repr, `outputs`
-    are the quantities that the user defines, and `origin` holds the arguments of `parts_of` from which the functions
-    can be made again, or None.
+    and then those on velocities, m in total, and ``gradient`` with their derivatives (m, n). `energies` and `momenta`
+    may be constant, and `note` is a line for the repr.
     """
 
     fill: Callable[..., None]

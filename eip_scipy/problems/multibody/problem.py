@@ -286,8 +286,7 @@ def mechanics_problem(
 ) -> MechanicsProblem:
     """Return the problem with the functions `parts`, started at the coordinates and speeds `start` at time `t`.
 
-    The components in `independent`, by default all, keep the values in `start`; the others are guesses. `tolerance` is
-    the `rank_tolerance` of the problem, and `others` are further attributes.
+    The components in `independent`, by default all, keep the values in `start`; the others are guesses.
     """
     sizes = Sizes(len(names.coordinates), len(names.speeds), len(names.velocities))
     functions = motion(parts.fill, sizes, tolerance)
@@ -334,11 +333,7 @@ def mechanics_problem(
 def _require_accelerations(
     what: str, parts: Parts, functions: Motion, names: Names, t: float, y: np.ndarray, params: np.ndarray | None
 ) -> None:
-    """Raise ValueError if constraints depend on each other at the start and no acceleration meets all of them.
-
-    `what` is the name of the problem, with which the message begins. `functions` are those that `motion` makes from
-    `parts`.
-    """
+    """Raise ValueError if constraints depend on each other at the start and no acceleration meets all of them."""
     nq, n, m = len(names.coordinates), len(names.speeds), len(names.velocities)
     sizes, extra = Sizes(nq, n, m), () if params is None else (params,)
     rates, accelerations, matrices = np.empty(nq), np.empty(n), np.empty(sizes.matrices + nq)
@@ -361,10 +356,7 @@ def _require_accelerations(
 def _constraints_invariant(
     fill: Callable[..., None], gradient: Callable[..., None], names: Names, params: np.ndarray | None
 ) -> tuple[Invariant, ...]:
-    """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints.
-
-    `fill` fills an array with the values of all constraints, and `gradient` an array with their gradients.
-    """
+    """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints."""
     size = len(names.positions) + len(names.velocities)
     if size == 0:
         return ()
@@ -387,8 +379,8 @@ def _at_speed(
 ) -> Any:
     """Return the `scale` of constraints, an array (size,), or of a momentum, a number, if `size` is None.
 
-    The scale is 0.1 times the size of the terms that are proportional to the speeds, at a typical speed, because these
-    terms vanish at rest. It is None if it is not finite.
+    The scale is 0.1 times the terms that are proportional to the speeds, at a typical speed, because these terms vanish
+    at rest. It is None if it is not finite.
     """
     nq = sizes.coordinates
     speed = typical_speed(y[:nq], y[nq:], derivative(t, y)[nq:])

@@ -23,32 +23,12 @@ def variational(
     start: tuple[float, ...],
     parameters: tuple[int, ...],
 ) -> Callable[..., None]:
-    """Return the right-hand side of a state and of its derivatives with respect to initial values and parameters.
+    """Return the right-hand side of a state and of columns of derivatives, see `variational` of `Problem`.
 
-    Each derivative is a column of 6 numbers after the state, see `variational` of `Problem`.
-
-    Jitted functions of the field are differentiated by dual numbers. Others are differentiated by complex steps if
-    these give correct derivatives at `start`, otherwise by differences of order 6. The shift of a coordinate is then
-    proportional to its distance from 0 plus `length`.
-
-    Parameters
-    ----------
-    rhs : callable
-        The right-hand side ``rhs(t, y, out, params)`` of the state alone.
-    functions : FieldFunctions
-    form : {"canonical", "velocity"}
-        "canonical" if the state is (x, p), "velocity" if it is (x, v).
-    length : float
-        See `ParticleField`.
-    start : tuple of float
-        (t, x, y, z), where complex steps are tried.
-    parameters : tuple of int
-        Indices in [mass, charge] of the parameters to which the last columns belong.
-
-    Raises
-    ------
-    ValueError
-        If another parameter is requested.
+    `rhs(t, y, out, params)` is that of the state alone, and `parameters` are the indices in [mass, charge] to which the
+    last columns belong; any other index raises ValueError. Jitted functions of the field are differentiated by dual
+    numbers. Others are differentiated by complex steps if these give correct derivatives at `start` (t, x, y, z),
+    otherwise by differences of order 6, with shifts proportional to a coordinate's distance from 0 plus `length`.
     """
     if not set(parameters) <= {MASS, CHARGE}:
         raise ValueError(
@@ -147,8 +127,7 @@ def _velocity(rhs, B, E, slopes, slopes_of_E, by_mass):
 def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[float, ...]) -> Callable[..., Any]:
     """Return ``slopes(t, y, y)``, the derivatives of a field's function with respect to the position y[:3].
 
-    The second y is not used. `ndim` is 1 if the function returns a vector, and 2 if it returns three rows. The last
-    index of the derivatives is that of the position. `length` and `start` are the arguments of `variational`.
+    The second y is not used. `ndim` is 1 for a vector and 2 for three rows; the last index is that of the position.
     """
     if is_jitted(fun) and not jit_is_off():
         try:
@@ -162,13 +141,7 @@ def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[floa
 
 
 def _by_duals(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
-    """Return the function that `_slopes` returns, compiled, with derivatives by dual numbers.
-
-    Raises
-    ------
-    NotCompilableError
-        If the function does something that dual numbers do not support.
-    """
+    """Return the compiled function of `_slopes`, by dual numbers; NotCompilableError if they do not support it."""
     from ...core.dual_arrays import for_duals, inside
     from ...core.dual_numbers import Dual, seed, slope
     from ...core.jitted_gradients import compiled_for

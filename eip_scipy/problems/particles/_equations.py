@@ -32,10 +32,9 @@ class FieldFunctions(NamedTuple):
 
 
 class ParticleEquations(NamedTuple):
-    """Functions of the problem of a particle.
+    """Functions of a particle: the energy is None without a potential, and the momentum and its gradient without A.
 
-    `energy` is None if the potential is not known, `momentum` and its gradient are None if A is not known, and the last
-    three functions, which concern the kinetic energy, are None in the canonical form.
+    The last three functions, which concern the kinetic energy, are None in the canonical form.
     """
 
     rhs: Callable[..., None]
@@ -49,10 +48,7 @@ class ParticleEquations(NamedTuple):
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
-    """Return `fun`, compiled if all of `others` are compiled; the functions of this module that it calls are inlined.
-
-    Items of `others` that are None are ignored.
-    """
+    """Return `fun`, compiled if all `others` (except None) are; functions of this module that it calls are inlined."""
     if all(is_compiled(other) for other in others if other is not None):
         _register()
     return compiled_like(fun, *(other for other in others if other is not None))
@@ -87,19 +83,10 @@ def no_force(t, x, y, z):
 
 
 def compose(field: FieldFunctions, form: str) -> ParticleEquations:
-    """Return the equations of motion and the invariants of a particle in one of the two forms.
+    """Return the equations of motion and the invariants of a particle in the form "canonical" or "velocity".
 
-    Parameters
-    ----------
-    field : FieldFunctions
-        The equations need A, jacobian and E in the canonical form, and B and E in the form (x, v). The other functions
-        are needed for invariants only.
-    form : {"canonical", "velocity"}
-
-    Returns
-    -------
-    ParticleEquations
-        Functions of ``(t, y, [f,] [out,] params)`` with ``params = [mass, charge]``.
+    The equations need A, jacobian and E in the canonical form, and B and E in the form (x, v). The other functions are
+    needed for invariants only. The results are functions of ``(t, y, [f,] [out,] params)``.
     """
     return _canonical(field) if form == "canonical" else _velocity(field)
 
@@ -218,10 +205,7 @@ def _velocity(field: FieldFunctions) -> ParticleEquations:
 
 @jitable
 def velocity_rhs(E, B, t, y, out, ratio):
-    """Fill `out` with Newton's equations, x' = v and v' = (q / m) (E + v x B) (Cai, Gong & Wang, eq. 3.8).
-
-    `ratio` is q / m.
-    """
+    """Fill `out` with x' = v and v' = ratio (E + v x B), where ratio is q / m (Cai, Gong & Wang, eq. 3.8)."""
     e = E(t, y[0], y[1], y[2])
     b = B(t, y[0], y[1], y[2])
     u, v, w = y[3], y[4], y[5]

@@ -36,10 +36,7 @@ class Rate(NamedTuple):
         return sympy.Add(*self.terms)
 
     def at(self, point: Mapping[Any, Any]) -> tuple[Any, Any] | None:
-        """Return the sums of the terms and of their absolute values at a point.
-
-        The result is a pair of numbers, or None if a term is not finite or not real.
-        """
+        """Return the sums of the terms and their absolute values at a point; None if a term is not finite and real."""
         known = {item: value.evalf(DIGITS) for item, value in point.items()}
         values = [_value(term, known) for term in self.terms]
         if any(value is None for value in values):
@@ -52,22 +49,10 @@ def how_kept(
 ) -> str:
     """Return how a quantity was shown to be conserved, such as "symbolically" or "numerically, at 8 points".
 
-    Parameters
-    ----------
-    name : str
-    quantity : sympy.Expr
-    variables, rates : sequence of sympy.Expr
-        The components of the state, and their derivatives in time.
-    parameters : mapping
-        Values by symbols.
-
-    Raises
-    ------
-    NotKeptError
-        If the quantity is not conserved. The message names a point and the rate there.
-    ValueError
-        If the rate is not finite at any point that was tried, or cannot be examined in all branches of functions such
-        as max.
+    `variables` and `rates` are the components of the state and their derivatives, and `parameters` are values by
+    symbols. NotKeptError, which names a point and the rate there, is raised if the quantity is not conserved.
+    ValueError is raised if the rate is not finite at any point, or cannot be examined in all branches of functions such
+    as max.
     """
     time = sympy.Symbol("t", real=True)
     terms = [sympy.diff(quantity, variable) * f for variable, f in zip(variables, rates, strict=True)]
@@ -108,8 +93,8 @@ def _require_kept(name: str, rate: Rate, points: Sequence[Any]) -> None:
 def _value(expression: Any, known: dict[Any, Any]) -> Any:
     """Return the value of an expression, computed from its parts; None if a part is not finite and real.
 
-    `known` holds the values of the symbols, and the values of the parts are added to it. SymPy's own evaluation has no
-    bound for the size of a part: a tower of exponentials would need more digits than there is memory.
+    `known` holds the values of symbols and parts. SymPy's own evaluation has no bound for the size of a part: a tower
+    of exponentials would need more digits than there is memory.
     """
     if expression not in known:
         known[expression] = None
@@ -143,10 +128,7 @@ def _simplifies_to_zero(expression: Any) -> bool:
 
 
 def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]) -> Iterator[tuple[Any, Any]]:
-    """Yield random points at which the rate is finite and real, each with the result of ``rate.at``.
-
-    If there are too few such points, for example because of roots or logarithms, points with positive values are drawn.
-    """
+    """Yield random points where the rate is finite and real, with ``rate.at``; in the second half they are positive."""
     draw = random.Random(20220)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}
     found = 0
@@ -163,10 +145,7 @@ def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float
 def _beside_switches(
     expressions: Sequence[Any], variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield points on both sides of each place at which a max, min, abs or the like in `expressions` changes branch.
-
-    Points are yielded with the result of ``rate.at``, if the rate is finite and real there.
-    """
+    """Yield points on both sides of each place at which a max, min, abs or the like changes, with ``rate.at``."""
     switches = Switches(expressions, variables)
     draw = random.Random(20221)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}

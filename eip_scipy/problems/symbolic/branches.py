@@ -18,13 +18,7 @@ BISECTIONS = 40  # after them the relative distance is 1e-11
 
 
 class Switches:
-    """The differences whose signs choose the branches of some expressions.
-
-    Parameters
-    ----------
-    expressions : sequence of sympy.Expr
-    variables : sequence of sympy.Symbol
-    """
+    """The differences of `variables` whose signs choose the branches of some expressions."""
 
     def __init__(self, expressions: Iterable[Any], variables: Sequence[Any]) -> None:
         atoms = sorted({atom for item in expressions for atom in item.atoms(*KINDS)}, key=str)
@@ -38,17 +32,8 @@ class Switches:
     def points(self, draw: Callable[[], dict[Any, Any]], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
         """Return points on both sides of all places at which a function changes its branch.
 
-        Parameters
-        ----------
-        draw : callable
-            ``draw()``: a random point.
-        at : callable
-            ``at(expression, point)``: the value of the expression at the point, None if it is not finite and real.
-
-        Raises
-        ------
-        ValueError
-            If there are too many branches, or one of them is not found; the message names the function.
+        ``draw()`` returns a random point, and ``at(expression, point)`` a value, None if it is not finite and real. A
+        ValueError is raised if there are too many branches, or one of them is not found.
         """
         if len(self._differences) > MOST:
             raise ValueError(f"its functions change branches at {len(self._differences)} places, more than {MOST}")
@@ -62,10 +47,7 @@ class Switches:
         return found
 
     def _sides(self, difference: Any, point: dict[Any, Any], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
-        """Return two points at which `difference` has opposite signs; [] if none are found.
-
-        Both points lie on a line through `point` along one of the variables. `at` is the argument of `points`.
-        """
+        """Return two points on a line through `point` on an axis at which `difference` has opposite signs, or []."""
         for variable in sorted(difference.free_symbols & set(self._variables), key=str):
             places = [sign * sympy.Integer(2) ** power for sign in (-1, 1) for power in POWERS]
             places = [sympy.Integer(0), point[variable], *places]

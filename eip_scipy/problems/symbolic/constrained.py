@@ -25,21 +25,9 @@ BRANCHES = (sympy.Piecewise, sympy.Abs, sympy.sign, sympy.Heaviside, sympy.Max, 
 class Constrained(NamedTuple):
     """A system with the state (q, u): q' = `rates`, M u' + G^T lambda = F, and its constraints, all in real symbols.
 
-    Equal systems share their compiled functions.
-
-    Attributes
-    ----------
-    coordinates, speeds, parameters : tuple of str
-    rates : tuple of expressions
-        The derivatives of the coordinates, linear in the speeds.
-    mass : tuple of expressions
-        M by rows.
-    forces : tuple of expressions
-    positions, velocities : tuple of expressions
-        Expressions that the constraints set to 0: constraints on positions, and all constraints on velocities, which
-        are linear in the speeds and include the derivatives of `positions`.
-    inputs : tuple of (str, callable)
-        Names of quantities in the forces that are computed by functions ``f(t, y)``, with these functions.
+    Equal systems share their compiled functions. `mass` is M by rows, and `rates` are linear in the speeds. `positions`
+    and `velocities` are the expressions that constraints set to 0; the latter are linear in the speeds and include the
+    derivatives of `positions`. `inputs` are names of quantities in the forces that functions ``f(t, y)`` compute.
     """
 
     coordinates: tuple[str, ...]
@@ -94,15 +82,10 @@ def own_speed(system: Constrained, k: int) -> list[Any]:
 def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) -> list[int]:
     """Return the indices of coordinates whose momenta may be constant, because masses and forces do not depend on them.
 
-    A coordinate is left out if exactly one speed depends on its rate and a constraint contains this speed, or if the
-    force along the coordinate has branches or comes from a function, because such a force may be 0 only near the start.
-
-    Parameters
-    ----------
-    system : Constrained
-    speeds_by_rate : callable
-        ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds with respect to the rate of coordinate k, or []
-        if they are not known; coordinate k is then left out.
+    ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds with respect to the rate of coordinate k, or [] if
+    they are not known; the coordinate is then left out. A coordinate is also left out if exactly one speed depends on
+    its rate and a constraint contains this speed, or if the force along it has branches or comes from a function,
+    because such a force may be 0 only near the start.
     """
     known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
     inputs = {symbol(name) for name, _ in system.inputs}
@@ -150,15 +133,8 @@ def parts_of(
 ) -> Parts:
     """Return the compiled functions of a system as `Parts`.
 
-    Parameters
-    ----------
-    system : Constrained
-    energies : sequence of (str, expression, expression or None)
-        Descriptions of quantities that may be constant, their expressions, and their rates if these are given.
-    momenta : sequence of (str, expression)
-        Names of further quantities that may be constant, and their expressions.
-    outputs : sequence of (str, expression)
-        Names of quantities that are computed at saved states, and their expressions, which may contain accelerations.
+    `energies` are descriptions and expressions of quantities that may be constant, and their rates or None. `momenta`
+    and `outputs` are names and expressions; the latter may contain accelerations.
     """
     found = tuple(
         Energy(label, *energy_functions(item, system), None if rate is None else rate_function(rate, system))
@@ -176,11 +152,7 @@ def parts_of(
 
 @lru_cache(maxsize=64)
 def matrices(system: Constrained) -> Callable[..., None]:
-    """Return the argument `fill` of `motion`: ``fill(t, y, out, *params)`` writes M, F, G, gamma and q' to `out`.
-
-    The rows of G are the derivatives of `velocities` with respect to the speeds, and gamma are the rates of change of
-    `velocities` for u' = 0. The constraints are therefore met if G u' = -gamma.
-    """
+    """Return `fill` of `motion`, which writes M, F, G, gamma and q'; G u' = -gamma keeps the constraints."""
     speeds = system.variables[len(system.coordinates) :]
     gradients = [sympy.diff(item, u) if item.has(u) else sympy.Integer(0) for item in system.velocities for u in speeds]
     gammas = map(system.rate, system.velocities)
@@ -201,8 +173,8 @@ def _with_inputs(
 ) -> Callable[..., None]:
     """Return ``fill(t, y, out, *params)``, where y holds the state and further values that are named in `behind`.
 
-    `made` receives the names of all these values and returns a function of them. `fill` calls the functions of the
-    inputs, appends their values to y, and calls that function.
+    `fill` appends the values of the inputs to y, and calls the function that `made` returns for the names of all
+    values.
     """
     names = (*system.coordinates, *system.speeds, *behind, *(name for name, _ in system.inputs))
     fill = made(Arguments(names, system.parameters))
@@ -252,10 +224,7 @@ def rate_function(rate: Any, system: Constrained) -> Callable[..., float]:
 
 
 def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Callable[..., None]:
-    """Return ``fill(t, y, out, *params)``, which fills `out` with the values of expressions.
-
-    Expressions that are 0 are not compiled. `what` describes the values in tracebacks and errors.
-    """
+    """Return ``fill(t, y, out, *params)``, which fills `out`; expressions that are 0 are not compiled."""
     found = {k: item for k, item in enumerate(expressions) if item != 0}
     return function(what, list(found.values()), arguments, in_place=True, places=list(found))
 

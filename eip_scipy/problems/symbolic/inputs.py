@@ -24,11 +24,7 @@ AGREES = 1e-9
 
 
 class Inputs(NamedTuple):
-    """Values of functions of time.
-
-    `expressions` maps functions of time to expressions. `called` are pairs of a name and a function ``f(t, y)`` that
-    returns a number, for values that are not converted to expressions. `notes` are lines about these for the repr.
-    """
+    """Values of functions of time as `expressions`, or as `called` functions ``f(t, y)`` by name, and `notes`."""
 
     expressions: dict[Any, Any]
     called: tuple[tuple[str, Callable[..., float]], ...]
@@ -40,22 +36,9 @@ def read_inputs(
 ) -> Inputs:
     """Return the inputs, converted into expressions where that is possible.
 
-    Parameters
-    ----------
-    given : mapping
-        The keys are functions of time, their names, or tuples of these. The values are numbers, expressions, or
-        functions ``f(t, y)`` that return one number for each function in the key.
-    known : mapping
-        The functions of time in the model by name.
-    state : mapping
-        The names of coordinates and speeds, in the order of the state.
-    start : (float, ndarray)
-        A time and a state at which functions are called.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If a key is not an input, or a value has the wrong type or size.
+    `given` are those of `mechanics`. `known` are the functions of time in the model by name, `state` the names of
+    coordinates and speeds in the order of the state, and `start` a time and a state at which functions are called. A
+    ValueError or TypeError is raised if a key is not an input, or a value has the wrong type or size.
     """
     if not isinstance(given, Mapping):
         raise TypeError(
@@ -121,10 +104,7 @@ def _traced(
 
 
 def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
-    """Return for each of `keys`, functions of time, its name and a function ``f(t, y)`` that returns one number.
-
-    The number is that component of the value of `fun`, which is called because it cannot be converted to expressions.
-    """
+    """Return for each function of time in `keys` its name, and a function ``f(t, y)`` of this component of `fun`."""
     from .models import name_of
 
     if len(keys) == 1:

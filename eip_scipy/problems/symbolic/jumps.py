@@ -14,8 +14,8 @@ __all__ = ["slope"]
 def slope(expression: Any, variable: Any) -> Any:
     """Return the derivative of an expression, without impulses at places where the expression does not jump.
 
-    SymPy's derivative of q**2 sign(q) contains q**2 DiracDelta(q), which is 0. An impulse that remains in the result
-    belongs to a jump, or to a function of several branches at one place that was not understood.
+    SymPy's derivative of q**2 sign(q) contains q**2 DiracDelta(q), which is 0. An impulse that remains belongs to a
+    jump, or to a function of several branches at one place that was not understood.
     """
     found = sympy.diff(expression, variable)
     for impulse in sorted(found.atoms(sympy.DiracDelta), key=str):

@@ -23,21 +23,9 @@ BEYOND = (ValueError, ZeroDivisionError, OverflowError)  # errors of functions o
 
 
 class Manifold:
-    """The states that meet constraints.
+    """The states at which `constraints`, expressions by name, are 0; `rates` are the derivatives of the `components`.
 
-    Parameters
-    ----------
-    constraints : mapping of str to sympy.Expr
-        Expressions that are 0, by name.
-    components : sequence of str
-    rates : sequence of sympy.Expr
-        The derivatives of the components in time.
-    parameters : mapping of str to float
-
-    Raises
-    ------
-    ValueError
-        If no state is found that meets the constraints.
+    A ValueError is raised if no state is found that meets the constraints.
     """
 
     def __init__(
@@ -66,10 +54,7 @@ class Manifold:
     def how_kept(self, name: str, quantity: Any) -> str:
         """Return how a quantity was shown to be conserved, as text such as "numerically, at 8 points ...".
 
-        Raises
-        ------
-        ValueError
-            If the quantity is not conserved, or its rate is not finite at any of the points.
+        A ValueError is raised if the quantity is not conserved, or its rate is not finite at any of the points.
         """
         terms = [sympy.diff(quantity, y) * f for y, f in zip(self._variables, self._rates, strict=True)]
         terms = [item for item in [*terms, sympy.diff(quantity, sympy.Symbol("t", real=True))] if item != 0]
@@ -100,10 +85,7 @@ class Manifold:
         )
 
     def _function(self, what: str, items: Sequence[Any]) -> Callable[[float, np.ndarray], np.ndarray | None]:
-        """Return a function of (t, y) that returns the values of the expressions `items`, or None if one is not finite.
-
-        `what` describes the values, for tracebacks and errors.
-        """
+        """Return a function of (t, y) that returns the values of expressions, or None if one of them is not finite."""
         places = {k: item for k, item in enumerate(items) if item != 0}
         fill = plain(function(what, list(places.values()), self._arguments, in_place=True, places=list(places)))
 

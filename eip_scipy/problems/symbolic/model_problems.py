@@ -93,10 +93,7 @@ def _swapped(function: Any) -> Any:
 
 
 def _by_name(given: Any, names: tuple[str, ...]) -> Any:
-    """Return the mapping `given` with the names of its keys as keys; return an array unchanged.
-
-    Keys that are not in `names` are left out, unless this would leave nothing.
-    """
+    """Return a mapping with names as keys, those in `names` or, if there are none, all; return an array unchanged."""
     if not isinstance(given, Mapping):
         return given
     found = {name_of(key): value for key, value in given.items()}

@@ -53,12 +53,10 @@ class Model(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """A model's equations in its own symbols.
+    """A model's equations in its own symbols: q' = `rates` and `mass` u' = `forces` plus the forces of the constraints.
 
-    The motion follows from q' = `rates` and `mass` u' = `forces` plus the forces of the constraints, where q are the
-    `coordinates` and u the `speeds`. `positions` and `velocities` are the expressions that the constraints on positions
-    and on velocities set to 0. `energies` are pairs (description, expression), and `independent` is None if the model
-    has no dependent coordinates or speeds, as in `Model`.
+    `positions` and `velocities` are the expressions that the constraints set to 0. `energies` are pairs (description,
+    expression), and `independent` is None if the model has no dependent coordinates or speeds.
     """
 
     coordinates: list[Any]
@@ -154,10 +152,7 @@ class Start(NamedTuple):
 
 
 class _Conversion:
-    """Converter of expressions from a model's functions of time and symbols to the real symbols of this package.
-
-    `found` are the model's equations; `inputs` and `start` are those of `read`.
-    """
+    """Converter of expressions from a model's functions of time and symbols to the real symbols of this package."""
 
     def __init__(self, found: _Equations, inputs: Any, start: Start) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
@@ -227,10 +222,9 @@ def _functions_of_time(found: _Equations) -> dict[str, Any]:
 
 
 def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, float]) -> Constrained:
-    """Return the equations as a `Constrained` without parameters.
+    """Return the equations as a `Constrained` whose parameters are not known yet, as outputs may have further ones.
 
-    The names of the parameters are known once all expressions, also those of outputs, are converted. A ValueError is
-    raised if a constraint or the kinematics depend on an input that is called as a function.
+    A ValueError is raised if a constraint or the kinematics depend on an input that is called as a function.
     """
     names = converted.names
     system = Constrained(
@@ -257,8 +251,7 @@ def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, 
 def _energies(found: _Equations, energy: Any, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
     """Yield the quantities that may be the energy.
 
-    If `energy` is None and inputs are called as functions, there are none, because such a force may begin to do work
-    after the times that are examined.
+    There are none if inputs are called as functions, because such a force may begin to do work later.
     """
     if energy is not None:
         if converted.depends_on_call(given := converted(energy)):
@@ -295,10 +288,7 @@ def _momenta(found: _Equations, system: Constrained, converted: _Conversion) -> 
 
 
 def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
-    """Return the derivatives of a KanesMethod's speeds with respect to the rate of the k-th coordinate, or [].
-
-    The result is [] if the numbers of coordinates and speeds differ.
-    """
+    """Return the derivatives of a KanesMethod's speeds by the rate of coordinate k; [] if their numbers differ."""
     by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
     if by_speeds.rows != by_speeds.cols:
         return []
@@ -411,10 +401,7 @@ def _is_constant(load: Any, frame: Any) -> bool:
 
 
 def _potential_of_loads(loads: Iterable[Any], frame: Any, state: set[Any]) -> Any:
-    """Return the potential of the forces that are constant in the inertial frame; None if a position is unknown.
-
-    Other loads are ignored.
-    """
+    """Return the potential of the forces that are constant in the inertial frame; None if a position is unknown."""
     total = sympy.Integer(0)
     for place, vector in loads:
         if not _is_constant((place, vector), frame):
@@ -451,11 +438,7 @@ def _require_distinct(names: Mapping[Any, str]) -> None:
 
 
 def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the names of the parameters that occur in the equations or in `others`, in the order of `values`.
-
-    `others` are expressions of energies, momenta and outputs, and `values` maps names to values. A ValueError is raised
-    if a parameter has no value.
-    """
+    """Return the parameters in the equations or in `others`, in the order of `values`; all must have a value."""
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
     known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
     known |= {symbol(name) for name, _ in system.inputs}
@@ -474,9 +457,9 @@ def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str,
 def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -> tuple[Constrained, list[str]]:
     """Add the derivatives of constraints on positions that do not follow from the constraints on velocities.
 
-    KanesMethod ignores a configuration constraint without its velocity constraint. The result is the system, and the
-    names g1, g2, ... of the constraints on positions whose derivatives were added. Dependence is tested at random
-    states with the `values` of the parameters.
+    KanesMethod ignores a configuration constraint without its velocity constraint. Return the system and the names of
+    the constraints whose derivatives were added. Dependence is tested at random states with the `values` of the
+    parameters.
     """
     if not system.positions:
         return system, []

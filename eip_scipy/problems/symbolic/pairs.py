@@ -14,14 +14,9 @@ KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
 def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the coordinates and, in the same order, the momenta for the names in a Hamiltonian.
 
-    A coordinate on which the Hamiltonian does not depend may be missing from `names`.
-
-    Pairs are x and px, q1 and p1, theta and p_theta or ptheta; p belongs to the one remaining coordinate, or to q.
-
-    Raises
-    ------
-    ValueError
-        If a name has no partner.
+    A coordinate on which the Hamiltonian does not depend may be missing from `names`. Pairs are x and px, q1 and p1,
+    theta and p_theta or ptheta; p belongs to the one remaining coordinate, or to q. A ValueError is raised if a name
+    has no partner.
     """
     free = set(names)
     pairs = []
@@ -40,10 +35,7 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
-    """Return the error message for the names `left`, which have no partner, or for an H without names.
-
-    `pairs` are the pairs (coordinate, momentum) that were found; the message lists them.
-    """
+    """Return the error message for the names `left`, which have no partner, or for an H without names."""
     rule = "Names are paired as x with px, q1 with p1, theta with p_theta; others by hamiltonian(H, 'a b', 'pa pb')."
     if not left:
         return f"hamiltonian: H contains neither coordinates nor momenta. {rule}"
@@ -58,10 +50,7 @@ def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
 
 
 def _coordinate(momentum: str, free: set[str]) -> str | None:
-    """Return the name of the coordinate to which `momentum` belongs; None if it is not the name of a momentum.
-
-    `free` are the names in H. The coordinate need not be one of them, because H may not depend on it.
-    """
+    """Return the coordinate, perhaps not in H, to which `momentum` belongs; None if it is not a momentum."""
     if not momentum.startswith("p") or momentum == "p":
         return None
     rest = momentum[1:].removeprefix("_")
@@ -72,11 +61,7 @@ def _coordinate(momentum: str, free: set[str]) -> str | None:
 
 
 def _partner_of_p(others: list[str]) -> str | None:
-    """Return the coordinate of p among the remaining names `others`; None if it is not clear.
-
-    The coordinate is q if q is among the names or there are none, otherwise the only usual name of a coordinate, or the
-    only name.
-    """
+    """Return q, the only usual name of a coordinate, or the only name among `others`; None if that is not clear."""
     if "q" in others or not others:
         return "q"
     likely = [name for name in others if name in KNOWN] or others

@@ -55,12 +55,7 @@ def symbol(name: str) -> sympy.Symbol:
 def as_names(what: str, names: Any) -> tuple[str, ...]:
     """Return the names in "x y", "x, y", or a sequence of strings, SymPy symbols and dynamicsymbols.
 
-    `what` describes the names in messages.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an item is not a name, is t, or occurs twice.
+    An error that begins with `what` is raised if an item is not a name, is t, or occurs twice.
     """
     items = names.replace(",", " ").split() if isinstance(names, str) else _items(what, names)
     found = tuple(_name(what, item) for item in items)
@@ -75,12 +70,8 @@ def as_names(what: str, names: Any) -> tuple[str, ...]:
 def as_expression(what: str, given: Any, declared: Iterable[str] = ()) -> sympy.Expr:
     """Return a SymPy expression in real symbols from text, a number or a SymPy expression.
 
-    A name in `declared`, such as a component of the state or a parameter, is neither a constant nor a function.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `given` is not such an expression. The message begins with `what`.
+    A name in `declared`, such as a component of the state or a parameter, is neither a constant nor a function. An
+    error that begins with `what` is raised if `given` is not such an expression.
     """
     if isinstance(given, str):
         found = Reader(what, given, declared).read()
@@ -144,10 +135,7 @@ def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
 
 
 class Reader:
-    """Converter of one text to a SymPy expression; `what` describes the expression in messages.
-
-    Names in `declared` are neither constants nor functions, as for `as_expression`.
-    """
+    """Converter of one text to a SymPy expression; names in `declared` are neither constants nor functions."""
 
     def __init__(self, what: str, text: str, declared: Iterable[str] = ()) -> None:
         self.what, self.text = what, " ".join(text.split())  # the text may have several lines
@@ -234,11 +222,7 @@ class Reader:
         raise self._refuse(node, "is not allowed")
 
     def _chain(self, node: ast.expr, pair: tuple[type, type], inverse: Any, depth: int) -> list[sympy.Expr]:
-        """Return the operands of a chain such as a + b - c or a * b / c, whose nodes are nested to the left.
-
-        `pair` holds the types of the two operators. Operands after the second one, - or /, are replaced by their
-        `inverse`. `depth` is the depth of nesting of `node` in the whole text.
-        """
+        """Return the operands of a chain such as a + b - c, nested left; `inverse` is applied after ``pair[1]``."""
         found = []
         while isinstance(node, ast.BinOp) and isinstance(node.op, pair):
             item = self._expression(node.right, depth + 1)

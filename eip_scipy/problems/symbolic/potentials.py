@@ -28,14 +28,8 @@ def at_rest(forces: Sequence[Any], speeds: Sequence[Any], others: set[Any]) -> l
 def potential_of(forces: Sequence[Any], coordinates: Sequence[Any]) -> Any:
     """Return V with forces = -dV/dq if the forces are conservative, None if no such expression is found.
 
-    V may be wrong if the forces are not conservative, so that the caller must check whether the energy that contains V
-    is conserved.
-
-    Parameters
-    ----------
-    forces : sequence of sympy.Expr
-        The generalised forces of the coordinates, without speeds.
-    coordinates : sequence of sympy.Symbol
+    V may be wrong if the forces, which contain no speeds, are not conservative: the caller must check whether the
+    energy that contains V is conserved.
     """
     if sum(item.count_ops() for item in forces) > MOST_OPERATIONS:
         return None
@@ -72,11 +66,9 @@ def _of_lengths(forces: Sequence[Any], coordinates: Sequence[Any]) -> tuple[Any,
 
 
 def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) -> Any:
-    """Return the potential: minus the integral of the forces along a path, or None if it is not found.
+    """Return minus the integral of the forces along a path, None if SymPy cannot integrate it quickly.
 
-    The path starts at the point whose coordinates are all `base` and moves along one coordinate at a time, along the
-    last one first. The result is None if SymPy cannot integrate a term quickly, or if the integral is not finite and
-    real.
+    The path starts at the point whose coordinates are all `base` and moves along one at a time, the last one first.
     """
     potential = sympy.Integer(0)
     for k, (force, q) in enumerate(zip(forces, coordinates, strict=True)):

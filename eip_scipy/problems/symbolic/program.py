@@ -84,22 +84,10 @@ def function(
 ) -> Callable[..., Any]:
     """Return a function of ``(t, y[, dy][, out][, params])``, jitted if Numba is installed.
 
-    Parameters
-    ----------
-    what : str
-        Description of the values, for tracebacks and errors.
-    expressions : sequence of sympy.Expr
-        The values that the function writes to `out`, or the one number that it returns.
-    arguments : Arguments
-    in_place : bool
-        Whether the function fills `out`.
-    places : sequence of int or of tuples of int, optional
-        The places of the expressions in `out`; the other entries become 0. Default: 0, 1, ...
-
-    Raises
-    ------
-    ValueError
-        If an expression contains a function that is not supported.
+    It fills `out` with the values of the expressions if `in_place`, otherwise it returns the value of the only one.
+    `places` are the places of the expressions in `out`, indices or tuples of them, by default 0, 1, ...; the other
+    entries become 0. `what` describes the values in tracebacks and errors. A ValueError is raised if an expression
+    contains a function that is not supported.
     """
     return _fastest(_compiled(what, _statements(what, expressions, arguments, in_place, places), arguments, in_place))
 
@@ -114,25 +102,9 @@ def variational(
     """Return a function of ``(t, Y, out[, params])`` that fills `out` with dY/dt.
 
     Y is the state, n numbers, followed by columns of derivatives, n numbers each. The rates of the state agree bit by
-    bit with those of ``function(what, rates, ...)``, because their statements come first. The statements for the
-    columns use intermediate results of the rates.
-
-    Parameters
-    ----------
-    what : str
-        Description of the values, for tracebacks and errors.
-    rates : sequence of sympy.Expr, of length n
-    jacobian : mapping of (int, int) to sympy.Expr
-        The nonzero derivatives of the rates by the components, by row and column.
-    by_parameters : sequence of mappings of int to sympy.Expr
-        One mapping for each of the last columns, which are derivatives with respect to a parameter: the nonzero
-        derivatives of the rates by this parameter, by row.
-    arguments : Arguments
-
-    Raises
-    ------
-    ValueError
-        If an expression contains a function that is not supported.
+    bit with those of ``function(what, rates, ...)``, because their statements come first, and the columns use their
+    intermediate results. `jacobian` holds the nonzero derivatives of the rates by row and column. `by_parameters`
+    holds, for each of the last columns, the nonzero derivatives of the rates with respect to its parameter, by row.
     """
     n = len(rates)
     writer = Writer(what, arguments)
@@ -252,10 +224,7 @@ def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
 
 
 def _checks_of_columns(n: int, columns: int) -> Iterable[ast.stmt]:
-    """Yield statements that check that `y` holds the state, n numbers, and at least `columns` columns of n numbers.
-
-    They also check that `out` is as long as `y`.
-    """
+    """Yield checks that `y` holds the state and `columns` or more columns, n numbers each, and `out` has its size."""
     rest = ast.BinOp(left=_size("y"), op=ast.Mod(), right=ast.Constant(value=n))
     few = ast.Compare(left=_size("y"), ops=[ast.Lt()], comparators=[ast.Constant(value=n * (columns + 1))])
     text = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {columns} columns"
@@ -276,10 +245,7 @@ def _set(target: ast.expr, value: ast.expr) -> ast.stmt:
 
 
 class Writer:
-    """Writer of statements that compute expressions; the same operation on the same values is written once.
-
-    `what` describes the values in errors. The statements are appended to `body`.
-    """
+    """Writer of statements that compute expressions, appended to `body`; the same operation is written once."""
 
     def __init__(self, what: str, arguments: Arguments) -> None:
         self.what = what
@@ -289,10 +255,7 @@ class Writer:
         self._places = arguments.places
 
     def values(self, expressions: Sequence[Any]) -> list[ast.expr]:
-        """Write statements that compute expressions; return for each the variable or constant that holds its value.
-
-        Common subexpressions are computed once.
-        """
+        """Write statements that compute expressions; return the variables or constants that hold their values."""
         written = [with_powers_of_roots(item) for item in expressions]
         common, reduced = sympy.cse(written, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
         for name, expression in common:
@@ -426,10 +389,7 @@ class Writer:
         raise self._unknown(expression)
 
     def _cases(self, expression: Any) -> ast.expr:
-        """Write the statements of a Piecewise expression, and return the variable or constant that holds its value.
-
-        This is the first value whose condition holds, NaN if none holds. All values are computed.
-        """
+        """Return the first value of a Piecewise whose condition holds, NaN if none holds; all values are computed."""
         chosen: ast.expr = ast.Constant(value=math.nan)
         for value, condition in reversed(expression.args):
             found = self.value(value)
@@ -453,10 +413,7 @@ class Writer:
         raise self._unknown(condition)
 
     def _by_sign(self, value: ast.expr, below: float, at_zero: float) -> ast.expr:
-        """Write a choice by the sign of a value, and return its variable.
-
-        The choice is 1 if the value is positive, `below` if it is negative, and `at_zero` if it is 0 or NaN.
-        """
+        """Return 1 if the value is positive, `below` if it is negative, and `at_zero` if it is 0 or NaN."""
 
         def choice(test: ast.cmpop, yes: float, no: ast.expr) -> ast.expr:
             compared = ast.Compare(left=value, ops=[test], comparators=[ast.Constant(value=0.0)])

@@ -83,8 +83,7 @@ def require_power(base: Any, exponent: Any) -> None:
 def require_function(name: str, arguments: Iterable[Any], compared: int) -> int:
     """Raise TooLargeError if SymPy would compare or expand too much to build the function.
 
-    `compared` is the number of values that the max and min before this function in the same text compare. Return the
-    number that includes those of this function.
+    Return the number of values that max and min compare in the text, `compared` before this function.
     """
     if name in ("max", "min"):
         kind = sympy.Max if name == "max" else sympy.Min

@@ -37,9 +37,8 @@ LARGEST_JACOBIAN = 16  # number of coordinates; the Jacobian has its square of e
 class System(NamedTuple):
     """Equations and their invariants and balances as expressions. Equal systems share their compiled functions.
 
-    `rates` are the time derivatives of `components`. `invariants` holds pairs (name, expression). `balances` holds
-    triples (name, expression, rate) of quantities that are not conserved but change at a known rate. `constraints` are
-    the names of the invariants that are 0.
+    `invariants` holds pairs (name, expression), `balances` triples (name, expression, rate), and `constraints` the
+    names of the invariants that are 0.
     """
 
     components: tuple[str, ...]
@@ -66,11 +65,10 @@ class System(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Functions made from a `System`.
+    """Functions made from a `System`; gradients fill an array, and `acc` and `jacobian` are None if there are none.
 
-    `rhs` fills an array with the derivative of the state. `acc` returns the accelerations, and `jacobian` is their
-    Jacobian times a vector; each is None if there is none. `invariants` holds (value, gradient) for each invariant, and
-    `balances` holds (value, gradient, rate) for each balance. Gradients fill an array.
+    `jacobian` is the Jacobian of the accelerations times a vector. `invariants` holds (value, gradient) for each, and
+    `balances` (value, gradient, rate).
     """
 
     rhs: Callable[..., None]
@@ -240,10 +238,7 @@ def hamiltonian_problem(
 
 
 class Further(NamedTuple):
-    """Arguments of `hamiltonian` and `equations`: mappings of names to expressions, or None.
-
-    `invariants` are conserved, and `constraints` are 0.
-    """
+    """Arguments of `hamiltonian` and `equations`: expressions by name that are conserved, and that are 0, or None."""
 
     invariants: Any
     constraints: Any = None
@@ -280,22 +275,10 @@ def _with_perturbation(
 ) -> tuple[tuple[Any, ...], tuple[tuple[str, Any, Any], ...]]:
     """Return the derivatives of the perturbed system, and its balances (name, expression, rate).
 
-    Balances are quantities that the system of H alone conserves, with their rates of change due to the perturbation and
-    the dissipation.
-
-    Parameters
-    ----------
-    energy : sympy.Expr
-        H.
-    names, rates : sequence
-        Names of the components of the state, and their derivatives in the system of H alone.
-    values : mapping
-        Values of the parameters by name.
-    declared : set of str
-        Names that expressions may contain, next to `names`, without being read as constants or functions.
-    perturbed : Perturbed
-    flow : callable
-        ``flow(expression)`` returns the derivatives of the components that belong to this Hamiltonian.
+    Balances are quantities that the system of H alone (`energy`, with the derivatives `rates` of the components
+    `names`) conserves, with their rates of change due to the perturbation and the dissipation. ``flow(expression)``
+    returns the derivatives that belong to another Hamiltonian. Names in `declared` are not read as constants or
+    functions.
     """
     if energy.has(symbol("t")):
         raise ValueError(
@@ -349,8 +332,7 @@ def _timed(given: Any, timed: Timed) -> Any:
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
     """Return the names of the components, a function that returns (dH/dp, -dH/dq) of H, and the pairs of names.
 
-    If neither q nor p is given, the pairs are found from the names in `energy`, which is H, except those of the
-    parameters, the keys of `values`.
+    If neither q nor p is given, the pairs are found from the names in H that are not keys of `values`.
     """
     if q is None and p is None:
         q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
@@ -372,11 +354,7 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
 
 
 def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
-    """Return the names of the components, a function that returns B(y) grad H of H, and no pairs, as `_canonical`.
-
-    B is the matrix `poisson`. Names in `declared` are not read as constants or functions in its entries. `p` must be
-    None.
-    """
+    """Return the names of the components, a function that returns B(y) grad H for B = `poisson`, and no pairs."""
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= give the names of the whole state as q, and omit p.")
     names = as_names("q", y)
@@ -408,13 +386,11 @@ def _checked(
     pairs: Any,
     slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
-    """Return the problem after checks of the names and of the given invariants and constraints.
+    """Return the problem after checks of the names and of the `given` invariants and constraints.
 
-    `names` and `rates` are the components and their derivatives, and `values` maps the names of parameters to their
-    values. `kept` maps the names of invariants that are known already to their expressions, and `checks` maps them to
-    how they were shown to be conserved; the `given` ones are added to both. `pairs` are those of `SymbolicProblem`, and
-    `slow` holds the balances as in `System`. `what` is the user's argument that contains the equations, "H" or "f"; it
-    is named in messages.
+    `kept` maps the names of invariants that are known already to their expressions, and `checks` to how they were shown
+    to be conserved. `slow` holds the balances as in `System`. `what` is the user's argument with the equations, "H" or
+    "f".
     """
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
@@ -453,15 +429,9 @@ def _checked(
 
 
 def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> Any:
-    """Return the SymPy expression of `given`, an invariant or a constraint, after a check of its names.
+    """Return the expression of an invariant or a constraint, described by `what`, after a check of its names.
 
-    `what` describes it in messages, `names` are the components of the state, and `known` are all names that it may
-    contain.
-
-    Raises
-    ------
-    ValueError
-        If it contains an unknown name or does not depend on the state.
+    A ValueError is raised if it contains a name that is not `known`, or does not depend on the components `names`.
     """
     quantity = as_expression(what, given, known)
     _require_known(what, quantity, known)
@@ -473,12 +443,9 @@ def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> A
 def _how_kept(
     label: str, quantity: Any, names: Sequence[str], rates: Any, parameters: Any, manifold: Manifold | None, hint: str
 ) -> str:
-    """Return how a quantity was shown to be conserved, such as "symbolically", see `SymbolicProblem`.
+    """Return how a quantity was shown to be conserved at all states, or else at those of the `manifold`.
 
-    If it is not conserved at all states, it must be conserved at those that meet the constraints, otherwise ValueError
-    is raised. `label` is the name of the quantity, `names` and `rates` are the components and their derivatives, and
-    `parameters` maps the symbols of parameters to their values. `manifold` stands for the states that meet the
-    constraints; if it is None, there are no constraints, and `hint` is added to the message of the error.
+    Without constraints `hint` is added to the message of the error.
     """
     try:
         return how_kept(label, quantity, [symbol(item) for item in names], rates, parameters)
@@ -561,10 +528,9 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
 
 
 def _deferred_jacobian(system: System) -> Deferred | None:
-    """Return the function for the Jacobian of the accelerations times a vector, as a `Deferred` made when it is called.
+    """Return the Jacobian of the accelerations times a vector, which is made when it is called.
 
-    Return None if the system is not of the form q'' = a(t, q), has more than `LARGEST_JACOBIAN` accelerations, or has
-    accelerations that jump.
+    Return None if the system is not of the form q'' = a(t, q), is too large, or has accelerations that jump.
     """
     found = system.accelerations
     if found is None or len(found) > LARGEST_JACOBIAN:
@@ -586,10 +552,7 @@ def _jacobian(system: System) -> Callable[..., None]:
 
 
 def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
-    """Return the right-hand side of a state followed by columns of derivatives, see `Problem`.
-
-    `parameters` are the indices of the parameters with respect to which the last columns are derivatives.
-    """
+    """Return the equations of a state and of columns of derivatives, the last ones by `parameters` (indices)."""
     for k in parameters:
         if not 0 <= k < len(system.parameters):
             raise ValueError(

@@ -14,24 +14,11 @@ __all__ = ["Timed"]
 
 
 class Timed:
-    """Names of the components of a state, and their time derivatives; components may be SymPy functions of time.
+    """Names of the components of a state, and the `values` of their derivatives; components may be functions of time.
 
     A derivative that is a component itself, such as x' in the state (x, x'), is called ``v_x``. Any other derivative of
-    a component is replaced by its right-hand side. A call with an expression makes these replacements in it.
-
-    Parameters
-    ----------
-    f : sequence or mapping
-        Derivatives, as `equations` takes them.
-    y : sequence or str, optional
-        The components. Default: the keys of `f`.
-
-    Attributes
-    ----------
-    names : sequence of str
-        Names of the components.
-    values : list
-        Time derivatives of the components, in the order of `names`.
+    a component is replaced by its right-hand side; a call with an expression makes these replacements in it. `f` and
+    `y` are the arguments of `equations`.
     """
 
     def __init__(self, f: Any, y: Any) -> None:

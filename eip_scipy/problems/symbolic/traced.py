@@ -31,10 +31,7 @@ class NotTraceableError(TypeError):
 
 
 class Number:
-    """Expression that can take the place of a number in functions of NumPy and of math.
-
-    `size` counts symbols, constants and operations in the expression, which may have at most `MOST_OPERATIONS`.
-    """
+    """Expression in place of a number; `size` counts its operands and operations, at most `MOST_OPERATIONS`."""
 
     __slots__ = ("expression", "size")
 
@@ -120,17 +117,8 @@ def _number(value: Any) -> Number:
 def traced(what: str, fun: Any, *groups: Any) -> np.ndarray:
     """Return the value of the function `fun` as an array of expressions; `what` describes it in messages.
 
-    Parameters
-    ----------
-    what : str
-    fun : callable
-    groups
-        The arguments of the function: a name stands for a number, a sequence of names for an array.
-
-    Raises
-    ------
-    NotTraceableError
-        If the value of the function cannot be written as an expression of its arguments.
+    Each of `groups` stands for an argument: a name for a number, a sequence of names for an array. NotTraceableError is
+    raised if the value cannot be written as an expression of the arguments.
     """
     arguments = [
         Number(symbol(names)) if isinstance(names, str) else _array([Number(symbol(name)) for name in names])
@@ -188,8 +176,7 @@ for _name in dir(math):
 def _replaced(item: Any, known: dict[int, Any]) -> Any:
     """Return the replacement of a global or closure variable, or the variable itself if it needs none.
 
-    NumPy, math and their functions are replaced by those of `NUMPY` and `MATH`. A Python or Numba function is replaced
-    by a copy whose own variables are replaced. `known` holds the copies made so far, by the id of the function.
+    A Python or Numba function is replaced by a copy whose own variables are replaced; `known` holds the copies by id.
     """
     if item is np:
         return NUMPY

@@ -25,12 +25,7 @@ AGREES = 1e-9
 def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
     """Return the `Parts` of a mechanism, made from expressions for the functions that `mechanism` was given.
 
-    The expressions are compared with the functions at the start (t, q, u).
-
-    Raises
-    ------
-    NotTraceableError
-        If a function cannot be converted to an expression, or its expression has another value at the start.
+    NotTraceableError is raised if a function cannot be converted, or its expression has another value at the start.
     """
     by_name = {"t": ("t", t), "q": (names.coordinates, q), "u": (names.speeds, u)}
 
@@ -78,11 +73,7 @@ def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
 
 
 def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
-    """Return the name and the expression of each output of the mechanism.
-
-    The list is empty if an output cannot be converted, or if its expression has another value at the start. `by_name`
-    has, for "t", "q" and "u", a pair of the names of the components and their values at the start.
-    """
+    """Return the name and the expression of each output; [] if one cannot be converted, or differs at the start."""
     symbols, numbers = zip(*(by_name[letter] for letter in "tqu"), strict=True)
     names = Names(by_name["q"][0], by_name["u"][0], (), ())
     found = []
@@ -97,11 +88,7 @@ def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
 
 
 def _require_agreement(what: str, found: Any, value: Any, names: Names, numbers: Any) -> None:
-    """Raise NotTraceableError if the expressions `found` do not have the value of the function at the start.
-
-    `what` is the name of the function, `value` is its value, `names` are those of the components of (q, u), and
-    `numbers` are (t, q, u) at the start.
-    """
+    """Raise NotTraceableError if the expressions `found` do not have the `value` of the function at the start."""
     t, q, u = numbers
     values = {symbol("t"): t, **{symbol(k): x for k, x in zip(names.state, (*q, *u), strict=True)}}
     wanted = np.asarray(value, float).ravel()

@@ -176,9 +176,9 @@ def korteweg_de_vries_solitons(
 def _solitons(x: np.ndarray, length: float, k: np.ndarray, x0: np.ndarray, t: float) -> np.ndarray:
     """Return the field of the solitons at the points x and the time t, 2 (log F)_xx.
 
-    Each soliton has an entry in `k`, the square root of its speed, and in `x0`. F is the sum over all sets of solitons
-    of the exponential of the sum of k (x - x0 - k^2 t) over the set and of the shifts of its pairs. With the terms of F
-    as weights the field is twice the variance of the sum of k over a set.
+    `k` are the square roots of the speeds. F is the sum over all sets of solitons of the exponential of the sum of k (x
+    - x0 - k^2 t) over the set and of the shifts of its pairs. With the terms of F as weights the field is twice the
+    variance of the sum of k over a set.
     """
     centre = np.mean(x0) + np.mean(k**2) * t
     place = _around(x - centre, length) + centre
