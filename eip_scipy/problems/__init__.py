@@ -26,9 +26,8 @@ from .gross_pitaevskii import (
     rotating_packet,
     soliton,
 )
-from .harmonic import harmonic
 from .invariant_search import find_invariants
-from .kepler import kepler
+from .kepler import harmonic, kepler
 from .multibody import MechanicsProblem, mechanism
 from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField

@@ -18,8 +18,7 @@ from ...engine.native import library
 from . import forces as _forces
 from .bodies import body_names, default_units, in_units
 from .forces import ForceConstants
-from .frequencies import orbital_frequencies
-from .orbits import balances_beside_frame
+from .orbits import balances_beside_frame, orbital_frequencies
 
 __all__ = ["component_names", "nbody"]
 

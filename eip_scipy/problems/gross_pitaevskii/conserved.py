@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .moments import Moments, expansion, shifted
-from .pointwise import turn
+from .pointwise import Moments, expansion, shifted, turn
 
 if TYPE_CHECKING:
     from .equation import GrossPitaevskii

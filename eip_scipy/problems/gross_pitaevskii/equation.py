@@ -15,8 +15,7 @@ from ...core.problem import Problem
 from ..named_invariants import named_invariant
 from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
-from .moments import Moments, moments, total_mass
-from .pointwise import add_potential, derivative, derivative_at_once
+from .pointwise import Moments, add_potential, derivative, derivative_at_once, moments, total_mass
 from .splitting import Splitting
 from .transforms import Axes, make_transforms
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .equation import FieldProblem, GrossPitaevskii
-from .flows import LinearFlow
+from .splitting import LinearFlow
 
 __all__ = ["at_rest", "rotated"]
 

@@ -8,19 +8,26 @@ Other Python threads run meanwhile if a field is large.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from ...engine.native import BUILD
 
 __all__ = [
+    "Moments",
     "add_potential",
     "derivative",
     "derivative_at_once",
     "divide_by_root",
+    "expansion",
     "inner",
     "interaction_energy",
     "local_flow",
+    "moments",
     "multiply",
     "quartic_sums",
     "rotate",
+    "shifted",
+    "total_mass",
     "turn",
     "weighted_square",
 ]
@@ -51,3 +58,31 @@ turn = _native.turn
 """``turn(f, factor, out)``: out = i factor f."""
 weighted_square = _native.weighted_square
 """``weighted_square(field, weight)``: the sum of ``weight |field|^2``, weights as factors of `multiply`."""
+moments = _native.moments
+"""``moments(psi, f)``: return the sums that `Moments` has for a field and its time derivative f = -i H psi."""
+total_mass = _native.total_mass
+"""``total_mass(psi)``: return the sum of ``|psi|^2``."""
+expansion = _native.expansion
+"""``expansion(psi, near, f)``: return the sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near."""
+shifted = _native.shifted
+"""``shifted(psi, f, a, b, out)``: fill out = psi + a psi + b i f.
+
+Returns the sums of ``|out|^2``, and of ``|d|^2`` and Re(conj(i f) d) for the difference d from psi.
+"""
+
+
+class Moments(NamedTuple):
+    """Sums over the grid of ``|psi|^2``, Re(conj(psi) H psi), ``|H psi|^2`` and ``|psi|^4``.
+
+    `sizes` is the sum of the absolute values of the terms of `along`.
+    """
+
+    mass: float
+    along: float
+    square: float
+    quartic: float
+    sizes: float
+
+    def energy(self, beta: float) -> float:
+        """Return the energy divided by the size of a cell; `along` contains beta / 2 times `quartic` twice."""
+        return self.along - 0.5 * beta * self.quartic

@@ -1,10 +1,11 @@
-"""Problems for the Gross-Pitaevskii equation: closed forms of the NLS equation, and condensates of "the paper".
+"""Problems for the Gross-Pitaevskii equation: closed forms of the NLS equation, condensates of "the paper", and traps.
 
 The paper is Cai, Gong & Wang; the condensates are those of its Experiment IV.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from math import pi, sqrt
 from typing import Any
@@ -14,9 +15,72 @@ import numpy as np
 from ...core.inputs import refuse_units
 from .equation import FieldProblem, GrossPitaevskii
 from .grid import Grid
-from .potentials import harmonic_trap, quartic_trap
 
-__all__ = ["breather", "line_condensate", "plane_wave", "ring_condensate", "rotating_packet", "soliton"]
+__all__ = [
+    "breather",
+    "harmonic_trap",
+    "line_condensate",
+    "plane_wave",
+    "quartic_trap",
+    "ring_condensate",
+    "rotating_packet",
+    "soliton",
+]
+
+Potential = Callable[..., Any]
+
+
+def harmonic_trap(*gamma: float) -> Potential:
+    """Harmonic trap, V = sum_a (gamma_a x_a)^2 / 2.
+
+    Parameters
+    ----------
+    *gamma : float
+        The frequency along each axis.
+
+    Returns
+    -------
+    callable
+        ``V(x[, y[, z]])``.
+
+    Raises
+    ------
+    ValueError
+        If called with another number of coordinates.
+    """
+    refuse_units(gamma=gamma)
+    return lambda *x: 0.5 * _squares(gamma, x)
+
+
+def quartic_trap(alpha: float, kappa: float, *gamma: float) -> Potential:
+    """Quadratic-plus-quartic trap, V = (1 - alpha) / 2 s + kappa / 4 s^2 with s = sum_a (gamma_a x_a)^2.
+
+    Parameters
+    ----------
+    alpha, kappa : float
+    *gamma : float
+        The frequency along each axis.
+
+    Returns
+    -------
+    callable
+        ``V(x[, y[, z]])``.
+    """
+    refuse_units(alpha=alpha, kappa=kappa, gamma=gamma)
+
+    def potential(*x: np.ndarray) -> np.ndarray:
+        s = _squares(gamma, x)
+        return 0.5 * (1 - alpha) * s + 0.25 * kappa * s * s
+
+    return potential
+
+
+def _squares(gamma: tuple[float, ...], x: tuple[np.ndarray, ...]) -> Any:
+    if len(gamma) != len(x):
+        raise ValueError(
+            f"a trap of {len(gamma)} frequencies does not fit {len(x)} coordinates; give one frequency for each."
+        )
+    return sum((g * a) ** 2 for g, a in zip(gamma, x, strict=True))
 
 
 def soliton(

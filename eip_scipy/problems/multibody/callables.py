@@ -12,8 +12,7 @@ from ...core.inputs import real_array, shown
 from ...core.problem import component_names
 from .motion import Sizes, plain
 from .numerical import numerical_parts
-from .outputs import required_outputs
-from .parts import Given, Parts
+from .parts import Given, Parts, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from ...core.gradients import NumericalGradient, difference_gradient
 from .energies import Energy
-from .outputs import Outputs
-from .parts import Given, Parts
+from .parts import Given, Outputs, Parts
 from .start import Names
 
 __all__ = ["numerical_parts", "outputs_as_given"]

@@ -1,14 +1,49 @@
-"""Records of the functions of a mechanism: those of the user, and those that a problem is made of."""
+"""Functions of a mechanism: those of the user, those that a problem is made of, and outputs that the user defines."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from .energies import Energy
-from .outputs import Outputs
+import numpy as np
 
-__all__ = ["Given", "Parts"]
+from ...core.inputs import shown
+from .energies import Energy
+
+__all__ = ["Given", "Outputs", "Parts", "columns_of", "required_outputs"]
+
+
+class Outputs(NamedTuple):
+    """Names of outputs, and ``fill(t, x, out, *params)``, which computes them from x = (q, u, u')."""
+
+    names: tuple[str, ...]
+    fill: Callable[..., None]
+
+
+def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times as an array (k,) and the states as columns (n, k); ValueError if they do not fit."""
+    times, states = np.atleast_1d(np.asarray(t, float)), np.asarray(y, float)
+    columns = states.reshape(len(states), -1)
+    if np.ndim(t) != states.ndim - 1 or columns.shape != (n, times.size):
+        raise ValueError(
+            f"{what}: y has the shape {states.shape} for {times.size} times; expected ({n},) for a number t, or a "
+            "column for each time."
+        )
+    return times, columns
+
+
+def required_outputs(what: str, outputs: Any, taken: Any) -> dict[str, Any]:
+    """Return `outputs` as a dictionary; raise an error if a key is not a string, or is `taken` by a component."""
+    if outputs is None:
+        return {}
+    if not isinstance(outputs, Mapping):
+        raise TypeError(f"{what}: outputs must be a mapping of names to quantities, got {shown(outputs)}.")
+    for name in outputs:
+        if not isinstance(name, str):
+            raise TypeError(f"{what}: names of outputs must be strings, got {shown(name)}.")
+        if name in taken:
+            raise ValueError(f"{what}: the output {name!r} has the name of a component of the state; rename it.")
+    return dict(outputs)
 
 
 class Given(NamedTuple):

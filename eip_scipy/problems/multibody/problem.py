@@ -16,8 +16,7 @@ from ...core.results import Multipliers
 from .conserved import momenta_of, norms_of
 from .energies import energy_of, states_near, typical_speed
 from .motion import Motion, Sizes, motion, plain, vector
-from .outputs import Outputs, columns_of
-from .parts import Parts
+from .parts import Outputs, Parts, columns_of
 from .start import Names, name_of, started
 
 __all__ = ["MechanicsProblem", "mechanics_problem"]

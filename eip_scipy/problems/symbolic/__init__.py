@@ -248,7 +248,7 @@ def mechanics(
     True
     """
     _require_sympy("mechanics")
-    from .model_problems import mechanics_of_model
+    from .models import mechanics_of_model
 
     with _nested("mechanics"):
         return mechanics_of_model(

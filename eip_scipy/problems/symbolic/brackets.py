@@ -1,17 +1,21 @@
-"""Test whether a quantity is conserved: its rate along the equations, {I, H} for Hamilton's equations."""
+"""Test whether a quantity is conserved: its rate along the equations, {I, H} for Hamilton's equations.
+
+Functions with branches, such as abs and max, are examined on both sides of each place at which they change, and their
+derivatives have no impulses where they do not jump.
+"""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import sympy
 
-from .branches import Switches
 from .sizes import EXPANDED_TERMS, expanded_terms
 
-__all__ = ["NotKeptError", "Rate", "how_kept", "shortened", "vanishes"]
+__all__ = ["NotKeptError", "Rate", "Switches", "how_kept", "shortened", "slope", "vanishes"]
 
 POINTS, TRIES = 8, 200
 DIGITS = 50
@@ -167,3 +171,92 @@ def shortened(expression: Any) -> str:
     """Return an expression as text, of which at most 120 characters are kept."""
     text = str(expression)
     return text if len(text) <= 120 else f"{text[:120]}..."
+
+
+def slope(expression: Any, variable: Any) -> Any:
+    """Return the derivative of an expression, without impulses at places where the expression does not jump.
+
+    SymPy's derivative of q**2 sign(q) contains q**2 DiracDelta(q), which is 0. An impulse that remains belongs to a
+    jump, or to a function of several branches at one place that was not understood.
+    """
+    found = sympy.diff(expression, variable)
+    for impulse in sorted(found.atoms(sympy.DiracDelta), key=str):
+        stands_for = sympy.Dummy()
+        factor = sympy.diff(found.xreplace({impulse: stands_for}), stands_for)
+        if len(impulse.args) == 1 and not factor.has(stands_for) and _vanishes_at(factor, impulse.args[0]):
+            found = found.xreplace({impulse: sympy.Integer(0)})
+    return found
+
+
+def _vanishes_at(factor: Any, place: Any) -> bool:
+    """Return True if a factor is 0 wherever `place` is 0, whatever the values of signs and steps in it are."""
+    if place.is_Mul:
+        return all(_vanishes_at(factor, item) for item in place.args if item.free_symbols)
+    # The value of sign(q) at 0 says nothing about an impulse there: sign(q)**3 jumps.
+    factor = factor.xreplace({item: sympy.Dummy(real=True) for item in factor.atoms(sympy.sign, sympy.Heaviside)})
+    for variable in sorted(place.free_symbols, key=str):
+        rate = sympy.diff(place, variable)
+        if rate.is_number and rate != 0:
+            return vanishes(factor.xreplace({variable: sympy.expand(variable - place / rate)}))
+    return vanishes(factor.xreplace({place: sympy.Integer(0), -place: sympy.Integer(0)}))
+
+
+KINDS = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside)
+MOST = 60  # largest number of differences whose signs choose branches
+LINES = 4  # number of lines on which a change of sign is searched for each difference
+POWERS = range(-40, 101, 4)  # the places on a line are these powers of 2
+BISECTIONS = 40  # after them the relative distance is 1e-11
+
+
+class Switches:
+    """The differences of `variables` whose signs choose the branches of some expressions."""
+
+    def __init__(self, expressions: Iterable[Any], variables: Sequence[Any]) -> None:
+        atoms = sorted({atom for item in expressions for atom in item.atoms(*KINDS)}, key=str)
+        self._variables = variables
+        self._differences: dict[Any, Any] = {}
+        for atom in atoms:
+            several = isinstance(atom, (sympy.Max, sympy.Min))
+            found = [a - b for a, b in combinations(atom.args, 2)] if several else [atom.args[0]]
+            self._differences |= {item: atom for item in found if item.free_symbols & set(variables)}
+
+    def points(self, draw: Callable[[], dict[Any, Any]], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
+        """Return points on both sides of all places at which a function changes its branch.
+
+        ``draw()`` returns a random point, and ``at(expression, point)`` a value, None if it is not finite and real. A
+        ValueError is raised if there are too many branches, or one of them is not found.
+        """
+        if len(self._differences) > MOST:
+            raise ValueError(f"its functions change branches at {len(self._differences)} places, more than {MOST}")
+        found = []
+        for difference, atom in self._differences.items():
+            sides = [side for _ in range(LINES) for side in self._sides(difference, draw(), at)]
+            one_sided = difference.is_nonnegative or difference.is_nonpositive
+            if not sides and not one_sided:
+                raise ValueError(f"no point was found where {shortened(atom)} changes its branch")
+            found += sides
+        return found
+
+    def _sides(self, difference: Any, point: dict[Any, Any], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
+        """Return two points on a line through `point` on an axis at which `difference` has opposite signs, or []."""
+        for variable in sorted(difference.free_symbols & set(self._variables), key=str):
+            places = [sign * sympy.Integer(2) ** power for sign in (-1, 1) for power in POWERS]
+            places = [sympy.Integer(0), point[variable], *places]
+            signs: dict[int, Any] = {}
+            for place in sorted(places, key=abs):
+                value = at(difference, point | {variable: place})
+                if value is not None and value != 0:
+                    signs.setdefault(1 if value > 0 else -1, place)
+                if len(signs) == 2:
+                    return self._closer(difference, point, variable, signs, at)
+        return []
+
+    def _closer(self, difference: Any, point: Any, variable: Any, signs: Any, at: Any) -> list[Any]:
+        below, above = signs[-1], signs[1]
+        for _ in range(BISECTIONS):
+            middle = (below + above) / 2
+            value = at(difference, point | {variable: middle})
+            if value is None or value == 0:
+                break
+            below, above = (middle, above) if value < 0 else (below, middle)
+        return [point | {variable: place} for place in (below, above)]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
+from sympy.core.function import AppliedUndef
 from sympy.physics.mechanics import dynamicsymbols
 
 from ...core.inputs import is_number, shown
@@ -16,11 +18,19 @@ from ...core.names import nearest
 from .parser import symbol
 from .traced import NotTraceableError, traced
 
-__all__ = ["Inputs", "read_inputs"]
+__all__ = ["Inputs", "name_of", "read_inputs"]
 
 TIME = dynamicsymbols._t
 # A traced function agrees with the function itself up to rounding errors; this bound is relative.
 AGREES = 1e-9
+
+
+def name_of(item: Any) -> str:
+    """Return the name of a dynamicsymbol, a symbol or a string; the derivative of x is the speed ``v_x``."""
+    if isinstance(item, sympy.Derivative):
+        return f"v_{name_of(item.expr)}"
+    text = item if isinstance(item, str) else item.func.__name__ if isinstance(item, AppliedUndef) else str(item)
+    return re.sub(r"\W", "_", text.replace("'", "_prime"))
 
 
 class Inputs(NamedTuple):
@@ -105,8 +115,6 @@ def _traced(
 
 def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
     """Return for each function of time in `keys` its name, and a function ``f(t, y)`` of this component of `fun`."""
-    from .models import name_of
-
     if len(keys) == 1:
         return [(name_of(keys[0]), _part(fun, None))]
     return [(name_of(key), _part(fun, k)) for k, key in enumerate(keys)]

@@ -1,8 +1,7 @@
-"""The equations of models of sympy.physics.mechanics, converted to real symbols."""
+"""Problems of models of sympy.physics.mechanics, whose equations are converted to real symbols."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,42 +13,19 @@ from sympy.physics.mechanics import KanesMethod, Point, msubs
 
 from ...core.names import nearest
 from ..multibody.motion import plain
-from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed
-from .inputs import TIME, read_inputs
+from ..multibody.parts import required_outputs
+from ..multibody.problem import MechanicsProblem, mechanics_problem
+from ..multibody.start import MET, Names
+from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed, parts_of
+from .inputs import TIME, name_of, read_inputs
 from .parser import as_expression, symbol
+from .system import parameter_values
 
-__all__ = ["Model", "Start", "name_of", "read"]
+__all__ = ["mechanics_of_model"]
 
 # A row of constraints depends on the others if its remainder is below DEPENDENT, relative to the row, at POINTS points.
 DEPENDENT, POINTS = 1e-9, 3
-
-
-class Model(NamedTuple):
-    """The equations of a model, and its known properties.
-
-    Attributes
-    ----------
-    system : Constrained
-    energies : tuple of (str, expression)
-        Descriptions of quantities that may be the energy, and their expressions.
-    momenta, outputs : tuple of (str, expression)
-        Names and expressions of momenta that may be constant, and of the quantities that are computed at saved states.
-    independent : tuple of str or None
-        The components of the state that the model calls independent; None if it has no dependent ones.
-    position_names, velocity_names : tuple of str
-        Names of the constraints on positions, and of those on velocities.
-    notes : tuple of str
-        Remarks for the user: velocity constraints that were added, and inputs that are called as functions.
-    """
-
-    system: Constrained
-    energies: tuple[tuple[str, Any], ...]
-    momenta: tuple[tuple[str, Any], ...]
-    outputs: tuple[tuple[str, Any], ...]
-    independent: tuple[str, ...] | None
-    position_names: tuple[str, ...]
-    velocity_names: tuple[str, ...]
-    notes: tuple[str, ...]
+QUATERNION = 4  # components
 
 
 class _Equations(NamedTuple):
@@ -74,95 +50,120 @@ class _Equations(NamedTuple):
     by_speeds: dict[Any, Any]  # derivatives of coordinates as functions of speeds
 
 
-def name_of(item: Any) -> str:
-    """Return the name of a dynamicsymbol, a symbol or a string; the derivative of x is the speed ``v_x``."""
-    if isinstance(item, sympy.Derivative):
-        return f"v_{name_of(item.expr)}"
-    text = item if isinstance(item, str) else item.func.__name__ if isinstance(item, AppliedUndef) else str(item)
-    return re.sub(r"\W", "_", text.replace("'", "_prime"))
-
-
-def read(
+def mechanics_of_model(
     model: Any,
-    inputs: Mapping[Any, Any],
-    parameters: Mapping[str, float],
+    params: Mapping[Any, float] | None,
+    q0: Any,
+    u0: Any,
+    *,
+    t_span: tuple[float, float] | None,
+    inputs: Mapping[Any, Any] | None,
     energy: Any,
-    outputs: Mapping[str, Any],
-    start: Start,
-) -> Model:
-    """Return the equations of a model.
-
-    Parameters
-    ----------
-    model
-        A KanesMethod, LagrangesMethod, or an object with the attribute ``eom_method``, which is one of these.
-    inputs : mapping
-        Values of the functions of time that are neither coordinates nor speeds, see `read_inputs`.
-    parameters : mapping
-        Values of the parameters by their names.
-    energy : expression or None
-        The total energy, if it is given.
-    outputs : mapping
-        Expressions of the quantities that are computed at saved states, by name.
-    start : Start
-        Time, coordinates and speeds at which `read_inputs` calls inputs that are functions.
-    """
+    outputs: Any,
+    independent: Iterable[Any] | None,
+    rank_tolerance: float,
+    name: str,
+    others: Mapping[str, Any],
+) -> MechanicsProblem:
+    """Return the problem of a model; see `mechanics`."""
+    values, q0, u0, inputs = _with_defaults(model, params, q0, u0, inputs)
+    t = 0.0 if t_span is None else float(t_span[0])
+    outputs = required_outputs("mechanics", outputs, ())
     method = _method(model)
     found = _of_lagrange(method) if hasattr(method, "_L") else _of_kane(method)
-    converted = _Conversion(found, inputs, start)
-    system = _system(found, converted, parameters)
-    energies = tuple(_energies(found, energy, system, converted))
-    momenta = tuple(_momenta(found, system, converted))
-    shown = tuple((name, converted.output(name, item, parameters)) for name, item in outputs.items())
-    extra = [item for _, item in (*energies, *momenta, *shown)]
-    system = system._replace(parameters=_parameters(system, extra, parameters))
-    system, added = _with_missing_velocities(system, parameters)
-    notes = () if not added else (f"velocity constraints were added for {', '.join(added)}, which the model lacks",)
-    own = len(system.velocities) - len(added)
+    converted = _Conversion(found, inputs, t, q0, u0)
+    system = _system(found, converted)
+    energies = [(label, item, None) for label, item in _energies(found, energy, system, converted)]
+    momenta = list(_momenta(found, system, converted))
+    observed = [(label, converted.output(label, item, values)) for label, item in outputs.items()]
+    extra = [item for _, item, *_ in (*energies, *momenta, *observed)]
+    system = system._replace(parameters=_parameters(system, extra, values))
+    system, added = _with_missing_velocities(system, values)
+    notes = [f"velocity constraints were added for {', '.join(added)}, which the model lacks"] if added else []
+    own = [f"v{k + 1}" for k in range(len(system.velocities) - len(added))]
     positions = tuple(f"g{k + 1}" for k in range(len(system.positions)))
-    return Model(
-        system,
-        energies,
-        momenta,
-        shown,
-        None if found.independent is None else tuple(converted.names[item] for item in found.independent),
-        positions,
-        (*(f"v{k + 1}" for k in range(own)), *(f"{item}'" for item in added)),
-        (*notes, *converted.inputs.notes),
+    names = Names(system.coordinates, system.speeds, positions, (*own, *(f"{item}'" for item in added)))
+    held = independent
+    if held is None and found.independent is not None:
+        held = [converted.names[item] for item in found.independent]
+    problem = mechanics_problem(
+        name,
+        parts_of(system, energies, momenta, observed),
+        names,
+        t,
+        (_by_name(q0, system.coordinates), _by_name(u0, system.speeds)),
+        np.array([values[key] for key in system.parameters]) if system.parameters else None,
+        None if held is None else [name_of(item) for item in held],
+        rank_tolerance,
+        t_span=t_span,
+        notes=(*notes, *converted.inputs.notes),
+        parameter_names=system.parameters,
+        **others,
     )
+    _require_rotations(problem)
+    return problem
 
 
-class Start(NamedTuple):
-    """The time, and the coordinates and speeds at the start, as they were given."""
+def _with_defaults(model: Any, params: Any, q0: Any, u0: Any, inputs: Any) -> tuple[dict[str, float], Any, Any, Any]:
+    """Return the parameters by name, the start, and the inputs, by default those that a System of PyDy has."""
+    # PyDy refuses constants that are in the constraints on positions alone: they are given here.
+    constants = {**(getattr(model, "constants", None) or {}), **(params or {})}
+    if q0 is None and u0 is None:
+        q0 = u0 = getattr(model, "initial_conditions", None)
+    if q0 is None or u0 is None:
+        raise TypeError("mechanics: q0 or u0 is missing; give the coordinates and speeds at the start.")
+    if inputs is None:
+        given = getattr(model, "specifieds", None) or {}
+        inputs = {key: _swapped(value) if callable(value) else value for key, value in given.items()}
+    return parameter_values({name_of(key): value for key, value in constants.items()}), q0, u0, inputs
 
-    t: float
-    q0: Any
-    u0: Any
 
-    def numbers(self, coordinates: Sequence[str], speeds: Sequence[str]) -> np.ndarray:
-        """Return a state with which functions can be called; components that were not given are 0."""
+def _require_rotations(problem: MechanicsProblem) -> None:
+    """Raise ValueError if a quaternion that SymPy uses for a rotation does not have the norm 1."""
+    args = () if problem.params is None else (problem.params,)
+    for item in problem.norms:
+        slopes, value = np.empty(problem.y0.size), plain(item.function)(0.0, problem.y0, *args)
+        plain(item.gradient)(0.0, np.ones(problem.y0.size), slopes, *args)
+        if np.count_nonzero(slopes) == QUATERNION and not abs(value - 1) <= MET:
+            raise ValueError(
+                f"mechanics: the start has {item.name} = {value:.6g}; expected 1, because the quaternion of a rotation "
+                "has norm 1. Divide its components by their norm."
+            )
 
-        def listed(given: Any, names: Sequence[str]) -> list[float]:
-            if isinstance(given, Mapping):
-                by_name = {name_of(key): value for key, value in given.items()}
-                return [float(by_name.get(name, 0.0)) for name in names]
-            return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
 
-        return np.array([*listed(self.q0, coordinates), *listed(self.u0, speeds)])
+def _swapped(function: Any) -> Any:
+    """Convert a function ``f(y, t)`` of PyDy into ``f(t, y)``; return an expression unchanged."""
+    return function if isinstance(function, sympy.Basic) else lambda t, y: function(y, t)
+
+
+def _by_name(given: Any, names: tuple[str, ...]) -> Any:
+    """Return a mapping with names as keys, those in `names` or, if there are none, all; return an array unchanged."""
+    if not isinstance(given, Mapping):
+        return given
+    found = {name_of(key): value for key, value in given.items()}
+    return {key: value for key, value in found.items() if key in names} or found
 
 
 class _Conversion:
     """Converter of expressions from a model's functions of time and symbols to the real symbols of this package."""
 
-    def __init__(self, found: _Equations, inputs: Any, start: Start) -> None:
+    def __init__(self, found: _Equations, inputs: Any, t: float, q0: Any, u0: Any) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
-        _require_distinct(self.names)
+        components = list(self.names.values())
+        for k, name in enumerate(components):
+            if name in components[:k] or name == "t":
+                raise ValueError(
+                    f"mechanics: {name!r} is the name of two components of the state, or of one and of the time; "
+                    "rename one."
+                )
         self._found = found
         self._symbols = {item: symbol(name) for item, name in self.names.items()} | {TIME: symbol("t")}
         self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in found.speeds}
         count = len(found.coordinates)
-        state = start.numbers(*(list(self.names.values())[part] for part in (slice(count), slice(count, None))))
-        self.inputs = read_inputs(inputs, _functions_of_time(found), self.names, (start.t, state))
+        state = np.array([*_numbers(q0, components[:count]), *_numbers(u0, components[count:])])
+        parts = (*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates)
+        functions = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in parts))
+        self.inputs = read_inputs(inputs, {name_of(item): item for item in functions}, self.names, (t, state))
         self._called = {name for name, _ in self.inputs.called}
         if taken := self._called & {*self.names.values(), "t"}:
             raise ValueError(
@@ -214,14 +215,15 @@ class _Conversion:
         return self(expression.xreplace(self._accelerations))
 
 
-def _functions_of_time(found: _Equations) -> dict[str, Any]:
-    """Return the functions of time in the equations by name."""
-    items = (*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates)
-    atoms = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in items))
-    return {name_of(item): item for item in atoms}
+def _numbers(given: Any, names: Sequence[str]) -> list[float]:
+    """Return values with which functions can be called; components that were not given are 0."""
+    if isinstance(given, Mapping):
+        by_name = {name_of(key): value for key, value in given.items()}
+        return [float(by_name.get(name, 0.0)) for name in names]
+    return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
 
 
-def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, float]) -> Constrained:
+def _system(found: _Equations, converted: _Conversion) -> Constrained:
     """Return the equations as a `Constrained` whose parameters are not known yet, as outputs may have further ones.
 
     A ValueError is raised if a constraint or the kinematics depend on an input that is called as a function.
@@ -426,15 +428,6 @@ def _fixed_point(place: Any, frame: Any) -> Any:
         seen.update(new)
         left += new
     return None
-
-
-def _require_distinct(names: Mapping[Any, str]) -> None:
-    found = list(names.values())
-    twice = next((name for k, name in enumerate(found) if name in found[:k] or name == "t"), None)
-    if twice is not None:
-        raise ValueError(
-            f"mechanics: {twice!r} is the name of two components of the state, or of one and of the time; rename one."
-        )
 
 
 def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> tuple[str, ...]:

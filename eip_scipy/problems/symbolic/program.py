@@ -20,7 +20,7 @@ import numpy as np
 import sympy
 
 from ...core.jitted import compilable, is_jitted, jitted
-from .cube_root import cbrt, with_powers_of_roots
+from .parser import cbrt, with_powers_of_roots
 
 __all__ = ["Arguments", "function", "variational"]
 

@@ -18,14 +18,12 @@ from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_jitted
 from ...core.problem import Deferred, Problem, bind
-from .brackets import NotKeptError, how_kept, vanishes
-from .jumps import slope
+from .brackets import NotKeptError, how_kept, slope, vanishes
 from .manifold import Manifold
-from .pairs import paired
+from .pairs import Timed, paired
 from .parser import as_expression, as_names, symbol
 from .program import Arguments, function
 from .program import variational as variational_function
-from .timed import Timed
 
 __all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem", "parameter_values"]
 

@@ -2,8 +2,7 @@
 
 from .korteweg_de_vries import KortewegDeVries
 from .lawson import Lawson
-from .modes import RealModes
-from .record import WaveProblem
+from .modes import RealModes, WaveProblem
 from .scenes import korteweg_de_vries_solitons, sine_gordon_breather, sine_gordon_kinks
 from .sine_gordon import SineGordon
 

@@ -1,13 +1,24 @@
-"""Fourier modes of real fields on periodic grids; only half of the modes are stored, the others are conjugates."""
+"""Real fields on periodic grids: the class of their problems, and their Fourier modes.
+
+Only half of the modes are stored, the others are conjugates.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.fft
 
+from ...core.problem import Problem
 from ..gross_pitaevskii.grid import Grid
 
-__all__ = ["RealModes"]
+if TYPE_CHECKING:
+    from .korteweg_de_vries import KortewegDeVries
+    from .sine_gordon import SineGordon
+
+__all__ = ["RealModes", "WaveProblem"]
 
 
 class RealModes:
@@ -46,3 +57,17 @@ class RealModes:
         """
         k = self.grid.wavenumbers(axis, odd=odd)
         return np.abs(k[..., : self.shape[-1]]) if axis == self.grid.dim - 1 else k
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WaveProblem(Problem):
+    """A `Problem` of real waves on a grid.
+
+    Attributes
+    ----------
+    equation : SineGordon or KortewegDeVries
+        The equation, with the attribute `grid` and functions of the state such as ``equation.energy(y)``. The other
+        attributes are those of `Problem`.
+    """
+
+    equation: SineGordon | KortewegDeVries | None = None

@@ -12,7 +12,7 @@ import numpy as np
 from ...core.inputs import refuse_units
 from ..gross_pitaevskii.grid import Grid
 from .korteweg_de_vries import KortewegDeVries
-from .record import WaveProblem
+from .modes import WaveProblem
 from .sine_gordon import SineGordon
 
 __all__ = ["korteweg_de_vries_solitons", "sine_gordon_breather", "sine_gordon_kinks"]
