@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core.gradients import NumericalGradient
 from ...core.jitted import NotCompilableError, is_jitted, jit_is_off
-from ._equations import CHARGE, MASS, FieldFunctions, jit_like, jitable
+from ._equations import CHARGE, MASS, FieldFunctions, jit_like
 
 __all__ = ["variational"]
 
@@ -48,7 +48,6 @@ def variational(
     return _canonical(rhs, A, jacobian, E, slopes(jacobian, 2), slopes(E, 1), by_mass)
 
 
-@jitable
 def combined(scale, u, v, w, first, second, third, fourth):
     """Return the vector scale (u first + v second + w third + fourth), from vectors of three numbers."""
     return (
@@ -59,7 +58,7 @@ def combined(scale, u, v, w, first, second, third, fourth):
 
 
 def _canonical(rhs, A, jacobian, E, slopes, slopes_of_E, by_mass):
-    last = by_mass.size
+    last, join = by_mass.size, jit_like(combined, rhs, A, jacobian, E, slopes, slopes_of_E)
 
     def wide(t, Y, out, params):
         rhs(t, Y[:6], out[:6], params)
@@ -68,9 +67,9 @@ def _canonical(rhs, A, jacobian, E, slopes, slopes_of_E, by_mass):
         H, F = slopes(t, Y, Y), slopes_of_E(t, Y, Y)
         v0, v1, v2 = out[0], out[1], out[2]
         # The derivative of the force at constant v, row by row.
-        x = combined(q, v0, v1, v2, H[0][0], H[1][0], H[2][0], F[0])
-        y = combined(q, v0, v1, v2, H[0][1], H[1][1], H[2][1], F[1])
-        z = combined(q, v0, v1, v2, H[0][2], H[1][2], H[2][2], F[2])
+        x = join(q, v0, v1, v2, H[0][0], H[1][0], H[2][0], F[0])
+        y = join(q, v0, v1, v2, H[0][1], H[1][1], H[2][1], F[1])
+        z = join(q, v0, v1, v2, H[0][2], H[1][2], H[2][2], F[2])
         inverse, first = 1.0 / m, Y.size - 6 * last
         for k in range(6, Y.size, 6):
             dx, dy, dz = Y[k], Y[k + 1], Y[k + 2]
@@ -96,7 +95,7 @@ def _canonical(rhs, A, jacobian, E, slopes, slopes_of_E, by_mass):
 
 
 def _velocity(rhs, B, E, slopes, slopes_of_E, by_mass):
-    last = by_mass.size
+    last, join = by_mass.size, jit_like(combined, rhs, B, E, slopes, slopes_of_E)
 
     def wide(t, Y, out, params):
         rhs(t, Y[:6], out[:6], params)
@@ -104,9 +103,9 @@ def _velocity(rhs, B, E, slopes, slopes_of_E, by_mass):
         b, r, v0, v1, v2 = B(t, Y[0], Y[1], Y[2]), q / m, Y[3], Y[4], Y[5]
         H, F = slopes(t, Y, Y), slopes_of_E(t, Y, Y)
         # The derivative of the acceleration at constant v, row by row.
-        x = combined(r, 0.0, -v2, v1, H[0], H[1], H[2], F[0])
-        y = combined(r, v2, 0.0, -v0, H[0], H[1], H[2], F[1])
-        z = combined(r, -v1, v0, 0.0, H[0], H[1], H[2], F[2])
+        x = join(r, 0.0, -v2, v1, H[0], H[1], H[2], F[0])
+        y = join(r, v2, 0.0, -v0, H[0], H[1], H[2], F[1])
+        z = join(r, -v1, v0, 0.0, H[0], H[1], H[2], F[2])
         first = Y.size - 6 * last
         for k in range(6, Y.size, 6):
             dx, dy, dz, u, v, w = Y[k], Y[k + 1], Y[k + 2], Y[k + 3], Y[k + 4], Y[k + 5]

@@ -1,22 +1,20 @@
 """Equations of motion and invariants of a charged particle, from functions of its field.
 
-The first arguments of the functions here are functions of the field; `compose` binds them. The functions are compiled
-if those of the field are jitted, otherwise they are plain Python. In compiled code they are inlined, and subexpressions
-that two functions of the field have in common are computed once, so that a loop is as fast as one written for the
-field. Components are written out, because Numba accepts only constant indices of a tuple such as (-y, x, 0), whose
-types differ.
+The functions are compiled if those of the field are jitted, otherwise they are plain Python. In compiled code they are
+inlined, and subexpressions that two functions of the field have in common are computed once, so that a loop is as fast
+as one written for the field. Components are written out, because Numba accepts only constant indices of a tuple such as
+(-y, x, 0), whose types differ.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any, NamedTuple, cast
 
 from ...core.gradients import DIFFERENCE_WEIGHTS
-from ...core.jitted import compiled_like, is_compiled, is_jitted
+from ...core.jitted import compiled_like, is_jitted
 
-__all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like", "jitable"]
+__all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
 
 MASS, CHARGE = 0, 1  # places in the parameters
 
@@ -48,28 +46,8 @@ class ParticleEquations(NamedTuple):
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
-    """Return `fun`, compiled if all `others` (except None) are; functions of this module that it calls are inlined."""
-    if all(is_compiled(other) for other in others if other is not None):
-        _register()
+    """Return `fun`, compiled if all `others`, except None, are compiled."""
     return compiled_like(fun, *(other for other in others if other is not None))
-
-
-_inlined: list[Callable[..., Any]] = []
-
-
-def jitable(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Mark a function of this package that compiled functions call, so that Numba inlines it; return it unchanged."""
-    _inlined.append(fun)
-    return fun
-
-
-@cache
-def _register() -> None:
-    """Make Numba inline the marked functions into the compiled functions that call them."""
-    from numba.extending import register_jitable
-
-    for fun in _inlined:
-        register_jitable(error_model="numpy", _nrt=False)(fun)
 
 
 def no_potential(t, x, y, z):
@@ -98,10 +76,23 @@ def _canonical(field: FieldFunctions) -> ParticleEquations:
     A, jacobian, phi, E = field.A, field.jacobian, field.phi, field.E
 
     def rhs(t, y, out, params):
-        canonical_rhs(A, jacobian, E, t, y, out, params[MASS], params[CHARGE])
+        # x' = v = (p - q A) / m and p_j' = q (sum_i v_i dA_i/dx_j + E_j)
+        a, d, e = A(t, y[0], y[1], y[2]), jacobian(t, y[0], y[1], y[2]), E(t, y[0], y[1], y[2])
+        q = params[CHARGE]
+        inverse = 1.0 / params[MASS]  # does not wait for the field, as a division of the velocity would
+        u, v, w = (y[3] - q * a[0]) * inverse, (y[4] - q * a[1]) * inverse, (y[5] - q * a[2]) * inverse
+        out[0] = u
+        out[1] = v
+        out[2] = w
+        out[3] = q * (u * d[0][0] + v * d[1][0] + w * d[2][0] + e[0])
+        out[4] = q * (u * d[0][1] + v * d[1][1] + w * d[2][1] + e[1])
+        out[5] = q * (u * d[0][2] + v * d[1][2] + w * d[2][2] + e[2])
 
     def energy(t, y, params):
-        return canonical_energy(A, phi, t, y, params[MASS], params[CHARGE])
+        # H = |p - q A|^2 / (2 m) + q phi (Cai, Gong & Wang, eq. 3.7)
+        q, a = params[CHARGE], A(t, y[0], y[1], y[2])
+        u, v, w = y[3] - q * a[0], y[4] - q * a[1], y[5] - q * a[2]
+        return 0.5 / params[MASS] * (u * u + v * v + w * w) + q * phi(t, y[0], y[1], y[2])
 
     return ParticleEquations(
         jit_like(rhs, A, jacobian, E),
@@ -110,34 +101,6 @@ def _canonical(field: FieldFunctions) -> ParticleEquations:
         jit_like(canonical_momentum, A),
         jit_like(canonical_momentum_gradient, A),
     )
-
-
-@jitable
-def canonical_rhs(A, jacobian, E, t, y, out, m, q):
-    """Fill `out` with the canonical equations, x' = v = (p - q A) / m and p_j' = q (sum_i v_i dA_i/dx_j + E_j)."""
-    a = A(t, y[0], y[1], y[2])
-    d = jacobian(t, y[0], y[1], y[2])
-    e = E(t, y[0], y[1], y[2])
-    inverse = 1.0 / m  # does not wait for the field, as a division of the velocity would
-    u = (y[3] - q * a[0]) * inverse
-    v = (y[4] - q * a[1]) * inverse
-    w = (y[5] - q * a[2]) * inverse
-    out[0] = u
-    out[1] = v
-    out[2] = w
-    out[3] = q * (u * d[0][0] + v * d[1][0] + w * d[2][0] + e[0])
-    out[4] = q * (u * d[0][1] + v * d[1][1] + w * d[2][1] + e[1])
-    out[5] = q * (u * d[0][2] + v * d[1][2] + w * d[2][2] + e[2])
-
-
-@jitable
-def canonical_energy(A, phi, t, y, m, q):
-    """Return H = |p - q A|^2 / (2 m) + q phi (Cai, Gong & Wang, eq. 3.7)."""
-    a = A(t, y[0], y[1], y[2])
-    u = y[3] - q * a[0]
-    v = y[4] - q * a[1]
-    w = y[5] - q * a[2]
-    return 0.5 / m * (u * u + v * v + w * w) + q * phi(t, y[0], y[1], y[2])
 
 
 def canonical_energy_gradient(t, y, f, out, params):
@@ -169,58 +132,65 @@ def canonical_momentum_gradient(t, y, out, params):
 
 
 def _velocity(field: FieldFunctions) -> ParticleEquations:
-    A, jacobian, phi, E, B = field
+    _, _, phi, E, B = field
 
     def rhs(t, y, out, params):
-        velocity_rhs(E, B, t, y, out, params[CHARGE] / params[MASS])
+        # x' = v and v' = (q / m) (E + v x B) (Cai, Gong & Wang, eq. 3.8)
+        e, b = E(t, y[0], y[1], y[2]), B(t, y[0], y[1], y[2])
+        ratio, u, v, w = params[CHARGE] / params[MASS], y[3], y[4], y[5]
+        out[0] = u
+        out[1] = v
+        out[2] = w
+        out[3] = ratio * (e[0] + v * b[2] - w * b[1])
+        out[4] = ratio * (e[1] + w * b[0] - u * b[2])
+        out[5] = ratio * (e[2] + u * b[1] - v * b[0])
 
     def energy(t, y, params):
-        return velocity_energy(phi, t, y, params[MASS], params[CHARGE])
+        # H = m |v|^2 / 2 + q phi
+        square = y[3] * y[3] + y[4] * y[4] + y[5] * y[5]
+        return 0.5 * params[MASS] * square + params[CHARGE] * phi(t, y[0], y[1], y[2])
 
     def energy_gradient(t, y, out, params):
-        velocity_energy_gradient(E, t, y, out, params[MASS], params[CHARGE])
-
-    def momentum(t, y, params):
-        return velocity_momentum(A, t, y, params[MASS], params[CHARGE])
-
-    def momentum_gradient(t, y, out, params):
-        velocity_momentum_gradient(A, jacobian, t, y, out, params[MASS], params[CHARGE])
+        # (-q E, m v)
+        e, m, q = E(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
+        out[0] = -q * e[0]
+        out[1] = -q * e[1]
+        out[2] = -q * e[2]
+        out[3] = m * y[3]
+        out[4] = m * y[4]
+        out[5] = m * y[5]
 
     def power(t, y, params):
         e = E(t, y[0], y[1], y[2])
         return params[CHARGE] * (y[3] * e[0] + y[4] * e[1] + y[5] * e[2])
 
-    known = A is not None
     return ParticleEquations(
         jit_like(rhs, E, B),
         None if phi is None else jit_like(energy, phi),
         jit_like(energy_gradient, E),
-        jit_like(momentum, A) if known else None,
-        jit_like(momentum_gradient, A, jacobian) if known else None,
+        *((None, None) if field.A is None else _velocity_momentum(field.A, field.jacobian)),
         jit_like(kinetic_energy, E),
         jit_like(kinetic_energy_gradient, E),
         jit_like(power, E),
     )
 
 
-@jitable
-def velocity_rhs(E, B, t, y, out, ratio):
-    """Fill `out` with x' = v and v' = ratio (E + v x B), where ratio is q / m (Cai, Gong & Wang, eq. 3.8)."""
-    e = E(t, y[0], y[1], y[2])
-    b = B(t, y[0], y[1], y[2])
-    u, v, w = y[3], y[4], y[5]
-    out[0] = u
-    out[1] = v
-    out[2] = w
-    out[3] = ratio * (e[0] + v * b[2] - w * b[1])
-    out[4] = ratio * (e[1] + w * b[0] - u * b[2])
-    out[5] = ratio * (e[2] + u * b[1] - v * b[0])
+def _velocity_momentum(A, jacobian):
+    def momentum(t, y, params):
+        # L = x p_y - y p_x with p = m v + q A
+        a, m, q = A(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
+        return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
 
+    def gradient(t, y, out, params):
+        a, d, m, q = A(t, y[0], y[1], y[2]), jacobian(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
+        out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
+        out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
+        out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
+        out[3] = -m * y[1]
+        out[4] = m * y[0]
+        out[5] = 0.0
 
-@jitable
-def velocity_energy(phi, t, y, m, q):
-    """Return H = m |v|^2 / 2 + q phi."""
-    return 0.5 * m * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5]) + q * phi(t, y[0], y[1], y[2])
+    return jit_like(momentum, A), jit_like(gradient, A, jacobian)
 
 
 def kinetic_energy(t, y, params):
@@ -234,38 +204,6 @@ def kinetic_energy_gradient(t, y, out, params):
     out[3] = params[MASS] * y[3]
     out[4] = params[MASS] * y[4]
     out[5] = params[MASS] * y[5]
-
-
-@jitable
-def velocity_energy_gradient(E, t, y, out, m, q):
-    """Fill `out` with the gradient of H, (-q E, m v)."""
-    e = E(t, y[0], y[1], y[2])
-    out[0] = -q * e[0]
-    out[1] = -q * e[1]
-    out[2] = -q * e[2]
-    out[3] = m * y[3]
-    out[4] = m * y[4]
-    out[5] = m * y[5]
-
-
-@jitable
-def velocity_momentum(A, t, y, m, q):
-    """Return L = x p_y - y p_x with p = m v + q A."""
-    a = A(t, y[0], y[1], y[2])
-    return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
-
-
-@jitable
-def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
-    """Fill `out` with the gradient of L."""
-    a = A(t, y[0], y[1], y[2])
-    d = jacobian(t, y[0], y[1], y[2])
-    out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
-    out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
-    out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
-    out[3] = -m * y[1]
-    out[4] = m * y[0]
-    out[5] = 0.0
 
 
 # Missing functions of a field, computed from those that it has.

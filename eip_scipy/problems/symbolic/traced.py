@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import types
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -30,6 +31,19 @@ class NotTraceableError(TypeError):
     """Error for a function that cannot be converted to an expression, for example because it branches on a value."""
 
 
+def _binary(operation: Callable[[Any, Any], Any], *, swapped: bool = False) -> Callable[[Number, Any], Any]:
+    """Return a method of `Number` that applies an operation to the expressions of both numbers."""
+
+    def method(self: Number, other: Any) -> Any:
+        if isinstance(other, np.ndarray):
+            return NotImplemented
+        found = _number(other)
+        first, second = (found, self) if swapped else (self, found)
+        return Number(operation(first.expression, second.expression), self.size + found.size + 1)
+
+    return method
+
+
 class Number:
     """Expression in place of a number; `size` counts its operands and operations, at most `MOST_OPERATIONS`."""
 
@@ -40,37 +54,13 @@ class Number:
             raise NotTraceableError("an expression is too long")
         self.expression, self.size = expression, size
 
-    def _with(self, other: Any, operation: Callable[[Any, Any], Any]) -> Any:
-        if isinstance(other, np.ndarray):
-            return NotImplemented
-        found = _number(other)
-        return Number(operation(self.expression, found.expression), self.size + found.size + 1)
-
-    def __add__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a + b)
-
-    def __sub__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a - b)
-
-    def __rsub__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: b - a)
-
-    def __mul__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a * b)
-
-    def __truediv__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a / b)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: b / a)
-
-    def __pow__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a**b)
-
-    def __rpow__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: b**a)
-
-    __radd__, __rmul__ = __add__, __mul__
+    __add__ = __radd__ = _binary(operator.add)
+    __sub__, __rsub__ = _binary(operator.sub), _binary(operator.sub, swapped=True)
+    __mul__ = __rmul__ = _binary(operator.mul)
+    __truediv__, __rtruediv__ = _binary(operator.truediv), _binary(operator.truediv, swapped=True)
+    __pow__, __rpow__ = _binary(operator.pow), _binary(operator.pow, swapped=True)
+    arctan2 = _binary(sympy.atan2)
+    hypot = _binary(lambda x, y: sympy.sqrt(x**2 + y**2))
 
     def __neg__(self) -> Number:
         return Number(-self.expression, self.size + 1)
@@ -84,14 +74,6 @@ class Number:
     def conjugate(self) -> Number:
         """Return the number itself, because traced numbers are real."""
         return self
-
-    def arctan2(self, other: Any) -> Number:
-        """Return the polar angle of the point (other, self)."""
-        return self._with(other, sympy.atan2)
-
-    def hypot(self, other: Any) -> Number:
-        """Return the distance of the point (self, other) from the origin."""
-        return self._with(other, lambda a, b: sympy.sqrt(a**2 + b**2))
 
     def __getattr__(self, name: str) -> Any:  # NumPy calls the method of each element
         if name in FUNCTIONS:
@@ -157,8 +139,8 @@ def _of_math(name: str, *arguments: Any) -> Any:
     if not any(isinstance(item, Number) for item in arguments):
         return getattr(math, name)(*arguments)
     first, *others = map(_number, arguments)
-    return getattr(first, {"atan2": "arctan2", "pow": "__pow__"}.get(name, name.replace("a", "arc", 1)
-                   if name in ("asin", "acos", "atan", "asinh", "acosh", "atanh") else name))(*others)  # fmt: skip
+    inverse = name in ("asin", "acos", "atan", "asinh", "acosh", "atanh", "atan2")
+    return getattr(first, "__pow__" if name == "pow" else name.replace("a", "arc", 1) if inverse else name)(*others)
 
 
 NUMPY = _NumPy("numpy")
