@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.gradients import NumericalGradient, difference_gradient
-from .energies import Energy
-from .parts import Given, Outputs, Parts
+from .parts import Energy, Given, Outputs, Parts
 from .start import Names
 
 __all__ = ["numerical_parts", "outputs_as_given"]

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core.inputs import shown
-from .energies import Energy
+from .motion import plain
+from .start import Names
 
-__all__ = ["Given", "Outputs", "Parts", "columns_of", "required_outputs"]
+__all__ = ["Energy", "Given", "Outputs", "Parts", "columns_of", "required_outputs"]
 
 
 class Outputs(NamedTuple):
@@ -62,6 +63,18 @@ class Given(NamedTuple):
     outputs: Any = None  # a mapping
 
 
+class Energy(NamedTuple):
+    """Description of a quantity that may be constant, ``value(t, y, *params)``, and ``gradient(t, y, out, *params)``.
+
+    `power` is the given rate of change, a function of (t, y, *params), or None.
+    """
+
+    description: str
+    value: Callable[..., float]
+    gradient: Callable[..., None]
+    power: Callable[..., float] | None = None
+
+
 class Parts(NamedTuple):
     """The functions of which a problem is made.
 
@@ -78,3 +91,11 @@ class Parts(NamedTuple):
     momenta: tuple[Energy, ...] = ()
     outputs: Outputs | None = None
     origin: Any = None  # arguments of `parts_of` in symbolic/constrained.py, if that made the functions
+
+    def matrices(self, names: Names, t: float, y: np.ndarray, args: tuple[Any, ...] = ()) -> list[np.ndarray]:
+        """Return M, F, G, gamma and q' at a state, computed by functions that are not compiled."""
+        n, m = len(names.speeds), len(names.velocities)
+        out = np.empty(names.sizes.matrices + len(names.coordinates))
+        plain(self.fill)(t, y, out, *args)
+        M, F, G, gamma, rates = np.split(out, np.cumsum([n * n, n, m * n, m]))
+        return [M.reshape(n, n), F, G.reshape(m, n), gamma, rates]

@@ -14,6 +14,7 @@ from ...core.invariants import Invariant, with_args
 from ...core.names import nearest
 from ...core.project import project
 from ...engine.trust import ProjectionWarning
+from .motion import Sizes
 
 __all__ = ["MET", "Names", "name_of", "nearest_start", "started"]
 
@@ -38,6 +39,11 @@ class Names(NamedTuple):
     def state(self) -> tuple[str, ...]:
         """Return the names of all components."""
         return (*self.coordinates, *self.speeds)
+
+    @property
+    def sizes(self) -> Sizes:
+        """Return the numbers of coordinates, speeds and constraints on velocities."""
+        return Sizes(len(self.coordinates), len(self.speeds), len(self.velocities))
 
 
 def name_of(key: Any) -> str:

@@ -20,8 +20,7 @@ from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
-from ._columns import variational
-from ._equations import CHARGE, MASS, ParticleEquations, compose
+from ._equations import CHARGE, MASS, ParticleEquations, compose, variational
 from .fields import TOKAMAK, UNIFORM, ParticleField
 
 __all__ = ["ORBITS", "ParticleProblem", "charged_particle", "tokamak", "uniform_field"]

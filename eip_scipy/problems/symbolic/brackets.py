@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import sympy
 
-from .sizes import EXPANDED_TERMS, expanded_terms
+from .parser import EXPANDED_TERMS, expanded_terms
 
 __all__ = ["NotKeptError", "Rate", "Switches", "how_kept", "shortened", "slope", "vanishes"]
 

@@ -10,9 +10,8 @@ import sympy
 from sympy.integrals.manualintegrate import manualintegrate
 
 from ...core.jitted import compilable, compiled_like, is_compiled, jitted
-from ..multibody.energies import Energy
-from ..multibody.motion import Sizes, new_floats, new_like
-from ..multibody.parts import Outputs, Parts
+from ..multibody.motion import new_floats, new_like
+from ..multibody.parts import Energy, Outputs, Parts
 from .parser import symbol
 from .program import Arguments, function
 
@@ -48,11 +47,6 @@ class Constrained(NamedTuple):
     positions: tuple[Any, ...]
     velocities: tuple[Any, ...]
     inputs: tuple[tuple[str, Callable[..., float]], ...] = ()
-
-    @property
-    def sizes(self) -> Sizes:
-        """Return the numbers of coordinates, speeds, and constraints."""
-        return Sizes(len(self.coordinates), len(self.speeds), len(self.velocities))
 
     @property
     def arguments(self) -> Arguments:
