@@ -79,7 +79,10 @@ def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
     start = _first(t_span)
     time = "d" if is_time(start) else None
     if time is None:
-        time = _named(start.unit if hasattr(start, "unit") else _time_unit(given["velocity"].unit), "s", 1)
+        speed = given["velocity"].unit
+        found = [base for base, power in zip(speed.bases, speed.powers, strict=True) if power == -1]
+        unit = next((base for base in found if base.physical_type == "time"), speed.si.bases[-1])
+        time = _named(start.unit if hasattr(start, "unit") else unit, "s", 1)
     return f"{_named(given['position'].unit, 'm', 0)}, {time}"
 
 
@@ -112,14 +115,10 @@ def _gravitational(gm: Any, known: tuple[Unit, Unit]) -> Any:
     """Return G m as plain numbers in the units `known` of length and time, from values of G m or masses with units."""
     if isinstance(gm, tuple | list) or type(gm) is np.ndarray:
         return np.array([_gravitational(value, known) for value in gm])
-    if not _is_mass(gm):  # a plain 0 among others is a test particle
+    if getattr(getattr(gm, "unit", None), "physical_type", None) != "mass":  # a plain 0 among others is a test particle
         return in_unit("gm", gm, (3, -2), known)
     length, time = known
     return gm.to_value("kg") * (G_SI * time.si**2 / length.si**3)
-
-
-def _is_mass(value: Any) -> bool:
-    return getattr(getattr(value, "unit", None), "physical_type", None) == "mass"
 
 
 def _first(value: Any) -> Any:
@@ -127,12 +126,6 @@ def _first(value: Any) -> Any:
     while isinstance(value, tuple | list) and len(value):
         value = value[0]
     return value
-
-
-def _time_unit(speed: Any) -> Any:
-    """Return the unit of time in a unit of velocity, such as s in km / s."""
-    found = [base for base, power in zip(speed.bases, speed.powers, strict=True) if power == -1]
-    return next((base for base in found if base.physical_type == "time"), speed.si.bases[-1])
 
 
 def _named(unit: Any, base: str, place: int) -> str:

@@ -162,6 +162,8 @@ def _check_constant(force: str, name: str, value: Any, n: int) -> None:
 
 def equations(forces: tuple[str, ...]) -> tuple[Any, Any]:
     """Return the right-hand side, and the accelerations if they depend on positions only (else None)."""
+    if not forces:
+        return library["gravity.rhs"], library["gravity.acc"]
     return library["forces.rhs"], None if set(forces) & set(VELOCITY_DEPENDENT) else library["forces.acc"]
 
 
@@ -174,6 +176,8 @@ def acceleration(y: np.ndarray, params: np.ndarray) -> np.ndarray:
 
 def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> tuple[Invariant, ...]:
     """Return the invariants of the equations with these forces, see `nbody`."""
+    if not forces:
+        return native_invariant("gravity.energy", "H", params), native_invariant("gravity.momentum", "L", params)
     if "drag" in forces:
         return ()
     if "1pn" in forces:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...core.inputs import has_unit, is_number, refuse_units, shown
-from ...core.invariants import Invariant
-from ...core.problem import Problem, bind, library_variational, native_invariant
-from ...core.units import Epoch, apart, as_epoch, in_unit, is_time, moment
+from ...core.problem import Problem, bind, library_variational
+from ...core.units import apart, as_epoch, in_unit, is_time, moment
 from ...core.units import units as known_units
 from ...engine.native import library
 from . import forces as _forces
@@ -154,7 +153,10 @@ def nbody(
     units = units or default_units(gm, position, velocity, t_span)
     known = known_units(units)
     gm, position, velocity = in_units(_gravitational(gm, G), position, velocity, known)
-    epoch = _epoch(t_span) if epoch is None else as_epoch("epoch", epoch)
+    if epoch is not None:
+        epoch = as_epoch("epoch", epoch)
+    elif isinstance(t_span, tuple | list) and t_span and is_time(t_span[0]):
+        epoch = as_epoch("t_span", t_span[0])
     t_span = moment("t_span", t_span, known, epoch, "nbody")
     h = in_unit("h", h, (0, 1), known)
     masses, q, v = _checked(gm, position, velocity)
@@ -162,11 +164,10 @@ def nbody(
     y0 = np.concatenate([q.ravel(), v.ravel()])
     params = _forces.parameters(masses, chosen, constants) if chosen else masses
     if balances is None:
-        kept = _forces.invariants(chosen, params, y0) if chosen else _newtonian(params)
+        kept = _forces.invariants(chosen, params, y0)
     else:
         kept = balances_beside_frame(masses, y0, balances, bodies, newton=not chosen)
-    equations = "forces" if chosen else "gravity"
-    rhs, acc = _forces.equations(chosen) if chosen else (library["gravity.rhs"], library["gravity.acc"])
+    rhs, acc = _forces.equations(chosen)
     return Problem(
         name=name,
         fun=bind(rhs, params),
@@ -184,7 +185,7 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
-        variational=partial(library_variational, f"{equations}.variational", ()),
+        variational=partial(library_variational, "forces.variational" if chosen else "gravity.variational", ()),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,
@@ -195,11 +196,6 @@ def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of the 6 n components, x_0, y_0, ... then vx_0, ..., with `bodies` in place of the numbers."""
     names = tuple(map(str, range(n))) if bodies is None else body_names(bodies, n)
     return tuple(f"{axis}_{body}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for body in names for axis in axes)
-
-
-def _epoch(t_span: Any) -> Epoch | None:
-    start = t_span[0] if isinstance(t_span, tuple | list) and t_span else None
-    return as_epoch("t_span", start) if is_time(start) else None
 
 
 def _gravitational(masses: Any, G: Any) -> Any:
@@ -215,10 +211,6 @@ def _gravitational(masses: Any, G: Any) -> Any:
             "a unit are multiplied by the constant of gravitation, and values of G m are used unchanged."
         )
     return G * np.asarray(masses, dtype=float)
-
-
-def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
-    return native_invariant("gravity.energy", "H", params), native_invariant("gravity.momentum", "L", params)
 
 
 def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -217,11 +217,6 @@ def _centre(gm: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.array([math.fsum(gm * column) for column in rows.T]) / math.fsum(gm)
 
 
-def _state(rows: np.ndarray) -> np.ndarray:
-    """Return the state (q of all bodies, v of all bodies) from an array whose rows are (q, v) of one body."""
-    return rows.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
-
-
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 

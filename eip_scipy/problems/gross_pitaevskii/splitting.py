@@ -196,7 +196,8 @@ class Splitting:
     def one_step(self, t: float, y: np.ndarray, h: float) -> np.ndarray:
         """Make one step of length h; `y` is overwritten and returned."""
         if h != self._h:
-            self._flows, self._h = self._linear_flows(h), h
+            made = {part: LinearFlow(self.gpe, part * h) for part in set(self.scheme.linear)}
+            self._flows, self._h = [made[part] for part in self.scheme.linear], h
         gpe, scheme = self.gpe, self.scheme
         psi = y.reshape(gpe.grid.shape)
         field, work = psi, np.empty_like(psi)
@@ -207,7 +208,3 @@ class Splitting:
         if field is not psi:
             psi[...] = field
         return y
-
-    def _linear_flows(self, h: float) -> list[LinearFlow]:
-        made = {part: LinearFlow(self.gpe, part * h) for part in set(self.scheme.linear)}
-        return [made[part] for part in self.scheme.linear]

@@ -88,7 +88,9 @@ def vortices(
     dx, dy = gpe.grid.spacing[:2]
     filled = scipy.ndimage.grey_closing(np.abs(psi) ** 2, size=core_size(gpe, top, core), mode="wrap")
     charge = _charges(psi, turning, x, y, dx, dy)
-    i, j = np.nonzero((charge != 0) & (_least_of_corners(filled) > threshold * top))
+    least = np.minimum(filled[1:], filled[:-1])
+    least = np.minimum(least[:, 1:], least[:, :-1])  # of the corners of each cell
+    i, j = np.nonzero((charge != 0) & (least > threshold * top))
     places = [_zero(psi[a : a + 2, b : b + 2], turning, x[a], y[b], dx, dy) for a, b in zip(i, j, strict=True)]
     return Vortices(np.array(places).reshape(-1, 2), charge[i, j])
 
@@ -106,11 +108,6 @@ def _charges(psi: np.ndarray, Omega: float, x: np.ndarray, y: np.ndarray, dx: fl
     along_y = np.angle(psi[:, 1:] * np.conj(psi[:, :-1]) * np.exp(-1j * Omega * dy * x[:, None]))
     around = along_x[:, :-1] + along_y[1:] - along_x[:, 1:] - along_y[:-1]
     return np.rint((around + 2 * Omega * dx * dy) / (2 * pi)).astype(int)
-
-
-def _least_of_corners(a: np.ndarray) -> np.ndarray:
-    along = np.minimum(a[1:], a[:-1])
-    return np.minimum(along[:, 1:], along[:, :-1])
 
 
 def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: float) -> tuple[float, float]:

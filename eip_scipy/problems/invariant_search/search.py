@@ -245,7 +245,7 @@ class Search:
                 continue
             left = gradient / size
             if others:
-                Q = np.linalg.qr(np.array([_unit(item[k]) for item in others]).T)[0]
+                Q = np.linalg.qr(np.array([item[k] / (np.linalg.norm(item[k]) or 1.0) for item in others]).T)[0]
                 left = left - Q @ (Q.T @ left)
             if np.linalg.norm(left) > INDEPENDENT:
                 return True
@@ -265,7 +265,3 @@ class Search:
         sure = ((np.abs(self._gradients(row, points)) * errors).sum(axis=1) <= bound) & np.isfinite(values)
         end = sure.size if sure.all() else int(np.argmin(sure))
         return bool(np.all(np.abs(values - values[0])[:end] <= bound[:end]))
-
-
-def _unit(vector: Array) -> Array:
-    return vector / (np.linalg.norm(vector) or 1.0)

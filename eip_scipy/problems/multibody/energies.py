@@ -117,7 +117,8 @@ def states_near(
             moved = _nearest(origin + share * sizes * direction, constraints, time, sizes)
             # Newton's method may end beyond a singular position. Such a state is farther away and is not used.
             near = np.linalg.norm((moved - origin) / sizes) <= 2 * share * np.linalg.norm(direction) * (1 + CONSTANT)
-            meets = all(_meets(item, time, moved) for item in constraints)
+            most = CONSTANT * max(1.0, np.abs(moved).max())
+            meets = all(np.abs(item.fun(time, moved)).max() <= most for item in constraints)
             if near and meets and np.isfinite(derivative(time, moved)).all():
                 found.append((time, moved))
                 break
@@ -134,10 +135,6 @@ def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> fl
     """Return the largest speed, or sqrt(size of q times the largest acceleration) if larger; size of 0 counts as 1."""
     size = np.abs(q).max(initial=0.0) or 1.0
     return float(max(np.abs(u).max(initial=0.0), np.sqrt(size * np.abs(accelerations).max(initial=0.0))))
-
-
-def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
-    return bool(np.abs(item.fun(t, y)).max() <= CONSTANT * max(1.0, np.abs(y).max()))
 
 
 def rates_of(
@@ -183,7 +180,9 @@ def momenta_of(
     known = [_rows(kept, t, y) for t, y in states]
     for item in candidates:
         rates, terms = rates_of(item, derivative, states, args)
-        slopes = [_slope(plain(item.gradient), t, y, args) for t, y in states]
+        slopes = [np.empty(y.size) for _, y in states]
+        for slope, (t, y) in zip(slopes, states, strict=True):
+            plain(item.gradient)(t, y, slope, *args)
         rounding = [np.abs(g).sum() * np.abs(derivative(t, y)).max() for g, (t, y) in zip(slopes, states, strict=True)]
         if not (np.abs(rates) <= CONSTANT * terms + ROUNDING * np.array(rounding)).all():
             continue
@@ -229,12 +228,6 @@ def _rows(items: Sequence[Invariant], t: float, y: np.ndarray) -> np.ndarray:
         plain(item.gradient)(t, y, out, *item.args)
         found.append(np.atleast_2d(out))
     return np.vstack(found)
-
-
-def _slope(gradient: Callable[..., None], t: float, y: np.ndarray, args: tuple[Any, ...]) -> np.ndarray:
-    out = np.empty(y.size)
-    gradient(t, y, out, *args)
-    return out
 
 
 def _is_independent(gradient: np.ndarray, rows: np.ndarray) -> bool:

@@ -28,7 +28,10 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
         out[:] = np.concatenate([np.ravel(part) for part in parts])
 
     energies = []
-    if (energy := _energy(given)) is not None:
+    energy, potential = given.energy, given.potential
+    if energy is None and potential is not None:
+        energy = lambda t, q, u: 0.5 * (u @ given.mass(q) @ u) + potential(t, q)  # noqa: E731
+    if energy is not None:
         y = np.concatenate([q, u])
         fun = lambda t, y: energy(t, y[:nq], y[nq:])  # noqa: E731
         slopes = NumericalGradient(fun, (), True, t, y, _sizes(y), ())
@@ -64,13 +67,6 @@ def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
         out[:] = [function(t, x[:nq], x[nq : nq + n]) for function in functions]
 
     return Outputs(tuple(given.outputs), fill) if functions else None
-
-
-def _energy(given: Given) -> Callable[..., Any] | None:
-    potential = given.potential
-    if given.energy is not None or potential is None:
-        return given.energy
-    return lambda t, q, u: 0.5 * (u @ given.mass(q) @ u) + potential(t, q)
 
 
 def _sizes(y: Array) -> Array:

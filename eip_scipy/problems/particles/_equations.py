@@ -63,6 +63,7 @@ def no_force(t, x, y, z):
     return 0.0, 0.0, 0.0
 
 
+@lru_cache(maxsize=32)  # compiled once in a process
 def compose(field: FieldFunctions, form: str) -> ParticleEquations:
     """Return the equations of motion and the invariants of a particle in the form "canonical" or "velocity".
 

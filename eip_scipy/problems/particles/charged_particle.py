@@ -178,7 +178,7 @@ def charged_particle(
             f"charged_particle: mass must be positive and charge not 0, both finite; got {mass!r} and {charge!r}."
         )
     field.check(x, float(t_span[0]))
-    equations = _equations(field, form)
+    equations = compose(field.functions, form)
     momentum = v if form == "velocity" else params[MASS] * v + params[CHARGE] * field.along("A", x[:, None])[:, 0]
     return ParticleProblem(
         name=name,
@@ -209,12 +209,6 @@ def _variational(
     parameters: tuple[int, ...],
 ) -> Callable[..., None]:
     return variational(rhs, field.functions, form, field.length, start, parameters)
-
-
-@lru_cache(maxsize=32)
-def _equations(field: ParticleField, form: str) -> ParticleEquations:
-    """Return the equations and invariants of a field in one form; they are compiled once in a process."""
-    return compose(field.functions, form)
 
 
 def _invariants(

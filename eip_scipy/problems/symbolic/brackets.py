@@ -7,7 +7,7 @@ derivatives have no impulses where they do not jump.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ import sympy
 
 from .parser import EXPANDED_TERMS, expanded_terms
 
-__all__ = ["NotKeptError", "Rate", "Switches", "how_kept", "shortened", "slope", "vanishes"]
+__all__ = ["NotKeptError", "Rate", "how_kept", "shortened", "slope", "vanishes"]
 
 POINTS, TRIES = 8, 200
 DIGITS = 50
@@ -23,6 +23,12 @@ LARGEST = sympy.Integer(10) ** 300
 ROUND_OFF = 1e-20  # bound for the rounding of a rate that is 0, relative to its terms, when computed with DIGITS
 # Beyond this number of operations `simplify` may take minutes, while an evaluation at points takes milliseconds.
 SIMPLIFIED_OPERATIONS = 120
+# Functions with branches, and the search for places where they change.
+KINDS = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside)
+MOST = 60  # largest number of differences whose signs choose branches
+LINES = 4  # number of lines on which a change of sign is searched for each difference
+POWERS = range(-40, 101, 4)  # the places on a line are these powers of 2
+BISECTIONS = 40  # after them the relative distance is 1e-11
 
 
 class NotKeptError(ValueError):
@@ -150,17 +156,55 @@ def _beside_switches(
     expressions: Sequence[Any], variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]
 ) -> Iterator[tuple[Any, Any]]:
     """Yield points on both sides of each place at which a max, min, abs or the like changes, with ``rate.at``."""
-    switches = Switches(expressions, variables)
+    differences: dict[Any, Any] = {}  # those whose signs choose branches, and the functions
+    for atom in sorted({atom for item in expressions for atom in item.atoms(*KINDS)}, key=str):
+        several = isinstance(atom, (sympy.Max, sympy.Min))
+        found = [a - b for a, b in combinations(atom.args, 2)] if several else [atom.args[0]]
+        differences |= {item: atom for item in found if item.free_symbols & set(variables)}
+    if len(differences) > MOST:
+        raise ValueError(f"its functions change branches at {len(differences)} places, more than {MOST}")
     draw = random.Random(20221)
     given = {item: sympy.Rational(value) for item, value in parameters.items()}
+    for difference, atom in differences.items():
+        known = sorted(difference.free_symbols & set(variables), key=str)
+        sides = [
+            side for _ in range(LINES) for side in _sides(difference, known, _drawn(draw, variables, (-1, 1)), given)
+        ]
+        if not (sides or difference.is_nonnegative or difference.is_nonpositive):
+            raise ValueError(f"no point was found where {shortened(atom)} changes its branch")
+        for point in sides:
+            values = rate.at(point | given)
+            if values is not None:
+                yield point, values
 
-    def value(expression: Any, point: Mapping[Any, Any]) -> Any:
-        return _value(expression, {item: number.evalf(DIGITS) for item, number in ({**point, **given}).items()})
 
-    for point in switches.points(lambda: _drawn(draw, variables, (-1, 1)), value):
-        values = rate.at(point | given)
-        if values is not None:
-            yield point, values
+def _sides(difference: Any, variables: Sequence[Any], point: dict[Any, Any], given: Mapping[Any, Any]) -> list[Any]:
+    """Return two points on a line through `point` on an axis at which `difference` has opposite signs, or []."""
+
+    def at(variable: Any, place: Any) -> Any:
+        return _value(
+            difference, {k: number.evalf(DIGITS) for k, number in (point | {variable: place} | given).items()}
+        )
+
+    for variable in variables:
+        places = [sign * sympy.Integer(2) ** power for sign in (-1, 1) for power in POWERS]
+        places = [sympy.Integer(0), point[variable], *places]
+        signs: dict[int, Any] = {}
+        for place in sorted(places, key=abs):
+            value = at(variable, place)
+            if value is not None and value != 0:
+                signs.setdefault(1 if value > 0 else -1, place)
+            if len(signs) < 2:
+                continue
+            below, above = signs[-1], signs[1]
+            for _ in range(BISECTIONS):
+                middle = (below + above) / 2
+                value = at(variable, middle)
+                if value is None or value == 0:
+                    break
+                below, above = (middle, above) if value < 0 else (below, middle)
+            return [point | {variable: place} for place in (below, above)]
+    return []
 
 
 def _drawn(draw: random.Random, variables: Sequence[Any], signs: Sequence[int]) -> dict[Any, Any]:
@@ -199,64 +243,3 @@ def _vanishes_at(factor: Any, place: Any) -> bool:
         if rate.is_number and rate != 0:
             return vanishes(factor.xreplace({variable: sympy.expand(variable - place / rate)}))
     return vanishes(factor.xreplace({place: sympy.Integer(0), -place: sympy.Integer(0)}))
-
-
-KINDS = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside)
-MOST = 60  # largest number of differences whose signs choose branches
-LINES = 4  # number of lines on which a change of sign is searched for each difference
-POWERS = range(-40, 101, 4)  # the places on a line are these powers of 2
-BISECTIONS = 40  # after them the relative distance is 1e-11
-
-
-class Switches:
-    """The differences of `variables` whose signs choose the branches of some expressions."""
-
-    def __init__(self, expressions: Iterable[Any], variables: Sequence[Any]) -> None:
-        atoms = sorted({atom for item in expressions for atom in item.atoms(*KINDS)}, key=str)
-        self._variables = variables
-        self._differences: dict[Any, Any] = {}
-        for atom in atoms:
-            several = isinstance(atom, (sympy.Max, sympy.Min))
-            found = [a - b for a, b in combinations(atom.args, 2)] if several else [atom.args[0]]
-            self._differences |= {item: atom for item in found if item.free_symbols & set(variables)}
-
-    def points(self, draw: Callable[[], dict[Any, Any]], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
-        """Return points on both sides of all places at which a function changes its branch.
-
-        ``draw()`` returns a random point, and ``at(expression, point)`` a value, None if it is not finite and real. A
-        ValueError is raised if there are too many branches, or one of them is not found.
-        """
-        if len(self._differences) > MOST:
-            raise ValueError(f"its functions change branches at {len(self._differences)} places, more than {MOST}")
-        found = []
-        for difference, atom in self._differences.items():
-            sides = [side for _ in range(LINES) for side in self._sides(difference, draw(), at)]
-            one_sided = difference.is_nonnegative or difference.is_nonpositive
-            if not sides and not one_sided:
-                raise ValueError(f"no point was found where {shortened(atom)} changes its branch")
-            found += sides
-        return found
-
-    def _sides(self, difference: Any, point: dict[Any, Any], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
-        """Return two points on a line through `point` on an axis at which `difference` has opposite signs, or []."""
-        for variable in sorted(difference.free_symbols & set(self._variables), key=str):
-            places = [sign * sympy.Integer(2) ** power for sign in (-1, 1) for power in POWERS]
-            places = [sympy.Integer(0), point[variable], *places]
-            signs: dict[int, Any] = {}
-            for place in sorted(places, key=abs):
-                value = at(difference, point | {variable: place})
-                if value is not None and value != 0:
-                    signs.setdefault(1 if value > 0 else -1, place)
-                if len(signs) == 2:
-                    return self._closer(difference, point, variable, signs, at)
-        return []
-
-    def _closer(self, difference: Any, point: Any, variable: Any, signs: Any, at: Any) -> list[Any]:
-        below, above = signs[-1], signs[1]
-        for _ in range(BISECTIONS):
-            middle = (below + above) / 2
-            value = at(difference, point | {variable: middle})
-            if value is None or value == 0:
-                break
-            below, above = (middle, above) if value < 0 else (below, middle)
-        return [point | {variable: place} for place in (below, above)]

@@ -103,7 +103,10 @@ def _traced(
         found = traced(keys[0].func.__name__, fun, "t", names).ravel()
     except NotTraceableError:
         return None
-    _require_size(keys, found)
+    if found.size != len(keys):
+        raise ValueError(
+            f"inputs: the function of {', '.join(map(str, keys))} returns {found.size} numbers; expected {len(keys)}."
+        )
     t, y = start
     values = {symbol("t"): t, **{symbol(name): x for name, x in zip(names, y, strict=True)}}
     own = [float(sympy.sympify(item).xreplace(values)) for item in found]
@@ -115,9 +118,7 @@ def _traced(
 
 def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
     """Return for each function of time in `keys` its name, and a function ``f(t, y)`` of this component of `fun`."""
-    if len(keys) == 1:
-        return [(name_of(keys[0]), _part(fun, None))]
-    return [(name_of(key), _part(fun, k)) for k, key in enumerate(keys)]
+    return [(name_of(key), _part(fun, k if len(keys) > 1 else None)) for k, key in enumerate(keys)]
 
 
 def _part(fun: Any, k: int | None) -> Callable[..., float]:
@@ -130,10 +131,3 @@ def _part(fun: Any, k: int | None) -> Callable[..., float]:
 
 def _called_in_python(fun: Callable[..., Any], k: int | None, t: float, y: np.ndarray) -> float:
     return float(fun(t, y) if k is None else fun(t, y)[k])
-
-
-def _require_size(keys: Sequence[Any], found: np.ndarray) -> None:
-    if found.size != len(keys):
-        raise ValueError(
-            f"inputs: the function of {', '.join(map(str, keys))} returns {found.size} numbers; expected {len(keys)}."
-        )

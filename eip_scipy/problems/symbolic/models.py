@@ -335,7 +335,7 @@ def _of_kane(method: Any) -> _Equations:
     dependent = {*method._qdep, *method._udep}
     kinetic = sympy.Add(*(body.kinetic_energy(frame) for body in bodies))
     potential = sympy.Add(*(body.potential_energy for body in bodies))
-    of_loads = _potential_of_loads(loads or [], frame, {*q, *u})
+    of_loads = _potential_of_loads(loads or [], frame)
     energies = [("kinetic and potential energy of the bodies", kinetic + potential)]
     if of_loads is not None and of_loads != 0:
         energies += [
@@ -402,7 +402,7 @@ def _is_constant(load: Any, frame: Any) -> bool:
     )
 
 
-def _potential_of_loads(loads: Iterable[Any], frame: Any, state: set[Any]) -> Any:
+def _potential_of_loads(loads: Iterable[Any], frame: Any) -> Any:
     """Return the potential of the forces that are constant in the inertial frame; None if a position is unknown."""
     total = sympy.Integer(0)
     for place, vector in loads:

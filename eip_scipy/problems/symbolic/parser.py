@@ -76,7 +76,9 @@ def require_power(base: Any, exponent: Any) -> None:
     if not exponent.is_Rational:
         return
     numbers = [factor.as_base_exp() for factor in sympy.Mul.make_args(base)]
-    total = sum(_bits(number) * math.ceil(abs(power)) for number, power in numbers if _rational(number, power))
+    total = sum(
+        _bits(number) * math.ceil(abs(power)) for number, power in numbers if number.is_Rational and power.is_Rational
+    )
     _require(total * math.ceil(abs(exponent)))
 
 
@@ -124,10 +126,6 @@ def expanded_terms(expression: Any) -> int:
             terms, power = expanded_terms(base), min(abs(int(exponent)), most)
             return min(most, math.comb(terms + power - 1, power)) if terms > 1 else 1
     return 1
-
-
-def _rational(number: Any, power: Any) -> bool:
-    return bool(number.is_Rational and power.is_Rational)
 
 
 def _bits(number: Any) -> int:

@@ -319,12 +319,13 @@ def equations_problem(
         as_expression(f"the derivative of {k}", item, declared)
         for k, item in zip(timed.names, timed.values, strict=True)
     )
-    further = Further(*(_timed(given, timed) for given in (invariants, constraints)))
+    further = Further(
+        *(
+            {key: timed(item) for key, item in given.items()} if isinstance(given, Mapping) else given
+            for given in (invariants, constraints)
+        )
+    )
     return _checked("f", name or "equations", timed.names, rates, values, {}, {}, further, ())
-
-
-def _timed(given: Any, timed: Timed) -> Any:
-    return {key: timed(item) for key, item in given.items()} if isinstance(given, Mapping) else given
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
@@ -412,8 +413,11 @@ def _checked(
             raise TypeError(f"invariants and constraints: names must be strings, got {shown(label)}.")
         if label in kept:
             raise ValueError(f"invariants: {label} is already the name of an invariant; choose another or omit it.")
-        kind = "constraint" if label in constraints else "invariant"
-        quantities[label] = _quantity(f"{kind} {label!r}", item, names, known)
+        described = f"{'constraint' if label in constraints else 'invariant'} {label!r}"
+        quantities[label] = quantity = as_expression(described, item, known)
+        _require_known(described, quantity, known)
+        if not quantity.has(*map(symbol, names)):
+            raise ValueError(f"{described} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
     zero = {label: quantities[label] for label in constraints}
     manifold = Manifold(zero, names, rates, values) if zero else None
     for label, quantity in quantities.items():
@@ -424,18 +428,6 @@ def _checked(
     return _problem(
         name=name, system=system, params=params, checks=checks, pairs=pairs, invariants=_invariants(system, params)
     )
-
-
-def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> Any:
-    """Return the expression of an invariant or a constraint, described by `what`, after a check of its names.
-
-    A ValueError is raised if it contains a name that is not `known`, or does not depend on the components `names`.
-    """
-    quantity = as_expression(what, given, known)
-    _require_known(what, quantity, known)
-    if not quantity.has(*map(symbol, names)):
-        raise ValueError(f"{what} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
-    return quantity
 
 
 def _how_kept(
