@@ -2,9 +2,19 @@
 
 from .damped import DampedGrossPitaevskii
 from .equation import FieldProblem, GrossPitaevskii
-from .frames import at_rest, rotated
 from .grid import Grid, Multiplier, SpectralSum
-from .ground_state import GroundState, ground_state
+from .ground_state import (
+    GroundState,
+    ground_state,
+    imprint,
+    lowest_ring,
+    lowest_state,
+    polygon,
+    ring_start,
+    thomas_fermi,
+    vortex_starts,
+    with_noise,
+)
 from .scenes import (
     breather,
     harmonic_trap,
@@ -15,8 +25,7 @@ from .scenes import (
     rotating_packet,
     soliton,
 )
-from .search import imprint, lowest_ring, lowest_state, polygon, ring_start, thomas_fermi, vortex_starts, with_noise
-from .splitting import RKN6, S6, STRANG, LinearFlow, Scheme, Splitting
+from .splitting import RKN6, S6, STRANG, LinearFlow, Scheme, Splitting, at_rest, rotated
 from .transforms import make_transforms
 from .vortices import Surface, Vortices, density_surface, vortices
 

@@ -11,8 +11,7 @@ import numpy as np
 from ...core.inputs import real_array, shown
 from ...core.problem import component_names
 from .motion import plain
-from .numerical import numerical_parts
-from .parts import Given, Parts, required_outputs
+from .parts import Given, Parts, numerical_parts, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
 
@@ -303,8 +302,7 @@ def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -
     """Return the `Parts`, made from expressions if all functions can be converted to them, else from functions."""
     if find_spec("sympy") is None:
         return numerical_parts(given, names, t, q, u, "SymPy is not installed")
-    from ..symbolic.traced import NotTraceableError
-    from ..symbolic.traced_mechanisms import traced_parts
+    from ..symbolic.traced import NotTraceableError, traced_parts
 
     try:
         return traced_parts(given, names, t, q, u)

@@ -1,4 +1,4 @@
-"""Functions of a mechanism: those of the user, those that a problem is made of, and outputs that the user defines."""
+"""Functions of a mechanism: those of the user, and those that a problem is made of, with numerical derivatives."""
 
 from __future__ import annotations
 
@@ -7,11 +7,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...core.gradients import NumericalGradient, difference_gradient
 from ...core.inputs import shown
 from .motion import plain
 from .start import Names
 
-__all__ = ["Energy", "Given", "Outputs", "Parts", "columns_of", "required_outputs"]
+__all__ = [
+    "Energy",
+    "Given",
+    "Outputs",
+    "Parts",
+    "columns_of",
+    "numerical_parts",
+    "outputs_as_given",
+    "required_outputs",
+]
 
 
 class Outputs(NamedTuple):
@@ -99,3 +109,142 @@ class Parts(NamedTuple):
         plain(self.fill)(t, y, out, *args)
         M, F, G, gamma, rates = np.split(out, np.cumsum([n * n, n, m * n, m]))
         return [M.reshape(n, n), F, G.reshape(m, n), gamma, rates]
+
+
+Array = np.ndarray
+
+
+def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
+    """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none; `why` is for the repr."""
+    found = _Constraints(given, names, t, q)
+    nq = q.size
+
+    def fill(t: float, y: Array, out: Array) -> None:
+        q, u = y[:nq], y[nq:]
+        F = given.forces(t, q, u)
+        parts = (given.mass(q), F, found.speed_gradient(t, q, u), found.gamma(t, q, u), found.rates(t, q, u))
+        out[:] = np.concatenate([np.ravel(part) for part in parts])
+
+    energies = []
+    energy, potential = given.energy, given.potential
+    if energy is None and potential is not None:
+        energy = lambda t, q, u: 0.5 * (u @ given.mass(q) @ u) + potential(t, q)  # noqa: E731
+    if energy is not None:
+        y = np.concatenate([q, u])
+        fun = lambda t, y: energy(t, y[:nq], y[nq:])  # noqa: E731
+        slopes = NumericalGradient(fun, (), True, t, y, _sizes(y), ())
+
+        def energy_gradient(t: float, y: Array, out: Array) -> None:
+            out[:] = slopes(t, y)
+
+        power = given.power
+        rate = None if power is None else (lambda t, y: float(power(t, y[:nq], y[nq:])))
+        energies.append(Energy("energy" if given.energy else "u M u / 2 + potential", fun, energy_gradient, rate))
+
+    def values(t: float, y: Array, out: Array) -> None:
+        out[:] = found.values(t, y[:nq], y[nq:])
+
+    def gradient(t: float, y: Array, out: Array) -> None:
+        found.gradient(t, y[:nq], y[nq:], out)
+
+    return Parts(
+        fill,
+        values,
+        gradient,
+        tuple(energies),
+        f"functions are not converted to expressions, and derivatives that are not given are numerical: {why}",
+        outputs=outputs_as_given(given, nq, u.size),
+    )
+
+
+def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
+    """Return `Outputs` that call the user's functions in ``given.outputs``; None if there are no such functions."""
+    functions = tuple(given.outputs.values())
+
+    def fill(t: float, x: Array, out: Array) -> None:
+        out[:] = [function(t, x[:nq], x[nq : nq + n]) for function in functions]
+
+    return Outputs(tuple(given.outputs), fill) if functions else None
+
+
+def _sizes(y: Array) -> Array:
+    """Return ``|y_k|``, or the largest ``|y_j|`` where y_k is 0: the units of steps for differences."""
+    return np.where(y != 0, np.abs(y), np.abs(y).max(initial=0.0) or 1.0)
+
+
+class _Constraints:
+    """Constraints on positions and velocities, and their derivatives, from the user's functions."""
+
+    def __init__(self, given: Given, names: Names, t: float, q: Array) -> None:
+        self.given = given
+        self._positions, self._rows, self._speeds = len(names.positions), len(names.velocities), len(names.speeds)
+        # The function of (q, t) gives the derivatives by q and by t together.
+        constraints = given.constraints
+        joint = np.append(q, t)
+        self._slopes = None
+        if constraints is not None:
+            self._slopes = NumericalGradient(
+                lambda _, x: np.asarray(constraints(x[-1], x[:-1])), (), True, 0.0, joint, _sizes(joint), ()
+            )
+
+    def rates(self, t: float, q: Array, u: Array) -> Array:
+        """Return q', the derivatives of the coordinates."""
+        return u if self.given.kinematics is None else np.asarray(self.given.kinematics(t, q, u))
+
+    def positions(self, t: float, q: Array) -> Array:
+        """Return the values of the constraints on positions."""
+        return np.zeros(0) if self.given.constraints is None else np.asarray(self.given.constraints(t, q), float)
+
+    def jacobian(self, t: float, q: Array) -> tuple[Array, Array]:
+        """Return the derivatives of the constraints on positions with respect to q, (m, nq), and to t, (m,)."""
+        if self._slopes is None:
+            return np.zeros((0, q.size)), np.zeros(0)
+        slopes = self._slopes(0.0, np.append(q, t))
+        own = slopes[:, :-1] if self.given.jacobian is None else np.asarray(self.given.jacobian(t, q), float)
+        return own, slopes[:, -1]
+
+    def velocities(self, t: float, q: Array, u: Array) -> Array:
+        """Return the values of the constraints on velocities: first the time derivatives of those on positions."""
+        J, explicit = self.jacobian(t, q)
+        others = self.given.velocity_constraints
+        own = [] if others is None else [np.asarray(others(t, q, u), float)]
+        return np.concatenate([J @ self.rates(t, q, u) + explicit, *own])
+
+    def values(self, t: float, q: Array, u: Array) -> Array:
+        """Return the values of the constraints on positions, and then of those on velocities."""
+        return np.concatenate([self.positions(t, q), self.velocities(t, q, u)])
+
+    def speed_gradient(self, t: float, q: Array, u: Array) -> Array:
+        """Return G, the derivatives of the constraints on velocities with respect to the speeds."""
+        n, others = u.size, self.given.velocity_constraints
+        J, _ = self.jacobian(t, q)
+        speeds = np.eye(n)
+
+        def linear(fun: Callable[..., Any]) -> Array:
+            zero = np.asarray(fun(t, q, np.zeros(n)), float)
+            return np.stack([np.asarray(fun(t, q, unit), float) - zero for unit in speeds], axis=1)
+
+        G = J if self.given.kinematics is None else J @ linear(self.given.kinematics)
+        return G if others is None else np.concatenate([G, linear(others)])
+
+    def gamma(self, t: float, q: Array, u: Array) -> Array:
+        """Return gamma, the time derivatives of the constraints on velocities for u' = 0."""
+        if self.given.gamma is not None:
+            return np.asarray(self.given.gamma(t, q, u), float)
+        if self._rows == 0:
+            return np.zeros(0)
+        rates = self.rates(t, q, u)
+        fastest = np.abs(rates).max(initial=0.0)
+        duration = np.abs(q).max(initial=0.0) / fastest if fastest > 0 else 1.0
+        return difference_gradient(
+            lambda s: self.velocities(t + s[0], q + s[0] * rates, u), np.zeros(1), np.array([duration or 1.0])
+        )[:, 0]
+
+    def gradient(self, t: float, q: Array, u: Array, out: Array) -> None:
+        """Fill `out` with the derivatives of all constraints (rows) with respect to the state (q, u)."""
+        out[:] = 0.0
+        m, nq = self._positions, q.size
+        out[:m, :nq] = self.jacobian(t, q)[0]
+        if self._rows > 0:
+            out[m:, :nq] = difference_gradient(lambda x: self.velocities(t, x, u), q, _sizes(q))
+            out[m:, nq:] = self.speed_gradient(t, q, u)

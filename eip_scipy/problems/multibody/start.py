@@ -50,7 +50,7 @@ def name_of(key: Any) -> str:
     """Return the name of a component from a string, or from a symbol or function of SymPy."""
     if isinstance(key, str):
         return key
-    from ..symbolic.inputs import name_of as of_symbol
+    from ..symbolic.models import name_of as of_symbol
 
     return of_symbol(key)
 

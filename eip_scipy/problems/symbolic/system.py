@@ -18,8 +18,7 @@ from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_jitted
 from ...core.problem import Deferred, Problem, bind
-from .brackets import NotKeptError, how_kept, slope, vanishes
-from .manifold import Manifold
+from .brackets import Manifold, NotKeptError, how_kept, slope, vanishes
 from .pairs import Timed, paired
 from .parser import as_expression, as_names, symbol
 from .program import Arguments, function
