@@ -116,17 +116,9 @@ Array = np.ndarray
 
 def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
     """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none; `why` is for the repr."""
-    found = _Constraints(given, names, t, q)
-    nq = q.size
-
-    def fill(t: float, y: Array, out: Array) -> None:
-        q, u = y[:nq], y[nq:]
-        F = given.forces(t, q, u)
-        parts = (given.mass(q), F, found.speed_gradient(t, q, u), found.gamma(t, q, u), found.rates(t, q, u))
-        out[:] = np.concatenate([np.ravel(part) for part in parts])
-
-    energies = []
-    energy, potential = given.energy, given.potential
+    found = _Numerical(given, names, t, q)
+    nq, energies = q.size, []
+    energy, potential, power = given.energy, given.potential, given.power
     if energy is None and potential is not None:
         energy = lambda t, q, u: 0.5 * (u @ given.mass(q) @ u) + potential(t, q)  # noqa: E731
     if energy is not None:
@@ -137,20 +129,12 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
         def energy_gradient(t: float, y: Array, out: Array) -> None:
             out[:] = slopes(t, y)
 
-        power = given.power
         rate = None if power is None else (lambda t, y: float(power(t, y[:nq], y[nq:])))
         energies.append(Energy("energy" if given.energy else "u M u / 2 + potential", fun, energy_gradient, rate))
-
-    def values(t: float, y: Array, out: Array) -> None:
-        out[:] = found.values(t, y[:nq], y[nq:])
-
-    def gradient(t: float, y: Array, out: Array) -> None:
-        found.gradient(t, y[:nq], y[nq:], out)
-
     return Parts(
-        fill,
-        values,
-        gradient,
+        found.fill,
+        found.values,
+        found.gradient,
         tuple(energies),
         f"functions are not converted to expressions, and derivatives that are not given are numerical: {why}",
         outputs=outputs_as_given(given, nq, u.size),
@@ -172,28 +156,47 @@ def _sizes(y: Array) -> Array:
     return np.where(y != 0, np.abs(y), np.abs(y).max(initial=0.0) or 1.0)
 
 
-class _Constraints:
-    """Constraints on positions and velocities, and their derivatives, from the user's functions."""
+class _Numerical:
+    """Matrices and constraints of a mechanism, and their derivatives, from the user's functions."""
 
     def __init__(self, given: Given, names: Names, t: float, q: Array) -> None:
-        self.given = given
-        self._positions, self._rows, self._speeds = len(names.positions), len(names.velocities), len(names.speeds)
+        self.given, self._nq = given, q.size
+        self._positions, self._rows = len(names.positions), len(names.velocities)
         # The function of (q, t) gives the derivatives by q and by t together.
-        constraints = given.constraints
-        joint = np.append(q, t)
+        constraints, joint = given.constraints, np.append(q, t)
         self._slopes = None
         if constraints is not None:
             self._slopes = NumericalGradient(
                 lambda _, x: np.asarray(constraints(x[-1], x[:-1])), (), True, 0.0, joint, _sizes(joint), ()
             )
 
+    def fill(self, t: float, y: Array, out: Array) -> None:
+        """Fill `out` with M, F, G, gamma and q'."""
+        q, u = y[: self._nq], y[self._nq :]
+        F = self.given.forces(t, q, u)
+        parts = (self.given.mass(q), F, self.speed_gradient(t, q, u), self.gamma(t, q, u), self.rates(t, q, u))
+        out[:] = np.concatenate([np.ravel(part) for part in parts])
+
+    def values(self, t: float, y: Array, out: Array) -> None:
+        """Fill `out` with the values of the constraints on positions, and then of those on velocities."""
+        q, u = y[: self._nq], y[self._nq :]
+        m = self._positions
+        if m > 0:
+            out[:m] = self.given.constraints(t, q)
+        out[m:] = self.velocities(t, q, u)
+
+    def gradient(self, t: float, y: Array, out: Array) -> None:
+        """Fill `out` with the derivatives of all constraints (rows) with respect to the state (q, u)."""
+        q, u, m, nq = y[: self._nq], y[self._nq :], self._positions, self._nq
+        out[:] = 0.0
+        out[:m, :nq] = self.jacobian(t, q)[0]
+        if self._rows > 0:
+            out[m:, :nq] = difference_gradient(lambda x: self.velocities(t, x, u), q, _sizes(q))
+            out[m:, nq:] = self.speed_gradient(t, q, u)
+
     def rates(self, t: float, q: Array, u: Array) -> Array:
         """Return q', the derivatives of the coordinates."""
         return u if self.given.kinematics is None else np.asarray(self.given.kinematics(t, q, u))
-
-    def positions(self, t: float, q: Array) -> Array:
-        """Return the values of the constraints on positions."""
-        return np.zeros(0) if self.given.constraints is None else np.asarray(self.given.constraints(t, q), float)
 
     def jacobian(self, t: float, q: Array) -> tuple[Array, Array]:
         """Return the derivatives of the constraints on positions with respect to q, (m, nq), and to t, (m,)."""
@@ -209,10 +212,6 @@ class _Constraints:
         others = self.given.velocity_constraints
         own = [] if others is None else [np.asarray(others(t, q, u), float)]
         return np.concatenate([J @ self.rates(t, q, u) + explicit, *own])
-
-    def values(self, t: float, q: Array, u: Array) -> Array:
-        """Return the values of the constraints on positions, and then of those on velocities."""
-        return np.concatenate([self.positions(t, q), self.velocities(t, q, u)])
 
     def speed_gradient(self, t: float, q: Array, u: Array) -> Array:
         """Return G, the derivatives of the constraints on velocities with respect to the speeds."""
@@ -239,12 +238,3 @@ class _Constraints:
         return difference_gradient(
             lambda s: self.velocities(t + s[0], q + s[0] * rates, u), np.zeros(1), np.array([duration or 1.0])
         )[:, 0]
-
-    def gradient(self, t: float, q: Array, u: Array, out: Array) -> None:
-        """Fill `out` with the derivatives of all constraints (rows) with respect to the state (q, u)."""
-        out[:] = 0.0
-        m, nq = self._positions, q.size
-        out[:m, :nq] = self.jacobian(t, q)[0]
-        if self._rows > 0:
-            out[m:, :nq] = difference_gradient(lambda x: self.velocities(t, x, u), q, _sizes(q))
-            out[m:, nq:] = self.speed_gradient(t, q, u)

@@ -215,27 +215,18 @@ def _invariants(
     equations: ParticleEquations, field: ParticleField, form: str, params: np.ndarray, balances: str | None
 ) -> tuple[Invariant, ...]:
     found: list[Invariant] = []
-    if balances == "energy" and field.varies and equations.energy is not None:
-        found.append(Balance(equations.energy, args=(params,), name="H"))
+    energy, momentum, args = equations.energy, equations.momentum, (params,)
+    if balances == "energy" and field.varies and energy is not None:
+        found.append(Balance(energy, args=args, name="H"))
     elif balances is not None:
         kinetic, gradient, power = equations.kinetic, equations.kinetic_gradient, equations.power
         assert kinetic is not None
-        found.append(Balance(kinetic, power, gradient, args=(params,), in_place=True, name="T"))
-    elif equations.energy is not None and not field.varies:
-        found.append(
-            Invariant(
-                equations.energy,
-                equations.energy_gradient,
-                args=(params,),
-                in_place=True,
-                uses_f=form == "canonical",
-                name="H",
-            )
-        )
-    if field.axisymmetric and equations.momentum is not None:
-        found.append(
-            Invariant(equations.momentum, equations.momentum_gradient, args=(params,), in_place=True, name="L")
-        )
+        found.append(Balance(kinetic, power, gradient, args=args, in_place=True, name="T"))
+    elif energy is not None and not field.varies:
+        uses_f = form == "canonical"
+        found.append(Invariant(energy, equations.energy_gradient, args=args, in_place=True, uses_f=uses_f, name="H"))
+    if field.axisymmetric and momentum is not None:
+        found.append(Invariant(momentum, equations.momentum_gradient, args=args, in_place=True, name="L"))
     return tuple(found)
 
 

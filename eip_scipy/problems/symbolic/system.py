@@ -16,8 +16,9 @@ import sympy
 from ...core.balances import Balance
 from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
-from ...core.jitted import compiled_like, is_jitted
+from ...core.jitted import is_jitted
 from ...core.problem import Deferred, Problem, bind
+from ..multibody.motion import vector
 from .brackets import Manifold, NotKeptError, how_kept, slope, vanishes
 from .pairs import Timed, paired
 from .parser import as_expression, as_names, symbol
@@ -318,13 +319,9 @@ def equations_problem(
         as_expression(f"the derivative of {k}", item, declared)
         for k, item in zip(timed.names, timed.values, strict=True)
     )
-    further = Further(
-        *(
-            {key: timed(item) for key, item in given.items()} if isinstance(given, Mapping) else given
-            for given in (invariants, constraints)
-        )
-    )
-    return _checked("f", name or "equations", timed.names, rates, values, {}, {}, further, ())
+    given = (invariants, constraints)
+    given = ({k: timed(item) for k, item in each.items()} if isinstance(each, Mapping) else each for each in given)
+    return _checked("f", name or "equations", timed.names, rates, values, {}, {}, Further(*given), ())
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
@@ -502,18 +499,7 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
         return None
     half = len(found)
     fill = function("acceleration", found, Arguments(system.components[:half], system.parameters), in_place=True)
-
-    def with_params(t, q, params):
-        out = np.empty(half)
-        fill(t, q, out, params)
-        return out
-
-    def without(t, q):
-        out = np.empty(half)
-        fill(t, q, out)
-        return out
-
-    return compiled_like(with_params if system.parameters else without, fill)
+    return vector(fill, half)
 
 
 def _deferred_jacobian(system: System) -> Deferred | None:

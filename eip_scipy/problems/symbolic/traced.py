@@ -203,14 +203,20 @@ def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndar
     """
     by_name = {"t": ("t", t), "q": (names.coordinates, q), "u": (names.speeds, u)}
 
-    def expressions(what: str, arguments: str) -> tuple[Any, ...]:
-        fun = getattr(given, what)
-        if fun is None:
-            return ()
+    values = {symbol("t"): t, **{symbol(k): x for k, x in zip(names.state, (*q, *u), strict=True)}}
+
+    def converted(what: str, fun: Any, arguments: str) -> tuple[Any, ...]:
         symbols, numbers = zip(*(by_name[letter] for letter in arguments), strict=True)
         found = traced(what, fun, *symbols).ravel()
-        _require_agreement(what, found, fun(*numbers), names, (t, q, u))
+        wanted = np.asarray(fun(*numbers), float).ravel()
+        own = np.array([float(sympy.sympify(item).xreplace(values)) for item in found])
+        if not np.allclose(own, wanted, rtol=AGREES, atol=AGREES * max(1.0, np.abs(wanted).max(initial=0.0))):
+            raise NotTraceableError(f"{what}: its value depends on more than its arguments")
         return tuple(found)
+
+    def expressions(what: str, arguments: str) -> tuple[Any, ...]:
+        fun = getattr(given, what)
+        return () if fun is None else converted(what, fun, arguments)
 
     speeds = [symbol(name) for name in names.speeds]
     system = Constrained(
@@ -233,7 +239,11 @@ def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndar
         energies.append(("u M u / 2 + potential", kinetic + expressions("potential", "tq")[0], power))
     elif (potential := conservative(system, system.forces, partial(own_speed, system))) is not None:
         energies.append(("u M u / 2 + the potential of the forces", kinetic + potential, power))
-    parts = parts_of(system, energies, tuple(_momenta(system)), _outputs(given, by_name))
+    try:
+        outputs = [(name, converted(name, fun, "tqu")[0]) for name, fun in given.outputs.items()]
+    except NotTraceableError:
+        outputs = []
+    parts = parts_of(system, energies, tuple(_momenta(system)), outputs)
     called = given.outputs and parts.outputs is None
     return parts._replace(outputs=outputs_as_given(given, q.size, u.size)) if called else parts
 
@@ -244,28 +254,3 @@ def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
     momenta = sympy.Matrix(n, n, system.mass) * sympy.Matrix([symbol(name) for name in system.speeds])
     for k in cyclic(system, partial(own_speed, system)):
         yield f"p_{system.coordinates[k]}", sympy.Matrix([own_speed(system, k)]).dot(momenta)
-
-
-def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
-    """Return the name and the expression of each output; [] if one cannot be converted, or differs at the start."""
-    symbols, numbers = zip(*(by_name[letter] for letter in "tqu"), strict=True)
-    names = Names(by_name["q"][0], by_name["u"][0], (), ())
-    found = []
-    for name, fun in given.outputs.items():
-        try:
-            item = traced(name, fun, *symbols).ravel()
-            _require_agreement(name, item, fun(*numbers), names, numbers)
-        except NotTraceableError:
-            return []
-        found.append((name, item[0]))
-    return found
-
-
-def _require_agreement(what: str, found: Any, value: Any, names: Names, numbers: Any) -> None:
-    """Raise NotTraceableError if the expressions `found` do not have the `value` of the function at the start."""
-    t, q, u = numbers
-    values = {symbol("t"): t, **{symbol(k): x for k, x in zip(names.state, (*q, *u), strict=True)}}
-    wanted = np.asarray(value, float).ravel()
-    own = np.array([float(sympy.sympify(item).xreplace(values)) for item in found])
-    if not np.allclose(own, wanted, rtol=AGREES, atol=AGREES * max(1.0, np.abs(wanted).max(initial=0.0))):
-        raise NotTraceableError(f"{what}: its value depends on more than its arguments")
