@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
-from eip_scipy.problems.gross_pitaevskii.conserved import Joint
-from eip_scipy.problems.gross_pitaevskii.pointwise import expansion, moments, shifted, total_mass
+from eip_scipy.problems.gross_pitaevskii.pointwise import Joint, expansion, moments, shifted, total_mass
 
 
 def noise(grid, seed=7):

@@ -79,10 +79,12 @@ def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
     start = _first(t_span)
     time = "d" if is_time(start) else None
     if time is None:
-        speed = given["velocity"].unit
-        found = [base for base, power in zip(speed.bases, speed.powers, strict=True) if power == -1]
-        unit = next((base for base in found if base.physical_type == "time"), speed.si.bases[-1])
-        time = _named(start.unit if hasattr(start, "unit") else unit, "s", 1)
+        unit = getattr(start, "unit", None)
+        if unit is None:
+            speed = given["velocity"].unit
+            found = [base for base, power in zip(speed.bases, speed.powers, strict=True) if power == -1]
+            unit = next((base for base in found if base.physical_type == "time"), speed.si.bases[-1])
+        time = _named(unit, "s", 1)
     return f"{_named(given['position'].unit, 'm', 0)}, {time}"
 
 

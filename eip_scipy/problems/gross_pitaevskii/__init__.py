@@ -1,7 +1,6 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
-from .damped import DampedGrossPitaevskii
-from .equation import FieldProblem, GrossPitaevskii
+from .equation import DampedGrossPitaevskii, FieldProblem, GrossPitaevskii
 from .grid import Grid, Multiplier, SpectralSum
 from .ground_state import (
     GroundState,

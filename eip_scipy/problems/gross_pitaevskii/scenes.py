@@ -149,15 +149,8 @@ def breather(
 
     Parameters
     ----------
-    points : int
-        Number of points of the grid.
-    amplitude, velocity : float
-        a and v.
-    beta : float
-        < 0.
-    length : float
-        Length of the ring; on the ring the closed form has an error of exp(-a length / 2).
-    t_end : float
+    points, amplitude, velocity, beta, length, t_end
+        As for `soliton`; a and v are amplitude and velocity.
     h : float, optional
         Default: 0.005 / a^2, a step for `Splitting`. The step of other methods must be below
         `GrossPitaevskii.largest_step`.

@@ -76,7 +76,7 @@ def compose(field: FieldFunctions, form: str) -> ParticleEquations:
 # The canonical form, y = (x, p).
 
 
-def _canonical(field: FieldFunctions) -> ParticleEquations:
+def _canonical(field: Any) -> ParticleEquations:
     A, jacobian, phi, E = field.A, field.jacobian, field.phi, field.E
 
     def rhs(t, y, out, params):
@@ -135,7 +135,7 @@ def canonical_momentum_gradient(t, y, out, params):
 # The form y = (x, v).
 
 
-def _velocity(field: FieldFunctions) -> ParticleEquations:
+def _velocity(field: Any) -> ParticleEquations:
     _, _, phi, E, B = field
 
     def rhs(t, y, out, params):
@@ -168,11 +168,13 @@ def _velocity(field: FieldFunctions) -> ParticleEquations:
         e = E(t, y[0], y[1], y[2])
         return params[CHARGE] * (y[3] * e[0] + y[4] * e[1] + y[5] * e[2])
 
+    momentum, momentum_gradient = (None, None) if field.A is None else _velocity_momentum(field.A, field.jacobian)
     return ParticleEquations(
         jit_like(rhs, E, B),
         None if phi is None else jit_like(energy, phi),
         jit_like(energy_gradient, E),
-        *((None, None) if field.A is None else _velocity_momentum(field.A, field.jacobian)),
+        momentum,
+        momentum_gradient,
         jit_like(kinetic_energy, E),
         jit_like(kinetic_energy_gradient, E),
         jit_like(power, E),

@@ -188,7 +188,7 @@ def _beside_switches(
                 yield point, values
 
 
-def _sides(difference: Any, variables: Sequence[Any], point: dict[Any, Any], given: Mapping[Any, Any]) -> list[Any]:
+def _sides(difference: Any, variables: Sequence[Any], point: dict[Any, Any], given: dict[Any, Any]) -> list[Any]:
     """Return two points on a line through `point` on an axis at which `difference` has opposite signs, or []."""
 
     def at(variable: Any, place: Any) -> Any:

@@ -319,8 +319,10 @@ def equations_problem(
         as_expression(f"the derivative of {k}", item, declared)
         for k, item in zip(timed.names, timed.values, strict=True)
     )
-    given = (invariants, constraints)
-    given = ({k: timed(item) for k, item in each.items()} if isinstance(each, Mapping) else each for each in given)
+    given = [
+        {key: timed(item) for key, item in items.items()} if isinstance(items, Mapping) else items
+        for items in (invariants, constraints)
+    ]
     return _checked("f", name or "equations", timed.names, rates, values, {}, {}, Further(*given), ())
 
 
