@@ -17,7 +17,7 @@ from ...engine.native import library
 from . import forces as _forces
 from .bodies import body_names, default_units, in_units
 from .forces import ForceConstants
-from .orbits import balances_beside_frame, orbital_frequencies
+from .orbits import balances_of_orbits, orbital_frequencies
 
 __all__ = ["component_names", "nbody"]
 
@@ -166,7 +166,7 @@ def nbody(
     if balances is None:
         kept = _forces.invariants(chosen, params, y0)
     else:
-        kept = balances_beside_frame(masses, y0, balances, bodies, newton=not chosen)
+        kept = balances_of_orbits(masses, y0, balances, bodies, not chosen, neutral=False)
     rhs, acc = _forces.equations(chosen)
     return Problem(
         name=name,

@@ -14,7 +14,7 @@ from ...engine.native import BUILD, library
 
 __all__ = [
     "QUANTITIES",
-    "balances_beside_frame",
+    "balances_of_orbits",
     "centres",
     "chosen_quantities",
     "orbital_balances",
@@ -97,24 +97,17 @@ def orbital_balances(
     >>> run.invariants.shape[0], run.trusted
     (9, True)
     """
-    return _balances(gm, y0, quantities, bodies, newton, neutral=True)
+    return balances_of_orbits(gm, y0, quantities, bodies, newton, neutral=True)
 
 
-def balances_beside_frame(
-    gm: Array, y0: Array, quantities: str | Sequence[str], bodies: Sequence[str] | None, newton: bool
-) -> tuple[Balance, ...]:
-    """Return the balances of `orbital_balances` for runs whose `frame` restores the centre of mass by a common shift.
-
-    Such a shift changes no orbit. Therefore the correction of an orbit about the heaviest body moves only the body on
-    this orbit, while a balance of `orbital_balances` also moves all other bodies in the opposite direction.
-    """
-    return _balances(gm, y0, quantities, bodies, newton, neutral=False)
-
-
-def _balances(
+def balances_of_orbits(
     gm: Any, y0: Any, quantities: Any, bodies: Sequence[str] | None, newton: bool, *, neutral: bool
 ) -> tuple[Balance, ...]:
-    """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged."""
+    """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged.
+
+    That moves all other bodies in the opposite direction. If the `frame` of a run restores the centre of mass by a
+    common shift, which changes no orbit, only the body on an orbit about the heaviest body needs to move.
+    """
     masses, state = real_array("gm", gm), real_array("y0", y0)
     newton = flag("newton", newton)
     if masses.ndim != 1 or masses.size < 2 or state.shape != (6 * masses.size,):

@@ -6,11 +6,9 @@ The starts are here; the reference states are data (``data/scene_references.json
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -26,6 +24,7 @@ __all__ = ["comet", "figure_eight", "pythagorean", "satellite"]
 
 FIGURE_EIGHT_PERIOD = 6.32591398
 YEAR_DAYS = 365.25
+STEPS = 16  # a revolution, of the default step of `satellite`
 # 1e13 kg, a nucleus of about 3 km, in solar masses.
 COMET_MASS = 5e-18
 # From the Sun, at the epoch of the DE440 data; AU and AU per year.
@@ -147,11 +146,8 @@ def _reference(name: str, t: float) -> np.ndarray | None:
 
 @cache
 def _references() -> dict[str, list[tuple[float, list[float]]]]:
-    text = files("eip_scipy.data").joinpath("scene_references.json").read_text(encoding="utf-8")
-    return {name: [(row["t"], row["state"]) for row in rows] for name, rows in json.loads(text)["states"].items()}
-
-
-STEPS = 16  # a revolution, of the default step
+    states = solar_data.read("scene_references.json")["states"]
+    return {name: [(row["t"], row["state"]) for row in rows] for name, rows in states.items()}
 
 
 def satellite(
@@ -252,7 +248,8 @@ def satellite(
         spin=spin,
     )
     if h is None:
-        h = _sixteenth(x, v, mu)
+        inverse = 2 / float(np.linalg.norm(x)) - float(v @ v) / mu  # of the semi-major axis
+        h = None if inverse <= 0 else 2 * np.pi / STEPS / float(np.sqrt(mu * inverse**3))
     problem = nbody(
         [mu, 0.0],
         [np.zeros(3), x],
@@ -268,9 +265,3 @@ def satellite(
         source="exponential atmosphere, drag proportional to the squared speed",
     )
     return problem if balances is not None else replace(problem, invariants=())
-
-
-def _sixteenth(x: np.ndarray, v: np.ndarray, mu: float) -> float | None:
-    """Return 1/16 of the period of the Kepler orbit through a state; None for an unbound orbit."""
-    inverse = 2 / float(np.linalg.norm(x)) - float(v @ v) / mu  # of the semi-major axis
-    return None if inverse <= 0 else 2 * np.pi / STEPS / float(np.sqrt(mu * inverse**3))
