@@ -116,9 +116,7 @@ class Timed:
             for item, value in zip(given, values, strict=True)
             if isinstance(item, AppliedUndef) and sympy.Derivative(item, TIME) not in self._speeds
         }
-        self._rates |= {
-            item.diff(TIME): value for item, value in zip(given, values, strict=True) if item in self._speeds
-        }
+        self._rates |= {item.diff(TIME): f for item, f in zip(given, values, strict=True) if item in self._speeds}
         self.values = [self(value) for value in values]
 
     def __call__(self, expression: Any) -> Any:

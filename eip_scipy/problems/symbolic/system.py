@@ -216,14 +216,12 @@ def hamiltonian_problem(
                 "extended=True, or perturbation= and dissipation=."
             )
         rates, slow = _with_perturbation(energy, names, rates, values, declared, perturbed, flow)
-        return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, Further(invariants), pairs, slow)
-    checks = {"H": "by construction"}
+        return _checked("H", name or "hamiltonian", names, rates, values, {}, Further(invariants), pairs, slow)
     kept = {"H": energy}
     time = symbol("t")
     if energy.has(time) and extended:
         names, rates = (*names, "p_t"), (*rates, -sympy.diff(energy, time))
         kept = {"H + p_t": energy + symbol("p_t")}
-        checks = {"H + p_t": "by construction"}
     elif energy.has(time):
         warnings.warn(
             "H depends on t, so that it is not an invariant, and the problem does not keep it. "
@@ -231,8 +229,8 @@ def hamiltonian_problem(
             UserWarning,
             stacklevel=3,
         )
-        kept, checks = {}, {}
-    return _checked("H", name or "hamiltonian", names, rates, values, kept, checks, Further(invariants), pairs)
+        kept = {}
+    return _checked("H", name or "hamiltonian", names, rates, values, kept, Further(invariants), pairs)
 
 
 class Further(NamedTuple):
@@ -323,7 +321,7 @@ def equations_problem(
         {key: timed(item) for key, item in items.items()} if isinstance(items, Mapping) else items
         for items in (invariants, constraints)
     ]
-    return _checked("f", name or "equations", timed.names, rates, values, {}, {}, Further(*given), ())
+    return _checked("f", name or "equations", timed.names, rates, values, {}, Further(*given), ())
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
@@ -378,16 +376,14 @@ def _checked(
     rates: Any,
     values: Any,
     kept: Any,
-    checks: Any,
     given: Further,
     pairs: Any,
     slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
     """Return the problem after checks of the names and of the `given` invariants and constraints.
 
-    `kept` maps the names of invariants that are known already to their expressions, and `checks` to how they were shown
-    to be conserved. `slow` holds the balances as in `System`. `what` is the user's argument with the equations, "H" or
-    "f".
+    `kept` maps the names of invariants by construction to their expressions. `slow` holds the balances as in `System`.
+    `what` is the user's argument with the equations, "H" or "f".
     """
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
@@ -418,6 +414,7 @@ def _checked(
             raise ValueError(f"{described} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
     zero = {label: quantities[label] for label in constraints}
     manifold = Manifold(zero, names, rates, values) if zero else None
+    checks = dict.fromkeys(kept, "by construction")
     for label, quantity in quantities.items():
         checks[label] = _how_kept(label, quantity, names, rates, parameters, manifold, HINT if what == "f" else "")
         kept[label] = quantity
