@@ -9,8 +9,7 @@ from .gravity.forces import ForceConstants
 from .gravity.nbody import nbody
 from .gravity.orbital_elements import OrbitalElements, orbital_elements
 from .gravity.orbits import orbital_balances
-from .gravity.satellite import satellite
-from .gravity.scenes import comet, figure_eight, pythagorean
+from .gravity.scenes import comet, figure_eight, pythagorean, satellite
 from .gravity.solar_data import SolarSystemData
 from .gravity.solar_system import solar_system
 from .gross_pitaevskii import (
@@ -26,9 +25,8 @@ from .gross_pitaevskii import (
     rotating_packet,
     soliton,
 )
-from .harmonic import harmonic
 from .invariant_search import find_invariants
-from .kepler import kepler
+from .kepler import harmonic, kepler
 from .multibody import MechanicsProblem, mechanism
 from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField

@@ -23,15 +23,9 @@ def named_invariant(
     uses_f: bool = False,
     where: str = "",
 ) -> Invariant:
-    """Return the invariant with the name `name`.
+    """Return the invariant with the name `name`; a ValueError lists the `known` names if it is not in `made`.
 
-    `made` maps names to pairs of functions, ``value(y)`` and ``gradient(t, y, out)``, or ``gradient(t, y, f, out)`` if
-    `uses_f` is True; the gradient fills `out`.
-
-    Raises
-    ------
-    ValueError
-        If the name is not in `made`; the message has `where` after the name, and lists the `known` names.
+    `made` maps names to functions ``value(y)`` and ``gradient(t, y, out)``, or ``gradient(t, y, f, out)`` if `uses_f`.
     """
     if name not in made:
         raise ValueError(f"unknown invariant {name!r}{where}, expected {', '.join(known)}{nearest(name, known)}")
@@ -44,13 +38,7 @@ def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
 
 
 def checked_damping(damping: float) -> float:
-    """Return the damping as a float.
-
-    Raises
-    ------
-    ValueError
-        If it is not a finite number >= 0.
-    """
+    """Return the damping as a float; raise ValueError if it is not a finite number >= 0."""
     refuse_units(damping=damping)
     if not (is_number(damping) and np.isfinite(damping) and damping >= 0):
         raise ValueError(f"damping must be a finite number >= 0, got {shown(damping)}.")
@@ -65,16 +53,10 @@ def damped_invariant(
 ) -> Balance:
     """Return an invariant of the undamped equation as a balance of the damped equation.
 
-    Parameters
-    ----------
-    item, rated : Invariant
-        Two separate objects for the same invariant, for its values and for its rates, because an invariant may store
-        results for its last state, and rates are computed at other states than values.
-    parts : callable
-        ``parts(y, f) -> (kept, lost)``, two parts of the derivative f: the derivative without damping, and the terms
-        that damping adds.
-    total : callable, optional
-        Function that returns the sum over the whole grid from the sum over the part of this process.
+    `item` and `rated` are separate objects for the same invariant, because an invariant may store results for its last
+    state, and rates are computed at other states than values. ``parts(y, f)`` splits the derivative f into the one
+    without damping, and the terms that damping adds. `total` returns the sum over the whole grid from that of this
+    process.
     """
     gradient = partial(_damped_gradient, item, parts)
     return Balance(

@@ -90,7 +90,9 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         )
     params = np.zeros(0) if problem.params is None else problem.params
     rhs = _transformed_rhs(problem.rhs, jitted(g))
-    n = problem.y0.size
+    n, blocks, frame = problem.y0.size, problem.blocks, problem.frame
+    if frame is not None:
+        frame = np.pad(frame[0], ((0, 0), (0, 1))), np.pad(frame[1], ((0, 1), (0, 0)))
     return Problem(
         name=f"{problem.name} in fictitious time",
         fun=bind(rhs, params),
@@ -100,8 +102,8 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         params=params,
         invariants=tuple(_transformed_invariant(item) for item in problem.invariants),
         component_names=None if problem.component_names is None else (*problem.component_names, "t"),
-        blocks=_blocks(problem.blocks, n),
-        frame=_frame(problem.frame),
+        blocks=tuple(np.arange(n).reshape(-1, blocks)) if isinstance(blocks, int) else blocks,
+        frame=frame,
         units=problem.units and f"state in {problem.units}",  # fictitious time has no unit
         source=problem.source,
     )
@@ -149,10 +151,7 @@ def _transformed_invariant(item: Invariant) -> Invariant:
 def _transformed_functions(
     fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return the functions for value and gradient of an invariant of y as functions of s and the state (y, t).
-
-    A gradient that uses f = dy/dt gets it from dy/ds and dt/ds.
-    """
+    """Return value and gradient of an invariant of y as functions of s and the state (y, t); f is dy/ds over dt/ds."""
 
     def value(s, y, params):
         return fun(y[-1], y[:-1], params)
@@ -166,14 +165,3 @@ def _transformed_functions(
         out[..., -1] = 0.0
 
     return compiled_like(value, fun), compiled_like(gradient_of_f if uses_f else gradient, grad)
-
-
-def _blocks(blocks: Any, n: int) -> Any:
-    return tuple(np.arange(n).reshape(-1, blocks)) if isinstance(blocks, int) else blocks
-
-
-def _frame(frame: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray] | None:
-    if frame is None:
-        return None
-    C, S = frame
-    return np.pad(C, ((0, 0), (0, 1))), np.pad(S, ((0, 1), (0, 0)))

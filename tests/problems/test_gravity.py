@@ -14,7 +14,7 @@ from numba import njit
 from eip_scipy import EIPGJ12, EIPGJ14, EIPRK4, EIPRKN12, integrate
 from eip_scipy.engine.native import library
 from eip_scipy.problems import nbody, solar_system
-from eip_scipy.problems.gravity import frequencies
+from eip_scipy.problems.gravity import orbits
 
 rhs, acc = library["gravity.rhs"], library["gravity.acc"]
 energy, energy_gradient = library["gravity.energy"], library["gravity.energy_gradient"]
@@ -308,7 +308,7 @@ def test_frequencies_of_orbits_and_of_a_moon():
     q[2], v[2] = q[0] + (0, 0, 0.01), v[0] + (np.sqrt((gm[0] + gm[2]) / 0.01), 0, 0)
     e = 0.5
     q[3], v[3] = (0, 4 * (1 - e), 0), (np.sqrt((1 + e) / (4 * (1 - e))), 0, 0)
-    about, others = frequencies.orbital_frequencies(gm, np.concatenate([q.ravel(), v.ravel()]))
+    about, others = orbits.orbital_frequencies(gm, np.concatenate([q.ravel(), v.ravel()]))
     assert about[1] == 0.0
     assert about[0] == pytest.approx(np.sqrt(1.001), rel=1e-12)
     assert about[3] == pytest.approx(np.sqrt(4**-3 * (1 - e) ** -1.5), rel=1e-12)
@@ -350,7 +350,7 @@ def test_frequencies_within_a_run(approaches):
     duration = abs(mean - (later - e * np.sin(later)))
 
     def found(duration):
-        return frequencies.orbital_frequencies(np.array([1.0, 0.0]), y, duration)[0][1]
+        return orbits.orbital_frequencies(np.array([1.0, 0.0]), y, duration)[0][1]
 
     assert found(duration) == pytest.approx((1 - e * np.cos(later)) ** -0.75, rel=1e-6)
     assert found(1.01 * to_pericentre) == found(np.inf) == pytest.approx((1 - e) ** -0.75, rel=1e-6)

@@ -7,7 +7,7 @@ from sympy.physics import mechanics as me
 
 from eip_scipy import Balance
 from eip_scipy.problems import mechanics, mechanism
-from eip_scipy.problems.symbolic.potentials import potential_of
+from eip_scipy.problems.symbolic.constrained import potential_of
 
 x, y, a, b = sympy.symbols("x y a b", real=True)
 k, l, m, g = sympy.symbols("k l m g", positive=True)  # noqa: E741

@@ -21,16 +21,7 @@ G_SI = 6.67430e-11
 
 
 class Bodies(NamedTuple):
-    """The bodies of a problem.
-
-    Attributes
-    ----------
-    problem : Problem
-    gm : ndarray, shape (N,)
-        G times the masses.
-    names : tuple of str
-        Names of the bodies; "0", "1" and so on for bodies without names.
-    """
+    """The bodies of a problem: G times their masses (N,), and their names; "0", "1" and so on without names."""
 
     problem: Problem
     gm: np.ndarray
@@ -52,13 +43,7 @@ class Bodies(NamedTuple):
 
 
 def bodies_of(run: Any) -> Bodies:
-    """Return the bodies of a problem that was made by `nbody`, or of a run of such a problem.
-
-    Raises
-    ------
-    TypeError
-        If `run` is another kind of problem or run, or a loaded result, which does not contain its problem.
-    """
+    """Return the bodies of a problem that was made by `nbody`, or of a run of it; TypeError for anything else."""
     origin = None if isinstance(run, Problem) else getattr(run, "__dict__", {}).get("_origin")
     problem = run if origin is None else origin.request.fun
     if not (isinstance(problem, Problem) and problem.rhs in (library["gravity.rhs"], library["forces.rhs"])):
@@ -75,13 +60,7 @@ def bodies_of(run: Any) -> Bodies:
 
 
 def body_names(names: Sequence[str], n: int) -> tuple[str, ...]:
-    """Return the names of n bodies.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the names are not strings, their number is not n, or two names are equal.
-    """
+    """Return the names of n bodies; raise an error if they are not n different strings."""
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise TypeError(f"bodies must be a sequence of names, got {shown(names)}.")
     if len(names) != n or len(set(names)) < n:
@@ -90,10 +69,9 @@ def body_names(names: Sequence[str], n: int) -> tuple[str, ...]:
 
 
 def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
-    """Return the units of length and time as text, such as "au, d".
+    """Return the units of length and time as text such as "au, d", or "" if an argument has no unit.
 
-    The unit of time is that of t_span (days for dates), or that of the velocities if t_span has no unit. The text
-    is empty if `gm`, `position` or `velocity` has no unit.
+    The unit of time is that of t_span (days for dates), or that of the velocities if t_span has no unit.
     """
     given = {name: _first(value) for name, value in (("gm", gm), ("position", position), ("velocity", velocity))}
     if not all(hasattr(value, "unit") and hasattr(value, "to_value") for value in given.values()):
@@ -101,23 +79,21 @@ def default_units(gm: Any, position: Any, velocity: Any, t_span: Any) -> str:
     start = _first(t_span)
     time = "d" if is_time(start) else None
     if time is None:
-        time = _named(start.unit if hasattr(start, "unit") else _time_unit(given["velocity"].unit), "s", 1)
+        unit = getattr(start, "unit", None)
+        if unit is None:
+            speed = given["velocity"].unit
+            found = [base for base, power in zip(speed.bases, speed.powers, strict=True) if power == -1]
+            unit = next((base for base in found if base.physical_type == "time"), speed.si.bases[-1])
+        time = _named(unit, "s", 1)
     return f"{_named(given['position'].unit, 'm', 0)}, {time}"
 
 
 def in_units(gm: Any, position: Any, velocity: Any, known: tuple[Unit, Unit] | None) -> tuple[Any, Any, Any]:
     """Return G m, positions and velocities as plain numbers in the problem's units; masses become G m.
 
-    `known` are the problem's units of length and time, or None if they are not known. If none of `gm`, `position` and
-    `velocity` has a unit, all three are returned unchanged.
-
-    Raises
-    ------
-    TypeError
-        If one argument has a unit and another has none, or an argument has a unit and the units of the problem are not
-        known.
-    TypeError and ValueError
-        If the dimension of a unit is wrong.
+    `known` are the problem's units of length and time, or None. Arguments without units are returned unchanged. A
+    TypeError is raised if only some of them have units, or the units of the problem are not known, and TypeError or
+    ValueError if a dimension is wrong.
     """
     given = {"gm": gm, "position": position, "velocity": velocity}
     with_unit = [name for name, value in given.items() if has_unit(_first(value))]
@@ -141,14 +117,10 @@ def _gravitational(gm: Any, known: tuple[Unit, Unit]) -> Any:
     """Return G m as plain numbers in the units `known` of length and time, from values of G m or masses with units."""
     if isinstance(gm, tuple | list) or type(gm) is np.ndarray:
         return np.array([_gravitational(value, known) for value in gm])
-    if not _is_mass(gm):  # a plain 0 among others is a test particle
+    if getattr(getattr(gm, "unit", None), "physical_type", None) != "mass":  # a plain 0 among others is a test particle
         return in_unit("gm", gm, (3, -2), known)
     length, time = known
     return gm.to_value("kg") * (G_SI * time.si**2 / length.si**3)
-
-
-def _is_mass(value: Any) -> bool:
-    return getattr(getattr(value, "unit", None), "physical_type", None) == "mass"
 
 
 def _first(value: Any) -> Any:
@@ -158,16 +130,10 @@ def _first(value: Any) -> Any:
     return value
 
 
-def _time_unit(speed: Any) -> Any:
-    """Return the unit of time in a unit of velocity, such as s in km / s."""
-    found = [base for base, power in zip(speed.bases, speed.powers, strict=True) if power == -1]
-    return next((base for base in found if base.physical_type == "time"), speed.si.bases[-1])
-
-
 def _named(unit: Any, base: str, place: int) -> str:
-    """Return a unit of astropy as text for `units`: its name, or a number of units `base`, "m" or "s".
+    """Return a unit of astropy as text for `units`: its name, or a number of `base`, or `base` if it is no such unit.
 
-    The text is `base` if the unit has another dimension. `place` is 0 for a length and 1 for a time.
+    `place` is 0 for a length and 1 for a time.
     """
     if not unit.is_equivalent(base):  # what is converted to it will say so
         return base

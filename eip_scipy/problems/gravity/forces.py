@@ -96,15 +96,7 @@ NEEDS = {
 
 
 def check_forces(forces: Any) -> tuple[str, ...]:
-    """Return the names of forces, one name or several, in the order of `FORCES`.
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown, or two of the names are kinds of relativity.
-    TypeError
-        If `forces` is neither a name nor a sequence.
-    """
+    """Return the names of forces, one name or several, in the order of `FORCES`; raise an error if they do not fit."""
     if not isinstance(forces, Iterable):
         raise TypeError(
             f"forces must be a name or a sequence of names, got {forces!r}; use () for Newton's gravitation alone."
@@ -123,10 +115,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
 def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstants | None) -> np.ndarray:
     """Return the vector of parameters: G m of all bodies, then the parameters of the forces.
 
-    Raises
-    ------
-    ValueError
-        If a constant that a force needs is missing or has a wrong value, or the first body has no mass.
+    A ValueError is raised if a constant is missing or wrong, or the first body has no mass.
     """
     known = ForceConstants() if constants is None else constants
     for force in forces:
@@ -173,6 +162,8 @@ def _check_constant(force: str, name: str, value: Any, n: int) -> None:
 
 def equations(forces: tuple[str, ...]) -> tuple[Any, Any]:
     """Return the right-hand side, and the accelerations if they depend on positions only (else None)."""
+    if not forces:
+        return library["gravity.rhs"], library["gravity.acc"]
     return library["forces.rhs"], None if set(forces) & set(VELOCITY_DEPENDENT) else library["forces.acc"]
 
 
@@ -185,6 +176,8 @@ def acceleration(y: np.ndarray, params: np.ndarray) -> np.ndarray:
 
 def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> tuple[Invariant, ...]:
     """Return the invariants of the equations with these forces, see `nbody`."""
+    if not forces:
+        return native_invariant("gravity.energy", "H", params), native_invariant("gravity.momentum", "L", params)
     if "drag" in forces:
         return ()
     if "1pn" in forces:
@@ -203,7 +196,7 @@ def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> t
 def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
     """Return True if the terms in 1/c^4 that the invariants of "eih" lack are below round-off.
 
-    Their relative size is about v^2/c^2 times that of the accelerations that "eih" adds to Newton's.
+    They are about v^2/c^2 times the accelerations that "eih" adds to Newton's.
     """
     n = y0.size // 6
     newton = np.empty_like(y0)

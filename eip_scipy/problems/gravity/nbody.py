@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 
 from ...core.inputs import has_unit, is_number, refuse_units, shown
-from ...core.invariants import Invariant
-from ...core.problem import Problem, bind, library_variational, native_invariant
-from ...core.units import Epoch, apart, as_epoch, in_unit, is_time, moment
+from ...core.problem import Problem, bind, library_variational
+from ...core.units import apart, as_epoch, in_unit, is_time, moment
 from ...core.units import units as known_units
 from ...engine.native import library
 from . import forces as _forces
 from .bodies import body_names, default_units, in_units
 from .forces import ForceConstants
-from .frequencies import orbital_frequencies
-from .orbits import balances_beside_frame
+from .orbits import balances_of_orbits, orbital_frequencies
 
 __all__ = ["component_names", "nbody"]
 
@@ -155,7 +153,10 @@ def nbody(
     units = units or default_units(gm, position, velocity, t_span)
     known = known_units(units)
     gm, position, velocity = in_units(_gravitational(gm, G), position, velocity, known)
-    epoch = _epoch(t_span) if epoch is None else as_epoch("epoch", epoch)
+    if epoch is not None:
+        epoch = as_epoch("epoch", epoch)
+    elif isinstance(t_span, tuple | list) and t_span and is_time(t_span[0]):
+        epoch = as_epoch("t_span", t_span[0])
     t_span = moment("t_span", t_span, known, epoch, "nbody")
     h = in_unit("h", h, (0, 1), known)
     masses, q, v = _checked(gm, position, velocity)
@@ -163,11 +164,10 @@ def nbody(
     y0 = np.concatenate([q.ravel(), v.ravel()])
     params = _forces.parameters(masses, chosen, constants) if chosen else masses
     if balances is None:
-        kept = _forces.invariants(chosen, params, y0) if chosen else _newtonian(params)
+        kept = _forces.invariants(chosen, params, y0)
     else:
-        kept = balances_beside_frame(masses, y0, balances, bodies, newton=not chosen)
-    equations = "forces" if chosen else "gravity"
-    rhs, acc = _forces.equations(chosen) if chosen else (library["gravity.rhs"], library["gravity.acc"])
+        kept = balances_of_orbits(masses, y0, balances, bodies, not chosen, neutral=False)
+    rhs, acc = _forces.equations(chosen)
     return Problem(
         name=name,
         fun=bind(rhs, params),
@@ -185,7 +185,7 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
-        variational=partial(library_variational, f"{equations}.variational", ()),
+        variational=partial(library_variational, "forces.variational" if chosen else "gravity.variational", ()),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,
@@ -193,17 +193,9 @@ def nbody(
 
 
 def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of the 6 n components: x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ...
-
-    If `bodies` is given, its names take the places of the numbers.
-    """
+    """Return the names of the 6 n components, x_0, y_0, ... then vx_0, ..., with `bodies` in place of the numbers."""
     names = tuple(map(str, range(n))) if bodies is None else body_names(bodies, n)
     return tuple(f"{axis}_{body}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for body in names for axis in axes)
-
-
-def _epoch(t_span: Any) -> Epoch | None:
-    start = t_span[0] if isinstance(t_span, tuple | list) and t_span else None
-    return as_epoch("t_span", start) if is_time(start) else None
 
 
 def _gravitational(masses: Any, G: Any) -> Any:
@@ -221,15 +213,8 @@ def _gravitational(masses: Any, G: Any) -> Any:
     return G * np.asarray(masses, dtype=float)
 
 
-def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
-    return native_invariant("gravity.energy", "H", params), native_invariant("gravity.momentum", "L", params)
-
-
 def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return gm, position and velocity as arrays of shapes (N,), (N, 3) and (N, 3).
-
-    A ValueError is raised if shapes or values are wrong, and a warning is given if the speeds suggest wrong units.
-    """
+    """Return gm, position and velocity as arrays (N,), (N, 3), (N, 3); raise an error, or warn of unlikely speeds."""
     masses, q, v = (np.array(x, dtype=float) for x in (gm, position, velocity))
     n = masses.size
     if masses.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
@@ -249,10 +234,9 @@ def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndar
 
 
 def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return each body's speed relative to the body that binds it most, in units of the escape speed of this pair.
+    """Return each body's speed relative to the body that binds it most, in units of the pair's escape speed, if not 0.
 
-    Bodies whose relative speed is 0, and pairs without mass, are left out. A ValueError is raised if two bodies are at
-    the same place.
+    A ValueError is raised if two bodies are at the same place.
     """
     found = []
     for i in range(gm.size):  # one row of distances at a time, because N^2 distances may not fit in memory
@@ -286,10 +270,8 @@ def _check_speeds(ratio: np.ndarray) -> None:
 def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the `frame` (C, S) of centre of mass and momentum, with shifts of bodies proportional to their masses.
 
-    C, of shape (6, 6 N), maps a state to the position and velocity of the centre of mass. The columns of S, of shape
-    (6 N, 6), are the shifts of the state that restore C y after a correction. With shifts proportional to the masses,
-    the recoil from the correction of a planet goes to its star. `common_shift` would move the outer planets by the same
-    distance as the star.
+    C (6, 6 N) maps a state to position and velocity of the centre of mass, and the columns of S (6 N, 6) are the shifts
+    that restore it. The recoil from the correction of a planet then goes to its star.
     """
     axes = np.eye(3)
     share = gm / gm.sum()
@@ -299,10 +281,6 @@ def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the `frame` (C, S) of centre of mass and momentum, with common shifts of all bodies.
-
-    C is that of `recoil`. The columns of S, of shape (6 N, 6), move all bodies by the same distance, or change all
-    velocities by the same amount, so that positions and velocities relative to other bodies do not change.
-    """
+    """Return the `frame` (C, S) of centre of mass and momentum, whose shifts move all bodies by the same distance."""
     C, _ = recoil(gm)
     return C, np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), np.eye(3)))

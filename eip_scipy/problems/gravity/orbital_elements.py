@@ -170,11 +170,7 @@ def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray,
 
 
 def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states of all bodies except the first in Jacobi's coordinates, and the gravitational parameters.
-
-    The states (2, N - 1, 3, ...) are relative to the centre of mass of all bodies before each body. The parameters
-    (N - 1,) are for each body G times the mass of this body and of all bodies before it.
-    """
+    """Return the states relative to the centre of mass of all bodies before each body, and G m of all up to it."""
     if not gm[0] > 0:
         raise ValueError(
             f"orbital_elements: primary='jacobi' needs a first body with a mass, but its G m is {gm[0]!r}. "
@@ -189,11 +185,7 @@ def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _around(
     state: np.ndarray, gm: np.ndarray, primary: str | int, names: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return the states relative to `primary`, the gravitational parameters, and the indices of the orbiting bodies.
-
-    The shapes are (2, bodies, 3, ...) and (bodies,). The orbiting bodies are all bodies except the primary, or all
-    bodies if the primary is the barycentre.
-    """
+    """Return the states relative to `primary`, the gravitational parameters, and the indices of the orbiting bodies."""
     every = list(range(gm.size))
     if primary == "barycentric":
         total = gm.sum()
@@ -218,10 +210,7 @@ def _around(
 
 
 def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the elements of relative states (2, bodies, 3, ...) by name, as arrays (bodies, ...).
-
-    The names are those of `OrbitalElements`. The gravitational parameters `mu` have the shape (bodies,).
-    """
+    """Return the elements (bodies, ...) of relative states (2, bodies, 3, ...) by their names in `OrbitalElements`."""
     (x, y, z), (vx, vy, vz) = np.moveaxis(state, 2, 1)
     mu = mu.reshape(-1, *[1] * (x.ndim - 1))
     # Adding 0 leaves no -0, whose arc tangent is pi.
@@ -268,8 +257,7 @@ def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
 def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return the angle in the plane of the orbit from the ascending node to q; 0 if the node or q is undefined.
 
-    `momentum` is the angular momentum (hx, hy, hz) per unit of mass, `level` the length of (hx, hy), and `h` that of
-    all three.
+    `level` is the length of the part (hx, hy) of the angular `momentum`, and `h` that of the whole.
     """
     hx, hy, hz = momentum
     along = hx * q[1] - hy * q[0] + 0.0
@@ -280,10 +268,7 @@ def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.nda
 
 
 def _mean_anomaly(e: np.ndarray, f: np.ndarray, a: np.ndarray, r: np.ndarray, rv: np.ndarray) -> np.ndarray:
-    """Return the mean anomaly by Kepler's equation, between 0 and 2 pi for an ellipse, NaN for a parabola.
-
-    `f` is the true anomaly, `r` the distance, and `rv` is q . v / sqrt(mu).
-    """
+    """Return the mean anomaly, between 0 and 2 pi for an ellipse, NaN for a parabola; `rv` is q . v / sqrt(mu)."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         sine, cosine = rv / np.sqrt(np.abs(a)), 1 - r / a  # e times those of the eccentric anomaly
         nearly = 2 * np.arctan2(np.sqrt(np.abs(1 - e)) * np.sin(f / 2), np.sqrt(1 + e) * np.cos(f / 2))

@@ -1,4 +1,4 @@
-"""Energies, angular momenta and Laplace vectors of the orbits of N bodies as balances, see `Balance`."""
+"""Orbits of N bodies: energies, angular momenta and Laplace vectors as balances, see `Balance`, and frequencies."""
 
 from __future__ import annotations
 
@@ -10,9 +10,16 @@ import numpy as np
 from ...core.balances import Balance
 from ...core.inputs import flag, real_array, shown
 from ...core.names import nearest
-from ...engine.native import library
+from ...engine.native import BUILD, library
 
-__all__ = ["QUANTITIES", "balances_beside_frame", "centres", "chosen_quantities", "orbital_balances"]
+__all__ = [
+    "QUANTITIES",
+    "balances_of_orbits",
+    "centres",
+    "chosen_quantities",
+    "orbital_balances",
+    "orbital_frequencies",
+]
 
 Array = np.ndarray
 QUANTITIES = ("energy", "momentum", "laplace")
@@ -23,10 +30,9 @@ ENERGY = 0
 class _Orbit(NamedTuple):
     """Orbit of the body with the index `body`, or of this body together with those that move about it.
 
-    `entries` are the parameters of the orbit for the functions of the library: the energy at the start (0 until it is
-    known), the number of bodies that take part, and for each of them its index and its weight in the relative position.
-    `components` (6, k) are the indices of the components of the state that a correction moves, and `weights` (6, k) the
-    sizes of their moves relative to each other.
+    `entries` are its parameters for the library: the energy at the start (0 until it is known), the number of bodies
+    that take part, and the index of each and its weight in the relative position. A correction moves the `components`
+    (6, k) of the state by multiples of `weights` (6, k).
     """
 
     body: int
@@ -91,25 +97,17 @@ def orbital_balances(
     >>> run.invariants.shape[0], run.trusted
     (9, True)
     """
-    return _balances(gm, y0, quantities, bodies, newton, neutral=True)
+    return balances_of_orbits(gm, y0, quantities, bodies, newton, neutral=True)
 
 
-def balances_beside_frame(
-    gm: Array, y0: Array, quantities: str | Sequence[str], bodies: Sequence[str] | None, newton: bool
-) -> tuple[Balance, ...]:
-    """Return the balances of `orbital_balances` for runs whose `frame` restores the centre of mass by a common shift.
-
-    A common shift of all bodies changes no orbit. Therefore the correction of an orbit about the heaviest body moves
-    only the body on this orbit, while a balance of `orbital_balances` also moves all other bodies in the opposite
-    direction.
-    """
-    return _balances(gm, y0, quantities, bodies, newton, neutral=False)
-
-
-def _balances(
+def balances_of_orbits(
     gm: Any, y0: Any, quantities: Any, bodies: Sequence[str] | None, newton: bool, *, neutral: bool
 ) -> tuple[Balance, ...]:
-    """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged."""
+    """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged.
+
+    That moves all other bodies in the opposite direction. If the `frame` of a run restores the centre of mass by a
+    common shift, which changes no orbit, only the body on an orbit about the heaviest body needs to move.
+    """
     masses, state = real_array("gm", gm), real_array("y0", y0)
     newton = flag("newton", newton)
     if masses.ndim != 1 or masses.size < 2 or state.shape != (6 * masses.size,):
@@ -144,15 +142,7 @@ def _balances(
 
 
 def chosen_quantities(given: Any) -> tuple[str, ...]:
-    """Return the quantities that `given`, a name or several names, stands for, in the order of `QUANTITIES`.
-
-    The name "kepler" stands for "energy". Repetitions are left out.
-
-    Raises
-    ------
-    ValueError
-        If a quantity is unknown.
-    """
+    """Return the quantities that a name or several names mean, in the order of `QUANTITIES`; "kepler" is "energy"."""
     names = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Iterable) else (given,)
     for name in names:
         if name not in (*QUANTITIES, "kepler"):
@@ -166,8 +156,7 @@ def chosen_quantities(given: Any) -> tuple[str, ...]:
 def centres(gm: Array, y0: Array) -> Array:
     """Return the indices (N,) of the bodies that the bodies move about at the start, -1 for the heaviest body.
 
-    Among the heavier bodies to which a body is bound and in whose Hill sphere it is, the one with the smallest sphere
-    is chosen. If there is none, the heaviest body is chosen.
+    Each moves about the heavier body with the smallest Hill sphere that it is in and bound to, or about the heaviest.
     """
     q, v = y0.reshape(2, -1, 3)
     order = np.argsort(-gm, kind="stable").tolist()
@@ -197,8 +186,7 @@ def _is_below(about: Array, body: int, top: int) -> bool:
 def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orbit:
     """Return the orbit of `body`, together with all bodies that move about it, about the body ``about[body]``.
 
-    If `neutral` is True, or `body` does not move about the heaviest body, corrections leave the centre of mass
-    unchanged: the bodies on the other side of the orbit move in the opposite direction.
+    If `neutral`, or if it is not the heaviest body, the other side moves too, so that the centre of mass stays.
     """
     centre = int(about[body])
     group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
@@ -220,11 +208,7 @@ def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orb
 def _balance(
     quantity: str, group: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str
 ) -> Balance:
-    """Return the balance of one quantity for all orbits.
-
-    Its functions are those of the `group` ("orbits" or "planets") of the library, with the parameters `entries`. The
-    function of the rate is called "group.quantity" followed by `end`. `names` are those of all bodies.
-    """
+    """Return the balance of one quantity for all orbits, by the functions "group.quantity" of the library."""
     fun, grad, rate = (library[f"{group}.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
     each = 1 if quantity == "energy" else 3
     kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)
@@ -234,3 +218,24 @@ def _balance(
     axes = ("",) if each == 1 else ("_x", "_y", "_z")
     kept.value_names = tuple(f"{quantity}{axis} of {names[orbit.body]}" for orbit in orbits for axis in axes)
     return kept
+
+
+def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf) -> tuple[np.ndarray, float]:
+    """Return an angular frequency for each orbit about the heaviest body, and the largest one of the other pairs.
+
+    `gm` (N,) are G times the masses, `y` (6 N,) positions and velocities, and `duration` is the length of the run,
+    negative if it goes back in time. The frequencies (N,) are in radians per unit of time, 0 for the heaviest body. The
+    other pairs are those, such as a planet and its moon, for which the sum of both G m divided by the cube of the
+    distance is larger than it is for the heaviest body and one body of the pair; without such pairs the second result
+    is 0.
+
+    The frequency of a bound pair is computed from its osculating orbit. It is the geometric mean of the mean motion n
+    and the frequency in the pericentre, n (1 - e)^(-3/2), because this mean determines the stability of a multistep
+    method, as was measured with Mercury (e = 0.2). If the eccentricity of a bound pair is above 0.5, and the pair does
+    not reach its pericentre within the run, its least distance within the run takes the place of the pericentre. If
+    other bodies change the motion of a pair more than its own attraction does, or if the pair flies apart for good, the
+    frequency is that of its attraction at the present distance. Therefore the frequency of a pair without angular
+    momentum is finite.
+    """
+    bodies, others = BUILD.gravity.frequencies(gm, y, duration)
+    return bodies, others

@@ -96,7 +96,7 @@ class SolarSystemData:
 
 def available() -> tuple[str, ...]:
     """Return the names of the data sets that `load` knows."""
-    return tuple(_read(SOLAR_SYSTEM_JSON))
+    return tuple(read(SOLAR_SYSTEM_JSON))
 
 
 def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
@@ -130,7 +130,7 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
     DE440: R. S. Park, W. M. Folkner, J. G. Williams and D. H. Boggs, The JPL planetary and lunar ephemerides DE440 and
     DE441, Astron. J. 161 (2021) 105, doi:10.3847/1538-3881/abd414.
     """
-    sets = _read(SOLAR_SYSTEM_JSON)
+    sets = read(SOLAR_SYSTEM_JSON)
     if name not in sets:
         raise ValueError(_unknown(name, tuple(sets)))
     if as_printed and name != "paper":
@@ -183,7 +183,7 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
         raise ValueError(
             f"reference states exist for 'de440' only, got {name!r}" if name in known else _unknown(name, known)
         )
-    states = {float(year): np.array(y, dtype=float) for year, y in _read(_REFERENCE_JSON)["states"].items()}
+    states = {float(year): np.array(y, dtype=float) for year, y in read(_REFERENCE_JSON)["states"].items()}
     for y in states.values():
         y[y.size // 2 :] /= YEAR_D
     return states
@@ -217,11 +217,6 @@ def _centre(gm: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.array([math.fsum(gm * column) for column in rows.T]) / math.fsum(gm)
 
 
-def _state(rows: np.ndarray) -> np.ndarray:
-    """Return the state (q of all bodies, v of all bodies) from an array whose rows are (q, v) of one body."""
-    return rows.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
-
-
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -231,10 +226,7 @@ def _arrays(entry: dict[str, Any]) -> _Arrays:
 
 
 def _with_sun(entry: dict[str, Any], as_printed: bool) -> _Arrays:
-    """Return G m, positions and velocities of the bodies of the paper's table, with the Sun added as the first body.
-
-    The units are AU and days, and the barycentre is at rest at the origin.
-    """
+    """Return G m, positions and velocities of the paper's table in AU and days, with the Sun added as first body."""
     gm, position, velocity = _arrays(entry)
     if not as_printed:
         misprint = entry["misprint"]
@@ -246,7 +238,8 @@ def _with_sun(entry: dict[str, Any], as_printed: bool) -> _Arrays:
     return gm, *to_barycentre(gm, position, velocity)
 
 
-def _read(file: str) -> dict[str, Any]:
+def read(file: str) -> dict[str, Any]:
+    """Return the content of a JSON file of the package's data."""
     return json.loads(files("eip_scipy.data").joinpath(file).read_text(encoding="utf-8"))
 
 

@@ -76,7 +76,9 @@ def solar_system(
         raise ValueError("solar_system: the force 'drag' needs an atmosphere; see satellite(...), or nbody(...).")
     length, time = _units(units)
     year = YEAR_D * time
-    references = reference_states() if _starts_as_references(known) and not chosen else {}
+    start = load("de440")  # from which the stored references start; names do not determine epochs
+    is_start = np.array_equal(known.gm, start.gm) and np.array_equal(known.y0, start.y0)
+    references = reference_states() if is_start and not chosen else {}
     return nbody(
         known.gm * (length**3 / time**2),
         known.position * length,
@@ -101,15 +103,6 @@ def _reference(references: dict[float, np.ndarray], length: float, time: float, 
         return None
     half = state.size // 2
     return np.concatenate([state[:half] * length, state[half:] * (length / time)])
-
-
-def _starts_as_references(data: SolarSystemData) -> bool:
-    """Return True if masses and states are those of the set "de440", from which the stored reference states start.
-
-    The name of the data is not compared, because it does not determine the epoch.
-    """
-    start = load("de440")
-    return np.array_equal(data.gm, start.gm) and np.array_equal(data.y0, start.y0)
 
 
 def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, time: float) -> ForceConstants:

@@ -1,19 +1,32 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
-from .damped import DampedGrossPitaevskii
-from .equation import FieldProblem, GrossPitaevskii
-from .flows import LinearFlow
-from .frames import at_rest, rotated
+from .equation import DampedGrossPitaevskii, FieldProblem, GrossPitaevskii
 from .grid import Grid, Multiplier, SpectralSum
-from .ground_state import GroundState, ground_state
-from .potentials import harmonic_trap, quartic_trap
-from .scenes import breather, line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
-from .search import lowest_ring, lowest_state
-from .splitting import RKN6, S6, STRANG, Scheme, Splitting
-from .starts import imprint, polygon, ring_start, thomas_fermi, vortex_starts, with_noise
-from .surfaces import Surface, density_surface
+from .ground_state import (
+    GroundState,
+    ground_state,
+    imprint,
+    lowest_ring,
+    lowest_state,
+    polygon,
+    ring_start,
+    thomas_fermi,
+    vortex_starts,
+    with_noise,
+)
+from .scenes import (
+    breather,
+    harmonic_trap,
+    line_condensate,
+    plane_wave,
+    quartic_trap,
+    ring_condensate,
+    rotating_packet,
+    soliton,
+)
+from .splitting import RKN6, S6, STRANG, LinearFlow, Scheme, Splitting, at_rest, rotated
 from .transforms import make_transforms
-from .vortices import Vortices, vortices
+from .vortices import Surface, Vortices, density_surface, vortices
 
 __all__ = [
     "RKN6",

@@ -148,7 +148,10 @@ class Multiplier:
         self._factor = np.ascontiguousarray(full, dtype=float).reshape(-1, columns) / points
         self._strips: list[tuple[slice, np.ndarray, np.ndarray]] = []
         if axes == (0,) and self._factor.shape == grid.shape and columns > STRIP:
-            self._strips = _in_strips(self._factor)
+            strips = [slice(begin, begin + STRIP) for begin in range(0, columns, STRIP)]
+            factors = [np.ascontiguousarray(self._factor[:, part]) for part in strips]
+            rooms = {part.shape: np.empty(part.shape, complex) for part in factors}  # shared by strips of equal widths
+            self._strips = [(part, f, rooms[f.shape]) for part, f in zip(strips, factors, strict=True)]
 
     def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
         """Fill `out` with the field whose modes are those of `psi` times the factor; `psi` is not changed.
@@ -172,17 +175,6 @@ class Multiplier:
         """Return the grid's sum of conj(psi) times the field of `apply`, by one transform into `work` (Parseval)."""
         fft.forward(psi, self.axes, work)
         return float(weighted_square(work, self._factor))
-
-
-def _in_strips(factor: np.ndarray) -> list[tuple[slice, np.ndarray, np.ndarray]]:
-    """Return the strips of columns into which a factor (J, K) is divided, each as its slice, its factor, and a buffer.
-
-    Strips of the same width share the buffer.
-    """
-    strips = [slice(begin, begin + STRIP) for begin in range(0, factor.shape[1], STRIP)]
-    factors = [np.ascontiguousarray(factor[:, columns]) for columns in strips]
-    rooms = {part.shape: np.empty(part.shape, complex) for part in factors}
-    return [(columns, part, rooms[part.shape]) for columns, part in zip(strips, factors, strict=True)]
 
 
 class SpectralSum:

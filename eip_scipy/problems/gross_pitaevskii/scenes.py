@@ -1,10 +1,11 @@
-"""Problems for the Gross-Pitaevskii equation: closed forms of the NLS equation, and condensates of "the paper".
+"""Problems for the Gross-Pitaevskii equation: closed forms of the NLS equation, condensates of "the paper", and traps.
 
 The paper is Cai, Gong & Wang; the condensates are those of its Experiment IV.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from math import pi, sqrt
 from typing import Any
@@ -14,9 +15,72 @@ import numpy as np
 from ...core.inputs import refuse_units
 from .equation import FieldProblem, GrossPitaevskii
 from .grid import Grid
-from .potentials import harmonic_trap, quartic_trap
 
-__all__ = ["breather", "line_condensate", "plane_wave", "ring_condensate", "rotating_packet", "soliton"]
+__all__ = [
+    "breather",
+    "harmonic_trap",
+    "line_condensate",
+    "plane_wave",
+    "quartic_trap",
+    "ring_condensate",
+    "rotating_packet",
+    "soliton",
+]
+
+Potential = Callable[..., Any]
+
+
+def harmonic_trap(*gamma: float) -> Potential:
+    """Harmonic trap, V = sum_a (gamma_a x_a)^2 / 2.
+
+    Parameters
+    ----------
+    *gamma : float
+        The frequency along each axis.
+
+    Returns
+    -------
+    callable
+        ``V(x[, y[, z]])``.
+
+    Raises
+    ------
+    ValueError
+        If called with another number of coordinates.
+    """
+    refuse_units(gamma=gamma)
+    return lambda *x: 0.5 * _squares(gamma, x)
+
+
+def quartic_trap(alpha: float, kappa: float, *gamma: float) -> Potential:
+    """Quadratic-plus-quartic trap, V = (1 - alpha) / 2 s + kappa / 4 s^2 with s = sum_a (gamma_a x_a)^2.
+
+    Parameters
+    ----------
+    alpha, kappa : float
+    *gamma : float
+        The frequency along each axis.
+
+    Returns
+    -------
+    callable
+        ``V(x[, y[, z]])``.
+    """
+    refuse_units(alpha=alpha, kappa=kappa, gamma=gamma)
+
+    def potential(*x: np.ndarray) -> np.ndarray:
+        s = _squares(gamma, x)
+        return 0.5 * (1 - alpha) * s + 0.25 * kappa * s * s
+
+    return potential
+
+
+def _squares(gamma: tuple[float, ...], x: tuple[np.ndarray, ...]) -> Any:
+    if len(gamma) != len(x):
+        raise ValueError(
+            f"a trap of {len(gamma)} frequencies does not fit {len(x)} coordinates; give one frequency for each."
+        )
+    return sum((g * a) ** 2 for g, a in zip(gamma, x, strict=True))
 
 
 def soliton(
@@ -85,15 +149,8 @@ def breather(
 
     Parameters
     ----------
-    points : int
-        Number of points of the grid.
-    amplitude, velocity : float
-        a and v.
-    beta : float
-        < 0.
-    length : float
-        Length of the ring; on the ring the closed form has an error of exp(-a length / 2).
-    t_end : float
+    points, amplitude, velocity, beta, length, t_end
+        As for `soliton`; a and v are amplitude and velocity.
     h : float, optional
         Default: 0.005 / a^2, a step for `Splitting`. The step of other methods must be below
         `GrossPitaevskii.largest_step`.
@@ -263,10 +320,7 @@ def _breather(x: np.ndarray, length: float, amplitude: float, velocity: float, b
 
 
 def _moving(x: np.ndarray, length: float, velocity: float, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the signed distances of points from a centre that moves around the ring, and factors for the field.
-
-    The factors exp(i phase) turn the field of a soliton at rest, taken at these distances, into that of a moving one.
-    """
+    """Return the signed distances of points from a moving centre on the ring, and factors that make a field move."""
     # The phase follows the distance, so that nothing jumps where it turns.
     s = np.remainder(x - velocity * t + length / 2, length) - length / 2
     return s, np.exp(1j * (velocity * (s + velocity * t) - 0.5 * velocity**2 * t))

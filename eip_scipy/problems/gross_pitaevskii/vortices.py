@@ -1,4 +1,4 @@
-"""Vortices of a field: cells of the grid inside the condensate around which the phase winds."""
+"""Vortices of a field, around which the phase winds, and surfaces of equal density that show them as tubes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import scipy  # its parts load when they are used
 
 from .equation import GrossPitaevskii
 
-__all__ = ["Vortices", "core_size", "vortices"]
+__all__ = ["Surface", "Vortices", "core_size", "density_surface", "vortices"]
 
 CORE = 4.0  # width of a core, in healing lengths
 
@@ -88,16 +88,15 @@ def vortices(
     dx, dy = gpe.grid.spacing[:2]
     filled = scipy.ndimage.grey_closing(np.abs(psi) ** 2, size=core_size(gpe, top, core), mode="wrap")
     charge = _charges(psi, turning, x, y, dx, dy)
-    i, j = np.nonzero((charge != 0) & (_least_of_corners(filled) > threshold * top))
+    least = np.minimum(filled[1:], filled[:-1])
+    least = np.minimum(least[:, 1:], least[:, :-1])  # of the corners of each cell
+    i, j = np.nonzero((charge != 0) & (least > threshold * top))
     places = [_zero(psi[a : a + 2, b : b + 2], turning, x[a], y[b], dx, dy) for a, b in zip(i, j, strict=True)]
     return Vortices(np.array(places).reshape(-1, 2), charge[i, j])
 
 
 def core_size(gpe: GrossPitaevskii, top: float, core: float | None = None) -> list[int]:
-    """Return the numbers of points across a vortex core along x and y, odd and at least 3.
-
-    The width of the core is `core`, or else four healing lengths at the largest density `top`.
-    """
+    """Return the odd numbers of points, at least 3, across a core of the width `core` or 4 healing lengths at `top`."""
     width = core if core is not None else CORE / sqrt(2 * gpe.beta * top) if gpe.beta > 0 else 0.0
     return [max(3, ceil(width / d) | 1) for d in gpe.grid.spacing[:2]]
 
@@ -111,16 +110,8 @@ def _charges(psi: np.ndarray, Omega: float, x: np.ndarray, y: np.ndarray, dx: fl
     return np.rint((around + 2 * Omega * dx * dy) / (2 * pi)).astype(int)
 
 
-def _least_of_corners(a: np.ndarray) -> np.ndarray:
-    along = np.minimum(a[1:], a[:-1])
-    return np.minimum(along[:, 1:], along[:, :-1])
-
-
 def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: float) -> tuple[float, float]:
-    """Return x and y of the zero of the linear function that fits the field best at the four corners of a cell.
-
-    `corners` (2, 2) holds the field there. The arguments `x` and `y` are the smallest coordinates in the cell.
-    """
+    """Return x and y of the zero of the linear function that fits the field at the `corners` of a cell best."""
     u = np.array([[-0.5], [0.5]])
     middle = x + 0.5 * dx, y + 0.5 * dy
     c = corners * np.exp(-1j * Omega * (middle[0] * dy * u.T - middle[1] * dx * u))
@@ -129,3 +120,66 @@ def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: 
     shift = np.linalg.lstsq(matrix, -np.array([mean.real, mean.imag]), rcond=None)[0]
     a, b = np.clip(shift, -0.5, 0.5)
     return middle[0] + a * dx, middle[1] + b * dy
+
+
+DEEP = 2.0  # a point is inside if the density with filled cores exceeds that of the surface by this factor
+SMOOTH = 2.0  # points, for an edge without teeth
+
+
+class Surface(NamedTuple):
+    """A surface of triangles.
+
+    Attributes
+    ----------
+    corners : ndarray, shape (m, 3, 3)
+        x, y and z of the three corners of each triangle.
+    inside : ndarray of bool, shape (m,)
+        True if the triangle lies inside the condensate. It is then part of a tube around a vortex line.
+    """
+
+    corners: np.ndarray
+    inside: np.ndarray
+
+
+def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
+    """Return the surface on which ``|psi|^2`` has a given value, by marching cubes (Lewiner et al. 2003, scikit-image).
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+        An equation in three dimensions.
+    psi : array_like
+        A field or flat state that is 0 at the ends of the box. It is interpolated to twice as many points on each axis.
+    level : float
+        The value of the density on the surface, between 0 and the largest density.
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    ValueError
+        If the grid has one or two dimensions, or the density does not reach the level.
+    ImportError
+        If scikit-image is not installed.
+    """
+    if gpe.grid.dim != 3:
+        raise ValueError(f"a surface needs three dimensions, got {gpe.grid!r}.")
+    psi = gpe.as_field(psi)
+    top = float((np.abs(psi) ** 2).max())
+    if not 0 < level < top:
+        raise ValueError(f"level must be between 0 and the largest density {top:.3g}, got {level!r}.")
+    try:
+        from skimage.measure import marching_cubes
+    except ModuleNotFoundError as error:
+        message = 'surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"'
+        raise ImportError(message, name="skimage") from error
+    for axis, n in enumerate(gpe.grid.shape):
+        psi = scipy.signal.resample(psi, 2 * n, axis=axis)
+    density = np.abs(psi) ** 2
+    points, triangles, _, _ = marching_cubes(density, level)
+    closed = scipy.ndimage.grey_closing(density, size=[*(2 * n + 1 for n in core_size(gpe, top)), 1])
+    filled = scipy.ndimage.gaussian_filter(closed, SMOOTH)
+    around = scipy.ndimage.map_coordinates(filled, points[triangles].mean(axis=1).T, order=1)
+    return Surface((gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level)

@@ -13,9 +13,8 @@ from ...core.inputs import count, is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like
 from ...core.problem import Problem
-from .points import Surroundings
 from .polynomials import Term, functions, written
-from .search import Search
+from .search import Search, Surroundings
 
 __all__ = ["find_invariants"]
 

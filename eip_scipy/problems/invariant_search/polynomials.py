@@ -49,8 +49,7 @@ def functions(
 ) -> Functions:
     """Return value and gradient of a polynomial of n variables plus multiples of given functions.
 
-    `terms` are pairs of a given function and its coefficient. Value and gradient are jitted if the given functions
-    and `like`, the user's right-hand side, are jitted.
+    Both are jitted if the given functions and `like`, the user's right-hand side, are jitted.
     """
     found = _of_polynomial(polynomial, n)
     compiled = [like]
@@ -102,10 +101,7 @@ def _with_term(others: Functions, term: Term, coefficient: float) -> Functions:
 
 
 def written(polynomial: Polynomial, terms: Sequence[tuple[Term, float]], names: Sequence[str]) -> str:
-    """Return a polynomial plus multiples of given functions as text such as "y0*y3 - y1*y2".
-
-    `terms` are pairs of a given function and its coefficient, and `names` the names of the variables.
-    """
+    """Return a polynomial plus multiples of given functions as text such as "y0*y3 - y1*y2"."""
     factors = [(_product(item, names), c) for item, c in polynomial.items()] + [(term.name, c) for term, c in terms]
     text = ""
     for name, coefficient in factors:

@@ -1,21 +1,211 @@
-"""Search for simple and independent invariants in the null space of the rates."""
+"""Search for simple and independent invariants in the null space of the rates.
+
+The rates are those of monomials and of further functions, at random points around a state.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from itertools import combinations_with_replacement
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.integrate import DOP853
 
-from .points import Surroundings
-from .polynomials import LARGEST_DENOMINATOR, Polynomial, Term, product_of
+from .polynomials import LARGEST_DENOMINATOR, Monomial, Polynomial, Term, product_of
 
-__all__ = ["Search"]
+__all__ = ["Sample", "Search", "Surroundings"]
 
 Array = np.ndarray
+
+SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01)  # of the points, in units of the components' sizes
+STEPS = 200
+# Largest time of the points in units of `tau`: what drives a system may be much slower than its motion.
+LATEST = 1000.0
+# A trajectory that moves by less than this part of the components' sizes tests nothing.
+AT_REST = 1e-3
+# Times after `t`, in any unit, at which a system is looked at that does not move at `t` from any state.
+LATER = 10.0 ** np.arange(-9, 19)
+
+
+class Sample(NamedTuple):
+    """Values at m random points, one row for each point.
+
+    `points` are z = y / scale, and `slopes` are dz/dt divided by the sum of its absolute values. `rates` (m, k) are the
+    rates dI/dz . slopes of k functions I: the monomials of a basis, then the given functions. `sizes` (m, k) are the
+    sums of the absolute values of the products in the rates, with one product for each factor of a monomial.
+    """
+
+    points: Array
+    slopes: Array
+    rates: Array
+    sizes: Array
+
+
+class Surroundings:
+    """The region around a state in which invariants are searched, and random points in it.
+
+    `terms` are the given functions. `scale` (n,) holds the sizes of the components of the state, `tau` is a time in
+    which the state moves by its own size, and `trajectory` (m, n) holds states on the trajectory from y0, or from
+    nearby if that from y0 tests nothing. A ValueError is raised if the vector field is not finite at y0.
+    """
+
+    def __init__(self, fun: Callable[..., Any], y0: Array, terms: Sequence[Term], t: float, seed: int) -> None:
+        self.fun, self.y0, self.terms, self.t = fun, y0, terms, t
+        self.rng = np.random.default_rng(seed)
+        self.failure: Exception | None = None
+        self._look_around()
+        self.trajectory = self._follow()
+
+    def _slope(self, t: float, y: Array) -> Array:
+        """Return the derivative f(t, y), shape (n,); all NaN if `fun` raises an ArithmeticError or ValueError."""
+        try:
+            found = np.asarray(self.fun(t, y.copy()), dtype=float)
+        except (ArithmeticError, ValueError) as error:
+            self.failure = self.failure or error
+            return np.full_like(y, np.nan)
+        if found.shape != y.shape:
+            raise ValueError(f"find_invariants: fun returned shape {found.shape} for a state of shape {y.shape}.")
+        return found
+
+    def term_gradients(self, y: Array) -> Array:
+        """Return the gradients (k, n) of the given functions (`terms`); all NaN if one of them cannot be computed."""
+        try:
+            return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
+        except (ArithmeticError, ValueError) as error:
+            self.failure = self.failure or error
+            return np.full((len(self.terms), y.size), np.nan)
+
+    def term_values(self, y: Array) -> Array:
+        """Return the values (k,) of the given functions (`terms`); all NaN if one of them cannot be computed."""
+        try:
+            return np.array([item.fun(y.copy()) for item in self.terms], dtype=float)
+        except (ArithmeticError, ValueError):
+            return np.full(len(self.terms), np.nan)
+
+    def _look_around(self) -> None:
+        """Set `scale`, the sizes of the components, and `tau`, a time in which the state moves by its own size."""
+        first = self._slope(self.t, self.y0)
+        if not np.isfinite(first).all():
+            found = f"is {first}" if self.failure is None else f"raised {type(self.failure).__name__}"
+            raise ValueError(
+                f"find_invariants: fun(t, y0) {found}, expected finite numbers. Choose another y0 or t."
+            ) from self.failure
+        here, self.scale, self.tau = self.y0, np.abs(self.y0), 0.0
+        for _ in range(3):  # a component may start to move only where others have moved
+            f = self._speeds(self.t, here)
+            if f.any():  # a start near a fixed point is slow, and its surroundings are not
+                tau = float(np.max(self.scale, initial=0.0) or 1.0) / float(np.max(f))
+                self.tau = min(self.tau or tau, tau)
+            self.scale = np.maximum(self.scale, self.tau * f)
+            here = self.y0 + 0.1 * self.scale * self.rng.standard_normal(self.y0.size)
+        self.scale[self.scale == 0.0] = np.max(self.scale) or 1.0
+        if self.tau == 0.0:
+            self.tau = self._time_of_a_start_at_rest()
+
+    def _speeds(self, t: float, y: Array) -> Array:
+        """Return the absolute values of the derivative (n,), with 0 for those that are not finite."""
+        f = np.abs(self._slope(t, y))
+        f[~np.isfinite(f)] = 0.0
+        return f
+
+    def _time_of_a_start_at_rest(self) -> float:
+        """Return a time in which displaced states around y0 move by their size, at `t` or later; 0 if nothing moves."""
+        if speed := self._speed_around(self.t):
+            return 1.0 / speed
+        tau = 0.0
+        for later in LATER.tolist():
+            if speed := self._speed_around(self.t + later):
+                tau = later
+            if later * speed >= 1.0:
+                break
+        return tau
+
+    def _speed_around(self, t: float) -> float:
+        y = self._near(t)
+        return float(np.max(self._speeds(t, y) / self.scale))
+
+    def _near(self, t: float) -> Array:
+        """Return a random state near y0 at which all functions are finite at `t`; y0 if none is found."""
+        for spread in SPREADS:
+            y = self.y0 + spread * self.scale * self.rng.standard_normal(self.y0.size)
+            if self._is_defined(t, y):
+                return y
+        return self.y0
+
+    def _is_defined(self, t: float, y: Array) -> bool:
+        return bool(np.isfinite(self._slope(t, y)).all() and np.isfinite(self.term_gradients(y)).all())
+
+    def sample(self, wanted: int, basis: Sequence[Monomial]) -> Sample:
+        """Return `wanted` random points, with the rates of the monomials `basis` and of the given functions there.
+
+        A ValueError is raised if the vector field, or the gradient of a given function, is finite at too few points.
+        """
+        for spread in SPREADS:
+            points, slopes, gradients = [], [], []
+            for k in range(4 * wanted):
+                y = self.y0 + spread * self.scale * self.rng.standard_normal(self.y0.size)
+                t = self.t + self.tau * self._later(k)
+                f, g = self._slope(t, y), self.term_gradients(y)
+                if np.isfinite(f).all() and np.isfinite(g).all():
+                    points.append(y / self.scale)
+                    slopes.append(f / self.scale)
+                    gradients.append(g * self.scale)
+                if len(points) == wanted:
+                    return _rates(np.array(points), np.array(slopes), np.array(gradients), basis)
+        raise ValueError(
+            f"find_invariants: fun or a term is finite at fewer than 25 % of the random points around y0, even at "
+            f"distances of {SPREADS[-1]} times the sizes of the components. Choose another y0 or t."
+        ) from self.failure
+
+    def _later(self, k: int) -> float:
+        """Return the time of point k after `t`, in units of `tau`: 0, a number below 1, or one up to `LATEST`.
+
+        Half of the points are at `t`, because `fun` may be undefined later.
+        """
+        part = float(self.rng.random())
+        return part if k % 4 == 1 else LATEST**part if k % 4 == 3 else 0.0
+
+    def _follow(self) -> Array:
+        """Return states (m, n) on a trajectory from y0, or from nearby if that from y0 would test nothing."""
+        if self._is_defined(self.t, self.y0):
+            states = self._states_from(self.y0)
+            if np.any(np.abs(states - self.y0) > AT_REST * self.scale):
+                return states
+        return self._states_from(self._near(self.t))
+
+    def _states_from(self, start: Array) -> Array:
+        """Return the states (m, n) of at most 200 steps from `start`, within the time 3 `tau`."""
+        solver = DOP853(self._slope, self.t, start, self.t + 3 * self.tau, rtol=1e-12, atol=1e-16 * self.scale)
+        states = [start]
+        while solver.status == "running" and len(states) <= STEPS:
+            solver.step()
+            if solver.status != "failed":
+                states.append(solver.y.copy())
+        return np.array(states)
+
+
+def _rates(points: Array, slopes: Array, gradients: Array, basis: Sequence[Monomial]) -> Sample:
+    speed = np.abs(slopes).sum(axis=1, keepdims=True)
+    slopes = slopes / np.where(speed == 0, 1.0, speed)
+    m, column = len(points), {item: k for k, item in enumerate(basis)}
+    values, rates, sizes = [np.empty((m, len(basis))) for _ in range(3)]
+    for k, (*rest, last) in enumerate(basis):
+        z, f = points[:, last], slopes[:, last]
+        if not rest:
+            values[:, k], rates[:, k], sizes[:, k] = z, f, np.abs(f)
+            continue
+        j = column[tuple(rest)]
+        values[:, k] = z * values[:, j]
+        rates[:, k] = f * values[:, j] + z * rates[:, j]
+        sizes[:, k] = np.abs(f * values[:, j]) + np.abs(z) * sizes[:, j]
+    products = gradients * slopes[:, None, :]
+    rates = np.hstack([rates, products.sum(axis=2)])
+    sizes = np.hstack([sizes, np.abs(products).sum(axis=2)])
+    return Sample(points, slopes, rates, sizes)
+
 
 FRESH = 60
 # Bound of a computed rate relative to the sum of its products, in units of rtol: 1e-12 for rtol = 1e-9.
@@ -31,10 +221,8 @@ APART = 1e3  # the least singular value that is not 0, in units of rounding
 class Search:
     """A search for invariants, which is made when the object is created; `found` has the result.
 
-    A candidate for an invariant is represented by a row of coefficients: first those of the monomials of z = y / scale,
-    then those of the given functions (`terms` of `Surroundings`). `columns` are indices in such a row: the monomials
-    and given functions that a candidate may contain. `degree` is the largest degree of the monomials, and `rtol` the
-    tolerance of the test whether a candidate is conserved (`_is_kept`).
+    A candidate is a row of coefficients: first those of the monomials of z = y / scale, up to `degree`, then those of
+    the given functions. `columns` are indices in such a row. `rtol` is the tolerance of `_is_kept`.
     """
 
     def __init__(self, around: Surroundings, degree: int, rtol: float) -> None:
@@ -85,11 +273,7 @@ class Search:
         return len(self.basis) + len(self.terms)
 
     def _null_space(self, columns: Any) -> Array:
-        """Return rows that span the null space of the rates of the functions in `columns`.
-
-        The rows are the constant functions, and then singular vectors, those of the smallest singular values first,
-        until one is not conserved.
-        """
+        """Return the constant functions and those singular vectors, smallest values first, that are conserved."""
         # A component that does not move is conserved; relative to such columns no rounding error is small.
         still, _, rows = self._singular(columns)
         found = [self._spread(np.ones(1), [k]) for k in still]
@@ -102,12 +286,10 @@ class Search:
     def _numerical_null_space(self, columns: Any) -> Array:
         """Return the constant functions and the singular vectors of singular values that are 0 up to rounding, as rows.
 
-        There are no rows, not even those of constant functions, if no singular value is above rounding, or the smallest
-        one above rounding is less than `APART` times as large.
-
-        The rows are not tested by `_is_kept`. Because of rounding such a row contains small multiples of all columns.
-        Near points at which all terms of the invariant vanish, these multiples exceed the terms, so that the row would
-        fail the test there. An example is y1**2 + y0**4/2 near y0 = 0.
+        There are none if no singular value is above rounding, or the smallest one above is less than `APART` times as
+        large. The rows are not tested by `_is_kept`: because of rounding they contain small multiples of all columns,
+        which exceed the terms of the invariant near points at which all of these vanish, as those of y1**2 + y0**4/2
+        near y0 = 0.
         """
         still, values, rows = self._singular(columns)
         if not values.size:
@@ -120,11 +302,7 @@ class Search:
         return np.array(found).reshape(-1, self._width)
 
     def _singular(self, columns: Any) -> tuple[Array, Array, Array]:
-        """Return the functions in `columns` that are constant, and a singular value decomposition for the others.
-
-        The constant functions are given by their indices. The decomposition is that of the rates of the others at the
-        random points: its singular values, largest first, and its right singular vectors as rows of coefficients.
-        """
+        """Return constant functions in `columns`, and the singular values and right vectors of the others' rates."""
         A, columns = self.sample.rates[:, columns], np.asarray(columns)
         weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
         still, moving = columns[weights == 0], columns[weights > 0]
@@ -134,12 +312,10 @@ class Search:
         return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
-        """Return True if a candidate I is conserved: its rate is 0 up to rounding at points that did not determine it.
+        """Return True if the rate of a candidate is 0 up to rounding at points that did not determine it.
 
-        At each of these points (`fresh`) the rate, the sum of the terms ``dI/dz_i dz_i/dt``, must satisfy two bounds:
-        `rtol` times the sum of the absolute values of these terms, and `ROUND_OFF` `rtol` times a sum that is at least
-        as large, in which the contributions of the single monomials and given functions do not cancel (the `sizes` of
-        `Sample`).
+        It must be below `rtol` times the sum of the absolute values of its terms ``dI/dz_i dz_i/dt``, and below
+        `ROUND_OFF` `rtol` times that sum without cancellation within the terms (the `sizes` of `Sample`).
         """
         rate = np.abs(self.fresh.rates @ row)
         if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
@@ -148,11 +324,7 @@ class Search:
         return bool(np.all(rate <= self.rtol * np.abs(gradients * self.fresh.slopes).sum(axis=1)))
 
     def _gradients(self, row: Array, points: Array, part: Callable[[Array], Array] = np.positive) -> Array:
-        """Return the gradients dI/dz (m, n) of a candidate I at the points z (m, n).
-
-        With ``part=np.abs`` the contributions of the monomials and given functions are replaced by their absolute
-        values.
-        """
+        """Return the gradients dI/dz (m, n) of a candidate at m points; `part` is applied to each contribution."""
         out = np.zeros_like(points)
         for k in np.flatnonzero(row[: len(self.basis)]):
             item = self.basis[k]
@@ -165,10 +337,7 @@ class Search:
         return out
 
     def _products(self, columns: list[int]) -> Iterator[Polynomial]:
-        """Yield the accepted polynomials and their products, up to the largest degree in `columns`.
-
-        Accepted invariants that contain given functions are left out.
-        """
+        """Yield the products of accepted polynomials that consist of functions in `columns`."""
         degree = max(len(self.basis[k]) for k in columns if k < len(self.basis))
         polynomials = [self._polynomial(row) for row in self.accepted if not row[len(self.basis) :].any()]
         stack: list[tuple[int, Polynomial]] = [(0, {(): 1.0})]
@@ -214,12 +383,7 @@ class Search:
         return [row / np.max(np.abs(row)) for row, _ in reduced[count_known:]]
 
     def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
-        """Return the key that sorts rows by simplicity.
-
-        The key consists of the number of nonzero coefficients; minus the number of those with the rarer sign, because
-        angular momenta are differences; the number of products of different variables; and the indices of the nonzero
-        coefficients.
-        """
+        """Return the key that sorts rows by simplicity; both signs count as simple, as in angular momenta."""
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0]).tolist()
         negative = sum(row[k] < 0 for k in support)
         mixed = sum(k < len(self.basis) and len(set(self.basis[k])) > 1 for k in support)
@@ -248,11 +412,7 @@ class Search:
         return row
 
     def _rational(self, row: Array) -> Array:
-        """Return a multiple of the row whose first nonzero coefficient is positive.
-
-        The coefficients, converted to those of functions of y, are small fractions or integers if all are close to such
-        numbers for a suitable multiple.
-        """
+        """Return a multiple of the row that begins with a positive number, of simple fractions if they are near."""
         raw = row * self.units
         raw = raw / raw[np.argmax(np.abs(row))]
         for unit in (1.0, np.min(np.abs(raw[raw != 0]))):
@@ -275,7 +435,7 @@ class Search:
                 continue
             left = gradient / size
             if others:
-                Q = np.linalg.qr(np.array([_unit(item[k]) for item in others]).T)[0]
+                Q = np.linalg.qr(np.array([item[k] / (np.linalg.norm(item[k]) or 1.0) for item in others]).T)[0]
                 left = left - Q @ (Q.T @ left)
             if np.linalg.norm(left) > INDEPENDENT:
                 return True
@@ -295,7 +455,3 @@ class Search:
         sure = ((np.abs(self._gradients(row, points)) * errors).sum(axis=1) <= bound) & np.isfinite(values)
         end = sure.size if sure.all() else int(np.argmin(sure))
         return bool(np.all(np.abs(values - values[0])[:end] <= bound[:end]))
-
-
-def _unit(vector: Array) -> Array:
-    return vector / (np.linalg.norm(vector) or 1.0)

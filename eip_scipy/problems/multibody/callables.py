@@ -10,10 +10,8 @@ import numpy as np
 
 from ...core.inputs import real_array, shown
 from ...core.problem import component_names
-from .motion import Sizes, plain
-from .numerical import numerical_parts
-from .outputs import required_outputs
-from .parts import Given, Parts
+from .motion import plain
+from .parts import Given, Parts, numerical_parts, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
 
@@ -156,21 +154,15 @@ def mechanism(
 
 
 def _as_functions(given: Given) -> Given:
-    """Return `given` with functions in place of arrays for mass and forces.
-
-    A TypeError is raised if another item is not a function.
-    """
+    """Return `given` with functions in place of arrays; raise TypeError if another item is not a function."""
     mass, forces = given.mass, given.forces
     if not callable(mass):
         M = real_array("mass", mass)
-        M = np.diag(M) if M.ndim == 1 else M
-        mass = _constant(M)
+        mass = _constant(np.diag(M) if M.ndim == 1 else M)
     if not callable(forces):
         forces = _constant(np.atleast_1d(real_array("forces", forces)))
-    others = {name: getattr(given, name) for name in ("constraints", "velocity_constraints", "kinematics")}
-    for name, value in {**others, "jacobian": given.jacobian, "gamma": given.gamma, "energy": given.energy,
-                        "potential": given.potential, "power": given.power}.items():  # fmt: skip
-        if value is not None and not callable(value):
+    for name, value in given._asdict().items():
+        if name not in ("mass", "forces") and value is not None and not callable(value):
             raise TypeError(f"mechanism: {name} must be a function, got {shown(value)}.")
     return given._replace(mass=mass, forces=forces)
 
@@ -194,10 +186,7 @@ def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
 
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
-    """Return `given`, the argument with the name `what`, as an array for the first calls of the functions.
-
-    Components that are missing from a mapping are 0.
-    """
+    """Return `given` as an array for the first calls of the functions; components missing from a mapping are 0."""
     if isinstance(given, dict):
         if names is None:
             raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")
@@ -226,8 +215,7 @@ def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
 
     def require(what: str, found: Any, shape: tuple[int | str, ...]) -> None:
         has = np.shape(found)
-        fits = len(has) == len(shape) and all(b in (a, "m") for a, b in zip(has, shape, strict=True))
-        if not fits:
+        if len(has) != len(shape) or not all(b in (a, "m") for a, b in zip(has, shape, strict=True)):
             raise ValueError(
                 f"mechanism: {what} has the shape {has}; expected ({', '.join(map(str, shape))}) for {q.size} "
                 f"coordinates and {n} speeds."
@@ -238,19 +226,19 @@ def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
             f"mechanism: q0 has {q.size} coordinates, but u0 has {n} speeds. Give as many speeds as coordinates, or "
             "kinematics=, which computes q' from the speeds."
         )
-    require("mass", given.mass(q), (n, n))
-    require("forces", given.forces(t, q, u), (n,))
-    if given.constraints is not None:
-        require("constraints", given.constraints(t, q), ("m",))
-    if given.velocity_constraints is not None:
-        require("velocity_constraints", given.velocity_constraints(t, q, u), ("m",))
-    if given.kinematics is not None:
-        require("kinematics", given.kinematics(t, q, u), (q.size,))
-    for what in ("energy", "power"):
+    shapes: dict[str, tuple[tuple[Any, ...], tuple[int | str, ...]]] = {
+        "mass": ((q,), (n, n)),
+        "forces": ((t, q, u), (n,)),
+        "constraints": ((t, q), ("m",)),
+        "velocity_constraints": ((t, q, u), ("m",)),
+        "kinematics": ((t, q, u), (q.size,)),
+        "energy": ((t, q, u), ()),
+        "power": ((t, q, u), ()),
+        "potential": ((t, q), ()),
+    }
+    for what, (args, shape) in shapes.items():
         if (fun := getattr(given, what)) is not None:
-            require(what, fun(t, q, u), ())
-    if given.potential is not None:
-        require("potential", given.potential(t, q), ())
+            require(what, fun(*args), shape)
     if given.jacobian is not None:
         if given.constraints is None:
             raise TypeError("mechanism: jacobian is given without constraints; give both, or omit jacobian.")
@@ -273,13 +261,10 @@ def _require_positive(parts: Parts, names: Names, t: float, y: np.ndarray, toler
 
     Directions of speeds count as allowed up to `tolerance`, the ``rank_tolerance`` of the problem.
     """
-    n, rows = len(names.speeds), len(names.velocities)
-    matrices = np.empty(Sizes(len(names.coordinates), n, rows).matrices + len(names.coordinates))
-    plain(parts.fill)(t, y, matrices)
-    M, G = matrices[: n * n].reshape(n, n), matrices[n * n + n :][: rows * n].reshape(rows, n)
+    M, _, G, _, _ = parts.matrices(names, t, y)
     sizes = np.linalg.norm(G, axis=1, keepdims=True)
     _, found, directions = np.linalg.svd(G / np.where(sizes > 0, sizes, 1.0))
-    allowed = directions[np.count_nonzero(found > tolerance) :].T if rows else np.eye(n)
+    allowed = directions[np.count_nonzero(found > tolerance) :].T if len(G) else np.eye(len(M))
     energies = np.diag(allowed.T @ M @ allowed)
     # In these units the signs do not depend on those of the masses.
     allowed = allowed / np.sqrt(np.where(energies != 0, np.abs(energies), 1.0))
@@ -317,8 +302,7 @@ def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -
     """Return the `Parts`, made from expressions if all functions can be converted to them, else from functions."""
     if find_spec("sympy") is None:
         return numerical_parts(given, names, t, q, u, "SymPy is not installed")
-    from ..symbolic.traced import NotTraceableError
-    from ..symbolic.traced_mechanisms import traced_parts
+    from ..symbolic.traced import NotTraceableError, traced_parts
 
     try:
         return traced_parts(given, names, t, q, u)
@@ -330,12 +314,9 @@ def _require_derivatives(given: Given, parts: Parts, names: Names, t: float, y: 
     """Raise ValueError if a given jacobian or gamma differs from the computed one at the start."""
     nq, n, m = len(names.coordinates), len(names.speeds), len(names.positions)
     q, u = y[:nq], y[nq:]
-    rows = len(names.velocities)
-    matrices = np.empty(Sizes(nq, n, rows).matrices + nq)
-    plain(parts.fill)(t, y, matrices)
-    found = {"gamma": matrices[n * n + n + rows * n :][:rows]}
+    found = {"gamma": parts.matrices(names, t, y)[3]}
     if m > 0:
-        gradient = np.empty((m + rows, nq + n))
+        gradient = np.empty((m + len(names.velocities), nq + n))
         plain(parts.gradient)(t, y, gradient)
         found["jacobian"] = gradient[:m, :nq]
     for what, fun, args in (("jacobian", given.jacobian, (t, q)), ("gamma", given.gamma, (t, q, u))):

@@ -21,8 +21,7 @@ _solve, _changed = inside(solve), inside(changed)
 def solve_duals(dual: Any) -> Callable[..., int]:
     """Return the function `solve` of `motion` for arrays of numbers of the type `dual`.
 
-    The library's solver takes addresses of floats. It solves the equations for the values, and the differentiated
-    equations for each direction.
+    The library's solver takes addresses of floats: it solves for the values, and then for each direction.
     """
     lanes = dual.lanes
 

@@ -1,20 +1,22 @@
-"""Search for an energy that a mechanical system conserves, by its rates at states that meet the constraints."""
+"""Quantities that a mechanical system conserves: its energy, momenta of cyclic coordinates, norms of quaternions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ...core.balances import Balance
 from ...core.gradients import difference_gradient
 from ...core.invariants import Invariant
+from ...core.jitted import compiled_like
 from .motion import plain
-from .start import nearest_start
+from .parts import Energy, Parts
+from .start import Names, nearest_start
 
-__all__ = ["CONSTANT", "FEWEST", "Energy", "energy_of", "rates_of", "states_near", "typical_speed"]
+__all__ = ["energy_of", "momenta_of", "norms_of", "states_near", "typical_speed"]
 
 # Number of states near the start at which rates are examined, and their distance in units of the components' sizes.
 STATES, AWAY = 6, 0.2
@@ -27,46 +29,19 @@ CONSTANT = 1e-9
 RIGHT = 1e-6
 
 
-class Energy(NamedTuple):
-    """A quantity that may be constant: its name, and its functions of (t, y).
-
-    The functions are ``value(t, y, *params)``, ``gradient(t, y, out, *params)``, which fills `out`, and optionally the
-    rate of change ``power(t, y, *params)``.
-    """
-
-    description: str
-    value: Callable[..., float]
-    gradient: Callable[..., None]
-    power: Callable[..., float] | None = None
-
-
 def energy_of(
     candidates: Sequence[Energy],
     derivative: Callable[[float, np.ndarray], np.ndarray],
     states: Sequence[tuple],
-    params: np.ndarray | None,
+    args: tuple[Any, ...],
 ) -> tuple[Invariant | None, str]:
     """Return the energy as an `Invariant` or `Balance`, or None if it is not kept, and a description for the repr.
 
     The energy is the first candidate without a given power that is constant, otherwise the candidate that changes most
-    slowly, if its rate is small enough for a balance. It is not kept if there are fewer than 3 states.
-
-    Raises
-    ------
-    ValueError
-        If a given power is not the rate of its energy.
-
-    Parameters
-    ----------
-    candidates : sequence of Energy
-    derivative : callable
-        ``derivative(t, y)`` returns y'.
-    states : sequence of (float, ndarray)
-        Times and states that meet the constraints.
-    params : ndarray or None
-        Values of the parameters; None if the functions have no parameters.
+    slowly, if its rate is small enough for a balance. It is not kept if there are fewer than 3 `states`, times and
+    states that meet the constraints. `derivative(t, y)` returns y'. A ValueError is raised if a given power is not the
+    rate of its energy.
     """
-    args = () if params is None else (params,)
     if candidates and len(states) < FEWEST:
         return None, "not kept: it was not examined, because too few states near the start meet the constraints"
     slowest, least = None, np.inf
@@ -97,10 +72,7 @@ def energy_of(
 def _require_power(
     item: Energy, rates: np.ndarray, terms: np.ndarray, states: Sequence[tuple], args: tuple[Any, ...]
 ) -> None:
-    """Raise ValueError if the power given for an energy is not its rate of change.
-
-    `rates` and `terms` are what `rates_of` returns for the other arguments.
-    """
+    """Raise ValueError if the given power is not the rate of change; `rates` and `terms` are those of `rates_of`."""
     if item.power is None:
         return
     given = np.array([float(plain(item.power)(t, y, *args)) for t, y in states])
@@ -125,7 +97,7 @@ def states_near(
     """Return times and states that meet the constraints: the start, and states near it at typical speeds.
 
     The times lie between t and `t_end`, and within the time in which the coordinates change by their size at a typical
-    speed. `derivative(t, y)` returns y', and `coordinates` is the number of coordinates in y.
+    speed.
     """
     rng = np.random.default_rng(20391)
     half = np.abs(y[:coordinates]).max(initial=0.0) or 1.0
@@ -145,7 +117,8 @@ def states_near(
             moved = _nearest(origin + share * sizes * direction, constraints, time, sizes)
             # Newton's method may end beyond a singular position. Such a state is farther away and is not used.
             near = np.linalg.norm((moved - origin) / sizes) <= 2 * share * np.linalg.norm(direction) * (1 + CONSTANT)
-            meets = all(_meets(item, time, moved) for item in constraints)
+            most = CONSTANT * max(1.0, np.abs(moved).max())
+            meets = all(np.abs(item.fun(time, moved)).max() <= most for item in constraints)
             if near and meets and np.isfinite(derivative(time, moved)).all():
                 found.append((time, moved))
                 break
@@ -159,25 +132,15 @@ def _nearest(y: np.ndarray, constraints: Sequence[Invariant], t: float, sizes: n
 
 
 def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> float:
-    """Return the largest speed, or the square root of the largest acceleration times the size of q if that is larger.
-
-    The size of q is that of its largest component, or 1 if all are 0.
-    """
+    """Return the largest speed, or sqrt(size of q times the largest acceleration) if larger; size of 0 counts as 1."""
     size = np.abs(q).max(initial=0.0) or 1.0
     return float(max(np.abs(u).max(initial=0.0), np.sqrt(size * np.abs(accelerations).max(initial=0.0))))
-
-
-def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
-    return bool(np.abs(item.fun(t, y)).max() <= CONSTANT * max(1.0, np.abs(y).max()))
 
 
 def rates_of(
     item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates of change (k,) of an energy at k states, and the sums (k,) of the sizes of the rates' terms.
-
-    The size of a term is its absolute value. `args` are the further arguments of the functions of the energy.
-    """
+    """Return the rates (k,) of an energy at k states, and the sums (k,) of the absolute values of the rates' terms."""
     rates, terms = np.zeros(len(states)), np.zeros(len(states))
     for k, (t, y) in enumerate(states):
         gradient = np.empty(y.size)
@@ -191,3 +154,140 @@ def rates_of(
 
 def _at_time(value: Callable[..., float], t: float, y: np.ndarray, args: tuple[Any, ...], shift: np.ndarray) -> float:
     return value(t + shift[0], y, *args)
+
+
+# Bound for the rounding of a rate, relative to the gradient times the largest derivative.
+ROUNDING = 1e-12
+# A gradient depends on those of other invariants if its distance from their span is below this share of its length.
+DEPENDENT = 1e-6
+
+
+def momenta_of(
+    candidates: Sequence[Energy],
+    kept: Sequence[Invariant],
+    derivative: Callable[[float, np.ndarray], np.ndarray],
+    states: Sequence[tuple],
+    args: tuple[Any, ...],
+) -> tuple[Invariant, ...]:
+    """Return the candidates that are constant and independent of the invariants in `kept` and of each other.
+
+    The functions of `kept` are not compiled, and `derivative(t, y)` returns y'. If there are fewer than 3 `states`,
+    pairs (t, y) that meet the constraints, no momenta are returned.
+    """
+    found: list[Invariant] = []
+    if len(states) < FEWEST:
+        return ()
+    known = [_rows(kept, t, y) for t, y in states]
+    for item in candidates:
+        rates, terms = rates_of(item, derivative, states, args)
+        slopes = [np.empty(y.size) for _, y in states]
+        for slope, (t, y) in zip(slopes, states, strict=True):
+            plain(item.gradient)(t, y, slope, *args)
+        rounding = [np.abs(g).sum() * np.abs(derivative(t, y)).max() for g, (t, y) in zip(slopes, states, strict=True)]
+        if not (np.abs(rates) <= CONSTANT * terms + ROUNDING * np.array(rounding)).all():
+            continue
+        if not any(_is_independent(g, rows) for g, rows in zip(slopes, known, strict=True)):
+            continue
+        found.append(Invariant(item.value, item.gradient, args=args, in_place=True, name=item.description))
+        known = [np.vstack([rows, g]) for g, rows in zip(slopes, known, strict=True)]
+    return tuple(found)
+
+
+def norms_of(
+    parts: Parts, names: Names, kept: Sequence[Invariant], states: Sequence[tuple], args: tuple[Any, ...]
+) -> tuple[Invariant, ...]:
+    """Return the sums of squares of coordinates, such as a quaternion's, whose sum of q q' is 0 for all speeds.
+
+    Those that depend on the invariants in `kept` are left out.
+    """
+    nq, n = len(names.coordinates), len(names.speeds)
+
+    def rates(t: float, y: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+        return parts.matrices(names, t, np.append(y[:nq], speeds), args)[-1]
+
+    t, y = states[-1]
+    speeds = np.arange(1.0, n + 1.0)
+    if nq == n and np.array_equal(rates(t, y, speeds), speeds):
+        return ()
+    # The products q_i q_i' of all coordinates: at zero speeds, then with each speed in turn set to 1.
+    units = np.vstack([np.zeros(n), np.eye(n)])
+    products = np.array([y[:nq] * rates(t, y, u) for t, y in states for u in units])
+    found = []
+    for places in _sets(products):
+        item = _sum_of_squares(parts, names, places, args)
+        if any(_is_independent(_rows([item], t, y)[0], _rows(kept, t, y)) for t, y in states):
+            found.append(item)
+    return tuple(found)
+
+
+def _rows(items: Sequence[Invariant], t: float, y: np.ndarray) -> np.ndarray:
+    """Return the gradients of the values of all invariants at a state as rows (l, n)."""
+    found = [np.zeros((0, y.size))]
+    for item in items:
+        out = np.empty((item.size, y.size) if item.size else y.size)
+        plain(item.gradient)(t, y, out, *item.args)
+        found.append(np.atleast_2d(out))
+    return np.vstack(found)
+
+
+def _is_independent(gradient: np.ndarray, rows: np.ndarray) -> bool:
+    """Return True if a gradient is not a linear combination of `rows`."""
+    sizes = np.linalg.norm(rows, axis=1)
+    rows = rows[sizes > 0] / sizes[sizes > 0, None]
+    _, values, directions = np.linalg.svd(rows, full_matrices=False)
+    directions = directions[values > DEPENDENT * values.max(initial=0.0)]
+    left = gradient - directions.T @ (directions @ gradient)
+    return bool(np.linalg.norm(left) > DEPENDENT * np.linalg.norm(gradient))
+
+
+def _sets(products: np.ndarray) -> list[tuple[int, ...]]:
+    """Return the sets of at least two columns of `products` whose sum is 0 in each row, as tuples of their indices."""
+    if not np.isfinite(products).all():
+        return []
+    size = np.abs(products).max(initial=0.0)
+    moving = np.flatnonzero(np.abs(products).max(axis=0, initial=0.0) > CONSTANT * size)
+    if moving.size < 2:
+        return []
+    _, values, directions = np.linalg.svd(products[:, moving])
+    rank = int((values > CONSTANT * values.max(initial=0.0)).sum())
+    basis = _reduced(directions[rank:])
+    chosen = np.abs(basis) > 0.5
+    whole = np.abs(basis - chosen).max(axis=1, initial=0.0) < DEPENDENT
+    return [
+        tuple(int(k) for k in moving[row]) for row, fits in zip(chosen, whole, strict=True) if fits and row.sum() > 1
+    ]
+
+
+def _reduced(rows: np.ndarray) -> np.ndarray:
+    """Return the reduced row echelon form of independent rows."""
+    rows, top = rows.copy(), 0
+    for k in range(rows.shape[1]):
+        if top == len(rows):
+            break
+        best = top + int(np.argmax(np.abs(rows[top:, k])))
+        if abs(rows[best, k]) < DEPENDENT:
+            continue
+        rows[[top, best]] = rows[[best, top]]
+        rows[top] /= rows[top, k]
+        others = np.arange(len(rows)) != top
+        rows[others] -= np.outer(rows[others, k], rows[top])
+        top += 1
+    return rows
+
+
+def _sum_of_squares(parts: Parts, names: Names, places: tuple[int, ...], args: tuple[Any, ...]) -> Invariant:
+    def value(t, y, *params):
+        total = 0.0
+        for k in places:
+            total += y[k] * y[k]
+        return total
+
+    def gradient(t, y, out, *params):
+        for k in range(y.size):
+            out[k] = 0.0
+        for k in places:
+            out[k] = 2.0 * y[k]
+
+    functions = compiled_like(value, parts.fill), compiled_like(gradient, parts.fill)
+    name = " + ".join(f"{names.coordinates[k]}^2" for k in places)
+    return Invariant(*functions, args=args, in_place=True, name=name)

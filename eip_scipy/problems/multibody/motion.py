@@ -41,14 +41,9 @@ class Sizes(NamedTuple):
 class Motion(NamedTuple):
     """The functions of the motion of a system with constraints, with the state y = (q, u).
 
-    Attributes
-    ----------
-    rhs : callable
-        ``rhs(t, y, out, *params)`` fills `out` with (q', u').
-    solved : callable
-        ``solved(t, y, rates, accelerations, multipliers, *params)`` fills the arrays with q' (the first entries of
-        `rates`), u' and lambda. It returns the rank of the constraints, or `NOT_FINITE` if a matrix is not finite, and
-        raises ValueError if the mass matrix is singular.
+    ``rhs(t, y, out, *params)`` fills `out` with (q', u'). ``solved(t, y, rates, accelerations, multipliers, *params)``
+    fills the arrays with q' (the first entries of `rates`), u' and lambda, and returns the rank of the constraints, or
+    `NOT_FINITE`. It raises ValueError if the mass matrix is singular.
     """
 
     rhs: Callable[..., None]
@@ -56,10 +51,7 @@ class Motion(NamedTuple):
 
 
 def plain(function: Any) -> Callable[..., Any]:
-    """Return the Python function of a jitted function, for a few calls that are not worth compilation.
-
-    A function that is not jitted is returned unchanged.
-    """
+    """Return the Python function of a jitted function, for a few calls that are not worth compilation."""
     return function.py_func if is_jitted(function) else function
 
 
@@ -130,13 +122,8 @@ solve.for_duals = _solve_duals  # type: ignore[attr-defined]
 def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
     """Return the functions of the motion that satisfies M u' + G^T lambda = F and G u' = -gamma.
 
-    Parameters
-    ----------
-    fill : callable
-        ``fill(t, y, out, *params)`` fills `out` with M (by rows), F, G (by rows), gamma and q', one after the other.
-    sizes : Sizes
-    tolerance : float
-        Distance within which gradients of constraints, each scaled to length 1, count as dependent.
+    ``fill(t, y, out, *params)`` fills `out` with M (by rows), F, G (by rows), gamma and q', one after the other.
+    Gradients of constraints within the distance `tolerance`, each scaled to length 1, count as dependent.
     """
     nq, n, m = sizes
     matrices = sizes.matrices

@@ -13,11 +13,9 @@ from ...core.invariants import Invariant
 from ...core.jitted import is_jitted
 from ...core.problem import Problem, bind
 from ...core.results import Multipliers
-from .conserved import momenta_of, norms_of
-from .energies import energy_of, states_near, typical_speed
+from .energies import energy_of, momenta_of, norms_of, states_near, typical_speed
 from .motion import Motion, Sizes, motion, plain, vector
-from .outputs import Outputs, columns_of
-from .parts import Parts
+from .parts import Outputs, Parts, columns_of
 from .start import Names, name_of, started
 
 __all__ = ["MechanicsProblem", "mechanics_problem"]
@@ -286,23 +284,22 @@ def mechanics_problem(
 ) -> MechanicsProblem:
     """Return the problem with the functions `parts`, started at the coordinates and speeds `start` at time `t`.
 
-    The components in `independent`, by default all, keep the values in `start`; the others are guesses. `tolerance` is
-    the `rank_tolerance` of the problem, and `others` are further attributes.
+    The components in `independent`, by default all, keep the values in `start`; the others are guesses.
     """
-    sizes = Sizes(len(names.coordinates), len(names.speeds), len(names.velocities))
+    sizes, args = names.sizes, () if params is None else (params,)
     functions = motion(parts.fill, sizes, tolerance)
     once = motion(plain(parts.fill), sizes, tolerance)
     fun = bind(once.rhs, params)
-    examined = _constraints_invariant(plain(parts.values), plain(parts.gradient), names, params)
+    examined = _constraints_invariant(plain(parts.values), plain(parts.gradient), names, args)
     y0, solved = started(name, names, examined, *start, params, t, independent)
-    _require_accelerations(name, parts, once, names, t, y0, params)
-    kept = _constraints_invariant(parts.values, parts.gradient, names, params)
+    _require_accelerations(name, parts, once, names, t, y0, args)
+    kept = _constraints_invariant(parts.values, parts.gradient, names, args)
     for item in (*examined, *kept):
         item.scale = _at_speed(plain(parts.gradient), item.size, t, y0, fun, sizes, item.args)
     states = states_near(t, y0, examined, fun, sizes.coordinates, None if t_span is None else float(t_span[1]))
-    energy, described = energy_of(parts.energies, fun, states, params)
-    norms = norms_of(parts, names, examined, states, params)
-    momenta = momenta_of(parts.momenta, (*examined, *norms), fun, states, params)
+    energy, described = energy_of(parts.energies, fun, states, args)
+    norms = norms_of(parts, names, examined, states, args)
+    momenta = momenta_of(parts.momenta, (*examined, *norms), fun, states, args)
     for item in momenta:
         item.scale = _at_speed(plain(item.gradient), None, t, y0, fun, sizes, item.args)
     nq = sizes.coordinates
@@ -332,20 +329,14 @@ def mechanics_problem(
 
 
 def _require_accelerations(
-    what: str, parts: Parts, functions: Motion, names: Names, t: float, y: np.ndarray, params: np.ndarray | None
+    what: str, parts: Parts, functions: Motion, names: Names, t: float, y: np.ndarray, args: tuple[Any, ...]
 ) -> None:
-    """Raise ValueError if constraints depend on each other at the start and no acceleration meets all of them.
-
-    `what` is the name of the problem, with which the message begins. `functions` are those that `motion` makes from
-    `parts`.
-    """
-    nq, n, m = len(names.coordinates), len(names.speeds), len(names.velocities)
-    sizes, extra = Sizes(nq, n, m), () if params is None else (params,)
-    rates, accelerations, matrices = np.empty(nq), np.empty(n), np.empty(sizes.matrices + nq)
-    if functions.solved(t, y, rates, accelerations, np.empty(m), *extra) == m:
+    """Raise ValueError if constraints depend on each other at the start and no acceleration meets all of them."""
+    nq, n, m = names.sizes
+    rates, accelerations = np.empty(nq), np.empty(n)
+    if functions.solved(t, y, rates, accelerations, np.empty(m), *args) == m:
         return
-    plain(parts.fill)(t, y, matrices, *extra)
-    G, gamma = matrices[n * n + n :][: m * n].reshape(m, n), matrices[n * n + n + m * n :][:m]
+    _, _, G, gamma, _ = parts.matrices(names, t, y, args)
     left = G @ accelerations + gamma
     terms = np.abs(G) @ np.abs(accelerations) + np.abs(gamma)
     if (np.abs(left) > CONTRADICTING * terms.max(initial=0.0)).any():
@@ -359,16 +350,12 @@ def _require_accelerations(
 
 
 def _constraints_invariant(
-    fill: Callable[..., None], gradient: Callable[..., None], names: Names, params: np.ndarray | None
+    fill: Callable[..., None], gradient: Callable[..., None], names: Names, args: tuple[Any, ...]
 ) -> tuple[Invariant, ...]:
-    """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints.
-
-    `fill` fills an array with the values of all constraints, and `gradient` an array with their gradients.
-    """
+    """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints."""
     size = len(names.positions) + len(names.velocities)
     if size == 0:
         return ()
-    args = () if params is None else (params,)
     item = Invariant(
         vector(fill, size), gradient, target=np.zeros(size), args=args, size=size, name="constraints", in_place=True
     )
@@ -387,8 +374,8 @@ def _at_speed(
 ) -> Any:
     """Return the `scale` of constraints, an array (size,), or of a momentum, a number, if `size` is None.
 
-    The scale is 0.1 times the size of the terms that are proportional to the speeds, at a typical speed, because these
-    terms vanish at rest. It is None if it is not finite.
+    The scale is 0.1 times the terms that are proportional to the speeds, at a typical speed, because these terms vanish
+    at rest. It is None if it is not finite.
     """
     nq = sizes.coordinates
     speed = typical_speed(y[:nq], y[nq:], derivative(t, y)[nq:])

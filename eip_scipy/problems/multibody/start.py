@@ -14,6 +14,7 @@ from ...core.invariants import Invariant, with_args
 from ...core.names import nearest
 from ...core.project import project
 from ...engine.trust import ProjectionWarning
+from .motion import Sizes
 
 __all__ = ["MET", "Names", "name_of", "nearest_start", "started"]
 
@@ -39,6 +40,11 @@ class Names(NamedTuple):
         """Return the names of all components."""
         return (*self.coordinates, *self.speeds)
 
+    @property
+    def sizes(self) -> Sizes:
+        """Return the numbers of coordinates, speeds and constraints on velocities."""
+        return Sizes(len(self.coordinates), len(self.speeds), len(self.velocities))
+
 
 def name_of(key: Any) -> str:
     """Return the name of a component from a string, or from a symbol or function of SymPy."""
@@ -61,8 +67,7 @@ def started(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return a state that meets the constraints, and notes on computed components; see `MechanicsProblem.start`.
 
-    `what` is the name of the problem, for error messages. `constraints` is empty, or contains one `Invariant` for all
-    constraints.
+    `constraints` is empty, or contains one `Invariant` for all constraints. `what` names the problem in messages.
     """
     held = _independent(names, independent)
     y = np.concatenate(
@@ -104,10 +109,9 @@ def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
 
 
 def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.ndarray:
-    """Return the values of `given`, a mapping or an array, in the order of `names`.
+    """Return the values of a mapping or an array in the order of `names`.
 
-    Names that are missing from a mapping have the value 0; a ValueError is raised if one of them is in `held`. `what`,
-    "q0" or "u0", is the name of the argument in error messages.
+    Names that are missing from a mapping have the value 0; a ValueError is raised if one of them is in `held`.
     """
     if isinstance(given, Mapping):
         by_name = {name_of(name): value for name, value in given.items()}
@@ -128,10 +132,9 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
 
 
 def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return the state near `y` at which the residuals of `item` are 0, found by Newton's method.
+    """Return the state near `y` at which the residuals of `item` are 0, found by Newton's method in units of `sigma`.
 
-    Distances are measured in units of `sigma`; components with `sigma` 0 do not change. If Newton's method does not
-    converge, the returned state has residuals; it is `y` itself if `project` raises ValueError.
+    Components with `sigma` 0 do not change. Residuals remain if Newton's method does not converge.
     """
     try:
         with warnings.catch_warnings():
@@ -142,10 +145,7 @@ def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -
 
 
 def _downhill(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return what `nearest_start` finds from a better guess, for a guess `y` from which it fails.
-
-    The better guess minimises the sum of squares of the residuals. Components with `sigma` 0 do not change.
-    """
+    """Return what `nearest_start` finds from the state near `y` with the smallest sum of squares of the residuals."""
     free = sigma > 0
 
     def whole(x: np.ndarray) -> np.ndarray:
@@ -167,11 +167,7 @@ def _gradient(item: Invariant, t: float, y: np.ndarray) -> np.ndarray:
 
 
 def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, float]:
-    """Return the index of the constraint that is violated most, its value, and the violation.
-
-    The violation is the absolute value of a constraint divided by the larger of ``sum(|g_i y_i|)`` and ``max(|g_i|)``,
-    where g is its gradient.
-    """
+    """Return the index of the constraint that is violated most, its value, and the violation relative to its size."""
     values = np.asarray(item.fun(t, y), float)
     gradient = np.abs(_gradient(item, t, y))
     # The size of a constraint is that of its terms, or its change while a component changes by 1.
@@ -182,10 +178,7 @@ def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, fl
 
 
 def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> None:
-    """Raise ValueError if a constraint is violated by more than `MET` times the size of its terms.
-
-    `what` is the name of the problem, and `sigma` is 0 for the components whose values were kept.
-    """
+    """Raise ValueError if a constraint is violated by more than `MET` times its size; `sigma` is 0 for kept ones."""
     worst, residual, share = _violation(y, item, t)
     if share <= MET:
         return
@@ -202,11 +195,7 @@ def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.
 
 
 def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
-    """Return the reason why the constraint with the index `worst` is not met, and what to do.
-
-    `values` are the values of all constraints, and `gradient` holds their derivatives with respect to the components
-    that are computed.
-    """
+    """Return why the constraint `worst` is not met, and what to do; `gradient` has the derivatives that could help."""
     sizes = np.linalg.norm(gradient, axis=1)
     if sizes[worst] <= DEPENDENT * sizes.max():
         return "It does not depend on any component that is computed; list fewer components in independent=."

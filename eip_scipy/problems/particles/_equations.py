@@ -1,22 +1,23 @@
-"""Equations of motion and invariants of a charged particle, from functions of its field.
+"""Equations of motion, their derivatives, and invariants of a charged particle, from functions of its field.
 
-The first arguments of the functions here are functions of the field; `compose` binds them. The functions are compiled
-if those of the field are jitted, otherwise they are plain Python. In compiled code they are inlined, and subexpressions
-that two functions of the field have in common are computed once, so that a loop is as fast as one written for the
-field. Components are written out, because Numba accepts only constant indices of a tuple such as (-y, x, 0), whose
-types differ.
+The functions are compiled if those of the field are jitted, otherwise they are plain Python. In compiled code they are
+inlined, and subexpressions that two functions of the field have in common are computed once, so that a loop is as fast
+as one written for the field. Components are written out, because Numba accepts only constant indices of a tuple such as
+(-y, x, 0), whose types differ.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
-from ...core.gradients import DIFFERENCE_WEIGHTS
-from ...core.jitted import compiled_like, is_compiled, is_jitted
+import numpy as np
 
-__all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like", "jitable"]
+from ...core.gradients import DIFFERENCE_WEIGHTS, NumericalGradient
+from ...core.jitted import NotCompilableError, compiled_like, is_jitted, jit_is_off
+
+__all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like", "variational"]
 
 MASS, CHARGE = 0, 1  # places in the parameters
 
@@ -32,10 +33,9 @@ class FieldFunctions(NamedTuple):
 
 
 class ParticleEquations(NamedTuple):
-    """Functions of the problem of a particle.
+    """Functions of a particle: the energy is None without a potential, and the momentum and its gradient without A.
 
-    `energy` is None if the potential is not known, `momentum` and its gradient are None if A is not known, and the last
-    three functions, which concern the kinetic energy, are None in the canonical form.
+    The last three functions, which concern the kinetic energy, are None in the canonical form.
     """
 
     rhs: Callable[..., None]
@@ -49,31 +49,8 @@ class ParticleEquations(NamedTuple):
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
-    """Return `fun`, compiled if all of `others` are compiled; the functions of this module that it calls are inlined.
-
-    Items of `others` that are None are ignored.
-    """
-    if all(is_compiled(other) for other in others if other is not None):
-        _register()
+    """Return `fun`, compiled if all `others`, except None, are compiled."""
     return compiled_like(fun, *(other for other in others if other is not None))
-
-
-_inlined: list[Callable[..., Any]] = []
-
-
-def jitable(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Mark a function of this package that compiled functions call, so that Numba inlines it; return it unchanged."""
-    _inlined.append(fun)
-    return fun
-
-
-@cache
-def _register() -> None:
-    """Make Numba inline the marked functions into the compiled functions that call them."""
-    from numba.extending import register_jitable
-
-    for fun in _inlined:
-        register_jitable(error_model="numpy", _nrt=False)(fun)
 
 
 def no_potential(t, x, y, z):
@@ -86,20 +63,12 @@ def no_force(t, x, y, z):
     return 0.0, 0.0, 0.0
 
 
+@lru_cache(maxsize=32)  # compiled once in a process
 def compose(field: FieldFunctions, form: str) -> ParticleEquations:
-    """Return the equations of motion and the invariants of a particle in one of the two forms.
+    """Return the equations of motion and the invariants of a particle in the form "canonical" or "velocity".
 
-    Parameters
-    ----------
-    field : FieldFunctions
-        The equations need A, jacobian and E in the canonical form, and B and E in the form (x, v). The other functions
-        are needed for invariants only.
-    form : {"canonical", "velocity"}
-
-    Returns
-    -------
-    ParticleEquations
-        Functions of ``(t, y, [f,] [out,] params)`` with ``params = [mass, charge]``.
+    The equations need A, jacobian and E in the canonical form, and B and E in the form (x, v). The other functions are
+    needed for invariants only. The results are functions of ``(t, y, [f,] [out,] params)``.
     """
     return _canonical(field) if form == "canonical" else _velocity(field)
 
@@ -107,14 +76,27 @@ def compose(field: FieldFunctions, form: str) -> ParticleEquations:
 # The canonical form, y = (x, p).
 
 
-def _canonical(field: FieldFunctions) -> ParticleEquations:
+def _canonical(field: Any) -> ParticleEquations:
     A, jacobian, phi, E = field.A, field.jacobian, field.phi, field.E
 
     def rhs(t, y, out, params):
-        canonical_rhs(A, jacobian, E, t, y, out, params[MASS], params[CHARGE])
+        # x' = v = (p - q A) / m and p_j' = q (sum_i v_i dA_i/dx_j + E_j)
+        a, d, e = A(t, y[0], y[1], y[2]), jacobian(t, y[0], y[1], y[2]), E(t, y[0], y[1], y[2])
+        q = params[CHARGE]
+        inverse = 1.0 / params[MASS]  # does not wait for the field, as a division of the velocity would
+        u, v, w = (y[3] - q * a[0]) * inverse, (y[4] - q * a[1]) * inverse, (y[5] - q * a[2]) * inverse
+        out[0] = u
+        out[1] = v
+        out[2] = w
+        out[3] = q * (u * d[0][0] + v * d[1][0] + w * d[2][0] + e[0])
+        out[4] = q * (u * d[0][1] + v * d[1][1] + w * d[2][1] + e[1])
+        out[5] = q * (u * d[0][2] + v * d[1][2] + w * d[2][2] + e[2])
 
     def energy(t, y, params):
-        return canonical_energy(A, phi, t, y, params[MASS], params[CHARGE])
+        # H = |p - q A|^2 / (2 m) + q phi (Cai, Gong & Wang, eq. 3.7)
+        q, a = params[CHARGE], A(t, y[0], y[1], y[2])
+        u, v, w = y[3] - q * a[0], y[4] - q * a[1], y[5] - q * a[2]
+        return 0.5 / params[MASS] * (u * u + v * v + w * w) + q * phi(t, y[0], y[1], y[2])
 
     return ParticleEquations(
         jit_like(rhs, A, jacobian, E),
@@ -123,34 +105,6 @@ def _canonical(field: FieldFunctions) -> ParticleEquations:
         jit_like(canonical_momentum, A),
         jit_like(canonical_momentum_gradient, A),
     )
-
-
-@jitable
-def canonical_rhs(A, jacobian, E, t, y, out, m, q):
-    """Fill `out` with the canonical equations, x' = v = (p - q A) / m and p_j' = q (sum_i v_i dA_i/dx_j + E_j)."""
-    a = A(t, y[0], y[1], y[2])
-    d = jacobian(t, y[0], y[1], y[2])
-    e = E(t, y[0], y[1], y[2])
-    inverse = 1.0 / m  # does not wait for the field, as a division of the velocity would
-    u = (y[3] - q * a[0]) * inverse
-    v = (y[4] - q * a[1]) * inverse
-    w = (y[5] - q * a[2]) * inverse
-    out[0] = u
-    out[1] = v
-    out[2] = w
-    out[3] = q * (u * d[0][0] + v * d[1][0] + w * d[2][0] + e[0])
-    out[4] = q * (u * d[0][1] + v * d[1][1] + w * d[2][1] + e[1])
-    out[5] = q * (u * d[0][2] + v * d[1][2] + w * d[2][2] + e[2])
-
-
-@jitable
-def canonical_energy(A, phi, t, y, m, q):
-    """Return H = |p - q A|^2 / (2 m) + q phi (Cai, Gong & Wang, eq. 3.7)."""
-    a = A(t, y[0], y[1], y[2])
-    u = y[3] - q * a[0]
-    v = y[4] - q * a[1]
-    w = y[5] - q * a[2]
-    return 0.5 / m * (u * u + v * v + w * w) + q * phi(t, y[0], y[1], y[2])
 
 
 def canonical_energy_gradient(t, y, f, out, params):
@@ -181,62 +135,68 @@ def canonical_momentum_gradient(t, y, out, params):
 # The form y = (x, v).
 
 
-def _velocity(field: FieldFunctions) -> ParticleEquations:
-    A, jacobian, phi, E, B = field
+def _velocity(field: Any) -> ParticleEquations:
+    _, _, phi, E, B = field
 
     def rhs(t, y, out, params):
-        velocity_rhs(E, B, t, y, out, params[CHARGE] / params[MASS])
+        # x' = v and v' = (q / m) (E + v x B) (Cai, Gong & Wang, eq. 3.8)
+        e, b = E(t, y[0], y[1], y[2]), B(t, y[0], y[1], y[2])
+        ratio, u, v, w = params[CHARGE] / params[MASS], y[3], y[4], y[5]
+        out[0] = u
+        out[1] = v
+        out[2] = w
+        out[3] = ratio * (e[0] + v * b[2] - w * b[1])
+        out[4] = ratio * (e[1] + w * b[0] - u * b[2])
+        out[5] = ratio * (e[2] + u * b[1] - v * b[0])
 
     def energy(t, y, params):
-        return velocity_energy(phi, t, y, params[MASS], params[CHARGE])
+        # H = m |v|^2 / 2 + q phi
+        square = y[3] * y[3] + y[4] * y[4] + y[5] * y[5]
+        return 0.5 * params[MASS] * square + params[CHARGE] * phi(t, y[0], y[1], y[2])
 
     def energy_gradient(t, y, out, params):
-        velocity_energy_gradient(E, t, y, out, params[MASS], params[CHARGE])
-
-    def momentum(t, y, params):
-        return velocity_momentum(A, t, y, params[MASS], params[CHARGE])
-
-    def momentum_gradient(t, y, out, params):
-        velocity_momentum_gradient(A, jacobian, t, y, out, params[MASS], params[CHARGE])
+        # (-q E, m v)
+        e, m, q = E(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
+        out[0] = -q * e[0]
+        out[1] = -q * e[1]
+        out[2] = -q * e[2]
+        out[3] = m * y[3]
+        out[4] = m * y[4]
+        out[5] = m * y[5]
 
     def power(t, y, params):
         e = E(t, y[0], y[1], y[2])
         return params[CHARGE] * (y[3] * e[0] + y[4] * e[1] + y[5] * e[2])
 
-    known = A is not None
+    momentum, momentum_gradient = (None, None) if field.A is None else _velocity_momentum(field.A, field.jacobian)
     return ParticleEquations(
         jit_like(rhs, E, B),
         None if phi is None else jit_like(energy, phi),
         jit_like(energy_gradient, E),
-        jit_like(momentum, A) if known else None,
-        jit_like(momentum_gradient, A, jacobian) if known else None,
+        momentum,
+        momentum_gradient,
         jit_like(kinetic_energy, E),
         jit_like(kinetic_energy_gradient, E),
         jit_like(power, E),
     )
 
 
-@jitable
-def velocity_rhs(E, B, t, y, out, ratio):
-    """Fill `out` with Newton's equations, x' = v and v' = (q / m) (E + v x B) (Cai, Gong & Wang, eq. 3.8).
+def _velocity_momentum(A, jacobian):
+    def momentum(t, y, params):
+        # L = x p_y - y p_x with p = m v + q A
+        a, m, q = A(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
+        return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
 
-    `ratio` is q / m.
-    """
-    e = E(t, y[0], y[1], y[2])
-    b = B(t, y[0], y[1], y[2])
-    u, v, w = y[3], y[4], y[5]
-    out[0] = u
-    out[1] = v
-    out[2] = w
-    out[3] = ratio * (e[0] + v * b[2] - w * b[1])
-    out[4] = ratio * (e[1] + w * b[0] - u * b[2])
-    out[5] = ratio * (e[2] + u * b[1] - v * b[0])
+    def gradient(t, y, out, params):
+        a, d, m, q = A(t, y[0], y[1], y[2]), jacobian(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
+        out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
+        out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
+        out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
+        out[3] = -m * y[1]
+        out[4] = m * y[0]
+        out[5] = 0.0
 
-
-@jitable
-def velocity_energy(phi, t, y, m, q):
-    """Return H = m |v|^2 / 2 + q phi."""
-    return 0.5 * m * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5]) + q * phi(t, y[0], y[1], y[2])
+    return jit_like(momentum, A), jit_like(gradient, A, jacobian)
 
 
 def kinetic_energy(t, y, params):
@@ -250,38 +210,6 @@ def kinetic_energy_gradient(t, y, out, params):
     out[3] = params[MASS] * y[3]
     out[4] = params[MASS] * y[4]
     out[5] = params[MASS] * y[5]
-
-
-@jitable
-def velocity_energy_gradient(E, t, y, out, m, q):
-    """Fill `out` with the gradient of H, (-q E, m v)."""
-    e = E(t, y[0], y[1], y[2])
-    out[0] = -q * e[0]
-    out[1] = -q * e[1]
-    out[2] = -q * e[2]
-    out[3] = m * y[3]
-    out[4] = m * y[4]
-    out[5] = m * y[5]
-
-
-@jitable
-def velocity_momentum(A, t, y, m, q):
-    """Return L = x p_y - y p_x with p = m v + q A."""
-    a = A(t, y[0], y[1], y[2])
-    return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
-
-
-@jitable
-def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
-    """Fill `out` with the gradient of L."""
-    a = A(t, y[0], y[1], y[2])
-    d = jacobian(t, y[0], y[1], y[2])
-    out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
-    out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
-    out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
-    out[3] = -m * y[1]
-    out[4] = m * y[0]
-    out[5] = 0.0
 
 
 # Missing functions of a field, computed from those that it has.
@@ -347,3 +275,147 @@ def difference_force(phi: Callable[..., Any], step: float) -> Callable[..., Any]
         return e0 / step, e1 / step, e2 / step
 
     return jit_like(force, phi)
+
+
+def variational(
+    rhs: Callable[..., None],
+    functions: FieldFunctions,
+    form: str,
+    length: float,
+    start: tuple[float, ...],
+    parameters: tuple[int, ...],
+) -> Callable[..., None]:
+    """Return the right-hand side of a state and of columns of derivatives, see `variational` of `Problem`.
+
+    `rhs(t, y, out, params)` is that of the state alone, and `parameters` are the indices in [mass, charge] to which the
+    last columns belong; any other index raises ValueError. Jitted functions of the field are differentiated by dual
+    numbers. Others are differentiated by complex steps if these give correct derivatives at `start` (t, x, y, z),
+    otherwise by differences of order 6, with shifts proportional to a coordinate's distance from 0 plus `length`.
+    """
+    if not set(parameters) <= {MASS, CHARGE}:
+        raise ValueError(
+            f"variational: a charged particle has derivatives with respect to its state, to parameter {MASS} (the "
+            f"mass) and to parameter {CHARGE} (the charge); got parameters={tuple(parameters)}."
+        )
+    by_mass = np.array([place == MASS for place in parameters], bool)
+
+    def slopes(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
+        return _slopes(fun, ndim, length, start)
+
+    A, jacobian, _, E, B = functions
+    if form == "velocity":
+        return _velocity_columns(rhs, B, E, slopes(B, 1), slopes(E, 1), by_mass)
+    assert A is not None
+    assert jacobian is not None
+    return _canonical_columns(rhs, A, jacobian, E, slopes(jacobian, 2), slopes(E, 1), by_mass)
+
+
+def combined(scale, u, v, w, first, second, third, fourth):
+    """Return the vector scale (u first + v second + w third + fourth), from vectors of three numbers."""
+    return (
+        scale * (u * first[0] + v * second[0] + w * third[0] + fourth[0]),
+        scale * (u * first[1] + v * second[1] + w * third[1] + fourth[1]),
+        scale * (u * first[2] + v * second[2] + w * third[2] + fourth[2]),
+    )
+
+
+def _canonical_columns(rhs, A, jacobian, E, slopes, slopes_of_E, by_mass):
+    last, join = by_mass.size, jit_like(combined, rhs, A, jacobian, E, slopes, slopes_of_E)
+
+    def wide(t, Y, out, params):
+        rhs(t, Y[:6], out[:6], params)
+        m, q = params[MASS], params[CHARGE]
+        a, d, e = A(t, Y[0], Y[1], Y[2]), jacobian(t, Y[0], Y[1], Y[2]), E(t, Y[0], Y[1], Y[2])
+        H, F = slopes(t, Y, Y), slopes_of_E(t, Y, Y)
+        v0, v1, v2 = out[0], out[1], out[2]
+        # The derivative of the force at constant v, row by row.
+        x = join(q, v0, v1, v2, H[0][0], H[1][0], H[2][0], F[0])
+        y = join(q, v0, v1, v2, H[0][1], H[1][1], H[2][1], F[1])
+        z = join(q, v0, v1, v2, H[0][2], H[1][2], H[2][2], F[2])
+        inverse, first = 1.0 / m, Y.size - 6 * last
+        for k in range(6, Y.size, 6):
+            dx, dy, dz = Y[k], Y[k + 1], Y[k + 2]
+            dm = dq = 0.0
+            if k >= first:
+                dm = 1.0 if by_mass[(k - first) // 6] else 0.0
+                dq = 1.0 - dm
+            dp0 = Y[k + 3] - q * (d[0][0] * dx + d[0][1] * dy + d[0][2] * dz)
+            dp1 = Y[k + 4] - q * (d[1][0] * dx + d[1][1] * dy + d[1][2] * dz)
+            dp2 = Y[k + 5] - q * (d[2][0] * dx + d[2][1] * dy + d[2][2] * dz)
+            dv0 = inverse * (dp0 - dq * a[0] - dm * v0)
+            dv1 = inverse * (dp1 - dq * a[1] - dm * v1)
+            dv2 = inverse * (dp2 - dq * a[2] - dm * v2)
+            u, v, w = q * dv0 + dq * v0, q * dv1 + dq * v1, q * dv2 + dq * v2
+            out[k] = dv0
+            out[k + 1] = dv1
+            out[k + 2] = dv2
+            out[k + 3] = u * d[0][0] + v * d[1][0] + w * d[2][0] + dq * e[0] + (x[0] * dx + x[1] * dy + x[2] * dz)
+            out[k + 4] = u * d[0][1] + v * d[1][1] + w * d[2][1] + dq * e[1] + (y[0] * dx + y[1] * dy + y[2] * dz)
+            out[k + 5] = u * d[0][2] + v * d[1][2] + w * d[2][2] + dq * e[2] + (z[0] * dx + z[1] * dy + z[2] * dz)
+
+    return jit_like(wide, rhs, A, jacobian, E, slopes, slopes_of_E)
+
+
+def _velocity_columns(rhs, B, E, slopes, slopes_of_E, by_mass):
+    last, join = by_mass.size, jit_like(combined, rhs, B, E, slopes, slopes_of_E)
+
+    def wide(t, Y, out, params):
+        rhs(t, Y[:6], out[:6], params)
+        m, q = params[MASS], params[CHARGE]
+        b, r, v0, v1, v2 = B(t, Y[0], Y[1], Y[2]), q / m, Y[3], Y[4], Y[5]
+        H, F = slopes(t, Y, Y), slopes_of_E(t, Y, Y)
+        # The derivative of the acceleration at constant v, row by row.
+        x = join(r, 0.0, -v2, v1, H[0], H[1], H[2], F[0])
+        y = join(r, v2, 0.0, -v0, H[0], H[1], H[2], F[1])
+        z = join(r, -v1, v0, 0.0, H[0], H[1], H[2], F[2])
+        first = Y.size - 6 * last
+        for k in range(6, Y.size, 6):
+            dx, dy, dz, u, v, w = Y[k], Y[k + 1], Y[k + 2], Y[k + 3], Y[k + 4], Y[k + 5]
+            growth = 0.0  # of the acceleration with the parameter, relative
+            if k >= first:
+                growth = -1.0 / m if by_mass[(k - first) // 6] else 1.0 / q
+            out[k] = u
+            out[k + 1] = v
+            out[k + 2] = w
+            out[k + 3] = r * (v * b[2] - w * b[1]) + growth * out[3] + (x[0] * dx + x[1] * dy + x[2] * dz)
+            out[k + 4] = r * (w * b[0] - u * b[2]) + growth * out[4] + (y[0] * dx + y[1] * dy + y[2] * dz)
+            out[k + 5] = r * (u * b[1] - v * b[0]) + growth * out[5] + (z[0] * dx + z[1] * dy + z[2] * dz)
+
+    return jit_like(wide, rhs, B, E, slopes, slopes_of_E)
+
+
+@lru_cache(maxsize=64)
+def _slopes(fun: Callable[..., Any], ndim: int, length: float, start: tuple[float, ...]) -> Callable[..., Any]:
+    """Return ``slopes(t, y, y)``, the derivatives of a field's function with respect to the position y[:3].
+
+    The second y is not used. `ndim` is 1 for a vector and 2 for three rows; the last index is that of the position.
+    """
+    if is_jitted(fun) and not jit_is_off():
+        try:
+            return _by_duals(fun, ndim)
+        except NotCompilableError:  # numbers may do
+            pass
+    t, *position = start
+    x, floors = np.array(position), np.full(3, length)
+    gradient = NumericalGradient(lambda t, x: np.asarray(fun(t, *x)), (), True, t, x, floors, ())
+    return lambda t, y, _: gradient(t, y[:3])
+
+
+def _by_duals(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
+    """Return the compiled function of `_slopes`, by dual numbers; NotCompilableError if they do not support it."""
+    from ...core.dual_arrays import for_duals, inside
+    from ...core.dual_numbers import Dual, seed, slope
+    from ...core.jitted_gradients import compiled_for
+
+    dual = Dual(3)
+    call = for_duals(fun, dual)
+    of_number = inside(lambda value: (slope(value, 0), slope(value, 1), slope(value, 2)))
+    # The places are constants, since a tuple may hold duals and plain numbers.
+    of_vector = inside(lambda values: (of_number(values[0]), of_number(values[1]), of_number(values[2])))
+    of_rows = inside(lambda rows: (of_vector(rows[0]), of_vector(rows[1]), of_vector(rows[2])))
+    parts = of_vector if ndim == 1 else of_rows
+
+    def slopes(t, y, _, params):
+        return parts(call(t, seed(dual, y[0], 0), seed(dual, y[1], 1), seed(dual, y[2], 2)))
+
+    return compiled_for(slopes, 1, False, "")

@@ -20,8 +20,7 @@ from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
-from ._columns import variational
-from ._equations import CHARGE, MASS, ParticleEquations, compose
+from ._equations import CHARGE, MASS, ParticleEquations, compose, variational
 from .fields import TOKAMAK, UNIFORM, ParticleField
 
 __all__ = ["ORBITS", "ParticleProblem", "charged_particle", "tokamak", "uniform_field"]
@@ -179,7 +178,7 @@ def charged_particle(
             f"charged_particle: mass must be positive and charge not 0, both finite; got {mass!r} and {charge!r}."
         )
     field.check(x, float(t_span[0]))
-    equations = _equations(field, form)
+    equations = compose(field.functions, form)
     momentum = v if form == "velocity" else params[MASS] * v + params[CHARGE] * field.along("A", x[:, None])[:, 0]
     return ParticleProblem(
         name=name,
@@ -212,37 +211,22 @@ def _variational(
     return variational(rhs, field.functions, form, field.length, start, parameters)
 
 
-@lru_cache(maxsize=32)
-def _equations(field: ParticleField, form: str) -> ParticleEquations:
-    """Return the equations and invariants of a field in one form; they are compiled once in a process."""
-    return compose(field.functions, form)
-
-
 def _invariants(
     equations: ParticleEquations, field: ParticleField, form: str, params: np.ndarray, balances: str | None
 ) -> tuple[Invariant, ...]:
     found: list[Invariant] = []
-    if balances == "energy" and field.varies and equations.energy is not None:
-        found.append(Balance(equations.energy, args=(params,), name="H"))
+    energy, momentum, args = equations.energy, equations.momentum, (params,)
+    if balances == "energy" and field.varies and energy is not None:
+        found.append(Balance(energy, args=args, name="H"))
     elif balances is not None:
         kinetic, gradient, power = equations.kinetic, equations.kinetic_gradient, equations.power
         assert kinetic is not None
-        found.append(Balance(kinetic, power, gradient, args=(params,), in_place=True, name="T"))
-    elif equations.energy is not None and not field.varies:
-        found.append(
-            Invariant(
-                equations.energy,
-                equations.energy_gradient,
-                args=(params,),
-                in_place=True,
-                uses_f=form == "canonical",
-                name="H",
-            )
-        )
-    if field.axisymmetric and equations.momentum is not None:
-        found.append(
-            Invariant(equations.momentum, equations.momentum_gradient, args=(params,), in_place=True, name="L")
-        )
+        found.append(Balance(kinetic, power, gradient, args=args, in_place=True, name="T"))
+    elif energy is not None and not field.varies:
+        uses_f = form == "canonical"
+        found.append(Invariant(energy, equations.energy_gradient, args=args, in_place=True, uses_f=uses_f, name="H"))
+    if field.axisymmetric and momentum is not None:
+        found.append(Invariant(momentum, equations.momentum_gradient, args=args, in_place=True, name="L"))
     return tuple(found)
 
 

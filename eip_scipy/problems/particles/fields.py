@@ -239,10 +239,9 @@ class ParticleField:
         warnings.warn(said, stacklevel=4)
 
     def _divergence(self, point: np.ndarray, t: float) -> tuple[float, float, float]:
-        """Return the divergence of B relative to the largest derivative of B, the divergence, and that derivative.
+        """Return the divergence of B relative to its largest derivative, the divergence, and that derivative.
 
-        Several steps of the differences are tried, and the result with the smallest relative divergence is returned,
-        because errors of differences only increase it.
+        The best of several steps is returned, because errors of differences only increase the divergence.
         """
         B = self._plain("magnetic")
         slack = ROUND_OFF * float(np.abs(B(t, *point)).max()) / self.length
@@ -298,8 +297,8 @@ def _difference_error(
     """Return the error of differences with a step near a position, relative to the largest derivative.
 
     The result is inf if the differences are 0, or the step is lost in the rounding of the position, and nan if the
-    function cannot be evaluated there. If the error comes from truncation, a smaller step shows it, and a larger step
-    exaggerates it; an error from rounding is the other way round. The smaller of the two disagreements is the error.
+    function cannot be evaluated. A smaller step shows an error from truncation, and a larger step exaggerates it; an
+    error from rounding is the other way round. The smaller of the two disagreements is the error.
     """
     points = [position + step * np.array(near) for near in NEAR]
 

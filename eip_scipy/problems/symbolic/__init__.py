@@ -94,10 +94,9 @@ def hamiltonian(
     >>> bool(run.max_defect[0] < 1e-14)
     True
     """
-    _require_sympy("hamiltonian")
-    from .system import Perturbed, hamiltonian_problem
+    with _sympy("hamiltonian"):
+        from .system import Perturbed, hamiltonian_problem
 
-    with _nested("hamiltonian"):
         perturbed = Perturbed(perturbation, dissipation, balances)
         return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended, perturbed)
 
@@ -156,10 +155,9 @@ def equations(
     >>> pendulum.checks["length"], pendulum.checks["energy"]
     ('numerically, at 8 points that meet the constraints', 'numerically, at 8 points that meet the constraints')
     """
-    _require_sympy("equations")
-    from .system import equations_problem
+    with _sympy("equations"):
+        from .system import equations_problem
 
-    with _nested("equations"):
         return equations_problem(f, y, params, invariants, constraints, name)
 
 
@@ -247,10 +245,9 @@ def mechanics(
     >>> bool(run.max_defect.max() < 1e-13)
     True
     """
-    _require_sympy("mechanics")
-    from .model_problems import mechanics_of_model
+    with _sympy("mechanics"):
+        from .models import mechanics_of_model
 
-    with _nested("mechanics"):
         return mechanics_of_model(
             model,
             params,
@@ -268,8 +265,10 @@ def mechanics(
 
 
 @contextmanager
-def _nested(what: str) -> Iterator[None]:
-    """Replace a RecursionError of SymPy by a ValueError with the reason; `what` names the function in its message."""
+def _sympy(what: str) -> Iterator[None]:
+    """Raise ImportError without SymPy, and replace its RecursionError by a ValueError with the reason."""
+    if find_spec("sympy") is None:
+        raise ImportError(f'{what} needs SymPy: python -m pip install "eip_scipy[sympy]".')
     try:
         yield
     except RecursionError:
@@ -277,8 +276,3 @@ def _nested(what: str) -> Iterator[None]:
             f"{what}: the expressions or their derivatives nest too deep for SymPy; pass Python functions to "
             "integrate instead."
         ) from None
-
-
-def _require_sympy(what: str) -> None:
-    if find_spec("sympy") is None:
-        raise ImportError(f'{what} needs SymPy: python -m pip install "eip_scipy[sympy]".')

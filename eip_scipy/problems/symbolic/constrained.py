@@ -1,4 +1,4 @@
-"""Mechanical systems with constraints as expressions, and the functions that are compiled from them."""
+"""Mechanical systems with constraints as expressions, the functions compiled from them, and potentials of forces."""
 
 from __future__ import annotations
 
@@ -7,17 +7,25 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import sympy
+from sympy.integrals.manualintegrate import manualintegrate
 
 from ...core.jitted import compilable, compiled_like, is_compiled, jitted
-from ..multibody.energies import Energy
-from ..multibody.motion import Sizes, new_floats, new_like
-from ..multibody.outputs import Outputs
-from ..multibody.parts import Parts
+from ..multibody.motion import new_floats, new_like
+from ..multibody.parts import Energy, Outputs, Parts
 from .parser import symbol
-from .potentials import at_rest, potential_of
 from .program import Arguments, function
 
-__all__ = ["Constrained", "acceleration", "conservative", "cyclic", "filling", "own_speed", "parts_of"]
+__all__ = [
+    "Constrained",
+    "acceleration",
+    "at_rest",
+    "conservative",
+    "cyclic",
+    "filling",
+    "own_speed",
+    "parts_of",
+    "potential_of",
+]
 
 BRANCHES = (sympy.Piecewise, sympy.Abs, sympy.sign, sympy.Heaviside, sympy.Max, sympy.Min)
 
@@ -25,21 +33,9 @@ BRANCHES = (sympy.Piecewise, sympy.Abs, sympy.sign, sympy.Heaviside, sympy.Max, 
 class Constrained(NamedTuple):
     """A system with the state (q, u): q' = `rates`, M u' + G^T lambda = F, and its constraints, all in real symbols.
 
-    Equal systems share their compiled functions.
-
-    Attributes
-    ----------
-    coordinates, speeds, parameters : tuple of str
-    rates : tuple of expressions
-        The derivatives of the coordinates, linear in the speeds.
-    mass : tuple of expressions
-        M by rows.
-    forces : tuple of expressions
-    positions, velocities : tuple of expressions
-        Expressions that the constraints set to 0: constraints on positions, and all constraints on velocities, which
-        are linear in the speeds and include the derivatives of `positions`.
-    inputs : tuple of (str, callable)
-        Names of quantities in the forces that are computed by functions ``f(t, y)``, with these functions.
+    Equal systems share their compiled functions. `mass` is M by rows, and `rates` are linear in the speeds. `positions`
+    and `velocities` are the expressions that constraints set to 0; the latter are linear in the speeds and include the
+    derivatives of `positions`. `inputs` are names of quantities in the forces that functions ``f(t, y)`` compute.
     """
 
     coordinates: tuple[str, ...]
@@ -51,11 +47,6 @@ class Constrained(NamedTuple):
     positions: tuple[Any, ...]
     velocities: tuple[Any, ...]
     inputs: tuple[tuple[str, Callable[..., float]], ...] = ()
-
-    @property
-    def sizes(self) -> Sizes:
-        """Return the numbers of coordinates, speeds, and constraints."""
-        return Sizes(len(self.coordinates), len(self.speeds), len(self.velocities))
 
     @property
     def arguments(self) -> Arguments:
@@ -94,15 +85,10 @@ def own_speed(system: Constrained, k: int) -> list[Any]:
 def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) -> list[int]:
     """Return the indices of coordinates whose momenta may be constant, because masses and forces do not depend on them.
 
-    A coordinate is left out if exactly one speed depends on its rate and a constraint contains this speed, or if the
-    force along the coordinate has branches or comes from a function, because such a force may be 0 only near the start.
-
-    Parameters
-    ----------
-    system : Constrained
-    speeds_by_rate : callable
-        ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds with respect to the rate of coordinate k, or []
-        if they are not known; coordinate k is then left out.
+    ``speeds_by_rate(k)`` returns the derivatives (n,) of the speeds with respect to the rate of coordinate k, or [] if
+    they are not known; the coordinate is then left out. A coordinate is also left out if exactly one speed depends on
+    its rate and a constraint contains this speed, or if the force along it has branches or comes from a function,
+    because such a force may be 0 only near the start.
     """
     known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
     inputs = {symbol(name) for name, _ in system.inputs}
@@ -150,15 +136,8 @@ def parts_of(
 ) -> Parts:
     """Return the compiled functions of a system as `Parts`.
 
-    Parameters
-    ----------
-    system : Constrained
-    energies : sequence of (str, expression, expression or None)
-        Descriptions of quantities that may be constant, their expressions, and their rates if these are given.
-    momenta : sequence of (str, expression)
-        Names of further quantities that may be constant, and their expressions.
-    outputs : sequence of (str, expression)
-        Names of quantities that are computed at saved states, and their expressions, which may contain accelerations.
+    `energies` are descriptions and expressions of quantities that may be constant, and their rates or None. `momenta`
+    and `outputs` are names and expressions; the latter may contain accelerations.
     """
     found = tuple(
         Energy(label, *energy_functions(item, system), None if rate is None else rate_function(rate, system))
@@ -176,11 +155,7 @@ def parts_of(
 
 @lru_cache(maxsize=64)
 def matrices(system: Constrained) -> Callable[..., None]:
-    """Return the argument `fill` of `motion`: ``fill(t, y, out, *params)`` writes M, F, G, gamma and q' to `out`.
-
-    The rows of G are the derivatives of `velocities` with respect to the speeds, and gamma are the rates of change of
-    `velocities` for u' = 0. The constraints are therefore met if G u' = -gamma.
-    """
+    """Return `fill` of `motion`, which writes M, F, G, gamma and q'; G u' = -gamma keeps the constraints."""
     speeds = system.variables[len(system.coordinates) :]
     gradients = [sympy.diff(item, u) if item.has(u) else sympy.Integer(0) for item in system.velocities for u in speeds]
     gammas = map(system.rate, system.velocities)
@@ -201,8 +176,8 @@ def _with_inputs(
 ) -> Callable[..., None]:
     """Return ``fill(t, y, out, *params)``, where y holds the state and further values that are named in `behind`.
 
-    `made` receives the names of all these values and returns a function of them. `fill` calls the functions of the
-    inputs, appends their values to y, and calls that function.
+    `fill` appends the values of the inputs to y, and calls the function that `made` returns for the names of all
+    values.
     """
     names = (*system.coordinates, *system.speeds, *behind, *(name for name, _ in system.inputs))
     fill = made(Arguments(names, system.parameters))
@@ -252,10 +227,7 @@ def rate_function(rate: Any, system: Constrained) -> Callable[..., float]:
 
 
 def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Callable[..., None]:
-    """Return ``fill(t, y, out, *params)``, which fills `out` with the values of expressions.
-
-    Expressions that are 0 are not compiled. `what` describes the values in tracebacks and errors.
-    """
+    """Return ``fill(t, y, out, *params)``, which fills `out`; expressions that are 0 are not compiled."""
     found = {k: item for k, item in enumerate(expressions) if item != 0}
     return function(what, list(found.values()), arguments, in_place=True, places=list(found))
 
@@ -264,3 +236,103 @@ def _gradient(item: Any, system: Constrained) -> dict[int, Any]:
     """Return the nonzero derivatives of an expression with respect to the state, by the indices of the components."""
     slopes = ((k, sympy.diff(item, x)) for k, x in enumerate(system.variables) if item.has(x))
     return {k: slope for k, slope in slopes if slope != 0}
+
+
+# Forces with more operations in all are not integrated, because that may take long.
+MOST_OPERATIONS = 1000
+# Largest number of factors of an integrand, and largest power of its sines and cosines.
+MOST_FACTORS = 4
+KNOWN = (sympy.sin, sympy.cos, sympy.exp)
+# Points from which integrals are taken: the second one if forces are infinite at the first.
+BASES = (0, 1)
+
+
+def at_rest(forces: Sequence[Any], speeds: Sequence[Any], others: set[Any]) -> list[Any]:
+    """Return the forces at zero speeds as expressions, without their terms that contain a symbol of `others`."""
+    still = [sympy.expand_mul(sympy.sympify(item).subs(dict.fromkeys(speeds, 0))) for item in forces]
+    return [sympy.Add(*(term for term in sympy.Add.make_args(F) if not term.free_symbols & others)) for F in still]
+
+
+def potential_of(forces: Sequence[Any], coordinates: Sequence[Any]) -> Any:
+    """Return V with forces = -dV/dq if the forces are conservative, None if no such expression is found.
+
+    V may be wrong if the forces, which contain no speeds, are not conservative: the caller must check whether the
+    energy that contains V is conserved.
+    """
+    if sum(item.count_ops() for item in forces) > MOST_OPERATIONS:
+        return None
+    forces = [sympy.expand_mul(item) for item in forces]
+    lengths, forces = _of_lengths(forces, coordinates)
+    for base in BASES:
+        rest = _along_axes(forces, coordinates, base)
+        if rest is not None:
+            return lengths + rest
+    return None
+
+
+def _of_lengths(forces: Sequence[Any], coordinates: Sequence[Any]) -> tuple[Any, list[Any]]:
+    """Return the potential of the force terms along the gradient of a length, and the forces without these terms.
+
+    Springs and gravitation have such terms. With S, the square of the length, such a term of the force of coordinate q
+    is c S^p with c = a dS/dq / 2, where a does not depend on the coordinates. Its potential is
+    -a S^(p + 1) / (2 p + 2).
+    """
+    potential, forces = sympy.Integer(0), list(forces)
+    powers = set().union(*(item.atoms(sympy.Pow) for item in forces))
+    powers = {item for item in powers if item.exp.is_Rational and item.exp < 0 and item.exp != -1 and item.base.is_Add}
+    for inverse in sorted(powers, key=str):
+        slopes = [sympy.diff(inverse.base, q) / 2 for q in coordinates]
+        parts = [item.coeff(inverse) for item in forces]
+        pairs = [(part, slope) for part, slope in zip(parts, slopes, strict=True) if part != 0 and slope != 0]
+        if not pairs:
+            continue
+        factor = sympy.cancel(sympy.expand_trig(pairs[0][0]) / sympy.expand_trig(pairs[0][1]))
+        if not factor.free_symbols & set(coordinates):
+            potential -= factor * inverse.base ** (inverse.exp + 1) / (2 * inverse.exp + 2)
+            forces = [sympy.expand_mul(item - part * inverse) for item, part in zip(forces, parts, strict=True)]
+    return potential, forces
+
+
+def _along_axes(forces: Sequence[Any], coordinates: Sequence[Any], base: int) -> Any:
+    """Return minus the integral of the forces along a path, None if SymPy cannot integrate it quickly.
+
+    The path starts at the point whose coordinates are all `base` and moves along one at a time, the last one first.
+    """
+    potential = sympy.Integer(0)
+    for k, (force, q) in enumerate(zip(forces, coordinates, strict=True)):
+        integrand = force.subs(dict.fromkeys(coordinates[:k], base))
+        terms = sympy.Add.make_args(sympy.expand(integrand))
+        if not all(_is_simple(term, q) for term in terms):
+            return None
+        integral = sympy.Add(*(manualintegrate(term, q) for term in terms))
+        if integral.has(sympy.Integral):
+            return None
+        potential -= integral - integral.subs(q, base)
+    is_finite = not potential.has(sympy.zoo, sympy.oo, -sympy.oo, sympy.nan, sympy.I)
+    return potential if is_finite else None
+
+
+def _is_simple(term: Any, q: Any) -> bool:
+    """Return True if SymPy can integrate a term over q quickly; the integration of other terms may not end.
+
+    Such a term has at most `MOST_FACTORS` factors that depend on q: powers of q and of one polynomial of degree at most
+    2 in q, or powers of q and of sines, cosines and exponentials of linear functions of q.
+    """
+    powers = [item.as_base_exp() for item in sympy.Mul.make_args(term) if item.has(q)]
+    if len(powers) > MOST_FACTORS:
+        return False
+    roots = [base for base, exponent in powers if base != q and not isinstance(base, sympy.Function | sympy.exp)]
+    waves = [(base, exponent) for base, exponent in powers if isinstance(base, sympy.sin | sympy.cos)]
+    others = [base for base, exponent in powers if base.has(q) and base != q and base not in roots]
+    if any(exponent.has(q) or not exponent.is_Rational for base, exponent in powers if base is not sympy.E):
+        return False
+    own = [exponent for base, exponent in powers if base == q] if others else []  # such a term is integrated by parts
+    if any(not (exponent.is_Integer and 0 < exponent <= MOST_FACTORS) for exponent in (*own, *(n for _, n in waves))):
+        return False
+    if any(not _degree(base.args[0], q) <= 1 or not isinstance(base, KNOWN) for base in others):
+        return False
+    return len(roots) <= 1 and all(_degree(base, q) <= 2 for base in roots) and not (roots and others)
+
+
+def _degree(expression: Any, q: Any) -> float:
+    return float(sympy.degree(expression, q)) if expression.is_polynomial(q) else float("inf")

@@ -1,64 +1,154 @@
-"""The equations of models of sympy.physics.mechanics, converted to real symbols."""
+"""Problems of models of sympy.physics.mechanics, whose equations are converted to real symbols."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
 from sympy.core.function import AppliedUndef
-from sympy.physics.mechanics import KanesMethod, Point, msubs
+from sympy.physics.mechanics import KanesMethod, Point, dynamicsymbols, msubs
 
+from ...core.inputs import is_number, shown
+from ...core.jitted import compiled_like, is_jitted
 from ...core.names import nearest
 from ..multibody.motion import plain
-from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed
-from .inputs import TIME, read_inputs
+from ..multibody.parts import required_outputs
+from ..multibody.problem import MechanicsProblem, mechanics_problem
+from ..multibody.start import MET, Names
+from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed, parts_of
 from .parser import as_expression, symbol
+from .system import parameter_values
+from .traced import NotTraceableError, traced
 
-__all__ = ["Model", "Start", "name_of", "read"]
+__all__ = ["Inputs", "mechanics_of_model", "name_of", "read_inputs"]
 
-# A row of constraints depends on the others if its remainder is below DEPENDENT, relative to the row, at POINTS points.
-DEPENDENT, POINTS = 1e-9, 3
+TIME = dynamicsymbols._t
+# A traced function agrees with the function itself up to rounding errors; this bound is relative.
+AGREES = 1e-9
 
 
-class Model(NamedTuple):
-    """The equations of a model, and its known properties.
+def name_of(item: Any) -> str:
+    """Return the name of a dynamicsymbol, a symbol or a string; the derivative of x is the speed ``v_x``."""
+    if isinstance(item, sympy.Derivative):
+        return f"v_{name_of(item.expr)}"
+    text = item if isinstance(item, str) else item.func.__name__ if isinstance(item, AppliedUndef) else str(item)
+    return re.sub(r"\W", "_", text.replace("'", "_prime"))
 
-    Attributes
-    ----------
-    system : Constrained
-    energies : tuple of (str, expression)
-        Descriptions of quantities that may be the energy, and their expressions.
-    momenta, outputs : tuple of (str, expression)
-        Names and expressions of momenta that may be constant, and of the quantities that are computed at saved states.
-    independent : tuple of str or None
-        The components of the state that the model calls independent; None if it has no dependent ones.
-    position_names, velocity_names : tuple of str
-        Names of the constraints on positions, and of those on velocities.
-    notes : tuple of str
-        Remarks for the user: velocity constraints that were added, and inputs that are called as functions.
-    """
 
-    system: Constrained
-    energies: tuple[tuple[str, Any], ...]
-    momenta: tuple[tuple[str, Any], ...]
-    outputs: tuple[tuple[str, Any], ...]
-    independent: tuple[str, ...] | None
-    position_names: tuple[str, ...]
-    velocity_names: tuple[str, ...]
+class Inputs(NamedTuple):
+    """Values of functions of time as `expressions`, or as `called` functions ``f(t, y)`` by name, and `notes`."""
+
+    expressions: dict[Any, Any]
+    called: tuple[tuple[str, Callable[..., float]], ...]
     notes: tuple[str, ...]
 
 
-class _Equations(NamedTuple):
-    """A model's equations in its own symbols.
+def read_inputs(
+    given: Any, known: Mapping[str, Any], state: Mapping[Any, str], start: tuple[float, np.ndarray]
+) -> Inputs:
+    """Return the inputs, converted into expressions where that is possible.
 
-    The motion follows from q' = `rates` and `mass` u' = `forces` plus the forces of the constraints, where q are the
-    `coordinates` and u the `speeds`. `positions` and `velocities` are the expressions that the constraints on positions
-    and on velocities set to 0. `energies` are pairs (description, expression), and `independent` is None if the model
-    has no dependent coordinates or speeds, as in `Model`.
+    `given` are those of `mechanics`. `known` are the functions of time in the model by name, `state` the names of
+    coordinates and speeds in the order of the state, and `start` a time and a state at which functions are called. A
+    ValueError or TypeError is raised if a key is not an input, or a value has the wrong type or size.
+    """
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            f"inputs must be a mapping of functions of time to expressions or functions, got {shown(given)}."
+        )
+    expressions: dict[Any, Any] = {}
+    called: list[tuple[str, Callable[..., float]]] = []
+    for key, value in given.items():
+        keys = [_function_of_time(item, known, state) for item in (key if isinstance(key, tuple) else (key,))]
+        if callable(value) and not isinstance(value, sympy.Basic):
+            found = _traced(keys, value, state, start)
+            if found is None:
+                called += _called(keys, value)
+            else:
+                expressions |= found
+        else:
+            expressions |= _as_expressions(keys, value)
+    notes = tuple(f"the input {name} is called as a function, not converted to an expression" for name, _ in called)
+    return Inputs(expressions, tuple(called), notes)
+
+
+def _function_of_time(key: Any, known: Mapping[str, Any], state: Mapping[Any, str]) -> Any:
+    if key in state or key in state.values():
+        raise ValueError(f"inputs: {key} is a component of the state; inputs are the other functions of time.")
+    if not isinstance(key, str):
+        return key
+    if key not in known:
+        raise ValueError(f"inputs: the model has no function {key!r}{nearest(key, known)}.")
+    return known[key]
+
+
+def _as_expressions(keys: Sequence[Any], value: Any) -> dict[Any, Any]:
+    """Return the numbers or expressions in `value` as a dictionary with the functions of time `keys`."""
+    values = [value] if len(keys) == 1 and not isinstance(value, (tuple, list, np.ndarray)) else list(value)
+    if len(values) != len(keys):
+        raise ValueError(f"inputs: got {len(values)} values for {', '.join(map(str, keys))}; expected {len(keys)}.")
+    for item in values:
+        if not (is_number(item) or isinstance(item, sympy.Expr)):
+            raise TypeError(
+                f"inputs: {keys[0]} is {shown(item)}; expected a number, an expression of t and the state, or a "
+                "function f(t, y)."
+            )
+    return dict(zip(keys, map(sympy.sympify, values), strict=True))
+
+
+def _traced(
+    keys: Sequence[Any], fun: Any, state: Mapping[Any, str], start: tuple[float, np.ndarray]
+) -> dict[Any, Any] | None:
+    """Return the values of `fun` as expressions, by the functions of time in `keys`; None if that is impossible."""
+    names = tuple(state.values())
+    try:
+        found = traced(keys[0].func.__name__, fun, "t", names).ravel()
+    except NotTraceableError:
+        return None
+    if found.size != len(keys):
+        raise ValueError(
+            f"inputs: the function of {', '.join(map(str, keys))} returns {found.size} numbers; expected {len(keys)}."
+        )
+    t, y = start
+    values = {symbol("t"): t, **{symbol(name): x for name, x in zip(names, y, strict=True)}}
+    own = [float(sympy.sympify(item).xreplace(values)) for item in found]
+    if not np.allclose(own, np.ravel(fun(t, y)), rtol=AGREES, atol=AGREES):  # `fun` depends on more than its arguments
+        return None
+    back = {symbol(name): item for item, name in state.items()} | {symbol("t"): TIME}
+    return {key: sympy.sympify(item).xreplace(back) for key, item in zip(keys, found, strict=True)}
+
+
+def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
+    """Return for each function of time in `keys` its name, and a function ``f(t, y)`` of this component of `fun`."""
+    return [(name_of(key), _part(fun, k if len(keys) > 1 else None)) for k, key in enumerate(keys)]
+
+
+def _part(fun: Any, k: int | None) -> Callable[..., float]:
+    if not is_jitted(fun):
+        return partial(_called_in_python, fun, k)
+    if k is None:
+        return fun
+    return compiled_like(lambda t, y: fun(t, y)[k], fun)
+
+
+def _called_in_python(fun: Callable[..., Any], k: int | None, t: float, y: np.ndarray) -> float:
+    return float(fun(t, y) if k is None else fun(t, y)[k])
+
+
+# A row of constraints depends on the others if its remainder is below DEPENDENT, relative to the row, at POINTS points.
+DEPENDENT, POINTS = 1e-9, 3
+QUATERNION = 4  # components
+
+
+class _Equations(NamedTuple):
+    """A model's equations in its own symbols: q' = `rates` and `mass` u' = `forces` plus the forces of the constraints.
+
+    `positions` and `velocities` are the expressions that the constraints set to 0. `energies` are pairs (description,
+    expression), and `independent` is None if the model has no dependent coordinates or speeds.
     """
 
     coordinates: list[Any]
@@ -76,98 +166,120 @@ class _Equations(NamedTuple):
     by_speeds: dict[Any, Any]  # derivatives of coordinates as functions of speeds
 
 
-def name_of(item: Any) -> str:
-    """Return the name of a dynamicsymbol, a symbol or a string; the derivative of x is the speed ``v_x``."""
-    if isinstance(item, sympy.Derivative):
-        return f"v_{name_of(item.expr)}"
-    text = item if isinstance(item, str) else item.func.__name__ if isinstance(item, AppliedUndef) else str(item)
-    return re.sub(r"\W", "_", text.replace("'", "_prime"))
-
-
-def read(
+def mechanics_of_model(
     model: Any,
-    inputs: Mapping[Any, Any],
-    parameters: Mapping[str, float],
+    params: Mapping[Any, float] | None,
+    q0: Any,
+    u0: Any,
+    *,
+    t_span: tuple[float, float] | None,
+    inputs: Mapping[Any, Any] | None,
     energy: Any,
-    outputs: Mapping[str, Any],
-    start: Start,
-) -> Model:
-    """Return the equations of a model.
-
-    Parameters
-    ----------
-    model
-        A KanesMethod, LagrangesMethod, or an object with the attribute ``eom_method``, which is one of these.
-    inputs : mapping
-        Values of the functions of time that are neither coordinates nor speeds, see `read_inputs`.
-    parameters : mapping
-        Values of the parameters by their names.
-    energy : expression or None
-        The total energy, if it is given.
-    outputs : mapping
-        Expressions of the quantities that are computed at saved states, by name.
-    start : Start
-        Time, coordinates and speeds at which `read_inputs` calls inputs that are functions.
-    """
+    outputs: Any,
+    independent: Iterable[Any] | None,
+    rank_tolerance: float,
+    name: str,
+    others: Mapping[str, Any],
+) -> MechanicsProblem:
+    """Return the problem of a model; see `mechanics`."""
+    values, q0, u0, inputs = _with_defaults(model, params, q0, u0, inputs)
+    t = 0.0 if t_span is None else float(t_span[0])
+    outputs = required_outputs("mechanics", outputs, ())
     method = _method(model)
     found = _of_lagrange(method) if hasattr(method, "_L") else _of_kane(method)
-    converted = _Conversion(found, inputs, start)
-    system = _system(found, converted, parameters)
-    energies = tuple(_energies(found, energy, system, converted))
-    momenta = tuple(_momenta(found, system, converted))
-    shown = tuple((name, converted.output(name, item, parameters)) for name, item in outputs.items())
-    extra = [item for _, item in (*energies, *momenta, *shown)]
-    system = system._replace(parameters=_parameters(system, extra, parameters))
-    system, added = _with_missing_velocities(system, parameters)
-    notes = () if not added else (f"velocity constraints were added for {', '.join(added)}, which the model lacks",)
-    own = len(system.velocities) - len(added)
+    converted = _Conversion(found, inputs, t, q0, u0)
+    system = _system(found, converted)
+    energies = [(label, item, None) for label, item in _energies(found, energy, system, converted)]
+    momenta = list(_momenta(found, system, converted))
+    observed = [(label, converted.output(label, item, values)) for label, item in outputs.items()]
+    extra = [item for _, item, *_ in (*energies, *momenta, *observed)]
+    system = system._replace(parameters=_parameters(system, extra, values))
+    system, added = _with_missing_velocities(system, values)
+    notes = [f"velocity constraints were added for {', '.join(added)}, which the model lacks"] if added else []
+    own = [f"v{k + 1}" for k in range(len(system.velocities) - len(added))]
     positions = tuple(f"g{k + 1}" for k in range(len(system.positions)))
-    return Model(
-        system,
-        energies,
-        momenta,
-        shown,
-        None if found.independent is None else tuple(converted.names[item] for item in found.independent),
-        positions,
-        (*(f"v{k + 1}" for k in range(own)), *(f"{item}'" for item in added)),
-        (*notes, *converted.inputs.notes),
+    names = Names(system.coordinates, system.speeds, positions, (*own, *(f"{item}'" for item in added)))
+    held = independent
+    if held is None and found.independent is not None:
+        held = [converted.names[item] for item in found.independent]
+    problem = mechanics_problem(
+        name,
+        parts_of(system, energies, momenta, observed),
+        names,
+        t,
+        (_by_name(q0, system.coordinates), _by_name(u0, system.speeds)),
+        np.array([values[key] for key in system.parameters]) if system.parameters else None,
+        None if held is None else [name_of(item) for item in held],
+        rank_tolerance,
+        t_span=t_span,
+        notes=(*notes, *converted.inputs.notes),
+        parameter_names=system.parameters,
+        **others,
     )
+    _require_rotations(problem)
+    return problem
 
 
-class Start(NamedTuple):
-    """The time, and the coordinates and speeds at the start, as they were given."""
+def _with_defaults(model: Any, params: Any, q0: Any, u0: Any, inputs: Any) -> tuple[dict[str, float], Any, Any, Any]:
+    """Return the parameters by name, the start, and the inputs, by default those that a System of PyDy has."""
+    # PyDy refuses constants that are in the constraints on positions alone: they are given here.
+    constants = {**(getattr(model, "constants", None) or {}), **(params or {})}
+    if q0 is None and u0 is None:
+        q0 = u0 = getattr(model, "initial_conditions", None)
+    if q0 is None or u0 is None:
+        raise TypeError("mechanics: q0 or u0 is missing; give the coordinates and speeds at the start.")
+    if inputs is None:
+        given = getattr(model, "specifieds", None) or {}
+        inputs = {key: _swapped(value) if callable(value) else value for key, value in given.items()}
+    return parameter_values({name_of(key): value for key, value in constants.items()}), q0, u0, inputs
 
-    t: float
-    q0: Any
-    u0: Any
 
-    def numbers(self, coordinates: Sequence[str], speeds: Sequence[str]) -> np.ndarray:
-        """Return a state with which functions can be called; components that were not given are 0."""
+def _require_rotations(problem: MechanicsProblem) -> None:
+    """Raise ValueError if a quaternion that SymPy uses for a rotation does not have the norm 1."""
+    args = () if problem.params is None else (problem.params,)
+    for item in problem.norms:
+        slopes, value = np.empty(problem.y0.size), plain(item.function)(0.0, problem.y0, *args)
+        plain(item.gradient)(0.0, np.ones(problem.y0.size), slopes, *args)
+        if np.count_nonzero(slopes) == QUATERNION and not abs(value - 1) <= MET:
+            raise ValueError(
+                f"mechanics: the start has {item.name} = {value:.6g}; expected 1, because the quaternion of a rotation "
+                "has norm 1. Divide its components by their norm."
+            )
 
-        def listed(given: Any, names: Sequence[str]) -> list[float]:
-            if isinstance(given, Mapping):
-                by_name = {name_of(key): value for key, value in given.items()}
-                return [float(by_name.get(name, 0.0)) for name in names]
-            return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
 
-        return np.array([*listed(self.q0, coordinates), *listed(self.u0, speeds)])
+def _swapped(function: Any) -> Any:
+    """Convert a function ``f(y, t)`` of PyDy into ``f(t, y)``; return an expression unchanged."""
+    return function if isinstance(function, sympy.Basic) else lambda t, y: function(y, t)
+
+
+def _by_name(given: Any, names: tuple[str, ...]) -> Any:
+    """Return a mapping with names as keys, those in `names` or, if there are none, all; return an array unchanged."""
+    if not isinstance(given, Mapping):
+        return given
+    found = {name_of(key): value for key, value in given.items()}
+    return {key: value for key, value in found.items() if key in names} or found
 
 
 class _Conversion:
-    """Converter of expressions from a model's functions of time and symbols to the real symbols of this package.
+    """Converter of expressions from a model's functions of time and symbols to the real symbols of this package."""
 
-    `found` are the model's equations; `inputs` and `start` are those of `read`.
-    """
-
-    def __init__(self, found: _Equations, inputs: Any, start: Start) -> None:
+    def __init__(self, found: _Equations, inputs: Any, t: float, q0: Any, u0: Any) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
-        _require_distinct(self.names)
+        components = list(self.names.values())
+        for k, name in enumerate(components):
+            if name in components[:k] or name == "t":
+                raise ValueError(
+                    f"mechanics: {name!r} is the name of two components of the state, or of one and of the time; "
+                    "rename one."
+                )
         self._found = found
         self._symbols = {item: symbol(name) for item, name in self.names.items()} | {TIME: symbol("t")}
         self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in found.speeds}
         count = len(found.coordinates)
-        state = start.numbers(*(list(self.names.values())[part] for part in (slice(count), slice(count, None))))
-        self.inputs = read_inputs(inputs, _functions_of_time(found), self.names, (start.t, state))
+        state = np.array([*_numbers(q0, components[:count]), *_numbers(u0, components[count:])])
+        parts = (*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates)
+        functions = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in parts))
+        self.inputs = read_inputs(inputs, {name_of(item): item for item in functions}, self.names, (t, state))
         self._called = {name for name, _ in self.inputs.called}
         if taken := self._called & {*self.names.values(), "t"}:
             raise ValueError(
@@ -219,18 +331,18 @@ class _Conversion:
         return self(expression.xreplace(self._accelerations))
 
 
-def _functions_of_time(found: _Equations) -> dict[str, Any]:
-    """Return the functions of time in the equations by name."""
-    items = (*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates)
-    atoms = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in items))
-    return {name_of(item): item for item in atoms}
+def _numbers(given: Any, names: Sequence[str]) -> list[float]:
+    """Return values with which functions can be called; components that were not given are 0."""
+    if isinstance(given, Mapping):
+        by_name = {name_of(key): value for key, value in given.items()}
+        return [float(by_name.get(name, 0.0)) for name in names]
+    return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
 
 
-def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, float]) -> Constrained:
-    """Return the equations as a `Constrained` without parameters.
+def _system(found: _Equations, converted: _Conversion) -> Constrained:
+    """Return the equations as a `Constrained` whose parameters are not known yet, as outputs may have further ones.
 
-    The names of the parameters are known once all expressions, also those of outputs, are converted. A ValueError is
-    raised if a constraint or the kinematics depend on an input that is called as a function.
+    A ValueError is raised if a constraint or the kinematics depend on an input that is called as a function.
     """
     names = converted.names
     system = Constrained(
@@ -257,8 +369,7 @@ def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, 
 def _energies(found: _Equations, energy: Any, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
     """Yield the quantities that may be the energy.
 
-    If `energy` is None and inputs are called as functions, there are none, because such a force may begin to do work
-    after the times that are examined.
+    There are none if inputs are called as functions, because such a force may begin to do work later.
     """
     if energy is not None:
         if converted.depends_on_call(given := converted(energy)):
@@ -295,10 +406,7 @@ def _momenta(found: _Equations, system: Constrained, converted: _Conversion) -> 
 
 
 def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
-    """Return the derivatives of a KanesMethod's speeds with respect to the rate of the k-th coordinate, or [].
-
-    The result is [] if the numbers of coordinates and speeds differ.
-    """
+    """Return the derivatives of a KanesMethod's speeds by the rate of coordinate k; [] if their numbers differ."""
     by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
     if by_speeds.rows != by_speeds.cols:
         return []
@@ -343,7 +451,7 @@ def _of_kane(method: Any) -> _Equations:
     dependent = {*method._qdep, *method._udep}
     kinetic = sympy.Add(*(body.kinetic_energy(frame) for body in bodies))
     potential = sympy.Add(*(body.potential_energy for body in bodies))
-    of_loads = _potential_of_loads(loads or [], frame, {*q, *u})
+    of_loads = _potential_of_loads(loads or [], frame)
     energies = [("kinetic and potential energy of the bodies", kinetic + potential)]
     if of_loads is not None and of_loads != 0:
         energies += [
@@ -410,11 +518,8 @@ def _is_constant(load: Any, frame: Any) -> bool:
     )
 
 
-def _potential_of_loads(loads: Iterable[Any], frame: Any, state: set[Any]) -> Any:
-    """Return the potential of the forces that are constant in the inertial frame; None if a position is unknown.
-
-    Other loads are ignored.
-    """
+def _potential_of_loads(loads: Iterable[Any], frame: Any) -> Any:
+    """Return the potential of the forces that are constant in the inertial frame; None if a position is unknown."""
     total = sympy.Integer(0)
     for place, vector in loads:
         if not _is_constant((place, vector), frame):
@@ -441,21 +546,8 @@ def _fixed_point(place: Any, frame: Any) -> Any:
     return None
 
 
-def _require_distinct(names: Mapping[Any, str]) -> None:
-    found = list(names.values())
-    twice = next((name for k, name in enumerate(found) if name in found[:k] or name == "t"), None)
-    if twice is not None:
-        raise ValueError(
-            f"mechanics: {twice!r} is the name of two components of the state, or of one and of the time; rename one."
-        )
-
-
 def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the names of the parameters that occur in the equations or in `others`, in the order of `values`.
-
-    `others` are expressions of energies, momenta and outputs, and `values` maps names to values. A ValueError is raised
-    if a parameter has no value.
-    """
+    """Return the parameters in the equations or in `others`, in the order of `values`; all must have a value."""
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
     known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
     known |= {symbol(name) for name, _ in system.inputs}
@@ -474,9 +566,9 @@ def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str,
 def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -> tuple[Constrained, list[str]]:
     """Add the derivatives of constraints on positions that do not follow from the constraints on velocities.
 
-    KanesMethod ignores a configuration constraint without its velocity constraint. The result is the system, and the
-    names g1, g2, ... of the constraints on positions whose derivatives were added. Dependence is tested at random
-    states with the `values` of the parameters.
+    KanesMethod ignores a configuration constraint without its velocity constraint. Return the system and the names of
+    the constraints whose derivatives were added. Dependence is tested at random states with the `values` of the
+    parameters.
     """
     if not system.positions:
         return system, []

@@ -1,11 +1,17 @@
-"""Division of the names in a Hamiltonian into coordinates and their momenta."""
+"""Names of the components of a state: coordinates with their momenta, and functions of time with derivatives."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
-__all__ = ["paired"]
+import sympy
+from sympy.core.function import AppliedUndef
+
+from .parser import TIME, as_names
+
+__all__ = ["Timed", "paired"]
 
 # Coordinates whose momenta may occur alone in H: a coordinate that H does not depend on is cyclic.
 KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
@@ -14,14 +20,9 @@ KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
 def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the coordinates and, in the same order, the momenta for the names in a Hamiltonian.
 
-    A coordinate on which the Hamiltonian does not depend may be missing from `names`.
-
-    Pairs are x and px, q1 and p1, theta and p_theta or ptheta; p belongs to the one remaining coordinate, or to q.
-
-    Raises
-    ------
-    ValueError
-        If a name has no partner.
+    A coordinate on which the Hamiltonian does not depend may be missing from `names`. Pairs are x and px, q1 and p1,
+    theta and p_theta or ptheta; p belongs to the one remaining coordinate, or to q. A ValueError is raised if a name
+    has no partner.
     """
     free = set(names)
     pairs = []
@@ -40,10 +41,7 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
-    """Return the error message for the names `left`, which have no partner, or for an H without names.
-
-    `pairs` are the pairs (coordinate, momentum) that were found; the message lists them.
-    """
+    """Return the error message for the names `left`, which have no partner, or for an H without names."""
     rule = "Names are paired as x with px, q1 with p1, theta with p_theta; others by hamiltonian(H, 'a b', 'pa pb')."
     if not left:
         return f"hamiltonian: H contains neither coordinates nor momenta. {rule}"
@@ -58,10 +56,7 @@ def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
 
 
 def _coordinate(momentum: str, free: set[str]) -> str | None:
-    """Return the name of the coordinate to which `momentum` belongs; None if it is not the name of a momentum.
-
-    `free` are the names in H. The coordinate need not be one of them, because H may not depend on it.
-    """
+    """Return the coordinate, perhaps not in H, to which `momentum` belongs; None if it is not a momentum."""
     if not momentum.startswith("p") or momentum == "p":
         return None
     rest = momentum[1:].removeprefix("_")
@@ -72,11 +67,7 @@ def _coordinate(momentum: str, free: set[str]) -> str | None:
 
 
 def _partner_of_p(others: list[str]) -> str | None:
-    """Return the coordinate of p among the remaining names `others`; None if it is not clear.
-
-    The coordinate is q if q is among the names or there are none, otherwise the only usual name of a coordinate, or the
-    only name.
-    """
+    """Return q, the only usual name of a coordinate, or the only name among `others`; None if that is not clear."""
     if "q" in others or not others:
         return "q"
     likely = [name for name in others if name in KNOWN] or others
@@ -86,3 +77,74 @@ def _partner_of_p(others: list[str]) -> str | None:
 def _natural(name: str) -> list[tuple[int, str]]:
     """Return a key for sorting that puts q2 before q10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+class Timed:
+    """Names of the components of a state, and the `values` of their derivatives; components may be functions of time.
+
+    A derivative that is a component itself, such as x' in the state (x, x'), is called ``v_x``. Any other derivative of
+    a component is replaced by its right-hand side; a call with an expression makes these replacements in it. `f` and
+    `y` are the arguments of `equations`.
+    """
+
+    def __init__(self, f: Any, y: Any) -> None:
+        keys = list(f) if isinstance(f, Mapping) else None
+        if y is not None:
+            given = y.replace(",", " ").split() if isinstance(y, str) else _listed(y)
+        elif keys is not None:
+            given = [key.expr if _is_rate(key) and key.expr not in keys else key for key in keys]
+        else:
+            raise TypeError("equations: y is missing; give the names of the components, or f as a mapping by names.")
+        self._speeds = {item: _speed(item) for item in given if isinstance(item, sympy.Derivative)}
+        self.names = as_names("the keys of f" if y is None else "y", [self._speeds.get(item, item) for item in given])
+        values = list(f.values()) if isinstance(f, Mapping) else _listed(f)
+        if keys is not None:
+            whole = [key.expr if _is_rate(key) and key not in given else key for key in keys]
+            found = [self._speeds.get(key, key) for key in whole]
+            by_name = dict(zip(as_names("the keys of f", found), values, strict=True))
+            if set(by_name) != set(self.names):
+                raise ValueError(
+                    f"equations: f has derivatives of {', '.join(by_name)}, but y is {', '.join(self.names)}."
+                )
+            values = [by_name[name] for name in self.names]
+        if len(values) != len(self.names):
+            raise ValueError(
+                f"equations: {len(values)} derivatives for the {len(self.names)} components {', '.join(self.names)}."
+            )
+        self._rates = {
+            sympy.Derivative(item, TIME): value
+            for item, value in zip(given, values, strict=True)
+            if isinstance(item, AppliedUndef) and sympy.Derivative(item, TIME) not in self._speeds
+        }
+        self._rates |= {item.diff(TIME): f for item, f in zip(given, values, strict=True) if item in self._speeds}
+        self.values = [self(value) for value in values]
+
+    def __call__(self, expression: Any) -> Any:
+        """Return an expression with the derivatives of components replaced; return text and numbers unchanged."""
+        if not isinstance(expression, sympy.Expr):
+            return expression
+        expression = self._with_speeds(expression)
+        expressions = {
+            key: self._with_speeds(value) for key, value in self._rates.items() if isinstance(value, sympy.Expr)
+        }
+        for _ in expressions:
+            if not expression.has(sympy.Derivative):
+                break
+            expression = expression.xreplace(expressions)
+        return expression
+
+    def _with_speeds(self, expression: Any) -> Any:
+        return expression.xreplace({item: sympy.Symbol(name) for item, name in self._speeds.items()})
+
+
+def _listed(given: Any) -> list[Any]:
+    return [given] if isinstance(given, (str, sympy.Expr)) else list(given)
+
+
+def _is_rate(key: Any) -> bool:
+    """Return True if `key`, a key of the mapping `f` of `Timed`, is a first derivative with respect to time."""
+    return isinstance(key, sympy.Derivative) and key.variables == (TIME,)
+
+
+def _speed(item: Any) -> str:
+    return f"v_{item.expr.func.__name__}" if isinstance(item.expr, AppliedUndef) else str(item)

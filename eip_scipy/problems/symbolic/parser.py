@@ -2,6 +2,10 @@
 
 The text is never executed. SymPy's own parser (`sympify`, `parse_expr`) calls `eval` and reads E, I, S, N, Q, beta and
 gamma as its own objects. Here every name that is not called is a symbol of the user, even pi if the user declares it.
+
+Before an expression is built, it is checked that SymPy will not need too much work. SymPy adds, multiplies and raises
+rational numbers exactly, collects equal terms and factors, and expands some arguments of functions. Each of these can
+take hours, within one operation that no signal interrupts.
 """
 
 from __future__ import annotations
@@ -11,16 +15,177 @@ import keyword
 import math
 import re
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import sympy
 from sympy.core.function import AppliedUndef
 
-from .cube_root import cbrt
-from .sizes import TooLargeError, require_constant, require_function, require_power, require_product, require_sum
+__all__ = ["EXPANDED_TERMS", "as_expression", "as_names", "cbrt", "expanded_terms", "symbol", "with_powers_of_roots"]
 
-__all__ = ["as_expression", "as_names", "symbol"]
+# Largest number of bits of a numerator and its denominator. 1.0001**365 has 10 000 bits, a float at most 2100.
+MOST_BITS = 2**14
+# Largest number of terms of an expanded polynomial. With more terms algebra may take minutes.
+EXPANDED_TERMS = 2000
+# Largest number of arguments of one max or min, and of all of them. SymPy compares all pairs of them.
+MOST_COMPARED, MOST_COMPARED_IN_ALL = 12, 400
+# Largest number of factors of a product. The derivatives of n factors have n terms with n factors each.
+MOST_FACTORS = 200
+# Largest number of operations of a constant that is not rational. SymPy evaluates such a constant to find its sign.
+LARGEST_CONSTANT = 64
+ZERO, ONE = sympy.Integer(0), sympy.Integer(1)
+
+
+class TooLargeError(ValueError):
+    """Error for an expression for which SymPy would need too much work."""
+
+
+def require_sum(items: Iterable[Any]) -> None:
+    """Raise TooLargeError if a coefficient of the sum of `items` has too many digits."""
+    coefficients: dict[Any, Any] = defaultdict(lambda: ZERO)
+    for item in items:
+        for term in sympy.Add.make_args(item):
+            factor, rest = term.as_coeff_Mul(rational=True)
+            coefficients[rest] += factor
+            _require(_bits(coefficients[rest]))
+
+
+def require_product(items: Iterable[Any]) -> None:
+    """Raise TooLargeError if the product of `items` has too many factors, or a number in it has too many digits."""
+    coefficient, roots = ONE, 0
+    exponents: dict[Any, Any] = defaultdict(lambda: ZERO)
+    for item in items:
+        for factor in sympy.Mul.make_args(item):
+            base, exponent = factor.as_base_exp()
+            if factor.is_Rational:
+                coefficient *= factor
+                _require(_bits(coefficient))
+            elif exponent.is_Rational:
+                exponents[base] += exponent
+                _require(_bits(exponents[base]))
+                if base.is_Rational:  # SymPy multiplies bases that have equal exponents
+                    roots += _bits(base) * math.ceil(abs(exponent))
+                    _require(roots)
+    if len(exponents) > MOST_FACTORS:
+        raise TooLargeError(f"has {len(exponents)} factors, more than {MOST_FACTORS}")
+
+
+def require_power(base: Any, exponent: Any) -> None:
+    """Raise TooLargeError if a number in `base`, raised to `exponent`, has too many digits."""
+    if not exponent.is_Rational:
+        return
+    numbers = [factor.as_base_exp() for factor in sympy.Mul.make_args(base)]
+    total = sum(
+        _bits(number) * math.ceil(abs(power)) for number, power in numbers if number.is_Rational and power.is_Rational
+    )
+    _require(total * math.ceil(abs(exponent)))
+
+
+def require_function(name: str, arguments: Iterable[Any], compared: int) -> int:
+    """Raise TooLargeError if SymPy would compare or expand too much to build the function.
+
+    Return the number of values that max and min compare in the text, `compared` before this function.
+    """
+    if name in ("max", "min"):
+        kind = sympy.Max if name == "max" else sympy.Min
+        count = sum(len(item.args) if isinstance(item, kind) else 1 for item in arguments)
+        compared += count
+        if count > MOST_COMPARED or compared > MOST_COMPARED_IN_ALL:
+            raise TooLargeError(
+                f"compares {count} values, and the text compares {compared} in all; the limits are {MOST_COMPARED} and "
+                f"{MOST_COMPARED_IN_ALL}"
+            )
+    if name == "abs":
+        for item in arguments:
+            if not item.is_extended_real and expanded_terms(item) > EXPANDED_TERMS:
+                raise TooLargeError(f"takes an argument that may be complex and has more than {EXPANDED_TERMS} terms")
+    return compared
+
+
+def require_constant(number: Any) -> None:
+    """Raise TooLargeError if `number` is not rational and has more than `LARGEST_CONSTANT` operations."""
+    if not number.is_Rational and number.count_ops() > LARGEST_CONSTANT:
+        raise TooLargeError(
+            f"is a constant of more than {LARGEST_CONSTANT} operations; write its value, or make it a parameter"
+        )
+
+
+def expanded_terms(expression: Any) -> int:
+    """Return an upper bound for the number of terms of the expanded expression, at most `EXPANDED_TERMS` + 1."""
+    most = EXPANDED_TERMS + 1
+    match expression:
+        case sympy.Add():
+            return min(most, sum(map(expanded_terms, expression.args)))
+        case sympy.Mul():
+            product = 1
+            for factor in expression.args:
+                product = min(most, product * expanded_terms(factor))
+            return product
+        case sympy.Pow(args=(base, sympy.Integer() as exponent)):
+            terms, power = expanded_terms(base), min(abs(int(exponent)), most)
+            return min(most, math.comb(terms + power - 1, power)) if terms > 1 else 1
+    return 1
+
+
+def _bits(number: Any) -> int:
+    return int(number.p).bit_length() + int(number.q).bit_length()
+
+
+def _require(bits: int) -> None:
+    if bits > MOST_BITS:
+        raise TooLargeError(f"has a number of {round(bits * math.log10(2))} digits or more when it is computed exactly")
+
+
+class cbrt(sympy.Function):  # noqa: N801  # expressions show this name
+    """Real cube root of a real argument, as NumPy's ``cbrt``: -2 for -8.
+
+    SymPy's function of this name is the power 1/3, which is not real for a negative number.
+    """
+
+    nargs = 1
+
+    @classmethod
+    def eval(cls, x: Any) -> Any:
+        """Return the root as a power if the sign of x is known, or without a factor of x; None to leave it as it is."""
+        if x.is_extended_nonnegative:
+            return x ** sympy.Rational(1, 3)
+        if x.is_extended_nonpositive or x.could_extract_minus_sign():
+            return -cls(-x)
+        factor, rest = x.as_coeff_Mul(rational=True)
+        return None if factor == 1 else factor ** sympy.Rational(1, 3) * cls(rest)
+
+    def fdiff(self, argindex: int = 1) -> Any:
+        """Return the derivative."""
+        return 1 / (3 * self**2)
+
+    def _eval_is_real(self) -> Any:
+        return self.args[0].is_real
+
+    def _eval_power(self, exponent: Any) -> Any:
+        # Reciprocals are left, so that they cancel in derivatives: those of cbrt(x)**4 are finite at 0.
+        whole = exponent.is_Integer and exponent > 0 and exponent % 3 == 0
+        return self.args[0] ** (exponent / 3) if whole else None
+
+
+def with_powers_of_roots(expression: Any) -> Any:
+    """Return an expression with x**m cbrt(x)**n in products written as cbrt(x)**(3 m + n).
+
+    The derivative of x cbrt(x) contains x/cbrt(x)**2, which would be NaN at 0.
+    """
+    if not expression.has(cbrt):
+        return expression
+    return expression.replace(lambda item: item.is_Mul and item.has(cbrt), _merged)
+
+
+def _merged(product: Any) -> Any:
+    powers = product.as_powers_dict()
+    for root in [item for item in powers if isinstance(item, cbrt)]:
+        n, m = powers[root], powers.get(root.args[0], sympy.Integer(0))
+        if n.is_Integer and m.is_Integer and m != 0:
+            product = product / (root**n * root.args[0] ** m) * root ** (3 * m + n)
+    return product
+
 
 TIME = sympy.Symbol("t")  # the time in dynamicsymbols
 ONE_ARGUMENT = (
@@ -55,12 +220,7 @@ def symbol(name: str) -> sympy.Symbol:
 def as_names(what: str, names: Any) -> tuple[str, ...]:
     """Return the names in "x y", "x, y", or a sequence of strings, SymPy symbols and dynamicsymbols.
 
-    `what` describes the names in messages.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an item is not a name, is t, or occurs twice.
+    An error that begins with `what` is raised if an item is not a name, is t, or occurs twice.
     """
     items = names.replace(",", " ").split() if isinstance(names, str) else _items(what, names)
     found = tuple(_name(what, item) for item in items)
@@ -75,12 +235,8 @@ def as_names(what: str, names: Any) -> tuple[str, ...]:
 def as_expression(what: str, given: Any, declared: Iterable[str] = ()) -> sympy.Expr:
     """Return a SymPy expression in real symbols from text, a number or a SymPy expression.
 
-    A name in `declared`, such as a component of the state or a parameter, is neither a constant nor a function.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `given` is not such an expression. The message begins with `what`.
+    A name in `declared`, such as a component of the state or a parameter, is neither a constant nor a function. An
+    error that begins with `what` is raised if `given` is not such an expression.
     """
     if isinstance(given, str):
         found = Reader(what, given, declared).read()
@@ -144,10 +300,7 @@ def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
 
 
 class Reader:
-    """Converter of one text to a SymPy expression; `what` describes the expression in messages.
-
-    Names in `declared` are neither constants nor functions, as for `as_expression`.
-    """
+    """Converter of one text to a SymPy expression; names in `declared` are neither constants nor functions."""
 
     def __init__(self, what: str, text: str, declared: Iterable[str] = ()) -> None:
         self.what, self.text = what, " ".join(text.split())  # the text may have several lines
@@ -234,11 +387,7 @@ class Reader:
         raise self._refuse(node, "is not allowed")
 
     def _chain(self, node: ast.expr, pair: tuple[type, type], inverse: Any, depth: int) -> list[sympy.Expr]:
-        """Return the operands of a chain such as a + b - c or a * b / c, whose nodes are nested to the left.
-
-        `pair` holds the types of the two operators. Operands after the second one, - or /, are replaced by their
-        `inverse`. `depth` is the depth of nesting of `node` in the whole text.
-        """
+        """Return the operands of a chain such as a + b - c, nested left; `inverse` is applied after ``pair[1]``."""
         found = []
         while isinstance(node, ast.BinOp) and isinstance(node.op, pair):
             item = self._expression(node.right, depth + 1)

@@ -1,9 +1,9 @@
 """Functions from SymPy expressions: each statement has one operation, and common subexpressions are computed once.
 
-A function is compiled from a tree of `ast` nodes. No text is executed, unlike in SymPy's `lambdify`, which writes
-source that contains the user's names and calls `exec`. The nodes are assignments of sums, products, powers, choices and
-calls of functions in the lists below, checks of array sizes, and in `variational` a loop over the columns. The names
-are those of the arguments, `k`, and `v` and `d` with a number; everything else is a number.
+A function is compiled from a tree of `ast` nodes. No text of the user is executed, unlike in SymPy's `lambdify`, which
+writes source that contains the user's names and calls `exec`. The nodes are assignments of sums, products, powers,
+choices and calls of functions in the lists below, checks of array sizes, and in `variational` a loop over the columns.
+The names are those of the arguments, `k`, and `v` and `d` with a number; everything else is a number.
 """
 
 from __future__ import annotations
@@ -20,28 +20,18 @@ import numpy as np
 import sympy
 
 from ...core.jitted import compilable, is_jitted, jitted
-from .cube_root import cbrt, with_powers_of_roots
+from .parser import cbrt, with_powers_of_roots
 
 __all__ = ["Arguments", "function", "variational"]
 
-# SymPy's functions and their names in math and NumPy.
-CALLS: dict[Any, tuple[str, str]] = {
-    sympy.exp: ("exp", "exp"),
-    sympy.log: ("log", "log"),
-    sympy.sin: ("sin", "sin"),
-    sympy.cos: ("cos", "cos"),
-    sympy.tan: ("tan", "tan"),
-    sympy.asin: ("asin", "arcsin"),
-    sympy.acos: ("acos", "arccos"),
-    sympy.atan: ("atan", "arctan"),
-    sympy.atan2: ("atan2", "arctan2"),
-    sympy.sinh: ("sinh", "sinh"),
-    sympy.cosh: ("cosh", "cosh"),
-    sympy.tanh: ("tanh", "tanh"),
-    sympy.asinh: ("asinh", "arcsinh"),
-    sympy.acosh: ("acosh", "arccosh"),
-    sympy.atanh: ("atanh", "arctanh"),
-}
+# SymPy's functions and their names, which are the same in math and NumPy.
+CALLS: dict[Any, str] = {
+    getattr(sympy, name): name
+    for name in (
+        "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh",
+        "atanh",
+    )
+}  # fmt: skip
 # Functions that are reciprocals of others.
 RECIPROCALS: dict[Any, str] = {sympy.sec: "cos", sympy.csc: "sin", sympy.cot: "tan"}
 COMPARISONS: dict[Any, type[ast.cmpop]] = {
@@ -50,14 +40,12 @@ COMPARISONS: dict[Any, type[ast.cmpop]] = {
 OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf, cbrt, sympy.Piecewise, *RECIPROCALS)
 ROOTS = ("sqrt", "copysign")  # functions of roots, which have these names in both libraries
 COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "range", "ValueError")} | {"erf": math.erf}
-COMPILED = {name: getattr(math, name) for name in (*ROOTS, *(name for name, _ in CALLS.values()))} | COMMON
+COMPILED = {name: getattr(math, name) for name in (*ROOTS, *CALLS.values())} | COMMON
 # Functions for runs without Numba. They are NumPy's because those of math raise an error outside their domain, while
 # the NaN of NumPy's functions shortens the step.
-INTERPRETED = (
-    {name: getattr(np, of_numpy) for name, of_numpy in CALLS.values()}
-    | {name: getattr(np, name) for name in ROOTS}
-    | COMMON
-)
+INTERPRETED = {name: getattr(np, name) for name in (*ROOTS, *CALLS.values())} | COMMON
+# The choice by the sign of a value, with numbers for a negative value, and for 0 or NaN.
+BY_SIGN = "1.0 if value > 0.0 else {} if value < 0.0 else {}"
 LARGEST_PRODUCT = 64  # largest exponent of a power that is computed by multiplications
 
 
@@ -84,22 +72,10 @@ def function(
 ) -> Callable[..., Any]:
     """Return a function of ``(t, y[, dy][, out][, params])``, jitted if Numba is installed.
 
-    Parameters
-    ----------
-    what : str
-        Description of the values, for tracebacks and errors.
-    expressions : sequence of sympy.Expr
-        The values that the function writes to `out`, or the one number that it returns.
-    arguments : Arguments
-    in_place : bool
-        Whether the function fills `out`.
-    places : sequence of int or of tuples of int, optional
-        The places of the expressions in `out`; the other entries become 0. Default: 0, 1, ...
-
-    Raises
-    ------
-    ValueError
-        If an expression contains a function that is not supported.
+    It fills `out` with the values of the expressions if `in_place`, otherwise it returns the value of the only one.
+    `places` are the places of the expressions in `out`, indices or tuples of them, by default 0, 1, ...; the other
+    entries become 0. `what` describes the values in tracebacks and errors. A ValueError is raised if an expression
+    contains a function that is not supported.
     """
     return _fastest(_compiled(what, _statements(what, expressions, arguments, in_place, places), arguments, in_place))
 
@@ -114,25 +90,9 @@ def variational(
     """Return a function of ``(t, Y, out[, params])`` that fills `out` with dY/dt.
 
     Y is the state, n numbers, followed by columns of derivatives, n numbers each. The rates of the state agree bit by
-    bit with those of ``function(what, rates, ...)``, because their statements come first. The statements for the
-    columns use intermediate results of the rates.
-
-    Parameters
-    ----------
-    what : str
-        Description of the values, for tracebacks and errors.
-    rates : sequence of sympy.Expr, of length n
-    jacobian : mapping of (int, int) to sympy.Expr
-        The nonzero derivatives of the rates by the components, by row and column.
-    by_parameters : sequence of mappings of int to sympy.Expr
-        One mapping for each of the last columns, which are derivatives with respect to a parameter: the nonzero
-        derivatives of the rates by this parameter, by row.
-    arguments : Arguments
-
-    Raises
-    ------
-    ValueError
-        If an expression contains a function that is not supported.
+    bit with those of ``function(what, rates, ...)``, because their statements come first, and the columns use their
+    intermediate results. `jacobian` holds the nonzero derivatives of the rates by row and column. `by_parameters`
+    holds, for each of the last columns, the nonzero derivatives of the rates with respect to its parameter, by row.
     """
     n = len(rates)
     writer = Writer(what, arguments)
@@ -141,22 +101,25 @@ def variational(
     found = iter(writer.values(derivatives))
     entries = {place: next(found) for place in jacobian}
     added = [{row: next(found) for row in column} for column in by_parameters]
-    body = [*_checks_of_columns(n, len(added)), *_checks(Arguments((), arguments.arrays["params"])), *writer.body]
-    body += [_set(_item("out", k, ast.Store()), value) for k, value in enumerate(values)]
-    bounds: list[ast.expr] = [ast.Constant(value=n), _size("y"), ast.Constant(value=n)]
-    body.append(
-        ast.For(
-            target=ast.Name(id="k", ctx=ast.Store()),
-            iter=ast.Call(func=_load("range"), args=bounds, keywords=[]),
-            body=_products(n, entries),
-            orelse=[],
-        )
+    columns = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {len(added)} columns"
+    body = _written(
+        f"""
+if y.size % {n} != 0 or y.size < {n * (len(added) + 1)}:
+    raise ValueError(columns)
+if out.size != y.size:
+    raise ValueError("out must be as long as y")
+""",
+        columns=ast.Constant(value=columns),
     )
+    body += [*_checks(Arguments((), arguments.arrays["params"])), *writer.body]
+    for k, value in enumerate(values):
+        body += _written(f"out[{k}] = value", value=value)
+    (loop,) = _written(f"for k in range({n}, y.size, {n}): pass")
+    loop.body = _products(n, entries)  # type: ignore[attr-defined]
+    body.append(loop)
     for behind, column in enumerate(reversed(added), 1):
-        start = ast.BinOp(left=_size("y"), op=ast.Sub(), right=ast.Constant(value=behind * n))
         for row, value in column.items():
-            target = ast.Subscript(value=_load("out"), slice=_after(start, row), ctx=ast.Store())
-            body.append(ast.AugAssign(target=target, op=ast.Add(), value=value))
+            body += _written(f"out[y.size - {behind * n} + {row}] += value", value=value)
     return _fastest(_compiled(what, body, arguments, in_place=True))
 
 
@@ -188,11 +151,11 @@ def _statements(
     values = writer.values(expressions)
     body = [*_checks(arguments), *writer.body]
     if places is not None:
-        everything = ast.Subscript(value=_load("out"), slice=ast.Slice(), ctx=ast.Store())
-        body.append(_set(everything, ast.Constant(value=0.0)))
+        body += _written("out[:] = 0.0")
     if in_place:
-        found = zip(range(len(values)) if places is None else places, values, strict=True)
-        return body + [_set(_item("out", k, ast.Store()), value) for k, value in found]
+        for k, value in zip(range(len(values)) if places is None else places, values, strict=True):
+            body += _written(f"out[{k}] = value", value=value)
+        return body
     (value,) = values
     return [*body, ast.Return(value=value)]
 
@@ -202,45 +165,17 @@ def _products(n: int, entries: Mapping[tuple[int, int], ast.expr]) -> list[ast.s
 
     `entries` holds the nonzero entries of the Jacobian (n, n), by row and column.
     """
-    read = sorted({j for _, j in entries})
     # The column of y is read first, because compiled code would read it again after each number that it writes.
-    body = [
-        _set(
-            ast.Name(id=f"d{j}", ctx=ast.Store()),
-            ast.Subscript(value=_load("y"), slice=_after(_load("k"), j), ctx=ast.Load()),
-        )
-        for j in read
-    ]
+    body = [item for j in sorted({j for _, j in entries}) for item in _written(f"d{j} = y[k + {j}]")]
     for i in range(n):
         terms: list[ast.expr] = [
             ast.BinOp(left=value, op=ast.Mult(), right=_load(f"d{j}"))
             for (row, j), value in entries.items()
             if row == i
         ]
-        total = reduce(_plus, terms) if terms else ast.Constant(value=0.0)
-        body.append(_set(ast.Subscript(value=_load("out"), slice=_after(_load("k"), i), ctx=ast.Store()), total))
+        total = reduce(lambda a, b: ast.BinOp(left=a, op=ast.Add(), right=b), terms or [ast.Constant(value=0.0)])
+        body += _written(f"out[k + {i}] = total", total=total)
     return body
-
-
-def _plus(left: ast.expr, right: ast.expr) -> ast.expr:
-    return ast.BinOp(left=left, op=ast.Add(), right=right)
-
-
-def _after(start: ast.expr, k: int) -> ast.expr:
-    return _plus(start, ast.Constant(value=k))
-
-
-def _size(array: str) -> ast.expr:
-    return ast.Attribute(value=_load(array), attr="size", ctx=ast.Load())
-
-
-def _differ(left: ast.expr, right: ast.expr) -> ast.expr:
-    return ast.Compare(left=left, ops=[ast.NotEq()], comparators=[right])
-
-
-def _refused(wrong: ast.expr, text: str) -> ast.stmt:
-    error = ast.Call(func=_load("ValueError"), args=[ast.Constant(value=text)], keywords=[])
-    return ast.If(test=wrong, body=[ast.Raise(exc=error)], orelse=[])
 
 
 def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
@@ -248,38 +183,29 @@ def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
     for array, names in arguments.arrays.items():
         if names:
             text = f"{array} must hold as many numbers as there are names in ({', '.join(names)}): {len(names)}"
-            yield _refused(_differ(_size(array), ast.Constant(value=len(names))), text)
+            template = f"if {array}.size != {len(names)}: raise ValueError(text)"
+            yield from _written(template, text=ast.Constant(value=text))
 
 
-def _checks_of_columns(n: int, columns: int) -> Iterable[ast.stmt]:
-    """Yield statements that check that `y` holds the state, n numbers, and at least `columns` columns of n numbers.
+def _written(template: str, **nodes: ast.expr) -> list[ast.stmt]:
+    """Return the statements of `template`, which has no names of users, with `nodes` in place of its names."""
+    return _Filled(nodes).visit(ast.parse(template)).body
 
-    They also check that `out` is as long as `y`.
-    """
-    rest = ast.BinOp(left=_size("y"), op=ast.Mod(), right=ast.Constant(value=n))
-    few = ast.Compare(left=_size("y"), ops=[ast.Lt()], comparators=[ast.Constant(value=n * (columns + 1))])
-    text = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {columns} columns"
-    yield _refused(ast.BoolOp(op=ast.Or(), values=[_differ(rest, ast.Constant(value=0)), few]), text)
-    yield _refused(_differ(_size("out"), _size("y")), "out must be as long as y")
+
+class _Filled(ast.NodeTransformer):
+    def __init__(self, nodes: Mapping[str, ast.expr]) -> None:
+        self.nodes = nodes
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return self.nodes.get(node.id, node)
 
 
 def _load(name: str) -> ast.expr:
     return ast.Name(id=name, ctx=ast.Load())
 
 
-def _item(array: str, k: Any, context: ast.expr_context) -> ast.expr:
-    return ast.Subscript(value=_load(array), slice=ast.Constant(value=k), ctx=context)
-
-
-def _set(target: ast.expr, value: ast.expr) -> ast.stmt:
-    return ast.Assign(targets=[target], value=value)
-
-
 class Writer:
-    """Writer of statements that compute expressions; the same operation on the same values is written once.
-
-    `what` describes the values in errors. The statements are appended to `body`.
-    """
+    """Writer of statements that compute expressions, appended to `body`; the same operation is written once."""
 
     def __init__(self, what: str, arguments: Arguments) -> None:
         self.what = what
@@ -289,10 +215,7 @@ class Writer:
         self._places = arguments.places
 
     def values(self, expressions: Sequence[Any]) -> list[ast.expr]:
-        """Write statements that compute expressions; return for each the variable or constant that holds its value.
-
-        Common subexpressions are computed once.
-        """
+        """Write statements that compute expressions; return the variables or constants that hold their values."""
         written = [with_powers_of_roots(item) for item in expressions]
         common, reduced = sympy.cse(written, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
         for name, expression in common:
@@ -340,13 +263,16 @@ class Writer:
         text = ast.dump(operation)
         if text not in self._written:
             name = f"v{len(self._written)}"
-            self.body.append(_set(ast.Name(id=name, ctx=ast.Store()), operation))
+            self.body.append(ast.Assign(targets=[ast.Name(id=name, ctx=ast.Store())], value=operation))
             self._written[text] = _load(name)
         return self._written[text]
 
     def _variable(self, name: str) -> ast.expr:
         array, place = self._places[name]
-        return _load(array) if place is None else self._name(_item(array, place, ast.Load()))
+        return _load(array) if place is None else self._expression(f"{array}[{place}]")
+
+    def _expression(self, template: str, **nodes: ast.expr) -> ast.expr:
+        return self._name(_written(template, **nodes)[0].value)  # type: ignore[attr-defined]
 
     def _binary(self, left: ast.expr, operator: ast.operator, right: ast.expr) -> ast.expr:
         return self._name(ast.BinOp(left=left, op=operator, right=right))
@@ -403,41 +329,34 @@ class Writer:
     def _call(self, expression: Any) -> ast.expr:
         kind, arguments = type(expression), [self.value(item) for item in expression.args]
         if kind in CALLS:
-            return self._function(CALLS[kind][0], *arguments)
+            return self._function(CALLS[kind], *arguments)
         if kind in RECIPROCALS:
-            below = self._function(RECIPROCALS[kind], *arguments)
-            return self._binary(ast.Constant(value=1.0), ast.Div(), below)
+            return self._expression("1.0 / value", value=self._function(RECIPROCALS[kind], *arguments))
         match expression:
-            case sympy.Abs():
-                return self._function("abs", *arguments)
+            case sympy.Abs() | sympy.erf():
+                return self._function(kind.__name__.lower(), *arguments)
             case cbrt():
-                size = self._function("abs", *arguments)
-                root = self._binary(size, ast.Pow(), ast.Constant(value=1 / 3))
+                root = self._expression(f"value ** {1 / 3!r}", value=self._function("abs", *arguments))
                 return self._function("copysign", root, *arguments)
-            case sympy.erf():
-                return self._function("erf", *arguments)
             case sympy.Max() | sympy.Min():
                 name = kind.__name__.lower()
                 return reduce(lambda a, b: self._function(name, a, b), arguments)
             case sympy.sign():
-                return self._by_sign(arguments[0], -1.0, 0.0)
+                return self._expression(BY_SIGN.format(-1.0, 0.0), value=arguments[0])
             case sympy.Heaviside():
-                return self._by_sign(arguments[0], 0.0, 0.5)
+                return self._expression(BY_SIGN.format(0.0, 0.5), value=arguments[0])
         raise self._unknown(expression)
 
     def _cases(self, expression: Any) -> ast.expr:
-        """Write the statements of a Piecewise expression, and return the variable or constant that holds its value.
-
-        This is the first value whose condition holds, NaN if none holds. All values are computed.
-        """
+        """Return the first value of a Piecewise whose condition holds, NaN if none holds; all values are computed."""
         chosen: ast.expr = ast.Constant(value=math.nan)
         for value, condition in reversed(expression.args):
             found = self.value(value)
-            chosen = found if condition == sympy.true else self._choice(self._condition(condition), found, chosen)
+            if condition == sympy.true:
+                chosen = found
+            else:
+                chosen = self._name(ast.IfExp(test=self._condition(condition), body=found, orelse=chosen))
         return chosen
-
-    def _choice(self, test: ast.expr, yes: ast.expr, no: ast.expr) -> ast.expr:
-        return self._name(ast.IfExp(test=test, body=yes, orelse=no))
 
     def _condition(self, condition: Any) -> ast.expr:
         kind = type(condition)
@@ -451,15 +370,3 @@ class Writer:
             case sympy.Not():
                 return ast.UnaryOp(op=ast.Not(), operand=self._condition(condition.args[0]))
         raise self._unknown(condition)
-
-    def _by_sign(self, value: ast.expr, below: float, at_zero: float) -> ast.expr:
-        """Write a choice by the sign of a value, and return its variable.
-
-        The choice is 1 if the value is positive, `below` if it is negative, and `at_zero` if it is 0 or NaN.
-        """
-
-        def choice(test: ast.cmpop, yes: float, no: ast.expr) -> ast.expr:
-            compared = ast.Compare(left=value, ops=[test], comparators=[ast.Constant(value=0.0)])
-            return ast.IfExp(test=compared, body=ast.Constant(value=yes), orelse=no)
-
-        return self._name(choice(ast.Gt(), 1.0, choice(ast.Lt(), below, ast.Constant(value=at_zero))))

@@ -16,16 +16,14 @@ import sympy
 from ...core.balances import Balance
 from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
-from ...core.jitted import compiled_like, is_jitted
+from ...core.jitted import is_jitted
 from ...core.problem import Deferred, Problem, bind
-from .brackets import NotKeptError, how_kept, vanishes
-from .jumps import slope
-from .manifold import Manifold
-from .pairs import paired
+from ..multibody.motion import vector
+from .brackets import Manifold, NotKeptError, how_kept, slope, vanishes
+from .pairs import Timed, paired
 from .parser import as_expression, as_names, symbol
 from .program import Arguments, function
 from .program import variational as variational_function
-from .timed import Timed
 
 __all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem", "parameter_values"]
 
@@ -37,9 +35,8 @@ LARGEST_JACOBIAN = 16  # number of coordinates; the Jacobian has its square of e
 class System(NamedTuple):
     """Equations and their invariants and balances as expressions. Equal systems share their compiled functions.
 
-    `rates` are the time derivatives of `components`. `invariants` holds pairs (name, expression). `balances` holds
-    triples (name, expression, rate) of quantities that are not conserved but change at a known rate. `constraints` are
-    the names of the invariants that are 0.
+    `invariants` holds pairs (name, expression), `balances` triples (name, expression, rate), and `constraints` the
+    names of the invariants that are 0.
     """
 
     components: tuple[str, ...]
@@ -66,11 +63,10 @@ class System(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Functions made from a `System`.
+    """Functions made from a `System`; gradients fill an array, and `acc` and `jacobian` are None if there are none.
 
-    `rhs` fills an array with the derivative of the state. `acc` returns the accelerations, and `jacobian` is their
-    Jacobian times a vector; each is None if there is none. `invariants` holds (value, gradient) for each invariant, and
-    `balances` holds (value, gradient, rate) for each balance. Gradients fill an array.
+    `jacobian` is the Jacobian of the accelerations times a vector. `invariants` holds (value, gradient) for each, and
+    `balances` (value, gradient, rate).
     """
 
     rhs: Callable[..., None]
@@ -220,14 +216,12 @@ def hamiltonian_problem(
                 "extended=True, or perturbation= and dissipation=."
             )
         rates, slow = _with_perturbation(energy, names, rates, values, declared, perturbed, flow)
-        return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, Further(invariants), pairs, slow)
-    checks = {"H": "by construction"}
+        return _checked("H", name or "hamiltonian", names, rates, values, {}, Further(invariants), pairs, slow)
     kept = {"H": energy}
     time = symbol("t")
     if energy.has(time) and extended:
         names, rates = (*names, "p_t"), (*rates, -sympy.diff(energy, time))
         kept = {"H + p_t": energy + symbol("p_t")}
-        checks = {"H + p_t": "by construction"}
     elif energy.has(time):
         warnings.warn(
             "H depends on t, so that it is not an invariant, and the problem does not keep it. "
@@ -235,15 +229,12 @@ def hamiltonian_problem(
             UserWarning,
             stacklevel=3,
         )
-        kept, checks = {}, {}
-    return _checked("H", name or "hamiltonian", names, rates, values, kept, checks, Further(invariants), pairs)
+        kept = {}
+    return _checked("H", name or "hamiltonian", names, rates, values, kept, Further(invariants), pairs)
 
 
 class Further(NamedTuple):
-    """Arguments of `hamiltonian` and `equations`: mappings of names to expressions, or None.
-
-    `invariants` are conserved, and `constraints` are 0.
-    """
+    """Arguments of `hamiltonian` and `equations`: expressions by name that are conserved, and that are 0, or None."""
 
     invariants: Any
     constraints: Any = None
@@ -280,22 +271,10 @@ def _with_perturbation(
 ) -> tuple[tuple[Any, ...], tuple[tuple[str, Any, Any], ...]]:
     """Return the derivatives of the perturbed system, and its balances (name, expression, rate).
 
-    Balances are quantities that the system of H alone conserves, with their rates of change due to the perturbation and
-    the dissipation.
-
-    Parameters
-    ----------
-    energy : sympy.Expr
-        H.
-    names, rates : sequence
-        Names of the components of the state, and their derivatives in the system of H alone.
-    values : mapping
-        Values of the parameters by name.
-    declared : set of str
-        Names that expressions may contain, next to `names`, without being read as constants or functions.
-    perturbed : Perturbed
-    flow : callable
-        ``flow(expression)`` returns the derivatives of the components that belong to this Hamiltonian.
+    Balances are quantities that the system of H alone (`energy`, with the derivatives `rates` of the components
+    `names`) conserves, with their rates of change due to the perturbation and the dissipation. ``flow(expression)``
+    returns the derivatives that belong to another Hamiltonian. Names in `declared` are not read as constants or
+    functions.
     """
     if energy.has(symbol("t")):
         raise ValueError(
@@ -338,19 +317,17 @@ def equations_problem(
         as_expression(f"the derivative of {k}", item, declared)
         for k, item in zip(timed.names, timed.values, strict=True)
     )
-    further = Further(*(_timed(given, timed) for given in (invariants, constraints)))
-    return _checked("f", name or "equations", timed.names, rates, values, {}, {}, further, ())
-
-
-def _timed(given: Any, timed: Timed) -> Any:
-    return {key: timed(item) for key, item in given.items()} if isinstance(given, Mapping) else given
+    given = [
+        {key: timed(item) for key, item in items.items()} if isinstance(items, Mapping) else items
+        for items in (invariants, constraints)
+    ]
+    return _checked("f", name or "equations", timed.names, rates, values, {}, Further(*given), ())
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
     """Return the names of the components, a function that returns (dH/dp, -dH/dq) of H, and the pairs of names.
 
-    If neither q nor p is given, the pairs are found from the names in `energy`, which is H, except those of the
-    parameters, the keys of `values`.
+    If neither q nor p is given, the pairs are found from the names in H that are not keys of `values`.
     """
     if q is None and p is None:
         q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
@@ -372,11 +349,7 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
 
 
 def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
-    """Return the names of the components, a function that returns B(y) grad H of H, and no pairs, as `_canonical`.
-
-    B is the matrix `poisson`. Names in `declared` are not read as constants or functions in its entries. `p` must be
-    None.
-    """
+    """Return the names of the components, a function that returns B(y) grad H for B = `poisson`, and no pairs."""
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= give the names of the whole state as q, and omit p.")
     names = as_names("q", y)
@@ -403,18 +376,14 @@ def _checked(
     rates: Any,
     values: Any,
     kept: Any,
-    checks: Any,
     given: Further,
     pairs: Any,
     slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
-    """Return the problem after checks of the names and of the given invariants and constraints.
+    """Return the problem after checks of the names and of the `given` invariants and constraints.
 
-    `names` and `rates` are the components and their derivatives, and `values` maps the names of parameters to their
-    values. `kept` maps the names of invariants that are known already to their expressions, and `checks` maps them to
-    how they were shown to be conserved; the `given` ones are added to both. `pairs` are those of `SymbolicProblem`, and
-    `slow` holds the balances as in `System`. `what` is the user's argument that contains the equations, "H" or "f"; it
-    is named in messages.
+    `kept` maps the names of invariants by construction to their expressions. `slow` holds the balances as in `System`.
+    `what` is the user's argument with the equations, "H" or "f".
     """
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
@@ -438,10 +407,14 @@ def _checked(
             raise TypeError(f"invariants and constraints: names must be strings, got {shown(label)}.")
         if label in kept:
             raise ValueError(f"invariants: {label} is already the name of an invariant; choose another or omit it.")
-        kind = "constraint" if label in constraints else "invariant"
-        quantities[label] = _quantity(f"{kind} {label!r}", item, names, known)
+        described = f"{'constraint' if label in constraints else 'invariant'} {label!r}"
+        quantities[label] = quantity = as_expression(described, item, known)
+        _require_known(described, quantity, known)
+        if not quantity.has(*map(symbol, names)):
+            raise ValueError(f"{described} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
     zero = {label: quantities[label] for label in constraints}
     manifold = Manifold(zero, names, rates, values) if zero else None
+    checks = dict.fromkeys(kept, "by construction")
     for label, quantity in quantities.items():
         checks[label] = _how_kept(label, quantity, names, rates, parameters, manifold, HINT if what == "f" else "")
         kept[label] = quantity
@@ -452,33 +425,12 @@ def _checked(
     )
 
 
-def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> Any:
-    """Return the SymPy expression of `given`, an invariant or a constraint, after a check of its names.
-
-    `what` describes it in messages, `names` are the components of the state, and `known` are all names that it may
-    contain.
-
-    Raises
-    ------
-    ValueError
-        If it contains an unknown name or does not depend on the state.
-    """
-    quantity = as_expression(what, given, known)
-    _require_known(what, quantity, known)
-    if not quantity.has(*map(symbol, names)):
-        raise ValueError(f"{what} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
-    return quantity
-
-
 def _how_kept(
     label: str, quantity: Any, names: Sequence[str], rates: Any, parameters: Any, manifold: Manifold | None, hint: str
 ) -> str:
-    """Return how a quantity was shown to be conserved, such as "symbolically", see `SymbolicProblem`.
+    """Return how a quantity was shown to be conserved at all states, or else at those of the `manifold`.
 
-    If it is not conserved at all states, it must be conserved at those that meet the constraints, otherwise ValueError
-    is raised. `label` is the name of the quantity, `names` and `rates` are the components and their derivatives, and
-    `parameters` maps the symbols of parameters to their values. `manifold` stands for the states that meet the
-    constraints; if it is None, there are no constraints, and `hint` is added to the message of the error.
+    Without constraints `hint` is added to the message of the error.
     """
     try:
         return how_kept(label, quantity, [symbol(item) for item in names], rates, parameters)
@@ -546,25 +498,13 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
         return None
     half = len(found)
     fill = function("acceleration", found, Arguments(system.components[:half], system.parameters), in_place=True)
-
-    def with_params(t, q, params):
-        out = np.empty(half)
-        fill(t, q, out, params)
-        return out
-
-    def without(t, q):
-        out = np.empty(half)
-        fill(t, q, out)
-        return out
-
-    return compiled_like(with_params if system.parameters else without, fill)
+    return vector(fill, half)
 
 
 def _deferred_jacobian(system: System) -> Deferred | None:
-    """Return the function for the Jacobian of the accelerations times a vector, as a `Deferred` made when it is called.
+    """Return the Jacobian of the accelerations times a vector, which is made when it is called.
 
-    Return None if the system is not of the form q'' = a(t, q), has more than `LARGEST_JACOBIAN` accelerations, or has
-    accelerations that jump.
+    Return None if the system is not of the form q'' = a(t, q), is too large, or has accelerations that jump.
     """
     found = system.accelerations
     if found is None or len(found) > LARGEST_JACOBIAN:
@@ -586,10 +526,7 @@ def _jacobian(system: System) -> Callable[..., None]:
 
 
 def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
-    """Return the right-hand side of a state followed by columns of derivatives, see `Problem`.
-
-    `parameters` are the indices of the parameters with respect to which the last columns are derivatives.
-    """
+    """Return the equations of a state and of columns of derivatives, the last ones by `parameters` (indices)."""
     for k in parameters:
         if not 0 <= k < len(system.parameters):
             raise ValueError(

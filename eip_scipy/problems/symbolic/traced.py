@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,9 +13,12 @@ import numpy as np
 import sympy
 
 from ...core.jitted import is_jitted
+from ..multibody.parts import Given, Parts, outputs_as_given
+from ..multibody.start import Names
+from .constrained import Constrained, conservative, cyclic, own_speed, parts_of
 from .parser import symbol
 
-__all__ = ["NotTraceableError", "traced"]
+__all__ = ["NotTraceableError", "traced", "traced_parts"]
 
 LIBRARIES = ("numpy", "scipy", "numba", "builtins")  # functions of these packages are not copied
 MOST_OPERATIONS = 20_000  # largest number of operations of one expression
@@ -30,11 +34,21 @@ class NotTraceableError(TypeError):
     """Error for a function that cannot be converted to an expression, for example because it branches on a value."""
 
 
-class Number:
-    """Expression that can take the place of a number in functions of NumPy and of math.
+def _binary(operation: Callable[[Any, Any], Any], *, swapped: bool = False) -> Callable[[Number, Any], Any]:
+    """Return a method of `Number` that applies an operation to the expressions of both numbers."""
 
-    `size` counts symbols, constants and operations in the expression, which may have at most `MOST_OPERATIONS`.
-    """
+    def method(self: Number, other: Any) -> Any:
+        if isinstance(other, np.ndarray):
+            return NotImplemented
+        found = _number(other)
+        first, second = (found, self) if swapped else (self, found)
+        return Number(operation(first.expression, second.expression), self.size + found.size + 1)
+
+    return method
+
+
+class Number:
+    """Expression in place of a number; `size` counts its operands and operations, at most `MOST_OPERATIONS`."""
 
     __slots__ = ("expression", "size")
 
@@ -43,37 +57,13 @@ class Number:
             raise NotTraceableError("an expression is too long")
         self.expression, self.size = expression, size
 
-    def _with(self, other: Any, operation: Callable[[Any, Any], Any]) -> Any:
-        if isinstance(other, np.ndarray):
-            return NotImplemented
-        found = _number(other)
-        return Number(operation(self.expression, found.expression), self.size + found.size + 1)
-
-    def __add__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a + b)
-
-    def __sub__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a - b)
-
-    def __rsub__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: b - a)
-
-    def __mul__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a * b)
-
-    def __truediv__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a / b)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: b / a)
-
-    def __pow__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a**b)
-
-    def __rpow__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: b**a)
-
-    __radd__, __rmul__ = __add__, __mul__
+    __add__ = __radd__ = _binary(operator.add)
+    __sub__, __rsub__ = _binary(operator.sub), _binary(operator.sub, swapped=True)
+    __mul__ = __rmul__ = _binary(operator.mul)
+    __truediv__, __rtruediv__ = _binary(operator.truediv), _binary(operator.truediv, swapped=True)
+    __pow__, __rpow__ = _binary(operator.pow), _binary(operator.pow, swapped=True)
+    arctan2 = _binary(sympy.atan2)
+    hypot = _binary(lambda x, y: sympy.sqrt(x**2 + y**2))
 
     def __neg__(self) -> Number:
         return Number(-self.expression, self.size + 1)
@@ -87,14 +77,6 @@ class Number:
     def conjugate(self) -> Number:
         """Return the number itself, because traced numbers are real."""
         return self
-
-    def arctan2(self, other: Any) -> Number:
-        """Return the polar angle of the point (other, self)."""
-        return self._with(other, sympy.atan2)
-
-    def hypot(self, other: Any) -> Number:
-        """Return the distance of the point (self, other) from the origin."""
-        return self._with(other, lambda a, b: sympy.sqrt(a**2 + b**2))
 
     def __getattr__(self, name: str) -> Any:  # NumPy calls the method of each element
         if name in FUNCTIONS:
@@ -120,17 +102,8 @@ def _number(value: Any) -> Number:
 def traced(what: str, fun: Any, *groups: Any) -> np.ndarray:
     """Return the value of the function `fun` as an array of expressions; `what` describes it in messages.
 
-    Parameters
-    ----------
-    what : str
-    fun : callable
-    groups
-        The arguments of the function: a name stands for a number, a sequence of names for an array.
-
-    Raises
-    ------
-    NotTraceableError
-        If the value of the function cannot be written as an expression of its arguments.
+    Each of `groups` stands for an argument: a name for a number, a sequence of names for an array. NotTraceableError is
+    raised if the value cannot be written as an expression of the arguments.
     """
     arguments = [
         Number(symbol(names)) if isinstance(names, str) else _array([Number(symbol(name)) for name in names])
@@ -169,8 +142,8 @@ def _of_math(name: str, *arguments: Any) -> Any:
     if not any(isinstance(item, Number) for item in arguments):
         return getattr(math, name)(*arguments)
     first, *others = map(_number, arguments)
-    return getattr(first, {"atan2": "arctan2", "pow": "__pow__"}.get(name, name.replace("a", "arc", 1)
-                   if name in ("asin", "acos", "atan", "asinh", "acosh", "atanh") else name))(*others)  # fmt: skip
+    inverse = name in ("asin", "acos", "atan", "asinh", "acosh", "atanh", "atan2")
+    return getattr(first, "__pow__" if name == "pow" else name.replace("a", "arc", 1) if inverse else name)(*others)
 
 
 NUMPY = _NumPy("numpy")
@@ -188,8 +161,7 @@ for _name in dir(math):
 def _replaced(item: Any, known: dict[int, Any]) -> Any:
     """Return the replacement of a global or closure variable, or the variable itself if it needs none.
 
-    NumPy, math and their functions are replaced by those of `NUMPY` and `MATH`. A Python or Numba function is replaced
-    by a copy whose own variables are replaced. `known` holds the copies made so far, by the id of the function.
+    A Python or Numba function is replaced by a copy whose own variables are replaced; `known` holds the copies by id.
     """
     if item is np:
         return NUMPY
@@ -218,3 +190,67 @@ def _replaced(item: Any, known: dict[int, Any]) -> Any:
 def _names(code: types.CodeType) -> set[str]:
     inside = (_names(item) for item in code.co_consts if isinstance(item, types.CodeType))
     return set(code.co_names).union(*inside)
+
+
+# Relative bound for the difference between a traced function and the function itself at the start.
+AGREES = 1e-9
+
+
+def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
+    """Return the `Parts` of a mechanism, made from expressions for the functions that `mechanism` was given.
+
+    NotTraceableError is raised if a function cannot be converted, or its expression has another value at the start.
+    """
+    by_name = {"t": ("t", t), "q": (names.coordinates, q), "u": (names.speeds, u)}
+
+    values = {symbol("t"): t, **{symbol(k): x for k, x in zip(names.state, (*q, *u), strict=True)}}
+
+    def converted(what: str, fun: Any, arguments: str) -> tuple[Any, ...]:
+        symbols, numbers = zip(*(by_name[letter] for letter in arguments), strict=True)
+        found = traced(what, fun, *symbols).ravel()
+        wanted = np.asarray(fun(*numbers), float).ravel()
+        own = np.array([float(sympy.sympify(item).xreplace(values)) for item in found])
+        if not np.allclose(own, wanted, rtol=AGREES, atol=AGREES * max(1.0, np.abs(wanted).max(initial=0.0))):
+            raise NotTraceableError(f"{what}: its value depends on more than its arguments")
+        return tuple(found)
+
+    def expressions(what: str, arguments: str) -> tuple[Any, ...]:
+        fun = getattr(given, what)
+        return () if fun is None else converted(what, fun, arguments)
+
+    speeds = [symbol(name) for name in names.speeds]
+    system = Constrained(
+        names.coordinates,
+        names.speeds,
+        (),
+        expressions("kinematics", "tqu") or tuple(speeds),
+        expressions("mass", "q"),
+        expressions("forces", "tqu"),
+        expressions("constraints", "tq"),
+        expressions("velocity_constraints", "tqu"),
+    ).with_velocities()
+    power = (expressions("power", "tqu") or (None,))[0]
+    energies = []
+    M, column = sympy.Matrix(len(speeds), len(speeds), system.mass), sympy.Matrix(speeds)
+    kinetic = (column.T * M * column)[0] / 2
+    if given.energy is not None:
+        energies.append(("energy", expressions("energy", "tqu")[0], power))
+    elif given.potential is not None:
+        energies.append(("u M u / 2 + potential", kinetic + expressions("potential", "tq")[0], power))
+    elif (potential := conservative(system, system.forces, partial(own_speed, system))) is not None:
+        energies.append(("u M u / 2 + the potential of the forces", kinetic + potential, power))
+    try:
+        outputs = [(name, converted(name, fun, "tqu")[0]) for name, fun in given.outputs.items()]
+    except NotTraceableError:
+        outputs = []
+    parts = parts_of(system, energies, tuple(_momenta(system)), outputs)
+    called = given.outputs and parts.outputs is None
+    return parts._replace(outputs=outputs_as_given(given, q.size, u.size)) if called else parts
+
+
+def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
+    """Yield the name and the expression of the momentum of each coordinate that may be cyclic."""
+    n = len(system.speeds)
+    momenta = sympy.Matrix(n, n, system.mass) * sympy.Matrix([symbol(name) for name in system.speeds])
+    for k in cyclic(system, partial(own_speed, system)):
+        yield f"p_{system.coordinates[k]}", sympy.Matrix([own_speed(system, k)]).dot(momenta)

@@ -1,9 +1,7 @@
 """Waves on periodic grids, by the method of lines: the sine-Gordon and the Korteweg-de Vries equation."""
 
 from .korteweg_de_vries import KortewegDeVries
-from .lawson import Lawson
-from .modes import RealModes
-from .record import WaveProblem
+from .modes import Lawson, RealModes, WaveProblem
 from .scenes import korteweg_de_vries_solitons, sine_gordon_breather, sine_gordon_kinks
 from .sine_gordon import SineGordon
 

@@ -13,8 +13,7 @@ import scipy.fft
 from ...core.invariants import Invariant
 from ..gross_pitaevskii.grid import Grid
 from ..named_invariants import checked_damping, named_invariant
-from .lawson import Lawson
-from .record import WaveProblem
+from .modes import Lawson, WaveProblem
 
 __all__ = ["KortewegDeVries"]
 

@@ -1,13 +1,25 @@
-"""Fourier modes of real fields on periodic grids; only half of the modes are stored, the others are conjugates."""
+"""Real fields on periodic grids: their Fourier modes, the class of their problems, and Lawson's method for modes.
+
+Only half of the modes are stored, the others are conjugates.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.fft
 
+from ...core.problem import Problem
+from ...methods.runge_kutta import DOP853, Tableau
 from ..gross_pitaevskii.grid import Grid
 
-__all__ = ["RealModes"]
+if TYPE_CHECKING:
+    from .korteweg_de_vries import KortewegDeVries
+    from .sine_gordon import SineGordon
+
+__all__ = ["Lawson", "RealModes", "WaveProblem"]
 
 
 class RealModes:
@@ -46,3 +58,110 @@ class RealModes:
         """
         k = self.grid.wavenumbers(axis, odd=odd)
         return np.abs(k[..., : self.shape[-1]]) if axis == self.grid.dim - 1 else k
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WaveProblem(Problem):
+    """A `Problem` of real waves on a grid.
+
+    Attributes
+    ----------
+    equation : SineGordon or KortewegDeVries
+        The equation, with the attribute `grid` and functions of the state such as ``equation.energy(y)``. The other
+        attributes are those of `Problem`.
+    """
+
+    equation: SineGordon | KortewegDeVries | None = None
+
+
+class Lawson:
+    """One-step method: a Runge-Kutta step for the modes ``exp(i w t) u``, which only the nonlinear term changes.
+
+    Parameters
+    ----------
+    equation : KortewegDeVries
+        The equation, or another object with the attribute `frequencies` (w) and the methods `modes`, `field` and
+        `nonlinear`.
+    tableau : Tableau, optional
+        Runge-Kutta method, by default that of `EIPDOP853`. If it has an error estimate, `one_step` returns the estimate
+        too.
+
+    Attributes
+    ----------
+    equation, tableau
+    order : int
+    error_estimator_order : int or None
+    evaluations : int
+        Number of evaluations of the nonlinear term in a step.
+    name : str
+
+    Raises
+    ------
+    TypeError
+        If `tableau` is not a `Tableau`.
+
+    Notes
+    -----
+    The linear part, which is stiff, only multiplies each mode by a factor and does not limit the step; the nonlinear
+    term limits it. If the frequencies are real (without damping), the factors have the modulus 1.
+
+    References
+    ----------
+    J. D. Lawson, "Generalized Runge-Kutta processes for stable systems with large Lipschitz constants", SIAM J. Numer.
+    Anal. 4 (1967) 372-380.
+
+    Examples
+    --------
+    >>> from eip_scipy import eip_method, integrate
+    >>> from eip_scipy.methods.runge_kutta import RK4
+    >>> from eip_scipy.problems import Lawson, korteweg_de_vries_solitons
+    >>> scene = korteweg_de_vries_solitons(t_end=1.0)
+    >>> run = integrate(scene, h=0.01, method=eip_method(Lawson(scene.equation, RK4)))
+    >>> bool(abs(run.y[:, -1] - scene.reference(1.0)).max() < 1e-5)
+    True
+    """
+
+    def __init__(self, equation: KortewegDeVries, tableau: Tableau = DOP853) -> None:
+        if not isinstance(tableau, Tableau):
+            raise TypeError(f"Lawson: expected a Tableau, such as that of EIPDOP853, got {tableau!r}.")
+        self.equation, self.tableau = equation, tableau
+        self.order, self.error_estimator_order = tableau.order, tableau.error_estimator_order
+        self.evaluations = tableau.n_stages + tableau.fsal
+        self.name = f"Lawson-{tableau.name}"
+        self._h: float | None = None
+        self._turns: list[np.ndarray] = []
+        self._back: list[np.ndarray] = []
+
+    def __repr__(self) -> str:
+        return f"Lawson({self.equation!r}, {self.tableau!r})"
+
+    def one_step(self, t: float, y: np.ndarray, h: float) -> Any:
+        """Make one step of length h from the state y at t.
+
+        Return the new state, or the new state and its error estimate if the tableau has one.
+        """
+        if h != self._h:
+            nodes = (*self.tableau.c, 1.0)
+            phases = [1j * h * c * self.equation.frequencies for c in nodes]
+            self._turns, self._back, self._h = [np.exp(-x) for x in phases], [np.exp(x) for x in phases], h
+        equation, tableau = self.equation, self.tableau
+        modes = equation.modes(y)
+        slopes = np.empty((tableau.n_stages + tableau.fsal, modes.size), complex)
+
+        def slope(stage: int, moved: np.ndarray) -> None:
+            np.multiply(equation.nonlinear(self._turns[stage] * moved), self._back[stage], out=slopes[stage])
+
+        slope(0, modes)
+        for stage in range(1, tableau.n_stages):
+            slope(stage, modes + (h * tableau.A[stage, :stage]) @ slopes[:stage])
+        new = modes + (h * tableau.b) @ slopes[: tableau.n_stages]
+        end = self._turns[-1]
+        if not tableau.has_estimate:
+            return equation.field(end * new)
+        if tableau.fsal:
+            slope(tableau.n_stages, new)
+        err, rough = (equation.field(end * ((h * e[: len(slopes)]) @ slopes)) for e in (tableau.e, tableau.e_low))
+        if tableau.paired:
+            size = np.hypot(err, 0.1 * rough)
+            err *= np.divide(np.abs(err), size, out=np.zeros_like(size), where=size > 0)
+        return equation.field(end * new), err

@@ -12,7 +12,7 @@ import numpy as np
 from ...core.inputs import refuse_units
 from ..gross_pitaevskii.grid import Grid
 from .korteweg_de_vries import KortewegDeVries
-from .record import WaveProblem
+from .modes import WaveProblem
 from .sine_gordon import SineGordon
 
 __all__ = ["korteweg_de_vries_solitons", "sine_gordon_breather", "sine_gordon_kinks"]
@@ -176,9 +176,9 @@ def korteweg_de_vries_solitons(
 def _solitons(x: np.ndarray, length: float, k: np.ndarray, x0: np.ndarray, t: float) -> np.ndarray:
     """Return the field of the solitons at the points x and the time t, 2 (log F)_xx.
 
-    Each soliton has an entry in `k`, the square root of its speed, and in `x0`. F is the sum over all sets of solitons
-    of the exponential of the sum of k (x - x0 - k^2 t) over the set and of the shifts of its pairs. With the terms of F
-    as weights the field is twice the variance of the sum of k over a set.
+    `k` are the square roots of the speeds. F is the sum over all sets of solitons of the exponential of the sum of k (x
+    - x0 - k^2 t) over the set and of the shifts of its pairs. With the terms of F as weights the field is twice the
+    variance of the sum of k over a set.
     """
     centre = np.mean(x0) + np.mean(k**2) * t
     place = _around(x - centre, length) + centre

@@ -13,8 +13,7 @@ from ...methods.nystrom import RKN1210
 from ...methods.runge_kutta import DOP853
 from ..gross_pitaevskii.grid import Grid
 from ..named_invariants import checked_damping, damped_invariant, named_invariant
-from .modes import RealModes
-from .record import WaveProblem
+from .modes import RealModes, WaveProblem
 
 __all__ = ["SineGordon"]
 
