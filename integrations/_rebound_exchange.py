@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -141,11 +142,7 @@ def problem_from_simulation(
 
 
 class _Exit:
-    """Terminal event that is 0 when a distance reaches the limit at which a simulation ends.
-
-    The distance is the largest from the origin if `name` is "exit_max_distance", and the smallest between two bodies
-    otherwise.
-    """
+    """Terminal event that is 0 when the distance `name` reaches the limit at which a simulation ends."""
 
     terminal, direction = True, 0.0
 
@@ -356,10 +353,8 @@ def _set_state(sim: rebound.Simulation, y: np.ndarray) -> None:
 
 
 def _active(sim: rebound.Simulation) -> int:
-    """Return the number of leading particles that attract the others.
-
-    If all do, REBOUND's N_active is -1, or, in versions in which N_active is unsigned, larger than N.
-    """
+    """Return the number of leading particles that attract the others."""
+    # If all do, N_active is -1, or, in versions in which it is unsigned, larger than N.
     return int(sim.N_active) if 0 <= sim.N_active < sim.N else int(sim.N)
 
 
@@ -408,10 +403,7 @@ def _named(size: float, known: dict[str, float], base: str) -> str:
 
 
 def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
-    """Return the names that `nbody` has for the forces that REBOUNDx has attached, and their constants.
-
-    Without such forces, return () and None.
-    """
+    """Return the names that `nbody` has for the forces that REBOUNDx has attached, and their constants, or None."""
     if not sim._additional_forces:
         return (), None
     extras = getattr(sim, "_extras_ref", None)
@@ -430,31 +422,25 @@ def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants 
         )
     if not names:
         return (), None
+
+    def parameter(thing: Any, name: str) -> Any:  # of a particle or a force; None if it is not set
+        with suppress(AttributeError):
+            return thing.params[name]
+
     for k in range(1, sim.N):
-        if _parameter(sim.particles[k], "gr_source") is not None:
+        if parameter(sim.particles[k], "gr_source") is not None:
             raise ValueError(
                 f"REBOUNDx's {names[0]}: particle {k} is its source (gr_source); only the first particle is supported "
                 "as a source. Make the source the first particle."
             )
-    return (REBOUNDX[names[0]],), ForceConstants(c=_parameter(extras.get_force(names[0]), "c"))
-
-
-def _parameter(thing: Any, name: str) -> Any:
-    """Return the parameter `name` that REBOUNDx keeps for `thing`, a particle or a force; None if it is not set."""
-    try:
-        return thing.params[name]
-    except AttributeError:
-        return None
+    return (REBOUNDX[names[0]],), ForceConstants(c=parameter(extras.get_force(names[0]), "c"))
 
 
 def _force_names(extras: Any) -> list[str]:
-    """Return the names of the forces that are attached to a simulation by `extras`, its `reboundx.Extras` object.
-
-    The names are read from the list in C, because no function of REBOUNDx returns them.
-    """
+    """Return the names of the forces that are attached to a simulation by `extras`, its `reboundx.Extras` object."""
     import reboundx
 
-    names, node = [], extras._additional_forces
+    names, node = [], extras._additional_forces  # a list in C, because no function of REBOUNDx returns the names
     while node:
         force = ctypes.cast(node.contents.object, ctypes.POINTER(reboundx.Force)).contents
         names.append(force.name.decode())
@@ -473,25 +459,20 @@ def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) 
         raise ValueError("to_simulation: row selects a state of a run, but a problem has only its start; omit row.")
     if row is not None and not -rows <= row < rows:
         raise ValueError(f"to_simulation: no row {row}, the run has {rows} saved states.")
+    k: Any = -1 if row is None else row
     if y is None:
-        k = -1 if row is None else row
-        at, y = (problem.t_span[0], problem.y0) if run is problem else (run.t[k], run.y[:, k])
-    else:
-        at = problem.t_span[0] if run is problem else _time_of(run, y, t)
-    y = np.array(y, dtype=float)
-    if y.shape != (6 * bodies.gm.size,):
-        n = bodies.gm.size
+        y = problem.y0 if run is problem else run.y[:, k]
+    elif t is None and run is not problem:
+        equal = (run.y == np.reshape(y, (-1, 1))).all(axis=0)
+        if not equal.any():
+            raise ValueError("to_simulation: y is not a saved state of the run. Give its time: t=...")
+        k = np.argmax(equal)
+    if t is None:
+        t = problem.t_span[0] if run is problem else run.t[k]
+    y, n = np.array(y, dtype=float), bodies.gm.size
+    if y.shape != (6 * n,):
         raise ValueError(f"to_simulation: y has the shape {y.shape}; expected ({6 * n},) for {n} bodies.")
-    return float(at if t is None else t), y
-
-
-def _time_of(run: Any, y: Any, t: float | None) -> float:
-    if t is not None:
-        return t
-    equal = (run.y == np.reshape(y, (-1, 1))).all(axis=0)
-    if not equal.any():
-        raise ValueError("to_simulation: y is not a saved state of the run. Give its time: t=...")
-    return float(run.t[np.argmax(equal)])
+    return float(t), y
 
 
 def _new(bodies: Bodies) -> rebound.Simulation:
@@ -518,21 +499,15 @@ def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | 
     The unit of mass is one in which the gravitational constant has the value `G`, and "msun" if `G` is None. Return
     None if the problem has no units of length and time, or if REBOUND has no name for one of the three units.
     """
-    known = problem.unit_system
-    if known is None:
-        return None
-    tables = rebound_units.lengths_SI, rebound_units.times_SI
-    found = [
-        next((name for name, si in table.items() if math.isclose(si, unit.si, rel_tol=1e-9)), None)
-        for table, unit in zip(tables, known, strict=True)
-    ]
-    if None in found:
+    tables, found = (rebound_units.lengths_SI, rebound_units.times_SI), []
+    for table, unit in zip(tables, problem.unit_system or (), strict=False):
+        found += [name for name, si in table.items() if math.isclose(si, unit.si, rel_tol=1e-9)][:1]
+    if len(found) < 2:
         return None
     length, time = found
-    masses = ["msun"] if G is None else list(rebound_units.masses_SI)
-    for mass in masses:
+    for mass in ["msun"] if G is None else rebound_units.masses_SI:
         if G is None or math.isclose(rebound_units.convert_G((length, time, mass)), G, rel_tol=1e-12):
-            return str(length), str(time), mass
+            return length, time, mass
     return None
 
 
