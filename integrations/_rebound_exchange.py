@@ -30,6 +30,7 @@ REBOUNDX = {"gr": "1pn", "gr_full": "eih", "gr_potential": "gr-potential"}
 OURS = {ours: theirs for theirs, ours in REBOUNDX.items()} | {"j2": "gravitational_harmonics"}
 MAGIC = b"REBOUND Binary File"
 UNKNOWN_UNITS = "as in the REBOUND simulation"
+UNSUPPORTED = "the simulation has a feature that an N-body problem of eip_scipy does not support"
 # G times a template's mass equals our G m up to the rounding of one product and one quotient.
 SAME = 1e-15
 
@@ -305,7 +306,7 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
     with open(place, "rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError(f"read_archive: {place} is not an archive of REBOUND.")
-    times, states, first = [], [], None
+    times, states = [], []
     with warnings.catch_warnings():
         # A file never contains functions of a simulation, and nothing is integrated here.
         warnings.filterwarnings("ignore", "You have to reset function pointers", RuntimeWarning)
@@ -313,26 +314,24 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
             archive = rebound.Simulationarchive(place)
         except RuntimeError as error:
             raise ValueError(f"read_archive: REBOUND cannot read {place}: {error}") from error
-        own = _archived_names(archive)
+        first = _first_snapshot(archive)
+        gm = first.G * _attracting_masses(first)
         for k in range(0, len(archive), every):
             sim = archive[k]
             sim.synchronize()
-            gm = sim.G * _attracting_masses(sim)
-            first = (gm, _units(sim)) if first is None else first
-            if not np.array_equal(gm, first[0]):
+            if not np.array_equal(sim.G * _attracting_masses(sim), gm):
                 raise ValueError(
                     f"read_archive: bodies or masses in snapshot {k} of {place} differ from those in the first one. "
                     "Read single snapshots by rebound.Simulation(path, snapshot=k)."
                 )
             times.append(sim.t)
             states.append(state(sim))
-    gm, units = first if first is not None else (np.zeros(0), "")
     return OptimizeResult(
         t=np.array(times),
         y=np.array(states).T,
         gm=gm,
-        component_names=component_names(gm.size, own if names is None else names),
-        units=units,
+        component_names=component_names(gm.size, _names(first) if names is None else names),
+        units=_units(first),
         message=f"{len(times)} snapshots of a REBOUND archive",
         success=True,
         status=0,
@@ -341,10 +340,9 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
 
 def state(sim: rebound.Simulation) -> np.ndarray:
     """Return the state (q, v) of all particles, shape (6 N,)."""
-    q = np.empty((sim.N, 3))
-    v = np.empty((sim.N, 3))
-    sim.serialize_particle_data(xyz=q, vxvyvz=v)
-    return np.concatenate((q, v), axis=None)
+    y = np.empty((2, sim.N, 3))
+    sim.serialize_particle_data(xyz=y[0], vxvyvz=y[1])
+    return y.ravel()
 
 
 def _set_state(sim: rebound.Simulation, y: np.ndarray) -> None:
@@ -371,21 +369,19 @@ def _names(sim: rebound.Simulation) -> tuple[str, ...]:
     return tuple(name if name is not None and given.count(name) == 1 else str(k) for k, name in enumerate(given))
 
 
-def _archived_names(archive: rebound.Simulationarchive) -> tuple[str, ...]:
-    """Return the particles' names in the first snapshot, as `_names` does.
+def _first_snapshot(archive: rebound.Simulationarchive) -> rebound.Simulation:
+    """Return the first snapshot, which is read until no name occurs twice, at most four times.
 
-    The snapshot is read until no name occurs twice, at most four times: REBOUND 5.2 identifies names by their memory
-    addresses in the process that wrote the archive, and mixes up two names if one is read to the old address of the
-    other. The earlier copies are kept in memory meanwhile, so that the next one gets other addresses.
+    REBOUND 5.2 identifies names by their memory addresses in the process that wrote the archive, and mixes up two names
+    if one is read to the old address of the other. Each copy is kept, so that the next one gets other addresses.
     """
-    held: list[rebound.Simulation] = []
+    held = [archive[0]]
     while len(held) < 4:
-        held.append(archive[0])
-        given = [getattr(particle, "name", None) for particle in held[-1].particles]
-        named = [name for name in given if name is not None]
+        named = [name for particle in held[-1].particles if (name := getattr(particle, "name", None)) is not None]
         if len(set(named)) == len(named):
             break
-    return _names(held[-1])
+        held.append(archive[0])
+    return held[-1]
 
 
 def _units(sim: rebound.Simulation) -> str:
@@ -393,13 +389,9 @@ def _units(sim: rebound.Simulation) -> str:
     names = sim.units
     if names["length"] is None or names["time"] is None:
         return UNKNOWN_UNITS
-    length, time = rebound_units.lengths_SI[names["length"]], rebound_units.times_SI[names["time"]]
-    return f"{_named(length, LENGTHS, 'm')}, {_named(time, TIMES, 's')}"
-
-
-def _named(size: float, known: dict[str, float], base: str) -> str:
-    """Return the name in `known` of a unit of `size` metres or seconds, or the size followed by `base` ("m" or "s")."""
-    return next((name for name, own in known.items() if own == size), f"{float(size)!r} {base}")
+    length, time = float(rebound_units.lengths_SI[names["length"]]), float(rebound_units.times_SI[names["time"]])
+    parts = (length, LENGTHS, "m"), (time, TIMES, "s")
+    return ", ".join(next((n for n, own in known.items() if own == si), f"{si!r} {base}") for si, known, base in parts)
 
 
 def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
@@ -409,16 +401,15 @@ def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants 
     extras = getattr(sim, "_extras_ref", None)
     if extras is None:
         raise ValueError(
-            "the simulation has a feature that an N-body problem of eip_scipy does not support: additional forces that "
-            "are not REBOUNDx's, whose invariants are unknown. If nbody has these forces, name them: "
-            "forces='gr-potential', constants=ForceConstants(c=...); forces=() leaves them out."
+            f"{UNSUPPORTED}: additional forces that are not REBOUNDx's, whose invariants are unknown. If nbody has "
+            "these forces, name them: forces='gr-potential', constants=ForceConstants(c=...); forces=() leaves them "
+            "out."
         )
     names = _force_names(extras)
-    unknown = [name for name in names if name not in REBOUNDX]
-    if unknown or len(names) > 1:
+    if len(names) > 1 or not set(names) <= REBOUNDX.keys():
         raise ValueError(
-            "the simulation has a feature that an N-body problem of eip_scipy does not support: REBOUNDx's additional "
-            f"forces {', '.join(names)}; expected one of {', '.join(REBOUNDX)}. Give forces=... to replace them."
+            f"{UNSUPPORTED}: REBOUNDx's additional forces {', '.join(names)}; expected one of {', '.join(REBOUNDX)}. "
+            "Give forces=... to replace them."
         )
     if not names:
         return (), None
@@ -487,9 +478,8 @@ def _new(bodies: Bodies) -> rebound.Simulation:
     label = "name" if hasattr(rebound.Particle, "name") else "hash"
     for k, (m, name) in enumerate(zip((bodies.gm / sim.G).tolist(), labels, strict=True)):
         sim.add(m=m, **({} if name == str(k) else {label: name}))
-    last = int(np.flatnonzero(bodies.gm)[-1]) + 1
-    if last < n:
-        sim.N_active = last
+    if bodies.gm[-1] == 0:
+        sim.N_active = int(np.flatnonzero(bodies.gm)[-1]) + 1
     return sim
 
 
@@ -549,6 +539,4 @@ def _refuse_unsupported(sim: rebound.Simulation) -> None:
     )
     for present, what in obstacles:
         if present:
-            raise ValueError(
-                f"the simulation has a feature that an N-body problem of eip_scipy does not support: {what}"
-            )
+            raise ValueError(f"{UNSUPPORTED}: {what}")

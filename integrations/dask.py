@@ -140,22 +140,9 @@ def _is_secure(address: str) -> bool:
 def pool(executor: Any, task: Task, key: str) -> DaskPool:
     """Return the pool that runs the chunks of an ensemble, for `eip_scipy.ensemble`.
 
-    Parameters
-    ----------
-    executor : "dask", distributed.Client or DaskExecutor
-    task : Task
-        The part of the ensemble that all chunks share.
-    key : str
-        Name under which a worker keeps the compiled task for further chunks.
-
-    Returns
-    -------
-    DaskPool
-
-    Raises
-    ------
-    PermissionError, RuntimeError
-        As for `DaskExecutor`, and as for `local_client` if processes are started.
+    `executor` is "dask", a `distributed.Client` or a `DaskExecutor`, `task` the part of the ensemble that all chunks
+    share, and `key` the name under which a worker keeps the compiled task for further chunks. Errors are those of
+    `DaskExecutor`, and of `local_client` if processes are started.
     """
     if isinstance(executor, DaskExecutor):
         _require_open(executor.client)

@@ -335,9 +335,7 @@ def _entry(data: SolarSystemData, epoch: tuple[float, float]) -> dict[str, Any]:
         "source": f"{data.source}; Park et al., Astron. J. 161 (2021) 105, doi:10.3847/1538-3881/abd414",
         "extracted_by": "python -m eip_scipy.integrations.jpl",
         "bodies": data.bodies,
-        "gm": data.gm.tolist(),
-        "position": data.position.tolist(),
-        "velocity": data.velocity.tolist(),
+        **{name: getattr(data, name).tolist() for name in ("gm", "position", "velocity")},
     }
 
 

@@ -296,9 +296,8 @@ def ias15_steps(
     ValueError
         If a value is wrong, as in `run`.
     """
-    gm, y0 = _check_state(gm, y0)
-    _count_steps(t_end, 1, None)
     sim = simulation(gm, y0)
+    _count_steps(t_end, 1, None)
     _set_integrator(sim, "ias15", epsilon, criterion)
     times, states, evaluations = [0.0], [_state(sim)], 0
 
