@@ -385,7 +385,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     # `attach` sets all attributes of a new record.
     record = Diagnostics.__new__(Diagnostics) if request.diagnostics is None else request.diagnostics
     run.attach(record)
-    system.events.fill(t0, run.y0, schedule.g)
+    schedule.g[:] = system.events.values(t0, run.y0)
     run.work.K[0] = run.start.f
     system.events.leave(t0, run.y0, run.work.K[0], run.start.tau * schedule.span.sign, schedule.g)
     run.work.counters[NFEV] = calls.count
