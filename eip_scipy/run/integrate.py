@@ -236,11 +236,7 @@ class Loop:
     An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
-    def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
-        """Prepare the run; `keeper` writes its checkpoints, if there are any.
-
-        `compiled` replaces the option `compiled` of the request, unless it is None.
-        """
+    def __init__(self, prepared: Prepared, keeper: _resume.Keeper) -> None:
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
@@ -254,7 +250,7 @@ class Loop:
                 )
             identity = prepared.identity(run.begin.y, system.parameters)
             keeper.identify(identity, run, system.derivative, system.events)
-        wanted = request.compiled if compiled is None else compiled
+        wanted = request.compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
             self.driver = Driver(
@@ -439,7 +435,7 @@ class Loop:
         return False
 
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
-        driver = self.driver
+        driver, problem = self.driver, self.prepared.problem
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
         values = self._values(broken)
         driver.note(values)
@@ -466,8 +462,8 @@ class Loop:
             method=self.method,
             h=abs(driver.schedule.span.h) or None,
             component_names=self.prepared.component_names,
-            units=self.prepared.units,
-            epoch=self.prepared.epoch,
+            units="" if problem is None else problem.units,
+            epoch=None if problem is None else problem.epoch,
         )
         t, y = events.last if self._event_ended else driver.now
         asked, variations = self.prepared.asked, self.prepared.variations
@@ -508,10 +504,7 @@ class Loop:
         return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:
-        """Return the invariants (l, m) of the saved states.
-
-        If an error has ended the run (`broken`) and an invariant raises one again, all values are NaN.
-        """
+        """Return the invariants (l, m) of the saved states; NaN if an error has `broken` the run and occurs again."""
         try:
             return self.driver.values()
         except BaseException:
@@ -526,11 +519,7 @@ def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
-    """Return True if a jitted right-hand side is called from Python only because invariants are not compiled.
-
-    `fun` is the right-hand side as the user gave it, `functions` are those that the loop of steps calls, and `run` is
-    the `Run` with the invariants.
-    """
+    """Return True if a jitted `fun` is called from Python only because invariants are not compiled."""
     if not (isinstance(functions, PythonFunctions) and is_jitted(fun)):
         return False
     kept = [found for item in run.invariants.items for found in (item.function, item.gradient)]
@@ -583,29 +572,18 @@ def _start_kept(request: Request) -> Iterator[None]:
             with suppress(TypeError, ValueError):  # the initial state itself cannot be read
                 t0, start = started_at(request)
                 error.partial = IntegrationResult(  # type: ignore[attr-defined]
-                    t=np.array([t0]),
-                    y=start[:, None],
-                    invariants=np.zeros((0, 1)),
-                    target=np.zeros(0),
+                    {"t": np.array([t0]), "y": start[:, None], "invariants": np.zeros((0, 1)), "target": np.zeros(0)},
                     max_defect=np.zeros(0),
                     diagnostics=Diagnostics(),
-                    t_events=None,
-                    y_events=None,
-                    sol=None,
-                    nfev=0,
-                    njev=0,
-                    nlu=0,
+                    **dict.fromkeys(("t_events", "y_events", "sol")),
+                    **dict.fromkeys(("nfev", "njev", "nlu"), 0),
                     status=-1,
                     message=f"interrupted by {type(error).__name__} at the start",
-                    success=False,
-                    trusted=False,
+                    **dict.fromkeys(("success", "trusted"), False),
                     wall_time=time.perf_counter() - begin,
                     compiled=False,
                     calls={},
                     method=getattr(request.method, "__name__", str(request.method)),
-                    h=None,
-                    component_names=None,
-                    units="",
-                    epoch=None,
+                    **{"h": None, "component_names": None, "units": "", "epoch": None},
                 )
         raise

@@ -25,11 +25,7 @@ FORMS = {  # (given as an acceleration, in place) -> name of the form of the use
 
 
 def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun") -> Callable[..., None]:
-    """Return an in-place right-hand side that calls the user's function `fun` and checks its value.
-
-    `extra` are the arguments of `fun` after t and y, `y0` has the shape and dtype of a value, and `name` is the name of
-    `fun` in messages.
-    """
+    """Return an in-place right-hand side that calls ``fun(t, y, *extra)`` and checks its value by `y0`."""
     n, dtype, shape = y0.size, y0.dtype, y0.shape
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
@@ -43,9 +39,7 @@ def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, na
 def _interpreted_in_place(
     fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun"
 ) -> Callable[..., None]:
-    """Return an in-place right-hand side that checks the user's in-place function `fun` in its first call.
-
-    `extra` are the arguments of `fun` after t, y and out, and `name` is the name of `fun` in messages.
+    """Return an in-place right-hand side that checks ``fun(t, y, out, *extra)`` in its first call.
 
     `out` is filled with NaN before each call: the first call raises an error if the function leaves components
     unfilled, and later ones leave NaN there. Functions of the package's problems are not checked.
@@ -67,11 +61,7 @@ def _interpreted_in_place(
 def _second_order(
     interpreted: Callable[..., Callable[..., None]], fun: Callable[..., Any], extra: tuple, y0: np.ndarray
 ) -> Callable[..., None]:
-    """Return the in-place right-hand side of y = (q, v) for the acceleration `fun`.
-
-    `interpreted` is the function of this module that makes `fun` in-place and checks its values, and `extra` are the
-    last arguments of `fun`.
-    """
+    """Return the in-place right-hand side of y = (q, v) for the acceleration `fun`, which `interpreted` checks."""
     check_halves(y0.size)
     half = y0.size // 2
     acc = interpreted(fun, extra, y0[:half], "acceleration")

@@ -302,8 +302,8 @@ class Prepared:
     def described_columns(self) -> dict[str, Any]:
         """Return the field ``columns`` of a result of this run, which carries derivatives."""
         assert self.variations is not None
-        columns, problem = self.variations.columns, self.asked.fun
-        known = dict(enumerate(problem.parameters)) if isinstance(problem, Problem) else {}
+        columns = self.variations.columns
+        known = {} if self.problem is None else dict(enumerate(self.problem.parameters))
         return {
             "state": columns.is_transition,
             "parameters": len(columns.parameters),
@@ -313,20 +313,15 @@ class Prepared:
         }
 
     @property
+    def problem(self) -> Problem | None:
+        """Return the problem, if one was given instead of a function."""
+        return self.asked.fun if isinstance(self.asked.fun, Problem) else None
+
+    @property
     def component_names(self) -> tuple[str, ...] | None:
         """Names of the components from the problem, or None if it has none for this state."""
-        names = self.asked.fun.component_names if isinstance(self.asked.fun, Problem) else None
+        names = None if self.problem is None else self.problem.component_names
         return names if names is not None and len(names) == self.n else None
-
-    @property
-    def units(self) -> str:
-        """Units of the problem."""
-        return self.asked.fun.units if isinstance(self.asked.fun, Problem) else ""
-
-    @property
-    def epoch(self) -> tuple[float, float] | None:
-        """Epoch of the problem, a Julian date (TDB) in two parts, or None if it has none."""
-        return self.asked.fun.epoch if isinstance(self.asked.fun, Problem) else None
 
     @property
     def pointers(self) -> list[PointerFunction]:
@@ -393,10 +388,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
 
 
 def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
-    """Return the specification of the run.
-
-    `given` is the function or the problem as given, and `calls` the right-hand side, which counts its calls.
-    """
+    """Return the specification of the run; `given` is the function or problem as given, `calls` the right-hand side."""
     problem = given if isinstance(given, Problem) else None
     return RunSpec(
         name=request.method.__name__,
@@ -417,10 +409,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
 
 
 def _variations(given: Any, request: Request, form: str) -> Variations | None:
-    """Return the `Variations` for the option `variations` of the request, or None if it was not given.
-
-    `given` is the function or the problem as given, and `form` the form of `request.fun`, a name in `FORMS`.
-    """
+    """Return the `Variations` for the option `variations` of the request, or None if it was not given."""
     if request.variations is None:
         if request.jvp is not None or request.symplectic is not None:
             raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
@@ -449,10 +438,7 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
 
 
 def _widened(request: Request, variations: Variations) -> Request:
-    """Return the request for the state followed by its columns of derivatives.
-
-    It has the functions, events and invariants of `variations`, which take this longer state.
-    """
+    """Return the request for the state followed by its columns of derivatives, with functions for this longer state."""
     extra = extra_arguments(request.args, request.params)
     return request._replace(
         fun=variations.rhs,
@@ -475,10 +461,7 @@ def started_at(request: Request) -> tuple[float, np.ndarray]:
 
 
 def _plain(request: Request) -> Request:
-    """Return the request with durations, units and names of parameters replaced by plain numbers.
-
-    Only a `Problem` knows its units and parameters; with another function the request is returned unchanged.
-    """
+    """Return the request with plain numbers for durations, units and names of parameters, which a `Problem` knows."""
     problem = request.fun
     if not isinstance(problem, Problem):
         return request
@@ -490,15 +473,11 @@ def _plain(request: Request) -> Request:
 
 
 def _second_order_hint(fun: Any) -> str:
-    """Return advice on how to write the problem in (q, v) or how to pass an acceleration, for the end of a message.
-
-    The text is empty if the problem has no such form.
-    """
+    """Return advice on how to write the problem in (q, v) or how to pass an acceleration, for the end of a message."""
     if not isinstance(fun, Problem):
         return f". If fun is the acceleration a(t, q), {BY_NAME}"
-    return (
-        "; problem.second_order() returns this problem in that form, for a start (q, v)" if fun.has_second_order else ""
-    )
+    hint = "; problem.second_order() returns this problem in that form, for a start (q, v)"
+    return hint if fun.has_second_order else ""
 
 
 def _method(method: Any) -> Any:
@@ -508,17 +487,12 @@ def _method(method: Any) -> Any:
             "fixed steps, or EIPRKN12 for q'' = a(t, q); eip_scipy.recommend(...) finds method and step."
         )
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
+        hint = "" if (name := class_named(method)) is None else f". Give the class: from eip_scipy import {name}"
         raise TypeError(
             f"integrate: method must be an EIP class such as EIPRK4, or a class made by eip_method; got {method!r}"
-            f"{_class_of(method)}."
+            f"{hint}."
         )
     return method.TABLEAU
-
-
-def _class_of(method: Any) -> str:
-    """Return a hint that names the EIP class if `method` is its name or that of a method of SciPy, otherwise ""."""
-    name = class_named(method)
-    return "" if name is None else f". Give the class: from eip_scipy import {name}"
 
 
 def _check_choices(request: Request) -> None:
@@ -552,10 +526,7 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
 
 
 def _with_problem(request: Request) -> tuple[Request, str]:
-    """Return the request, completed by the attributes of its `Problem` if it has one, and the form of its function.
-
-    The form is a name in `FORMS`.
-    """
+    """Return the request, completed by the attributes of its `Problem`, and its function's form, a name in `FORMS`."""
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
     problem, in_place = request.fun, flag("in_place", request.in_place)
@@ -591,10 +562,7 @@ def _with_problem(request: Request) -> tuple[Request, str]:
 
 
 def _without_own(projection: Mapping[str, Any], *extra: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the option `invariants`, in which an invariant whose args equal one of `extra` has no args.
-
-    The run passes these arguments on itself. The result is empty if the option was not given.
-    """
+    """Return the option `invariants`, if given, without args that equal one of `extra`, which the run passes on."""
     if "invariants" not in projection:
         return {}
     items = as_invariants(projection["invariants"])

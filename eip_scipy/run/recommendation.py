@@ -121,11 +121,8 @@ def _shown(value: Any) -> str:
         return value.__name__
     if isinstance(value, float):
         return f"{value:g}"
-    return repr(value) if isinstance(value, (str, int)) or value is None or _empty(value) else "..."
-
-
-def _empty(value: Any) -> bool:
-    return isinstance(value, tuple) and not value
+    plain = isinstance(value, (str, int)) or value is None or (isinstance(value, tuple) and not value)
+    return repr(value) if plain else "..."
 
 
 def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
@@ -152,8 +149,7 @@ def _telling(options: Mapping[str, Any]) -> str:
 def _one_each(trials: tuple[Trial, ...], chosen: Trial) -> list[Trial]:
     """Return one trial of each group of trials that differ only in the values of `h`, or of `rtol` and `atol`.
 
-    It is `chosen` if this trial belongs to the group, else the last trial whose `Trial.good` is True, or the last trial
-    if there is none.
+    It is `chosen` if this trial belongs to the group, else the last good trial, or the last one if there is none.
     """
     ways: dict[str, Trial] = {}
     for trial in trials:
