@@ -222,9 +222,7 @@ def origin() -> dict[str, Any]:
 def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
     """Write the header `text` and the arrays to `stream` as a zip archive."""
     with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr(
-            zipfile.ZipInfo(HEADER), text
-        )  # ZipInfo has a fixed date, so that equal contents give equal files
+        archive.writestr(zipfile.ZipInfo(HEADER), text)  # with a fixed date, so that equal contents give equal files
         for name, value in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, np.asarray(value, order="C"), version=(1, 0), allow_pickle=False)

@@ -244,7 +244,7 @@ def interpolation_weights(order: int) -> np.ndarray:
             polynomial = [Fraction(1)]
             for other in (k for k in range(order) if k != j):
                 # theta_j - theta_other = (back - j) - (back - other) = other - j
-                pairs = zip([0, *polynomial], [*polynomial, 0], strict=True)
+                pairs = zip([Fraction(0), *polynomial], [*polynomial, Fraction(0)], strict=True)
                 polynomial = [(raised - (back - other) * same) / (other - j) for raised, same in pairs]
             out[back, j] = [float(c) for c in polynomial]
     return out

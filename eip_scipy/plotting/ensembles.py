@@ -151,7 +151,7 @@ def _draw_counts(axis: Axes, counts: Mapping[str, int]) -> None:
     largest = max(1, *counts.values())
     for k, name in enumerate(names):
         axis.barh(k, counts[name], height=0.6, color=ENDS[name])
-        place = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+        place: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
         axis.annotate(str(counts[name]), (counts[name], k), fontsize="small", **place)
     axis.set_yticks(range(len(names)), names, fontsize="small")
     axis.set_ylim(max(len(ENDS), len(names)) - 0.5, -0.5)

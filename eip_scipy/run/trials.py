@@ -154,7 +154,7 @@ class Bench:
         except (ValueError, ArithmeticError) as error:
             return Trial(options, math.nan, 0, 0.0, f"{error}")
         found = self.judged(options, done, self.truth)
-        # It may be the reference run.
+        # This may be the reference run itself.
         return replace(found, error=max(found.error, self.doubt)) if found.good else found
 
     def with_output(self, trial: Trial) -> Trial:
