@@ -632,10 +632,7 @@ def _odd(symmetry: Any, y: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Shooting:
-    """Function of (y, T) that integrates from y over the time `share` * T, with the state-transition matrix.
-
-    `odd` is the mask of the components that must vanish at the end, see `_odd`.
-    """
+    """Integration from y over `share` * T with the transition matrix; see `_odd` for the mask `odd`."""
 
     fun: Any
     options: dict[str, Any]

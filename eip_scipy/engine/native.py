@@ -65,10 +65,7 @@ class Call(NamedTuple):
 
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: Any) -> Call:
-    """Return a `Call` of ``fun(t, y, ..., *args)``; if the engine does not accept as many `args`, Python adds them.
-
-    `shape`, `convert` and `kind` are fields of the `Call`.
-    """
+    """Return a `Call` of ``fun(t, y, ..., *args)``; if the engine does not accept as many `args`, Python adds them."""
     if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
     return Call(fun, args, shape, convert, **kind)

@@ -662,10 +662,7 @@ def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
 
 
 def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
-    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change.
-
-    `every` is the option `checkpoint_every`, in seconds.
-    """
+    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change."""
     refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")

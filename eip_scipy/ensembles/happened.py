@@ -22,10 +22,7 @@ class Flat(NamedTuple):
 
 
 def happened(count: int, which: np.ndarray, t: np.ndarray, y: np.ndarray) -> Happened:
-    """Return the times and states of one member's events, grouped by event.
-
-    `count` is the number of event functions, `which` the function of each event; events are in the order of time.
-    """
+    """Return the times and states of one member's events, in the order of time, for each of `count` event functions."""
     return [(t[which == k].copy(), y[which == k].copy()) for k in range(count)]
 
 

@@ -113,10 +113,7 @@ class Members(NamedTuple):
 
     @classmethod
     def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
-        """Return the results of `m` members that did not run.
-
-        A state has `n` components, `invariants` is the number of invariants, and `times` that of saved states.
-        """
+        """Return the results of `m` members that did not run, for states with `n` components at `times` times."""
         return cls(
             y=np.full((m, n), np.nan, dtype),
             t=np.full(m, np.nan),
@@ -162,10 +159,7 @@ class Plan:
         self._together, self._idle = False, list[Sweeper]()
 
     def compile(self, *, progress: bool = False) -> Plan:
-        """Compile the functions and return the plan itself.
-
-        This is done before threads start, because each thread would compile them otherwise.
-        """
+        """Compile the functions, before threads start and would each compile them, and return the plan itself."""
         ready = self.ready
         loop = Loop(replace(ready, request=ready.request._replace(progress=progress)), Keeper())
         self.why_not = loop.why_not
@@ -255,10 +249,7 @@ class Plan:
 
 
 def _of_events(ready: Prepared, t: float, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of a member's events, at its start and then at its end (t, y), and their sizes.
-
-    `f` is the derivative at the end. Values that are not finite are replaced by 0.
-    """
+    """Return values and sizes of a member's events, at its start and its end (t, y); 0 if they are not finite."""
     events, begin = ready.system.events, ready.run.begin
     step = ready.run.start.tau * ready.schedule.span.sign  # into the interval: beyond it events need not be defined
     places = (begin.t, begin.y, begin.f, step), (t, y, f, -step)
@@ -575,10 +566,7 @@ class Sweeper:
         self._arrived(done, each, out)
 
     def _adapt(self, seconds: float) -> None:
-        """Choose the number of steps for the next call of the engine, so that it takes about `SWEEP_SECONDS`.
-
-        `seconds` is the duration of the last call, which made all of its steps. The number is at most doubled.
-        """
+        """Choose the number of steps, at most doubled, for about `SWEEP_SECONDS`, by the time of the last call."""
         self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / max(seconds, 1e-9))))
 
     def _look_at(

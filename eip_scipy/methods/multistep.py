@@ -269,10 +269,7 @@ def _step_weights(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
 
 def _growth(order: int, corrected: bool, square: float, damping: complex) -> float:
-    """Return the largest growth of a mode in a step, for h^2 q'' = -square q - damping h v.
-
-    It is the largest modulus of a root of the characteristic polynomial, including the roots of the solution.
-    """
+    """Return the largest modulus of a root of the characteristic polynomial for h^2 q'' = -square q - damping h v."""
     positions, newest, others, velocities = _step_weights(order)
     predicted = square * positions + damping * np.convolve(velocities, [1.0, -1.0])
     polynomial = np.zeros(order + 3, complex)

@@ -56,10 +56,7 @@ def stability_map(
 
 
 def draw_stability(axis: Axes, x: Any, y: Any, megno: Any, most: float) -> Any:
-    """Draw the cells of a stability map, and return them as the QuadMesh for a colour bar.
-
-    The arguments after `axis` are those of `stability_map`.
-    """
+    """Draw the cells of a `stability_map`, and return them as the QuadMesh for a colour bar."""
     x, y, values = (np.asarray(item, dtype=float) for item in (x, y, megno))
     if values.shape != (y.size, x.size):
         raise ValueError(

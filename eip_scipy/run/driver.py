@@ -94,10 +94,7 @@ class Driver:
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:
-        """Replace a `FailedCallError` raised inside the block by the exception of the Numba function that failed.
-
-        If a C function failed, replace it by an error that names the function and its status.
-        """
+        """Replace a `FailedCallError` raised in the block by the exception of the Numba or C function that failed."""
         try:
             yield
         except FailedCallError as error:
@@ -136,10 +133,7 @@ class Driver:
         return float(self.schedule.clock[TIME_NEW if pending else TIME]), self.new if pending else self.state
 
     def parts(self) -> dict[str, np.ndarray]:
-        """Return the buffers that determine the remaining steps, and the counters, by name.
-
-        All other buffers are filled before they are read.
-        """
+        """Return the counters and the buffers, by name, that determine the remaining steps."""
         w, schedule, history = self.run.work, self.schedule, self.run.method.multistep
         found = {"place": schedule.place, "clock": schedule.clock, "y": self.state, "slope": w.K[0], "g": schedule.g}
         if schedule.g.size:
@@ -249,10 +243,7 @@ class Driver:
         return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
 
     def note(self, values: np.ndarray) -> None:
-        """Update the largest invariant errors (l,) with the `values` (l, m) of the invariants at the m saved states.
-
-        Values at the start do not count.
-        """
+        """Update the largest invariant errors (l,) with the `values` (l, m) at the saved states except the start."""
         largest, target = self.run.work.max_defect, self.run.invariants.fixed_target
         later = values[:, np.count_nonzero(self.t[: self.rows] == self.schedule.span.t0) :]
         np.fmax(largest, np.fmax.reduce(np.abs(later - target[:, None]), axis=1, initial=0.0), out=largest)

@@ -297,10 +297,7 @@ class Loop:
         return result
 
     def steps(self, bar: Any) -> tuple[int, str]:
-        """Run to the end of the interval, or until something ends the run earlier; return status and message.
-
-        Afterwards `told` is True if the run has not failed but is not reliable.
-        """
+        """Run until something ends the run; return status and message, and set `told` if it is not reliable."""
         self._doubtful = False
         status, message = self._steps(bar)
         self.driver.run.trust.failed = status < 0
@@ -373,10 +370,7 @@ class Loop:
         return abs(self.driver.now[0] - schedule.span.t0) - shown
 
     def _ended(self, code: int) -> bool:
-        """Return True if an event ends the run; `code` is the loop's status code.
-
-        If the loop has paused in a step, first save the states at `t_eval` in this step and record its events.
-        """
+        """Return True if an event ends the run, by the loop's `code`, and handle a step that has paused."""
         driver, schedule = self.driver, self.driver.schedule
         self._event_ended = self._pause() if code == PAUSE else code == ENDED
         if self._event_ended and schedule.t_eval.size == 0:
@@ -384,10 +378,7 @@ class Loop:
         return self._event_ended
 
     def _pause(self) -> bool:
-        """Save the states at `t_eval` in the step in which the loop has paused, and record the events in this step.
-
-        Return True if an event ends the run.
-        """
+        """Save states at `t_eval` and record events in a step that has paused; return True if one ends the run."""
         driver, schedule = self.driver, self.driver.schedule
         sol = driver.dense()
         end = self.events.handle(*driver.pending_events(), sol)

@@ -178,10 +178,7 @@ class System:
         return out
 
     def product(self) -> Callable[..., np.ndarray] | None:
-        """Return the function ``product(t, q, dq)``, the Jacobian of the accelerations times dq.
-
-        A `Deferred` Jacobian is made here. Without the option `jacobian` the result is None.
-        """
+        """Return the option `jacobian`, made now if it is `Deferred`, as ``product(t, q, dq)``; None without it."""
         self.jacobian = made(self.jacobian)
         return None if self.jacobian is None else times(self.jacobian, *self.extra)
 
@@ -332,10 +329,7 @@ class Prepared:
         return [function for function in functions if isinstance(function, PointerFunction)]
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
-        """Return all settings, except functions, that determine the result of a run from `y0` to the last bit.
-
-        The keys of the dict are the names of arguments and options that users know.
-        """
+        """Return all settings except functions, by users' names, that determine the result of a run to the last bit."""
         found = settings(self.label, y0, params, self.run, self.schedule, self.system.events)
         if self.variations is not None:
             found |= {name: plain(value) for name, value in self.variations.columns.identity.items()}

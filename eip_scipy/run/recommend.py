@@ -171,10 +171,7 @@ def _problem(
 
 
 def _made(fun: Any, t_span: Any, y0: Any, common: dict[str, Any]) -> Problem:
-    """Return a problem made from a function, with `in_place` removed from the options in `common`.
-
-    For an in-place function, `params` also moves from the options to the problem.
-    """
+    """Return a problem made from a function; `in_place`, and if it is True `params`, are removed from `common`."""
     if not callable(by_pointer(fun, "fun")):
         raise TypeError(f"recommend: fun must be callable or a Problem, got {shown(fun)}.")
     name = getattr(getattr(fun, "acceleration", fun), "__name__", "problem")

@@ -316,10 +316,7 @@ class _FileKeeper(Keeper):
         )
 
     def _state(self) -> Arrays:
-        """Return the values that identify the functions at the snapshot; {} if a function raises an error.
-
-        The evaluations are not counted.
-        """
+        """Return the values that identify the functions at the snapshot; {} if a function raises an error."""
         arrays = self._snapshot.arrays
         try:
             return self._known_by_at(float(arrays["clock"][TIME]), arrays["y"])

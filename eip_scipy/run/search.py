@@ -176,10 +176,7 @@ class Search:
         return Look(size, float(np.median(lengths)), float(long / short), velocities)
 
     def _find_truth(self) -> None:
-        """Store in `bench` the reference states: those of the tighter of two runs that agree well enough.
-
-        Raise ValueError if no two runs agree well enough.
-        """
+        """Store the reference states, of the tighter of two runs that agree; raise ValueError if no two do."""
         size, plain = self.look.size, Kind(EIPDOP853, size=self.look.size, options=PLAIN)
         found, enough = [self._reference(plain, REFERENCE_START * self.wanted)], AGREEMENT * self.wanted
         method, options = (EIPRKN12, LONG) if self.look.velocities is False else (EIPDOP853, {})
@@ -236,10 +233,7 @@ class Search:
         return chosen
 
     def _others(self, rtol: float) -> list[tuple[Kind, float]]:
-        """Return each `Kind` to try after `EIPDOP853`, with the step or tolerance at which its search starts.
-
-        `rtol` is this tolerance for kinds with adaptive steps.
-        """
+        """Return each `Kind` to try after `EIPDOP853`, with the step or `rtol` at which its search starts."""
         look, found = self.look, []
         if look.velocities is False:
             found += [(self._kind(EIPRKN8, **LONG), rtol), (self._kind(EIPRKN12, **LONG), rtol)]

@@ -201,10 +201,7 @@ def difference(y: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _power(errors: np.ndarray) -> float:
-    """Return the power of time with which errors at equidistant times grow.
-
-    It is the slope of the running maximum on logarithmic axes.
-    """
+    """Return the power of time with which errors at equidistant times grow: the slope of the logarithms."""
     largest = np.maximum.accumulate(errors)
     seen = largest > 0
     if seen.sum() < 2:
