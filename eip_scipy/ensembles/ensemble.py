@@ -804,7 +804,8 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
         return ThreadPool(plan, workers if plan.why_not is None else 1)
     if isinstance(executor, Executor):
         return FuturesPool(executor, partial(run_elsewhere, task, key), cores())
-    if executor == "dask" or _is_of_dask(executor):
+    kind = type(executor)
+    if executor == "dask" or kind.__module__.partition(".")[0] == "distributed" or kind.__name__ == "DaskExecutor":
         if pointers := plan.ready.pointers:
             raise pointers[0].unpicklable()  # Dask's own message for it is very long
         # Imported by name, because the integrations depend on this package and need further libraries.
@@ -813,7 +814,3 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
         f"executor must be None, a number of threads, 'dask', a dask.distributed Client or an executor of "
         f"concurrent.futures, got {executor!r}."
     )
-
-
-def _is_of_dask(executor: Any) -> bool:
-    return type(executor).__module__.partition(".")[0] == "distributed" or type(executor).__name__ == "DaskExecutor"

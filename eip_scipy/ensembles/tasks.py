@@ -506,7 +506,7 @@ class Sweeper:
             self._arrived(np.arange(those.start + first, those.start + done), each, out)
             failed = reason is not None or code != OK
             if plan.events and (failed or done > first):
-                out.happened[those.start + first] = happened(plan.events, *self.loop.driver.events_found())
+                out.happened[those.start + first] = happened(plan.events, *self.loop.driver.interpolants.roots())
             if failed:
                 self._look_at(plan, those.start + done, code, reason, each, out, watch)
                 where[:] = done + 1, 0

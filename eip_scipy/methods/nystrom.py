@@ -232,7 +232,10 @@ class NystromTableau(Ordered):
             )
         self._check_order(name, exact["A"], exact["c"], rows)
         self._set(name=name, order=order, error_estimator_order=error_estimator_order, reference=reference)
-        self._set(b_hat=None, b_prime_hat=None, exact=MappingProxyType(exact), n_stages=s, fsal=_is_fsal(exact))
+        # The last stage may be at the new position and time, without being used by the step.
+        unused = exact["c"][-1] == 1 and exact["b"][-1] == 0 and exact["b_prime"][-1] == 0
+        fsal = bool(unused and np.array_equal(exact["A"][-1], exact["b"]))
+        self._set(b_hat=None, b_prime_hat=None, exact=MappingProxyType(exact), n_stages=s, fsal=fsal)
         self._set(**{key: values.astype(float) for key, values in exact.items()})
         self._set(e=_difference(exact, "b"), e_prime=_difference(exact, "b_prime"))
         # Values that a method of this order requires of sum_i b_i c_i^k and of sum_i b'_i c_i^k, k = 0, 1, ...
@@ -272,12 +275,6 @@ def _row(name: str, label: str, values: Sequence[Number], s: int) -> np.ndarray:
     if len(values) != s:
         raise ValueError(f"{name}: {label} has {len(values)} entries and b has {s}; they must have the same number.")
     return _vector(name, values)
-
-
-def _is_fsal(exact: Mapping[str, np.ndarray]) -> bool:
-    """Return True if the last stage is at the new position and time, and the step does not use it."""
-    unused = exact["c"][-1] == 1 and exact["b"][-1] == 0 and exact["b_prime"][-1] == 0
-    return bool(unused and np.array_equal(exact["A"][-1], exact["b"]))
 
 
 def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:

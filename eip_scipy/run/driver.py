@@ -219,17 +219,16 @@ class Driver:
         """Number of interpolants stored so far."""
         return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
 
-    def pending_events(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the indices and times of the events in the pending step, if the loop left them to the caller."""
-        assert self._interpolants is not None  # the loop pauses for nothing else
-        return self._interpolants.pending()
+    @property
+    def interpolants(self) -> Interpolants:
+        """Return the interpolants of a run that has events or times between steps, or stores its steps."""
+        assert self._interpolants is not None
+        return self._interpolants
 
     def dense(self) -> DenseOutput:
         """Return the dense output over the pending step."""
-        interpolants = self._interpolants
-        assert interpolants is not None  # the loop pauses for nothing else
-        piece = self._pieces[self._kept - 1] if self._kept else interpolants.record.piece.copy()
-        return ManifoldDenseOutput(interpolants, piece)
+        piece = self._pieces[self._kept - 1] if self._kept else self.interpolants.record.piece.copy()
+        return ManifoldDenseOutput(self.interpolants, piece)
 
     def warn(self) -> None:
         """Warn about states between steps that the loop could not project."""
@@ -258,11 +257,6 @@ class Driver:
         with self.own_errors():
             self.engine.values(t, y, out, *params)
         return out
-
-    def events_found(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the indices, times and states of the events that the loop has found since the last call."""
-        assert self._interpolants is not None  # a run with events has them
-        return self._interpolants.roots()
 
 
 def _first(size: int) -> int:

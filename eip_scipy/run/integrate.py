@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, Unpack
 
@@ -214,20 +214,16 @@ def integrate(
     ((4, 68), True)
     """
     asked = dict(locals())  # the fields of Request have the same names and defaults
-    _check_names(projection)
-    request = Request(*map(asked.__getitem__, Request._fields))
-    keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
-    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
-        return Loop(prepared(request), keeper).run()
-
-
-def _check_names(projection: Iterable[str]) -> None:
     known = ProjectionOptions.names()
     for name in projection:
         if name not in known:
             own = (name for name in Request._fields if name != "projection")
             others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
+    request = Request(*map(asked.__getitem__, Request._fields))
+    keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
+    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
+        return Loop(prepared(request), keeper).run()
 
 
 class Loop:
@@ -240,7 +236,7 @@ class Loop:
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
-        self.rhs, self.events, self.diagnostics = system.rhs, system.events, prepared.diagnostics
+        self.events, self.diagnostics = system.events, prepared.diagnostics
         self.callback, self.progress = request.callback, request.progress
         if keeper.keeps:
             if run.tableau.drives:
@@ -308,16 +304,10 @@ class Loop:
     def _look(self, *, ended: bool = False) -> None:
         driver = self.driver
         t, y = driver.now
-
-        def derivative(t: float, y: np.ndarray) -> np.ndarray:
-            f = np.empty_like(y)
-            self.rhs(t, y, f, driver.params)
-            return f
-
-        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy(), derivative)
+        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy(), self.prepared.system.derivative)
 
     def _steps(self, bar: Any) -> tuple[int, str]:
-        driver = self.driver
+        driver, schedule = self.driver, self.driver.schedule
         if driver.step == 0:
             driver.save_start()
             if self._stopped_by_callback(0):
@@ -332,18 +322,21 @@ class Loop:
             driver.warn()
             self._tell_why_slow(seconds)
             ended = self._ended(code)
-            bar.update(self._progress(bar.n, k))
+            if schedule.span.h != 0.0:
+                bar.update(driver.step - k)
+            else:
+                bar.update(abs(driver.now[0] - schedule.span.t0) - bar.n)
             if self._stopped_by_callback(rows):
                 return 1, STOPPED
             if ended:
                 return 1, ENDED_BY_EVENT
             if code not in (OK, PAUSE, ENDED, FULL):
-                return -1, failure(code, driver.run, driver.schedule.clock)
+                return -1, failure(code, driver.run, schedule.clock)
             if is_check_due(driver.step) or driver.suspects:
                 self._look()
             if code == FULL:
                 driver.grow()
-            elif code == OK and driver.schedule.clock[TIME] == driver.schedule.span.t_bound:
+            elif code == OK and schedule.clock[TIME] == schedule.span.t_bound:
                 return 0, ARRIVED
             if code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
@@ -362,13 +355,6 @@ class Loop:
                 stacklevel=5,
             )
 
-    def _progress(self, shown: float, k: int) -> float:
-        """Return the advance of the progress bar: steps since step `k`, or if adaptive the time beyond `shown`."""
-        schedule = self.driver.schedule
-        if schedule.span.h != 0.0:
-            return self.driver.step - k
-        return abs(self.driver.now[0] - schedule.span.t0) - shown
-
     def _ended(self, code: int) -> bool:
         """Return True if an event ends the run, by the loop's `code`, and handle a step that has paused."""
         driver, schedule = self.driver, self.driver.schedule
@@ -381,7 +367,7 @@ class Loop:
         """Save states at `t_eval` and record events in a step that has paused; return True if one ends the run."""
         driver, schedule = self.driver, self.driver.schedule
         sol = driver.dense()
-        end = self.events.handle(*driver.pending_events(), sol)
+        end = self.events.handle(*driver.interpolants.pending(), sol)
         limit = sol.t if end is None else end
         while driver.rows < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[driver.rows] - limit) <= 0:
             t = float(schedule.t_eval[driver.rows])
@@ -540,16 +526,13 @@ def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
         return nullcontext(_NoBar())
     from tqdm import tqdm
 
-    fixed = schedule.span.h != 0.0
-    total: float | None
-    if fixed:
-        total = schedule.span.n_steps if schedule.span.n_steps < UNBOUNDED else None
-    else:
-        total = abs(schedule.span.t_bound - schedule.span.t0) if math.isfinite(schedule.span.t_bound) else None
-    unit = "step" if fixed else "time"
-    # Above 0 if the run is resumed.
-    initial = int(schedule.place[STEP]) if fixed else abs(float(schedule.clock[TIME]) - schedule.span.t0)
-    return tqdm(total=total, initial=initial, desc=label, unit=unit, unit_scale=True, smoothing=0.05)
+    span, shown = schedule.span, {"desc": label, "unit_scale": True, "smoothing": 0.05}
+    # `initial` is above 0 if the run is resumed.
+    if span.h != 0.0:
+        total = span.n_steps if span.n_steps < UNBOUNDED else None
+        return tqdm(total=total, initial=int(schedule.place[STEP]), unit="step", **shown)
+    length = abs(span.t_bound - span.t0) if math.isfinite(span.t_bound) else None
+    return tqdm(total=length, initial=abs(float(schedule.clock[TIME]) - span.t0), unit="time", **shown)
 
 
 @contextmanager

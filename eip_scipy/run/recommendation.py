@@ -133,17 +133,14 @@ def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
         if output:
             cost += f" {trial.cost if trial.output else '-':>11}"
         trouble = textwrap.shorten(trial.trouble, WIDTH, placeholder=" ...")
-        rows.append(("->" if trial is chosen else "", _telling(trial.options), cost, f"  {trouble}".rstrip()))
+        # `atol` and `compensated` follow from the others.
+        others = {name: x for name, x in trial.options.items() if name not in ("method", "atol", "compensated")}
+        name = f"{trial.options['method'].__name__}, {called(others)}"
+        rows.append(("->" if trial is chosen else "", name, cost, f"  {trouble}".rstrip()))
     width = max(len(row[1]) for row in rows)
     yield f"     {'trials':<{width}}     error evaluations{' with output' if output else ''}"
     for mark, name, cost, trouble in rows:
         yield f"  {mark:>2} {name:<{width}} {cost}{trouble}"
-
-
-def _telling(options: Mapping[str, Any]) -> str:
-    """Return the method and its options as text, without `atol` and `compensated`, which follow from the others."""
-    others = {name: value for name, value in options.items() if name not in ("method", "atol", "compensated")}
-    return f"{options['method'].__name__}, {called(others)}"
 
 
 def _one_each(trials: tuple[Trial, ...], chosen: Trial) -> list[Trial]:
