@@ -160,23 +160,21 @@ class Plan:
 
     def compile(self, *, progress: bool = False) -> Plan:
         """Compile the functions, before threads start and would each compile them, and return the plan itself."""
-        ready = self.ready
+        ready, invariants = self.ready, self.ready.run.invariants
         loop = Loop(replace(ready, request=ready.request._replace(progress=progress)), Keeper())
+        own_targets = any(item.target is not None for item in invariants.items)
+        reasons = {
+            "members have different intervals or times": self.task.rows is not None,
+            "the runs have derivatives": self.variations is not None,
+            "the runs have balances": invariants.balances.items,
+            # The shifts of the differences depend on the start.
+            "the gradient of an invariant is computed by differences": invariants.by_differences,
+            "the start of each member is projected, or an invariant has a target": own_targets
+            or ready.run.identity["project_initial"],
+        }
         self.why_not = loop.why_not
-        own_targets = any(item.target is not None for item in ready.run.invariants.items)
-        own_start = ready.run.identity["project_initial"] or own_targets or self.task.rows is not None
-        by_differences = bool(ready.run.invariants.by_differences)  # their shifts depend on the start
-        carries = bool(ready.run.invariants.balances.items) or self.variations is not None
-        self._together = self.why_not is None and not (own_start or by_differences or carries)
-        if self.task.rows is not None:
-            own = "members have different intervals or times"
-        elif carries:
-            own = f"the runs have {'balances' if self.variations is None else 'derivatives'}"
-        elif by_differences:
-            own = "the gradient of an invariant is computed by differences"
-        else:
-            own = "the start of each member is projected, or an invariant has a target"
-        self.one_by_one = self.why_not or own
+        self.one_by_one = self.why_not or next((reason for reason, holds in reasons.items() if holds), "")
+        self._together = not self.one_by_one
         if self._together:
             sweeper = Sweeper(loop, self.task.members)
             self.one_by_one, self._idle = sweeper.one_by_one, [sweeper]
