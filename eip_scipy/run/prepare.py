@@ -33,7 +33,7 @@ from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
 from .events import Events, as_events, replaced
-from .interpreted_functions import FORMS, INTERPRETED
+from .interpreted_functions import FORMS, interpreted
 from .memory import check_bytes
 from .resume import plain, settings
 
@@ -147,11 +147,7 @@ class System:
             raise TypeError(
                 f"jacobian must be a function jacobian(t, q, dq, out[, params]), got {shown(self.jacobian)}."
             )
-        self.rhs: Callable[..., None]
-
-    def bind(self, y0: np.ndarray) -> None:
-        """Make `rhs` for states of the shape and type of y0."""
-        self.rhs = INTERPRETED[self.form](self.fun, self.extra, y0)
+        self.rhs: Callable[..., None]  # for states of the shape and type of y0, set when these are known
 
     @property
     def name(self) -> str:
@@ -169,7 +165,7 @@ class System:
         """Return the derivative at (t, y) as a new array; raise TypeError if the function takes other arguments."""
         out = np.empty_like(y)
         try:
-            self.rhs(t, y, out, self.parameters)
+            self.rhs(t, y, out)
         except TypeError:
             third = ("out",) if "in place" in self.form else ()
             state, called = ("y", CALLED) if self.name == "fun" else ("q", CALLED_ACCELERATION)
@@ -359,7 +355,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     y0 = _state(request.y0)
     n = y0.size if variations is None else variations.columns.n
     stepping = request.steps.checked(request.method.__name__, method, t0, t_bound, n, stacklevel=4)
-    system.bind(y0)
+    system.rhs = interpreted(form, system.fun, system.extra, y0)
     calls = Counted(system.derivative)
     spec = _spec(asked.fun, request, system, calls, stepping)
     if variations is not None:
