@@ -456,13 +456,12 @@ class Sweeper:
         little = members * schedule.span.n_steps * run.y0.size < LEAST_WORK
         if not reason and little and need_compiling(driver.functions):
             reason = "compiling functions for eight members would take longer than the run"
-        if reason:
-            return reason
         try:
-            driver.engine.side_by_side(octet_functions(driver.functions))
+            if not reason:
+                driver.engine.side_by_side(octet_functions(driver.functions))
         except NotCompilableError as error:
-            return str(error)
-        return ""
+            reason = str(error)
+        return reason
 
     def _each(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> data.Members:
         """Return the inputs of the members and the buffers for their results."""
@@ -574,23 +573,15 @@ class Sweeper:
 
         `reason` is the text of an exception in the user's functions, or None.
         """
-        loop = self.loop
-        driver = loop.driver
+        loop, driver = self.loop, self.loop.driver
         if code in (DOUBTFUL, PAUSE):
             _alone(plan, k, each.starts[k], each.params[k], out, watch)
             if each.kept:
                 each.rows[k, :-1] = out.saved[k]
             return
         rows = each.rows[k if each.kept else 0, : driver.rows]
-        _store(
-            loop,
-            k,
-            FAILED,
-            reason or failure(code, driver.run, driver.schedule.clock),
-            out,
-            rows,
-            broken=reason is not None,
-        )
+        message = reason or failure(code, driver.run, driver.schedule.clock)
+        _store(loop, k, FAILED, message, out, rows, broken=reason is not None)
         if each.kept:
             each.rows[k, driver.rows :] = np.nan
 
