@@ -275,8 +275,7 @@ class EnsembleResult(WithColumns):
         """Return the fields in the form that `eip_scipy.results.save` accepts."""
         from .saving import packed
 
-        ends = vars(self).get("_ends")
-        return packed(self if ends is None else {**self, "end_invariants": ends})
+        return packed(self)
 
     @classmethod
     def _unpacked(cls, fields: dict[str, Any]) -> EnsembleResult:
@@ -748,7 +747,7 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
         request = task.request._replace(y0=starts[k].copy(), params=own, **everyone.own.of(k))
         tried = dataclasses.replace(task, request=request)
         try:
-            ready = tried.prepared(tried.request.y0, own, check_start=True)
+            ready = tried.prepared(request.y0, own, check_start=True)
         except MemoryError:
             raise
         except Exception as error:

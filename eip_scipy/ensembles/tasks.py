@@ -77,10 +77,11 @@ class Task:
     def prepared(
         self, y0: np.ndarray, params: np.ndarray | None, own: Mapping[str, Any] = NOTHING, *, check_start: bool = False
     ) -> Prepared:
-        """Return the run of one member, prepared as `integrate` does.
+        """Return the run of one member, prepared as `integrate` does; without parameters if the request has none.
 
         `own` contains the `t_span` and `t_eval` of the member, if they differ between members.
         """
+        params = None if self.request.params is None else params
         return prepared(self.request._replace(y0=y0, params=params, **own), check_start=check_start)
 
 
@@ -191,10 +192,6 @@ class Plan:
         last = np.where((members.status >= 0)[:, None], members.y, np.nan)
         return np.array([self.t_bound]), last[:, None]
 
-    def prepared(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Prepared:
-        """Return the run of one member, see `Task.prepared`; `params` may be empty."""
-        return self.task.prepared(y0, None if self.task.request.params is None else params, own)
-
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
         """Return the data, in a form for JSON, by which a resumed ensemble is recognised as this one.
 
@@ -219,7 +216,7 @@ class Plan:
         k = int(ended[0])
         t, y = float(members.t[k]), members.y[k].copy()
         try:
-            ready = self.prepared(y0s[k], params[k])
+            ready = self.task.prepared(y0s[k], params[k])
             f, invariants = ready.system.derivative(t, y.copy()), ready.run.invariants
             values, sizes = invariants.values(t, y), invariants.term_sizes(t, y, f)
             events = _of_events(ready, t, y, f)
@@ -324,7 +321,7 @@ def _alone(
 ) -> None:
     """Run member `k` as `integrate` does, and store its results in `out`; `own` is that of `Task.prepared`."""
     try:
-        loop = Loop(plan.prepared(y0, params, own), Keeper())
+        loop = Loop(plan.task.prepared(y0, params, own), Keeper())
     except Exception as error:
         places = slice(None) if plan.variations is None else plan.variations.columns.places
         out.y[k, places], out.t[k] = y0, own.get("t_span", (plan.t0,))[0]
