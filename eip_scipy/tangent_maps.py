@@ -196,22 +196,15 @@ class PeriodicOrbit:
 
 
 class _Piece(NamedTuple):
-    """A part of a run between two orthonormalisations.
+    """A part of a run between two orthonormalisations."""
 
-    `run` ends with the piece; its first row is the start of the piece. `growth` and `columns` are R and Q of the QR
-    factorisation of the tangent vectors at the end of the piece.
-    """
-
-    run: IntegrationResult
-    growth: Array
-    columns: Array
+    run: IntegrationResult  # ends with the piece; its first row is the start of the piece
+    growth: Array  # R of the QR factorisation of the tangent vectors at the end of the piece
+    columns: Array  # Q of it
 
 
 def _refuse(function: str, options: dict[str, Any], also: Sequence[str] = ()) -> None:
-    """Raise TypeError if `options` contains an option in `OWN` or `also`, or one that `integrate` does not have.
-
-    `function` is the name of the calling function, for the message.
-    """
+    """Raise TypeError if `options` contains an option in `OWN` or `also`, or one that `integrate` does not have."""
     for name in (*OWN, *also):
         if name in options:
             raise TypeError(
@@ -246,11 +239,10 @@ def _length(every: Any, start: Prepared, pieces: int) -> float:
 
 
 def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: float, options: Any) -> Iterator[_Piece]:
-    """Yield the pieces of a run from t[0] to t[1], in which the tangent vectors are orthonormal when a piece starts.
+    """Yield the pieces of a run from t[0] to t[1], each with orthonormal tangent vectors at its start.
 
-    `columns` are the tangent vectors at t[0], and `every` is the duration of a piece. A piece is repeated with half its
-    duration if its tangent vectors become too long, too different in length, or not finite. A piece that fails for
-    another reason is the last one.
+    `columns` are those at t[0], and `every` is the duration of a piece. A piece is repeated with half its duration if
+    its vectors become too long, too different in length, or not finite. One that fails for another reason is the last.
     """
     begin, end = t
     now, sign, run = begin, np.sign(end - begin), None
@@ -559,7 +551,13 @@ def periodic_orbit(
     names = start.component_names or default_names(n)
     free = np.ones(n + 1, bool)
     for item in [fixed] if isinstance(fixed, str | int) else fixed:
-        free[_place(item, names)] = False
+        place = n if item == "period" else _component(item, names)
+        if place is None:
+            raise ValueError(
+                f'fixed: {shown(item)} is neither "period" nor the name or index of one of the components '
+                f"{', '.join(names)}."
+            )
+        free[place] = False
     odd = _odd(symmetry, y)
     free[:n] &= ~odd
     share = 0.5 if odd.any() else 1.0
@@ -593,22 +591,8 @@ def _component(item: Any, names: Sequence[str]) -> int | None:
     return int(item) if is_place else None
 
 
-def _place(item: Any, names: Sequence[str]) -> int:
-    """Return the index of an item of `fixed` among the unknowns: all components, then the period."""
-    place = len(names) if item == "period" else _component(item, names)
-    if place is None:
-        raise ValueError(
-            f'fixed: {shown(item)} is neither "period" nor the name or index of one of the components '
-            f"{', '.join(names)}."
-        )
-    return place
-
-
 def _require_period(start: Prepared, y: Array, T: float, free: bool) -> None:
-    """Raise ValueError if the equations depend on t, unless the period is not `free` and they have the period T.
-
-    `start` is a run that has not made its first step. Its function is called for the state y and different times.
-    """
+    """Raise ValueError if the equations depend on t, unless the period is not `free` and they have the period T."""
 
     def change(t: float, later: float) -> float:
         before, after = start.system.derivative(t, y), start.system.derivative(later, y)
@@ -648,11 +632,7 @@ def _odd(symmetry: Any, y: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Shooting:
-    """Function of (y, T) that integrates from y over the time `share` * T, with the state-transition matrix.
-
-    It returns a `_Reached`. `odd` is the mask of the components that must vanish at the end, see `_odd`. RuntimeError
-    is raised if the run fails.
-    """
+    """Integration from y over `share` * T with the transition matrix; see `_odd` for the mask `odd`."""
 
     fun: Any
     options: dict[str, Any]
@@ -688,10 +668,7 @@ class _Reached:
 
     @property
     def size(self) -> float:
-        """Return the largest component of the residual, relative to the largest component of the start.
-
-        It is 0 if the residual is 0, also for a start at 0, and inf if only the start is 0.
-        """
+        """Return the largest component of the residual relative to that of the start: inf if only the start is 0."""
         with np.errstate(divide="ignore"):
             largest = np.abs(self.residual).max()
             return float(largest / np.abs(self.y0).max()) if largest else 0.0
@@ -714,10 +691,7 @@ class _Reached:
         return move
 
     def instead(self, start: Prepared, guess: float) -> str:
-        """Return a text on what was found instead of an orbit if the state does not move, and "" if it moves.
-
-        `start` is the run from `y0` before its first step, and `guess` is the first guess of the period.
-        """
+        """Return a text on what was found instead of an orbit, with the first `guess` of the period; "" if y0 moves."""
         still = max(NEAR_CLOSURE * self.size, STILL) * np.abs(self.y0).max()
         # On an orbit of a system with forcing the derivative may be 0 at one time.
         times = (0.0, *(share * self.period for share in BETWEEN))
@@ -734,10 +708,7 @@ class _Reached:
         )
 
     def result(self, iterations: int, tol: float, guess: float) -> PeriodicOrbit:
-        """Return the result, with the multipliers and residuals of the state-transition matrix.
-
-        `guess` is the first guess of the period.
-        """
+        """Return the result, with the multipliers and residuals of the state-transition matrix."""
         M = self.run.stm[-1]
         begun = self.begun_at(self.y0)
         start = begun.run
@@ -855,8 +826,7 @@ class TrajectoryFit:
         _refuse("TrajectoryFit", options, ("t_span", "save_every", "args", "symplectic"))
         self._fun, self._options = fun, options
         self._free = [free] if isinstance(free, str | int) else list(free)
-        self._span, self._t, repeated = _times(t, t0)
-        self._from = repeated
+        self._span, self._t, self._from = _times(t, t0)
         asked = {**options, "variations": self._free}
         start = _start(fun, self._span, y0, asked)
         assert start.variations is not None
@@ -917,10 +887,7 @@ class TrajectoryFit:
 
 
 def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
-    """Return the interval of the run, the distinct times of the data, and an array of indices.
-
-    The array holds, for each column of the data, the index of its time among the distinct times.
-    """
+    """Return the interval, the distinct times of the data, and for each column the index of its time among these."""
     times = _numbers(t)
     if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all():
         raise ValueError(f"t must be a 1-D array of finite times, one for each column of data, got {shown(t)}.")

@@ -20,12 +20,8 @@ def run_orbits(
 
     ``system(t, w)`` is the derivative (dH/dp, -dH/dq), and ``system.energy(t, w)`` is H. `options` are those of
     `integrate`; by default the method is `EIPDOP853`, the tolerances (without `h`) are 1e-10, and the invariants are
-    those that `kept_invariants` finds for the first orbit and `pattern_speed`.
-
-    Raises
-    ------
-    RuntimeError
-        If a run does not reach its end.
+    those that `kept_invariants` finds for the first orbit and `pattern_speed`. RuntimeError is raised if a run does not
+    reach its end.
     """
     starts = np.ascontiguousarray(starts)
     options = {"method": EIPDOP853} | ({} if "h" in options else {"rtol": 1e-10, "atol": 1e-10}) | options

@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ REBOUNDX = {"gr": "1pn", "gr_full": "eih", "gr_potential": "gr-potential"}
 OURS = {ours: theirs for theirs, ours in REBOUNDX.items()} | {"j2": "gravitational_harmonics"}
 MAGIC = b"REBOUND Binary File"
 UNKNOWN_UNITS = "as in the REBOUND simulation"
+UNSUPPORTED = "the simulation has a feature that an N-body problem of eip_scipy does not support"
 # G times a template's mass equals our G m up to the rounding of one product and one quotient.
 SAME = 1e-15
 
@@ -141,11 +143,7 @@ def problem_from_simulation(
 
 
 class _Exit:
-    """Terminal event that is 0 when a distance reaches the limit at which a simulation ends.
-
-    The distance is the largest from the origin if `name` is "exit_max_distance", and the smallest between two bodies
-    otherwise.
-    """
+    """Terminal event that is 0 when the distance `name` reaches the limit at which a simulation ends."""
 
     terminal, direction = True, 0.0
 
@@ -308,7 +306,7 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
     with open(place, "rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError(f"read_archive: {place} is not an archive of REBOUND.")
-    times, states, first = [], [], None
+    times, states = [], []
     with warnings.catch_warnings():
         # A file never contains functions of a simulation, and nothing is integrated here.
         warnings.filterwarnings("ignore", "You have to reset function pointers", RuntimeWarning)
@@ -316,26 +314,24 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
             archive = rebound.Simulationarchive(place)
         except RuntimeError as error:
             raise ValueError(f"read_archive: REBOUND cannot read {place}: {error}") from error
-        own = _archived_names(archive)
+        first = _first_snapshot(archive)
+        gm = first.G * _attracting_masses(first)
         for k in range(0, len(archive), every):
             sim = archive[k]
             sim.synchronize()
-            gm = sim.G * _attracting_masses(sim)
-            first = (gm, _units(sim)) if first is None else first
-            if not np.array_equal(gm, first[0]):
+            if not np.array_equal(sim.G * _attracting_masses(sim), gm):
                 raise ValueError(
                     f"read_archive: bodies or masses in snapshot {k} of {place} differ from those in the first one. "
                     "Read single snapshots by rebound.Simulation(path, snapshot=k)."
                 )
             times.append(sim.t)
             states.append(state(sim))
-    gm, units = first if first is not None else (np.zeros(0), "")
     return OptimizeResult(
         t=np.array(times),
         y=np.array(states).T,
         gm=gm,
-        component_names=component_names(gm.size, own if names is None else names),
-        units=units,
+        component_names=component_names(gm.size, _names(first) if names is None else names),
+        units=_units(first),
         message=f"{len(times)} snapshots of a REBOUND archive",
         success=True,
         status=0,
@@ -344,10 +340,9 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
 
 def state(sim: rebound.Simulation) -> np.ndarray:
     """Return the state (q, v) of all particles, shape (6 N,)."""
-    q = np.empty((sim.N, 3))
-    v = np.empty((sim.N, 3))
-    sim.serialize_particle_data(xyz=q, vxvyvz=v)
-    return np.concatenate((q, v), axis=None)
+    y = np.empty((2, sim.N, 3))
+    sim.serialize_particle_data(xyz=y[0], vxvyvz=y[1])
+    return y.ravel()
 
 
 def _set_state(sim: rebound.Simulation, y: np.ndarray) -> None:
@@ -356,10 +351,8 @@ def _set_state(sim: rebound.Simulation, y: np.ndarray) -> None:
 
 
 def _active(sim: rebound.Simulation) -> int:
-    """Return the number of leading particles that attract the others.
-
-    If all do, REBOUND's N_active is -1, or, in versions in which N_active is unsigned, larger than N.
-    """
+    """Return the number of leading particles that attract the others."""
+    # If all do, N_active is -1, or, in versions in which it is unsigned, larger than N.
     return int(sim.N_active) if 0 <= sim.N_active < sim.N else int(sim.N)
 
 
@@ -376,21 +369,19 @@ def _names(sim: rebound.Simulation) -> tuple[str, ...]:
     return tuple(name if name is not None and given.count(name) == 1 else str(k) for k, name in enumerate(given))
 
 
-def _archived_names(archive: rebound.Simulationarchive) -> tuple[str, ...]:
-    """Return the particles' names in the first snapshot, as `_names` does.
+def _first_snapshot(archive: rebound.Simulationarchive) -> rebound.Simulation:
+    """Return the first snapshot, which is read until no name occurs twice, at most four times.
 
-    The snapshot is read until no name occurs twice, at most four times: REBOUND 5.2 identifies names by their memory
-    addresses in the process that wrote the archive, and mixes up two names if one is read to the old address of the
-    other. The earlier copies are kept in memory meanwhile, so that the next one gets other addresses.
+    REBOUND 5.2 identifies names by their memory addresses in the process that wrote the archive, and mixes up two names
+    if one is read to the old address of the other. Each copy is kept, so that the next one gets other addresses.
     """
-    held: list[rebound.Simulation] = []
+    held = [archive[0]]
     while len(held) < 4:
-        held.append(archive[0])
-        given = [getattr(particle, "name", None) for particle in held[-1].particles]
-        named = [name for name in given if name is not None]
+        named = [name for particle in held[-1].particles if (name := getattr(particle, "name", None)) is not None]
         if len(set(named)) == len(named):
             break
-    return _names(held[-1])
+        held.append(archive[0])
+    return held[-1]
 
 
 def _units(sim: rebound.Simulation) -> str:
@@ -398,63 +389,49 @@ def _units(sim: rebound.Simulation) -> str:
     names = sim.units
     if names["length"] is None or names["time"] is None:
         return UNKNOWN_UNITS
-    length, time = rebound_units.lengths_SI[names["length"]], rebound_units.times_SI[names["time"]]
-    return f"{_named(length, LENGTHS, 'm')}, {_named(time, TIMES, 's')}"
-
-
-def _named(size: float, known: dict[str, float], base: str) -> str:
-    """Return the name in `known` of a unit of `size` metres or seconds, or the size followed by `base` ("m" or "s")."""
-    return next((name for name, own in known.items() if own == size), f"{float(size)!r} {base}")
+    length, time = float(rebound_units.lengths_SI[names["length"]]), float(rebound_units.times_SI[names["time"]])
+    parts = (length, LENGTHS, "m"), (time, TIMES, "s")
+    return ", ".join(next((n for n, own in known.items() if own == si), f"{si!r} {base}") for si, known, base in parts)
 
 
 def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
-    """Return the names that `nbody` has for the forces that REBOUNDx has attached, and their constants.
-
-    Without such forces, return () and None.
-    """
+    """Return the names that `nbody` has for the forces that REBOUNDx has attached, and their constants, or None."""
     if not sim._additional_forces:
         return (), None
     extras = getattr(sim, "_extras_ref", None)
     if extras is None:
         raise ValueError(
-            "the simulation has a feature that an N-body problem of eip_scipy does not support: additional forces that "
-            "are not REBOUNDx's, whose invariants are unknown. If nbody has these forces, name them: "
-            "forces='gr-potential', constants=ForceConstants(c=...); forces=() leaves them out."
+            f"{UNSUPPORTED}: additional forces that are not REBOUNDx's, whose invariants are unknown. If nbody has "
+            "these forces, name them: forces='gr-potential', constants=ForceConstants(c=...); forces=() leaves them "
+            "out."
         )
     names = _force_names(extras)
-    unknown = [name for name in names if name not in REBOUNDX]
-    if unknown or len(names) > 1:
+    if len(names) > 1 or not set(names) <= REBOUNDX.keys():
         raise ValueError(
-            "the simulation has a feature that an N-body problem of eip_scipy does not support: REBOUNDx's additional "
-            f"forces {', '.join(names)}; expected one of {', '.join(REBOUNDX)}. Give forces=... to replace them."
+            f"{UNSUPPORTED}: REBOUNDx's additional forces {', '.join(names)}; expected one of {', '.join(REBOUNDX)}. "
+            "Give forces=... to replace them."
         )
     if not names:
         return (), None
+
+    def parameter(thing: Any, name: str) -> Any:  # of a particle or a force; None if it is not set
+        with suppress(AttributeError):
+            return thing.params[name]
+
     for k in range(1, sim.N):
-        if _parameter(sim.particles[k], "gr_source") is not None:
+        if parameter(sim.particles[k], "gr_source") is not None:
             raise ValueError(
                 f"REBOUNDx's {names[0]}: particle {k} is its source (gr_source); only the first particle is supported "
                 "as a source. Make the source the first particle."
             )
-    return (REBOUNDX[names[0]],), ForceConstants(c=_parameter(extras.get_force(names[0]), "c"))
-
-
-def _parameter(thing: Any, name: str) -> Any:
-    """Return the parameter `name` that REBOUNDx keeps for `thing`, a particle or a force; None if it is not set."""
-    try:
-        return thing.params[name]
-    except AttributeError:
-        return None
+    return (REBOUNDX[names[0]],), ForceConstants(c=parameter(extras.get_force(names[0]), "c"))
 
 
 def _force_names(extras: Any) -> list[str]:
-    """Return the names of the forces that are attached to a simulation by `extras`, its `reboundx.Extras` object.
-
-    The names are read from the list in C, because no function of REBOUNDx returns them.
-    """
+    """Return the names of the forces that are attached to a simulation by `extras`, its `reboundx.Extras` object."""
     import reboundx
 
-    names, node = [], extras._additional_forces
+    names, node = [], extras._additional_forces  # a list in C, because no function of REBOUNDx returns the names
     while node:
         force = ctypes.cast(node.contents.object, ctypes.POINTER(reboundx.Force)).contents
         names.append(force.name.decode())
@@ -473,25 +450,20 @@ def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) 
         raise ValueError("to_simulation: row selects a state of a run, but a problem has only its start; omit row.")
     if row is not None and not -rows <= row < rows:
         raise ValueError(f"to_simulation: no row {row}, the run has {rows} saved states.")
+    k: Any = -1 if row is None else row
     if y is None:
-        k = -1 if row is None else row
-        at, y = (problem.t_span[0], problem.y0) if run is problem else (run.t[k], run.y[:, k])
-    else:
-        at = problem.t_span[0] if run is problem else _time_of(run, y, t)
-    y = np.array(y, dtype=float)
-    if y.shape != (6 * bodies.gm.size,):
-        n = bodies.gm.size
+        y = problem.y0 if run is problem else run.y[:, k]
+    elif t is None and run is not problem:
+        equal = (run.y == np.reshape(y, (-1, 1))).all(axis=0)
+        if not equal.any():
+            raise ValueError("to_simulation: y is not a saved state of the run. Give its time: t=...")
+        k = np.argmax(equal)
+    if t is None:
+        t = problem.t_span[0] if run is problem else run.t[k]
+    y, n = np.array(y, dtype=float), bodies.gm.size
+    if y.shape != (6 * n,):
         raise ValueError(f"to_simulation: y has the shape {y.shape}; expected ({6 * n},) for {n} bodies.")
-    return float(at if t is None else t), y
-
-
-def _time_of(run: Any, y: Any, t: float | None) -> float:
-    if t is not None:
-        return t
-    equal = (run.y == np.reshape(y, (-1, 1))).all(axis=0)
-    if not equal.any():
-        raise ValueError("to_simulation: y is not a saved state of the run. Give its time: t=...")
-    return float(run.t[np.argmax(equal)])
+    return float(t), y
 
 
 def _new(bodies: Bodies) -> rebound.Simulation:
@@ -506,9 +478,8 @@ def _new(bodies: Bodies) -> rebound.Simulation:
     label = "name" if hasattr(rebound.Particle, "name") else "hash"
     for k, (m, name) in enumerate(zip((bodies.gm / sim.G).tolist(), labels, strict=True)):
         sim.add(m=m, **({} if name == str(k) else {label: name}))
-    last = int(np.flatnonzero(bodies.gm)[-1]) + 1
-    if last < n:
-        sim.N_active = last
+    if bodies.gm[-1] == 0:
+        sim.N_active = int(np.flatnonzero(bodies.gm)[-1]) + 1
     return sim
 
 
@@ -518,21 +489,15 @@ def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | 
     The unit of mass is one in which the gravitational constant has the value `G`, and "msun" if `G` is None. Return
     None if the problem has no units of length and time, or if REBOUND has no name for one of the three units.
     """
-    known = problem.unit_system
-    if known is None:
-        return None
-    tables = rebound_units.lengths_SI, rebound_units.times_SI
-    found = [
-        next((name for name, si in table.items() if math.isclose(si, unit.si, rel_tol=1e-9)), None)
-        for table, unit in zip(tables, known, strict=True)
-    ]
-    if None in found:
+    tables, found = (rebound_units.lengths_SI, rebound_units.times_SI), []
+    for table, unit in zip(tables, problem.unit_system or (), strict=False):
+        found += [name for name, si in table.items() if math.isclose(si, unit.si, rel_tol=1e-9)][:1]
+    if len(found) < 2:
         return None
     length, time = found
-    masses = ["msun"] if G is None else list(rebound_units.masses_SI)
-    for mass in masses:
+    for mass in ["msun"] if G is None else rebound_units.masses_SI:
         if G is None or math.isclose(rebound_units.convert_G((length, time, mass)), G, rel_tol=1e-12):
-            return str(length), str(time), mass
+            return length, time, mass
     return None
 
 
@@ -574,6 +539,4 @@ def _refuse_unsupported(sim: rebound.Simulation) -> None:
     )
     for present, what in obstacles:
         if present:
-            raise ValueError(
-                f"the simulation has a feature that an N-body problem of eip_scipy does not support: {what}"
-            )
+            raise ValueError(f"{UNSUPPORTED}: {what}")

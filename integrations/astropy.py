@@ -61,7 +61,8 @@ def span(start: Any, end: Any, *, scale: str | None = None) -> tuple[Time, Time]
     ('utc', '2014-02-02T00:01:07.185', '864000.000 s')
     """
     first = _time("start", start, scale)
-    return first, first + end if _is_duration(end) else _time("end", end, scale)
+    is_duration = isinstance(end, units.Quantity) or (hasattr(end, "jd1") and not is_time(end))
+    return first, first + end if is_duration else _time("end", end, scale)
 
 
 def times(run: Any, *, scale: str = "tdb") -> Time:
@@ -146,8 +147,7 @@ def _part(run: Any, part: int, own: Any, unit: Any) -> units.Quantity:
             "y_..., z_... of each body, and then vx_..., vy_..., vz_..."
         )
     rows = np.asarray(run.y).reshape(2, half // 3, 3, -1)[part]
-    found = units.Quantity(rows, own)
-    return found if unit is None else found.to(unit)
+    return units.Quantity(rows, own).to(own if unit is None else unit)
 
 
 def _units(run: Any) -> tuple[Unit, Unit]:
@@ -177,7 +177,3 @@ def _time(name: str, value: Any, scale: str | None) -> Time:
         raise ValueError(f"span: unknown time scale {scale!r}; expected one of {', '.join(sorted(Time.SCALES))}.")
     first, second = value if isinstance(value, tuple | list) else (value, 0.0)
     return Time(first, second, format="jd", scale=scale)
-
-
-def _is_duration(value: Any) -> bool:
-    return isinstance(value, units.Quantity) or (hasattr(value, "jd1") and not is_time(value))

@@ -13,7 +13,7 @@ import ipaddress
 import time
 import uuid
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import replace
@@ -33,8 +33,7 @@ except ModuleNotFoundError as error:
 
 __all__ = ["DaskExecutor", "local_client", "pool"]
 
-ENCRYPTED = ("tls", "wss")
-WITHIN_A_PROCESS = "inproc"
+SAFE = ("tls", "wss", "inproc")  # protocols that encrypt, or stay within a process
 RUNNING = "running"
 # Seconds between two checks for workers, and before a member is tried that may kill one.
 PATIENCE, GRACE = 20.0, 1.0
@@ -109,16 +108,7 @@ def local_client(workers: int | None = None) -> distributed.Client:
 
 
 def require_secure(client: distributed.Client) -> None:
-    """Raise an error if the client's cluster listens beyond this machine without TLS.
-
-    Raises
-    ------
-    PermissionError
-        If the scheduler or a worker listens beyond this machine without TLS; the message names the address and says
-        what to do.
-    RuntimeError
-        If the client is closed.
-    """
+    """Raise PermissionError if a scheduler or worker listens beyond this machine without TLS, see `DaskExecutor`."""
     _require_open(client)
     information = client.scheduler_info(n_workers=-1)
     for address in (information["address"], *information["workers"]):
@@ -138,7 +128,7 @@ def _require_open(client: distributed.Client) -> None:
 
 def _is_secure(address: str) -> bool:
     protocol, _, rest = address.partition("://")
-    if protocol in ENCRYPTED or protocol == WITHIN_A_PROCESS:
+    if protocol in SAFE:
         return True
     host = get_address_host(address) if rest else address
     try:
@@ -150,22 +140,9 @@ def _is_secure(address: str) -> bool:
 def pool(executor: Any, task: Task, key: str) -> DaskPool:
     """Return the pool that runs the chunks of an ensemble, for `eip_scipy.ensemble`.
 
-    Parameters
-    ----------
-    executor : "dask", distributed.Client or DaskExecutor
-    task : Task
-        The part of the ensemble that all chunks share.
-    key : str
-        Name under which a worker keeps the compiled task for further chunks.
-
-    Returns
-    -------
-    DaskPool
-
-    Raises
-    ------
-    PermissionError, RuntimeError
-        As for `DaskExecutor`, and as for `local_client` if processes are started.
+    `executor` is "dask", a `distributed.Client` or a `DaskExecutor`, `task` the part of the ensemble that all chunks
+    share, and `key` the name under which a worker keeps the compiled task for further chunks. Errors are those of
+    `DaskExecutor`, and of `local_client` if processes are started.
     """
     if isinstance(executor, DaskExecutor):
         _require_open(executor.client)
@@ -202,9 +179,8 @@ class DaskPool:
         try:
             return self._result(ticket)
         except distributed.KilledWorker as error:
-            task = replace(self._task, reduce=None, keep=True)
             plan = Plan(self._task)
-            members = Members.joined(list(self._one_by_one(task, plan, chunk, error)))
+            members = self._one_by_one(replace(self._task, reduce=None, keep=True), plan, chunk, error)
             return finished(self._task, plan, members)
 
     def close(self) -> None:
@@ -252,19 +228,14 @@ class DaskPool:
         finally:
             self._open.discard(future)
 
-    def _look_after_workers(self) -> bool:
-        """Return whether there are any workers; start new processes if all those of this machine are gone.
+    def _look_after_workers(self) -> None:
+        """Start new processes if all those of this machine are gone; warn once if a cluster elsewhere has no workers.
 
         Dask's supervisor of a worker (its "nanny") gives up on a process that dies while it starts, and Dask then waits
-        without end. If a cluster elsewhere has no workers, warn once.
-
-        Raises
-        ------
-        RuntimeError
-            If the processes of this machine were lost more than `LOSSES` times without a result in between.
+        without end. RuntimeError is raised if the processes were lost more than `LOSSES` times without a result.
         """
         if self._client.nthreads():
-            return True
+            return
         cluster = self._client.cluster
         if not isinstance(cluster, distributed.LocalCluster):
             if not self._warned:
@@ -274,7 +245,7 @@ class DaskPool:
                     RuntimeWarning,
                     stacklevel=2,
                 )
-            return False
+            return
         self._losses += 1
         if self._losses > LOSSES:
             raise RuntimeError(
@@ -287,16 +258,9 @@ class DaskPool:
         while cluster.workers and time.monotonic() < until:
             time.sleep(0.1)
         cluster.scale(workers)
-        return False
 
     def _wait_for_workers(self) -> None:
-        """Wait until there is a worker. If none appears, start new processes in a cluster on this machine.
-
-        For a cluster elsewhere, warn once and continue to wait.
-
-        Dask's supervisor of a worker (its "nanny") does not replace a process that died before the nanny knew that it
-        had started.
-        """
+        """Wait until there is a worker; if none appears, see `_look_after_workers`."""
         until = time.monotonic() + PATIENCE
         while not self._client.nthreads():
             if time.monotonic() > until:
@@ -305,20 +269,18 @@ class DaskPool:
             time.sleep(0.1)
         time.sleep(GRACE)
 
-    def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Iterable[Members]:
-        """Run a chunk that killed its workers in halves, again and again, to find the member that kills them.
+    def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Members:
+        """Run a chunk that killed its workers, with `error`, in halves, again and again, by `task`.
 
-        Return the results of all members of the chunk, in their order. The status of a member that kills its workers is
-        `FAILED`; the others have been run. `task` is the task with which the halves run, `plan` makes the result of
-        a member that kills its workers, and `error`, the error of the chunk, is named in the message of this member.
+        The status of a member that kills its workers alone is `FAILED`; `plan` makes its result.
         """
         m = len(chunk.y0s)
         if m == 1:
             members = plan.empty(1)
             members.y[:], members.t[:], members.status[:] = chunk.y0s, plan.t0, FAILED
             members.message[0] = f"its workers died, one after the other: {error}"
-            return [members]
-        found: list[Members] = []
+            return members
+        found = []
         for first, last in ((0, m // 2), (m // 2, m)):
             with self._connected():
                 self._wait_for_workers()
@@ -326,5 +288,5 @@ class DaskPool:
             try:
                 found.append(self._result(self._submit(task, half)).members)
             except distributed.KilledWorker as again:
-                found.extend(self._one_by_one(task, plan, half, again))
-        return found
+                found.append(self._one_by_one(task, plan, half, again))
+        return Members.joined(found)

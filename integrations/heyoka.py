@@ -97,7 +97,7 @@ class ProjectedTaylor:
     @property
     def values(self) -> np.ndarray:
         """Values of the invariants at the present state, shape (l,)."""
-        return np.split(self._examined(), 2)[0]
+        return self._examined()[0]
 
     def propagate_until(self, t: float, *, c_output: bool = False, **options: Any) -> tuple[Any, ...]:
         """Integrate to `t`, before or after the present time, as ``heyoka.taylor_adaptive.propagate_until``.
@@ -148,11 +148,10 @@ class ProjectedTaylor:
         return self._function(np.ascontiguousarray(z))[: y.shape[1]].T.copy()
 
     def _run(self, advance: Any, starts: list[Any] | None) -> tuple[Any, ...]:
-        """Alternate calls of `advance` and projections until the end of the run; return what heyoka returns.
+        """Alternate calls of `advance` and projections until a call ends for another reason than its number of steps.
 
-        ``advance()`` lets heyoka make up to `every` steps, and returns what heyoka returns. The run ends when a call of
-        `advance` ends for another reason than its number of steps. If `starts` is a list, the time and state at the
-        start of each call are appended to it.
+        ``advance()`` lets heyoka make up to `every` steps; this and `_run` return what heyoka returns. If `starts` is a
+        list, the time and state at the start of each call are appended to it.
         """
         state, function = self.integrator.state, self._function
         z, out = np.concatenate([state, self._known()]), np.empty(state.size + len(self.names))
@@ -176,16 +175,15 @@ class ProjectedTaylor:
     def _known(self) -> np.ndarray:
         return np.concatenate([self.integrator.pars, self.targets])
 
-    def _examined(self) -> np.ndarray:
-        return self._checked(np.concatenate([self.integrator.state, self.integrator.pars]))
+    def _examined(self) -> list[np.ndarray]:
+        return np.split(self._checked(np.concatenate([self.integrator.state, self.integrator.pars])), 2)
 
     def _judge(self, before: np.ndarray) -> None:
         """Warn about each invariant whose errors are too large to be errors of accurate steps.
 
-        These are errors that the last projection did not reduce (`before` (l,) are the magnitudes before it), and
-        errors that were a large share of the size of the invariant's terms, see `_examination`.
+        The last projection did not reduce them from `before` (l,), or they were a large share of the invariant's terms.
         """
-        values, terms = np.split(self._examined(), 2)
+        values, terms = self._examined()
         after = np.abs(self.targets - values)
         for k, name in enumerate(self.names):
             remains = not after[k] <= max(before[k], REMAINS * EPS * terms[k])
@@ -256,10 +254,8 @@ def _named(invariants: Any, integrator: Any) -> dict[str, Any]:
 def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
     """Compile a function of state, parameters and targets that returns the projected state and the residuals.
 
-    `names`, `pars` and `expressions` are the state variables, the parameters and the invariants as expressions of
-    heyoka. The residuals (l,) are the targets minus the invariants. The function takes one Newton step: it adds the
-    correction x of smallest norm with G x = residuals, where the rows of G are the gradients, which are made orthogonal
-    one after the other.
+    The residuals (l,) are the targets minus the invariants `expressions`. The function adds the correction x of
+    smallest norm with G x = residuals to the state; the rows of G, the gradients, are made orthogonal in turn.
     """
     targets = _variables("__target", len(expressions))
     basis: list[list[Any]] = []
@@ -287,8 +283,7 @@ def _projection(names: list[Any], pars: list[Any], expressions: list[Any]) -> An
 def _examination(names: list[Any], pars: list[Any], expressions: list[Any]) -> Any:
     """Compile a function of state and parameters that returns the invariants (l,) and the sizes of their terms (l,).
 
-    The arguments are those of `_projection`. The size of the terms of an invariant is the norm of the products of the
-    components of its gradient and the state.
+    A size is the norm of the products of the components of the gradient and the state.
     """
     terms = [_dot(row := [heyoka.diff(item, name) * name for name in names], row) for item in expressions]
     return heyoka.cfunc(

@@ -36,18 +36,9 @@ from eip_scipy.problems.gravity.solar_data import (
 __all__ = ["constants", "heliocentric", "initial_data", "kernel_path", "main", "mass_parameters"]
 
 # name: (NAIF numbers of the segments to be added up, name of its GM in the kernel's comments)
-_BODIES = {
-    "Sun": ([(0, 10)], "GMS"),
-    "Mercury": ([(0, 1)], "GM1"),
-    "Venus": ([(0, 2)], "GM2"),
-    "EMB": ([(0, 3)], "GMB"),
-    "Mars": ([(0, 4)], "GM4"),
-    "Jupiter": ([(0, 5)], "GM5"),
-    "Saturn": ([(0, 6)], "GM6"),
-    "Uranus": ([(0, 7)], "GM7"),
-    "Neptune": ([(0, 8)], "GM8"),
-    "Pluto": ([(0, 9)], "GM9"),
-}
+_PLANETS = "Mercury", "Venus", "EMB", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto"
+_BODIES = {"Sun": ([(0, 10)], "GMS")}
+_BODIES |= {name: ([(0, k)], "GMB" if name == "EMB" else f"GM{k}") for k, name in enumerate(_PLANETS, start=1)}
 _EARTH_AND_MOON = {"Earth": ([(0, 3), (3, 399)], "GM3"), "Moon": ([(0, 3), (3, 301)], "GMM")}
 _J2000_JD = 2451545.0
 # Two parts: a single float64 is up to 20 microseconds off, 1 m on Mercury's orbit.
@@ -303,11 +294,7 @@ def _comments(path: _StrPath | None) -> str:
 
 
 def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
-    """Return the kernel's segments and the name of GM of each body, by the names of the bodies.
-
-    A segment is given by the NAIF numbers of its centre and its target. GM has its name in the kernel's comments.
-    The bodies are in the order of their distance from the Sun; if `moon`, Earth and Moon replace EMB.
-    """
+    """Return `_BODIES`, in the order of their distance from the Sun; if `moon`, Earth and Moon replace EMB."""
     bodies = {}
     for name, entry in _BODIES.items():
         bodies.update(_EARTH_AND_MOON if moon and name == "EMB" else {name: entry})
@@ -315,10 +302,7 @@ def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
 
 
 def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, int]], str]]) -> list[list[Any]]:
-    """Return for each body the segments whose sum is its position relative to the solar system's barycentre.
-
-    `bodies` is the mapping that `_bodies` returns, and `path` is the path of the kernel, for the error message.
-    """
+    """Return for each body the segments whose sum is its position relative to the solar system's barycentre."""
     missing = [name for name, (pairs, _) in bodies.items() if any(pair not in kernel.pairs for pair in pairs)]
     if missing:
         raise ValueError(f"{path} has no segment for {', '.join(missing)}; expected a planetary kernel such as DE440")
@@ -327,10 +311,7 @@ def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, i
 
 @contextmanager
 def _whole(path: Path) -> Iterator[None]:
-    """Replace a TypeError in the block, which jplephem raises for an incomplete file, by a ValueError that says so.
-
-    `path` is the path of the kernel.
-    """
+    """Replace a TypeError in the block, which jplephem raises for an incomplete file, by a ValueError that says so."""
     try:
         yield
     except TypeError as error:
@@ -354,9 +335,7 @@ def _entry(data: SolarSystemData, epoch: tuple[float, float]) -> dict[str, Any]:
         "source": f"{data.source}; Park et al., Astron. J. 161 (2021) 105, doi:10.3847/1538-3881/abd414",
         "extracted_by": "python -m eip_scipy.integrations.jpl",
         "bodies": data.bodies,
-        "gm": data.gm.tolist(),
-        "position": data.position.tolist(),
-        "velocity": data.velocity.tolist(),
+        **{name: getattr(data, name).tolist() for name in ("gm", "position", "velocity")},
     }
 
 

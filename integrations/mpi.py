@@ -69,18 +69,13 @@ def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
         message[1 : 1 + size] = part.reshape(-1)
     comm.Allgather(message, messages)
     if any(messages[:, 0].tolist()):
-        _raise_that_of_another(comm)
+        rank, text = next((rank, text) for rank, text in enumerate(comm.allgather(None)) if text is not None)
+        raise RankError(f"rank {rank} raised {text}")
     if size <= ROOM:
         return messages[:, 1 : 1 + size].copy().reshape(shape)
     parts = np.empty(shape)
     comm.Allgather(part, parts)
     return parts
-
-
-def _raise_that_of_another(comm: MPI.Comm) -> None:
-    texts = comm.allgather(None)
-    rank = next(rank for rank, text in enumerate(texts) if text is not None)
-    raise RankError(f"rank {rank} raised {texts[rank]}")
 
 
 @contextmanager
@@ -238,22 +233,13 @@ class _OverRanks(SolverOfParts):
 
 
 def _refuse(name: str, options: dict[str, Any]) -> None:
-    """Reject options and values that a run on several ranks does not support.
-
-    Raises
-    ------
-    TypeError
-        If an option is not in `OPTIONS`.
-    ValueError
-        If `h` is missing, or a value is not supported for a state on several ranks.
-    """
+    """Raise an error for an option that is not in `OPTIONS` or a value that a run on several ranks does not support."""
     for option in options:
         if option not in OPTIONS:
             raise TypeError(f"{name} has no option {option!r}, only {', '.join(OPTIONS)}{nearest(option, OPTIONS)}")
     if options.get("h") is None:
         raise ValueError(f"{name} takes fixed steps only: give h.")
-    metric = options.get("metric")
-    if metric is not None and not (isinstance(metric, str) and metric == "euclidean"):
+    if not isinstance(metric := options.get("metric"), str | None) or metric not in ("euclidean", None):
         raise ValueError(f"{name} has the Euclidean metric only, got metric = {metric!r}.")
     if options.get("every", 1) == "auto":
         raise ValueError(f"{name}: every='auto' needs an error estimate, which fixed steps do not take; give a number.")
@@ -263,14 +249,9 @@ def _refuse(name: str, options: dict[str, Any]) -> None:
 
 
 def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.ndarray, h: float) -> None:
-    """Check that the invariants `known` are the same on all ranks, and that they agree with their gradients.
+    """Raise ValueError on all ranks if an invariant differs between them or disagrees with its gradient.
 
     The gradients are checked as in a run on one rank, but only on the plane through y along two random directions.
-
-    Raises
-    ------
-    ValueError
-        On all ranks, if an invariant differs between them or disagrees with its gradient.
     """
     for name, values in zip(known.names, gathered(comm, known.start_values).T, strict=True):
         if np.any(values != values[0]):

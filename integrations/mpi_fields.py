@@ -1,9 +1,8 @@
 """The rotating Gross-Pitaevskii equation with its field cut into slabs, one for each rank of an MPI communicator.
 
 A rank holds the field at some of the points x, for all y and z. It transforms along y and z directly, and along x after
-a transposition, after which it holds some of the points y, for all x and z. For this each rank sends a part of its
-points to every other rank. A right-hand side takes two transpositions. An energy takes two as well, unless the
-right-hand side at the same state is known already.
+a transposition, after which it holds some of the points y, for all x and z. A right-hand side takes two transpositions,
+and so does an energy, unless the right-hand side at the same state is known already.
 
 Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
 """
@@ -92,7 +91,8 @@ class Transposition:
                 "ranks or a larger grid, of two or three dimensions."
             )
         self._comm = comm
-        xs, ys = ([slice(*ends) for ends in pairwise(_cuts(n, comm.size))] for n in grid.shape[:2])
+        cuts = ([n * rank // comm.size for rank in range(comm.size + 1)] for n in grid.shape[:2])
+        xs, ys = ([slice(*ends) for ends in pairwise(places)] for places in cuts)
         self.slab, self.turned = Slab(grid, 0, xs[comm.rank]), Slab(grid, 1, ys[comm.rank])
         self.here, self.image = np.empty(self.turned.shape, complex), np.empty(self.turned.shape, complex)
         self._sent = np.empty(self.slab.size, complex)
@@ -129,16 +129,10 @@ class Transposition:
         out[:, self.turned.part] = self.image[self.slab.part]
 
 
-def _cuts(n: int, ranks: int) -> list[int]:
-    """Return the indices (ranks + 1) at which n points are cut into parts of equal sizes, as far as possible."""
-    return [n * rank // ranks for rank in range(ranks + 1)]
-
-
 class _TurnedMultiplier(Multiplier):
-    """Multiplier of the modes along x by a real factor, which may vary with y and z.
+    """Multiplier of the modes along x, between two transpositions by `way`, by a real `factor` on the whole grid.
 
-    It is applied between two transpositions by `way`. `factor` (J, K[, L]) is given on the whole grid; axes along
-    which it is constant may have the length 1.
+    `factor` (J, K[, L]) may have the length 1 along axes on which it does not depend.
     """
 
     def __init__(self, way: Transposition, factor: np.ndarray) -> None:
@@ -147,16 +141,13 @@ class _TurnedMultiplier(Multiplier):
         super().__init__(way.turned, (0,), here)
 
     def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
-        """Fill `out` with the field `psi` whose modes along x are multiplied by the factor; `first` is not used."""
+        """Fill `out` with the field `psi` whose modes along x are multiplied by the factor."""
         self._way.turn(psi)
         super().apply(fft, self._way.here, self._way.image)
         self._way.turn_back(out)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
-        """Return this rank's part of the sum over the grid of conj(psi) times the field of `apply`.
-
-        `work` is not used.
-        """
+        """Return this rank's part of the sum over the grid of conj(psi) times the field of `apply`."""
         self._way.turn(psi)
         return super().expectation(fft, self._way.here, self._way.image)
 

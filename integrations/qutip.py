@@ -76,14 +76,8 @@ class IntegratorEIP(Integrator):
             )
         self._shape = state0.shape
         control = {name: value for name, value in self.options.items() if value}
-        self.solver = self.solver_class(
-            self._derivative,
-            t,
-            state0.to_array().astype(complex).ravel(),
-            np.inf,
-            invariants=self._invariants(),
-            **control,
-        )
+        y0 = state0.to_array().astype(complex).ravel()
+        self.solver = self.solver_class(self._derivative, t, y0, np.inf, invariants=self._invariants(), **control)
         self._t, self._y = float(t), self.solver.y
         self._is_set = True
 

@@ -232,11 +232,17 @@ def run(
     H. Rein, D. Tamayo, G. Brown, High-order symplectic integrators for planetary dynamics, MNRAS 489 (2019) 4632-4640.
     """
     gm, y0 = _check_state(gm, y0)
-    _check_integrator(integrator, gm)
-    saved = _saved_steps(_count_steps(h, n_steps, t_end), save_every)
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"unknown integrator {integrator!r}: expected one of {', '.join(map(repr, INTEGRATORS))}")
+    if integrator.startswith(("whfast", "saba")) and gm.argmax() != 0:
+        raise ValueError(
+            f"{integrator} follows orbits around body 0, which is not the heaviest; put the heaviest body (the Sun) "
+            "first"
+        )
+    steps = _count_steps(h, n_steps, t_end)
+    saved = np.append(np.arange(0, steps, steps if save_every is None else count("save_every", save_every)), steps)
     sim = simulation(gm, y0)
-    _set_integrator(sim, integrator)
-    _set_ias15(sim, integrator, epsilon, criterion)
+    _set_integrator(sim, integrator, epsilon, criterion)
     kept = None if prepare is None else prepare(sim)
     if integrator != "ias15":
         sim.dt = h
@@ -248,7 +254,8 @@ def run(
         if integrator == "ias15":
             sim.integrate(last * h, exact_finish_time=1)
         else:
-            _take_steps(sim, last - first)
+            for done in range(first, last, _CHUNK):
+                sim.steps(min(_CHUNK, last - done))
         sim.synchronize()
         wall_time += perf_counter() - start
         y[row] = _state(sim)
@@ -289,25 +296,23 @@ def ias15_steps(
     ValueError
         If a value is wrong, as in `run`.
     """
-    gm, y0 = _check_state(gm, y0)
-    _count_steps(t_end, 1, None)
     sim = simulation(gm, y0)
-    _set_integrator(sim, "ias15")
-    _set_ias15(sim, "ias15", epsilon, criterion)
-    times, states, evaluations = [0.0], [_state(sim)], [0]
+    _count_steps(t_end, 1, None)
+    _set_integrator(sim, "ias15", epsilon, criterion)
+    times, states, evaluations = [0.0], [_state(sim)], 0
 
     def note(_: Any) -> None:
-        evaluations[0] += 1
+        nonlocal evaluations
+        evaluations += 1
 
     def look(_: Any) -> None:
         if sim.t != times[-1]:
             times.append(sim.t)
             states.append(_state(sim))
 
-    sim.additional_forces = note
-    sim.heartbeat = look
+    sim.additional_forces, sim.heartbeat = note, look
     sim.integrate(t_end, exact_finish_time=1)
-    return ReboundSteps(np.array(times), np.array(states).T, evaluations[0])
+    return ReboundSteps(np.array(times), np.array(states).T, evaluations)
 
 
 def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -322,16 +327,6 @@ def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
     if not (gm > 0).all():
         raise ValueError(f"gm must be positive (test particles are not supported), got {gm.min()!r}")
     return gm, y
-
-
-def _check_integrator(integrator: str, gm: np.ndarray) -> None:
-    if integrator not in INTEGRATORS:
-        raise ValueError(f"unknown integrator {integrator!r}: expected one of {', '.join(map(repr, INTEGRATORS))}")
-    if integrator.startswith(("whfast", "saba")) and gm.argmax() != 0:
-        raise ValueError(
-            f"{integrator} follows orbits around body 0, which is not the heaviest; put the heaviest body (the Sun) "
-            "first"
-        )
 
 
 def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
@@ -354,12 +349,9 @@ def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
     return n_steps
 
 
-def _saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:
-    every = n_steps if save_every is None else count("save_every", save_every)
-    return np.unique(np.append(np.arange(0, n_steps, every), n_steps))
-
-
-def _set_integrator(sim: rebound.Simulation, name: str) -> None:
+def _set_integrator(
+    sim: rebound.Simulation, name: str, epsilon: float | None = None, criterion: str | None = None
+) -> None:
     family = name.removesuffix("-c17").removesuffix("(10,6,4)")
     sim.integrator = family
     # Version 4 keeps an integrator's options in sim.ri_<family>, version 5 in sim.integrator.
@@ -373,15 +365,9 @@ def _set_integrator(sim: rebound.Simulation, name: str) -> None:
         options.type = "10,6,4" if version_4 else "10_6_4"
     if name == "whfast-c17":
         options.corrector = 17
-
-
-def _set_ias15(sim: rebound.Simulation, integrator: str, epsilon: float | None, criterion: str | None) -> None:
-    given = {name: value for name, value in (("epsilon", epsilon), ("criterion", criterion)) if value is not None}
-    if not given:
-        return
-    if integrator != "ias15":
-        raise ValueError(f"{' and '.join(given)} can be given only with integrator='ias15', got {integrator!r}")
-    options = getattr(sim, "ri_ias15", None) or sim.integrator
+    given = [what for what, value in (("epsilon", epsilon), ("criterion", criterion)) if value is not None]
+    if given and name != "ias15":
+        raise ValueError(f"{' and '.join(given)} can be given only with integrator='ias15', got {name!r}")
     if epsilon is not None:
         if not (epsilon > 0 and math.isfinite(epsilon)):
             raise ValueError(f"epsilon must be positive and finite, got {epsilon!r}")
@@ -390,11 +376,6 @@ def _set_ias15(sim: rebound.Simulation, integrator: str, epsilon: float | None, 
         if criterion not in _CRITERIA:
             raise ValueError(f"unknown criterion {criterion!r}: expected one of {', '.join(map(repr, _CRITERIA))}")
         options.adaptive_mode = _CRITERIA[criterion]
-
-
-def _take_steps(sim: rebound.Simulation, n: int) -> None:
-    for done in range(0, n, _CHUNK):
-        sim.steps(min(_CHUNK, n - done))
 
 
 def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -131,10 +131,7 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
 
 
 def existing(name: str, what: str) -> CheckpointError:
-    """Return the error for a run without ``resume=True`` whose checkpoint file or Zarr group `name` exists.
-
-    `what` names the kind of run in the message: "run" or "ensemble".
-    """
+    """Return the error for a run or ensemble (`what`) without ``resume=True`` whose file or group `name` exists."""
     return CheckpointError(
         f"{name!r} exists. Pass resume=True to continue the {what} that it holds; for a new {what}, use another "
         "place or delete this one."
@@ -209,11 +206,7 @@ def _machine() -> str:
 
 
 def origin() -> dict[str, Any]:
-    """Return the entries ``versions`` and ``machine`` of the header of a checkpoint.
-
-    They are the versions of Python, of this package, NumPy, SciPy and, if it is loaded, Numba; and the names of the
-    operating system and the processor.
-    """
+    """Return the entries of a checkpoint's header on versions, of Numba only if it is loaded, and on the machine."""
     # The version of Numba only if it is loaded: otherwise it has compiled no function of the run.
     decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
     return {"versions": decide, "machine": _machine()}
@@ -222,9 +215,7 @@ def origin() -> dict[str, Any]:
 def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
     """Write the header `text` and the arrays to `stream` as a zip archive."""
     with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr(
-            zipfile.ZipInfo(HEADER), text
-        )  # ZipInfo has a fixed date, so that equal contents give equal files
+        archive.writestr(zipfile.ZipInfo(HEADER), text)  # with a fixed date, so that equal contents give equal files
         for name, value in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, np.asarray(value, order="C"), version=(1, 0), allow_pickle=False)

@@ -27,25 +27,10 @@ class Lock:
     The lock is held on a separate file next to the place, because a checkpoint is replaced by another file each time it
     is written. The lock file contains the name of the process that holds the lock, and `close` removes it. Processes
     that are started or forked do not inherit the lock. A file system without locks causes a RuntimeWarning. If the user
-    has no right to create the lock file, nothing is locked.
+    has no right to create the lock file, nothing is locked. CheckpointError is raised if another run holds the lock, in
+    this process or another, or the file cannot be opened or created for another reason than missing rights.
 
-    Parameters
-    ----------
-    place : path-like
-        File or folder to lock; it need not exist.
-
-    Attributes
-    ----------
-    name : str
-        Absolute path of `place`.
-    path : Path
-        Absolute path with links resolved.
-
-    Raises
-    ------
-    CheckpointError
-        If another run holds the lock, in this process or another. Also if the lock file exists but cannot be opened, or
-        cannot be created for another reason than missing rights.
+    `place`, the file or folder, need not exist; `name` is its absolute path, and `path` that with links resolved.
     """
 
     def __init__(self, place: str | os.PathLike[str]) -> None:

@@ -36,21 +36,11 @@ AGAIN = "python -m pip install --no-build-isolation --no-deps --editable ."
 
 
 class NumbaEntry(NamedTuple):
-    """The code that Numba compiled for ``fun(t, y)``, in Numba's calling convention.
-
-    Attributes
-    ----------
-    address : int
-        Address of the code.
-    release : int
-        Address of the function that gives up a reference to the memory of a returned array.
-    owner : object
-        Keeps the code in memory.
-    """
+    """The code that Numba compiled for ``fun(t, y)``, in Numba's calling convention."""
 
     address: int
-    release: int
-    owner: Any
+    release: int  # address of the function that gives up a reference to the memory of a returned array
+    owner: Any  # keeps the code in memory
 
 
 class Call(NamedTuple):
@@ -75,10 +65,7 @@ class Call(NamedTuple):
 
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: Any) -> Call:
-    """Return a `Call` of ``fun(t, y, ..., *args)``; if the engine does not accept as many `args`, Python adds them.
-
-    `shape`, `convert` and `kind` are fields of the `Call`.
-    """
+    """Return a `Call` of ``fun(t, y, ..., *args)``; if the engine does not accept as many `args`, Python adds them."""
     if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
     return Call(fun, args, shape, convert, **kind)
@@ -87,19 +74,12 @@ def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...],
 class Rates(NamedTuple):
     """The rates at which the balances of a run change.
 
-    Attributes
-    ----------
-    items : tuple of (int, int)
-        For each balance the index of its function among those of the invariants, and the number of its values.
-    functions : tuple
-        For each balance its rate, as a `Call`, an address or a `LibraryFunction`. If it is None, the rate is computed
-        from the gradient along the flow and from the explicit dependence on time.
-    low, high, shift : float
-        Lower and upper end of the run's interval, within which derivatives with respect to time are computed, and the
-        shift of the time in the finite differences that give these derivatives.
+    `functions` has for each balance its rate, as a `Call`, an address or a `LibraryFunction`. If it is None, the rate
+    is computed from the gradient along the flow and from the explicit dependence on time, by finite differences with
+    the `shift` of the time, in the interval from `low` to `high`.
     """
 
-    items: tuple[tuple[int, int], ...] = ()
+    items: tuple[tuple[int, int], ...] = ()  # of each balance: index among the invariants' functions, number of values
     functions: tuple[Any, ...] = ()
     low: float = 0.0
     high: float = 0.0

@@ -71,24 +71,12 @@ class ProjectionWarning(RuntimeWarning):
 
 
 class Trust:
-    """The figures recorded in the projections of a run, and the findings of the checks of the run.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the l invariants.
-    figures : ndarray, shape (l, N_FIGURES)
-        Figures recorded by the step.
-    doubts : list of str
-        Findings of the checks of the invariants, as sentences.
-    failed : bool
-        True if a step failed.
-    """
+    """The figures (l, N_FIGURES) recorded in the projections of a run, and the findings of the checks of the run."""
 
     def __init__(self, names: Sequence[str], figures: np.ndarray) -> None:
         self.names, self.figures = tuple(names), figures
-        self.doubts: list[str] = []
-        self.failed = False
+        self.doubts: list[str] = []  # findings of the checks of the invariants, as sentences
+        self.failed = False  # True if a step failed
 
     @property
     def trusted(self) -> bool:
@@ -145,12 +133,10 @@ class Trust:
             return []
         found = np.flatnonzero(sick(self.figures))
         worst = found[np.argsort(-_severity(self.figures[found]), kind="stable")]
-        more = (
-            [f"{found.size - MOST_REASONS} more invariants exceed the bounds of correct runs"]
-            if found.size > MOST_REASONS
-            else []
-        )
-        return [_reason(self.names[k], self.figures[k]) for k in worst[:MOST_REASONS]] + more
+        reasons = [_reason(self.names[k], self.figures[k]) for k in worst[:MOST_REASONS]]
+        if found.size > MOST_REASONS:
+            reasons.append(f"{found.size - MOST_REASONS} more invariants exceed the bounds of correct runs")
+        return reasons
 
     @property
     def message(self) -> str:

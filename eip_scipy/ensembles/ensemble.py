@@ -39,7 +39,6 @@ from ..run.prepare import DEFAULT, Request, default_method
 from ..run.results import WithColumns
 from ..run.tables import dataset, default_names, to_dataframe
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order, run_elsewhere
-from .happened import Happened
 from .own_times import OwnTimes, own_times
 from .side_by_side import LANES
 from .statistics import Statistics, merge
@@ -276,8 +275,7 @@ class EnsembleResult(WithColumns):
         """Return the fields in the form that `eip_scipy.results.save` accepts."""
         from .saving import packed
 
-        ends = vars(self).get("_ends")
-        return packed(self if ends is None else {**self, "end_invariants": ends})
+        return packed(self)
 
     @classmethod
     def _unpacked(cls, fields: dict[str, Any]) -> EnsembleResult:
@@ -486,13 +484,7 @@ def _check_choices(reduce: Any, callback: Any, progress: Any, max_bytes: Any) ->
 
 
 def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
-    """Warn about members that are not to be trusted; `doubtful` holds the indices of these members.
-
-    Raises
-    ------
-    ProjectionWarning
-        If warnings are errors; its attribute ``partial`` is the result.
-    """
+    """Warn about the members with the indices `doubtful`, which are not to be trusted."""
     if not doubtful.size:
         return
     k = int(doubtful[0])
@@ -540,38 +532,19 @@ class _Gathered:
 
         done = self._stored()
         total = len(self.whole.t)
+        chunks = (self.everyone.part(first, first + self.chunk) for first in range(done, total, self.chunk))
+        shown: dict[str, Any] = {"desc": self.method, "unit": "member", "unit_scale": True, "disable": not progress}
         try:
             if done < total:
-                with (
-                    kept_ctrl_c(),
-                    tqdm(
-                        total=total,
-                        initial=done,
-                        desc=self.method,
-                        unit="member",
-                        unit_scale=True,
-                        disable=not progress,
-                    ) as bar,
-                ):
-                    self._gather(pool(), self._chunks(done), bar)
+                with kept_ctrl_c(), tqdm(total=total, initial=done, **shown) as bar:
+                    self._gather(pool(), chunks, bar)
         except BaseException as error:
-            error.partial = self.result()  # type: ignore[attr-defined]
+            error.partial = self._of(self.whole, self.statistics, 0)  # type: ignore[attr-defined]
             raise
-        return self.result()
-
-    def _chunks(self, done: int) -> Iterator[Chunk]:
-        """Yield the members starting at number `done`, in chunks."""
-        for first in range(done, len(self.whole.t), self.chunk):
-            yield self.everyone.part(first, first + self.chunk)
+        return self._of(self.whole, self.statistics, 0)
 
     def _stored(self) -> int:
-        """Read the results of the stored members and return the number of these members.
-
-        Raises
-        ------
-        CheckpointError
-            If the functions of this ensemble have other values than those of the stored one.
-        """
+        """Read the results of the stored members, compare their functions, and return the number of these members."""
         if self.store is None:
             return 0
         done, statistics = self.store.finished, self.store.statistics
@@ -609,10 +582,6 @@ class _Gathered:
         self.statistics = merge(self.statistics, part.statistics)
         self.one_by_one = part.one_by_one or self.one_by_one
 
-    def result(self) -> EnsembleResult:
-        """Return the result of the members finished so far."""
-        return self._of(self.whole, self.statistics, 0)
-
     def _of(self, members: Members, statistics: Statistics | None, first: int) -> EnsembleResult:
         plan, counters, times = self.plan, members.counters, _all_times(self.plan, self.everyone.own)
         trajectories = members.saved.swapaxes(1, 2) if members.saved.shape[1] else None
@@ -620,6 +589,8 @@ class _Gathered:
         invariants = ends if trajectories is None else members.saved_values.swapaxes(1, 2)
         if members is self.whole and self.store is not None and self.store.states is not None:
             trajectories, invariants = self.store.states, self.store.saved_values
+        none = [(np.zeros(0), np.zeros((0, plan.size), plan.dtype))] * plan.events  # of a member that did not run
+        events = [found or none for found in members.happened]
         trusted, message = members.trusted.copy(), np.array(members.message, dtype=object)
         for k in range(len(trusted)) if self.doubts else ():
             if trusted[k] and first + k in self.doubts:
@@ -645,8 +616,8 @@ class _Gathered:
             trajectories=trajectories,
             invariants=invariants,
             target=members.target,
-            t_events=[[t for t, _ in member] for member in self._events(members)] if plan.events else None,
-            y_events=[[y for _, y in member] for member in self._events(members)] if plan.events else None,
+            t_events=[[t for t, _ in member] for member in events] if plan.events else None,
+            y_events=[[y for _, y in member] for member in events] if plan.events else None,
             statistics=statistics,
             first=first,
             stopped=self.stopped,
@@ -654,19 +625,13 @@ class _Gathered:
             method=self.method,
             h=plan.h,
             chunk=self.chunk,
-            component_names=plan.component_names,
+            component_names=plan.ready.component_names,
         )
         if plan.variations is not None:
             _separate(result, plan.variations.columns)
-            result["columns"] = plan.described_columns
+            result["columns"] = plan.ready.described_columns
         object.__setattr__(result, "_ends", ends)  # an attribute, not a field
         return result
-
-    def _events(self, members: Members) -> list[Happened]:
-        """Return the events of members, empty for those that did not run."""
-        n, dtype = self.plan.size, self.plan.dtype
-        none = [(np.zeros(0), np.zeros((0, n), dtype))] * self.plan.events
-        return [found or none for found in members.happened]
 
 
 def _separate(result: EnsembleResult, columns: Columns) -> None:
@@ -696,10 +661,7 @@ def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
 
 
 def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
-    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change.
-
-    `every` is the option `checkpoint_every`, in seconds.
-    """
+    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change."""
     refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
@@ -785,7 +747,7 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
         request = task.request._replace(y0=starts[k].copy(), params=own, **everyone.own.of(k))
         tried = dataclasses.replace(task, request=request)
         try:
-            ready = tried.prepared(tried.request.y0, own, check_start=True)
+            ready = tried.prepared(request.y0, own, check_start=True)
         except MemoryError:
             raise
         except Exception as error:
@@ -841,16 +803,13 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
         return ThreadPool(plan, workers if plan.why_not is None else 1)
     if isinstance(executor, Executor):
         return FuturesPool(executor, partial(run_elsewhere, task, key), cores())
-    if executor == "dask" or _is_of_dask(executor):
-        if plan.pointers:
-            raise plan.pointers[0].unpicklable()  # Dask's own message for it is very long
+    kind = type(executor)
+    if executor == "dask" or kind.__module__.partition(".")[0] == "distributed" or kind.__name__ == "DaskExecutor":
+        if pointers := plan.ready.pointers:
+            raise pointers[0].unpicklable()  # Dask's own message for it is very long
         # Imported by name, because the integrations depend on this package and need further libraries.
         return import_module("eip_scipy.integrations.dask").pool(executor, task, key)
     raise TypeError(
         f"executor must be None, a number of threads, 'dask', a dask.distributed Client or an executor of "
         f"concurrent.futures, got {executor!r}."
     )
-
-
-def _is_of_dask(executor: Any) -> bool:
-    return type(executor).__module__.partition(".")[0] == "distributed" or type(executor).__name__ == "DaskExecutor"

@@ -34,10 +34,7 @@ def plot(result: Any, names: Any = None) -> Any:
 
 
 def _states(result: Any) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return the saved times and states (members, n, m), or None and the last states (members, n, 1).
-
-    The last states are returned if no states were saved or if the members have different times.
-    """
+    """Return saved times and states (members, n, m); None and last states (members, n, 1) without common times."""
     times = result.times
     if times.ndim == 2 and times.size and np.array_equal(times, np.broadcast_to(times[0], times.shape)):
         times = times[0]

@@ -14,39 +14,21 @@ Happened = list[tuple[np.ndarray, np.ndarray]]
 
 
 class Flat(NamedTuple):
-    """Events of several members.
+    """Events of several members, member after member, event after event."""
 
-    Attributes
-    ----------
-    counts : ndarray, shape (members, events)
-        How often each event happened in each member.
-    t : ndarray, shape (total,)
-    y : ndarray, shape (total, n)
-        Times and states, member after member, event after event.
-    """
-
-    counts: np.ndarray
-    t: np.ndarray
-    y: np.ndarray
+    counts: np.ndarray  # (members, events): how often each event happened in each member
+    t: np.ndarray  # (total,)
+    y: np.ndarray  # (total, n)
 
 
 def happened(count: int, which: np.ndarray, t: np.ndarray, y: np.ndarray) -> Happened:
-    """Return the times and states of one member's events, grouped by event.
-
-    `count` is the number of event functions; `which`, `t` and `y` are the number of the event function, the time and
-    the state of each event, in the order of time.
-    """
+    """Return the times and states of one member's events, in the order of time, for each of `count` event functions."""
     return [(t[which == k].copy(), y[which == k].copy()) for k in range(count)]
 
 
 def flattened(members: Sequence[Happened], events: int, n: int, dtype: Any) -> Flat:
-    """Return the events of members as flat arrays.
-
-    `events` is the number of event functions, `n` the number of components of a state, and `dtype` that of the states.
-    """
-    counts = np.zeros((len(members), events), np.int64)
-    times: list[np.ndarray] = [np.zeros(0)]
-    states: list[np.ndarray] = [np.zeros((0, n), dtype)]
+    """Return the events of members, `events` functions of states with `n` components of `dtype`, as flat arrays."""
+    counts, times, states = np.zeros((len(members), events), np.int64), [np.zeros(0)], [np.zeros((0, n), dtype)]
     for i, member in enumerate(members):
         for k, (t, y) in enumerate(member):
             counts[i, k] = t.size
@@ -57,8 +39,8 @@ def flattened(members: Sequence[Happened], events: int, n: int, dtype: Any) -> F
 
 def unflattened(flat: Flat) -> list[Happened]:
     """Return the events of members from flat arrays."""
-    ends = np.cumsum(flat.counts.reshape(-1))
-    begins = ends - flat.counts.reshape(-1)
-    pairs = [(flat.t[a:b].copy(), flat.y[a:b].copy()) for a, b in zip(begins, ends, strict=True)]
-    m, events = flat.counts.shape
-    return [pairs[i * events : (i + 1) * events] for i in range(m)]
+    ends = np.cumsum(flat.counts).reshape(flat.counts.shape)
+    return [
+        [(flat.t[b - n : b].copy(), flat.y[b - n : b].copy()) for n, b in zip(*row, strict=True)]
+        for row in zip(flat.counts, ends, strict=True)
+    ]

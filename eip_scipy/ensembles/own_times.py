@@ -15,14 +15,9 @@ __all__ = ["OwnTimes", "own_times"]
 
 
 class OwnTimes(NamedTuple):
-    """Intervals and times of members.
+    """Intervals of members, None if all members have the same, and times of their saved states.
 
-    Attributes
-    ----------
-    spans : list of (float, float) or None
-        Interval of each member; None if all members have the same interval.
-    times : list of ndarray or None
-        Times of saved states of each member; None if all members have the same interval and times, or no times.
+    `times` are None if all members have the same interval and times, or no times.
     """
 
     spans: list[tuple[float, float]] | None = None
@@ -48,22 +43,14 @@ class OwnTimes(NamedTuple):
 
     def of(self, k: int) -> dict[str, Any]:
         """Return the arguments `t_span` and `t_eval` of `integrate` for member `k`, if they differ between members."""
-        found: dict[str, Any] = {}
-        if self.spans is not None:
-            found["t_span"] = self.spans[k]
-        if self.times is not None:
-            found["t_eval"] = self.times[k]
-        return found
+        found = {"t_span": self.spans, "t_eval": self.times}
+        return {name: rows[k] for name, rows in found.items() if rows is not None}
 
     @property
     def identity(self) -> dict[str, Any]:
         """Return by name the intervals and times as arrays, which are compared when an ensemble is resumed."""
-        found: dict[str, Any] = {}
-        if self.spans is not None:
-            found["t_span"] = np.array(self.spans)
-        if self.times is not None:
-            found["t_eval"] = self.padded
-        return found
+        found = {} if self.spans is None else {"t_span": np.array(self.spans)}
+        return found if self.times is None else found | {"t_eval": self.padded}
 
     @property
     def padded(self) -> np.ndarray:
@@ -79,15 +66,15 @@ def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) 
     """Return the rows of `t_span` and `t_eval` for each member, if they have such rows.
 
     If `fun` is a `Problem`, times with units and dates are converted to numbers in its units.
-
-    Raises
-    ------
-    ValueError
-        If a row has a wrong shape, or with `save_every` or `reduce`, which need the same times for all members.
     """
     spans, times = None, None
     if _has_rows(t_span):
-        spans = [interval(_plain(fun, "t_span", _pair(row))) for row in t_span]
+        for row in t_span:
+            if np.shape(row) != (2,):
+                raise ValueError(
+                    f"t_span must be (start, end), or have the shape (members, 2); got the row {shown(row)}."
+                )
+        spans = [interval(_plain(fun, "t_span", row)) for row in t_span]
     if _has_rows(t_eval):
         times = [np.array(_plain(fun, "t_eval", row), float) for row in t_eval]
         for k, row in enumerate(times):
@@ -115,12 +102,6 @@ def _has_rows(given: Any) -> bool:
     if isinstance(given, np.ndarray) or not isinstance(given, Sequence):
         return np.ndim(given) == 2
     return len(given) > 0 and all(np.ndim(item) == 1 for item in given)
-
-
-def _pair(row: Any) -> Any:
-    if np.shape(row) != (2,):
-        raise ValueError(f"t_span must be (start, end), or have the shape (members, 2); got the row {shown(row)}.")
-    return row
 
 
 def _plain(fun: Any, name: str, row: Any) -> Any:

@@ -19,12 +19,11 @@ TUPLES = "names", "component_names"
 def packed(result: Any) -> dict[str, Any]:
     """Return the fields of a result as arrays and values that JSON can hold."""
     fields = dict(result)
-    ends = fields.pop("end_invariants", None)
     fields["messages"] = shortened(fields.pop("message"))
     if not isinstance(fields["trajectories"], np.ndarray):
         fields["trajectories"] = None
     if not isinstance(fields["invariants"], np.ndarray):  # they are in the store, as the trajectories are
-        fields["invariants"] = ends
+        fields["invariants"] = vars(result).get("_ends")
     statistics = fields.pop("statistics")
     if statistics is not None:
         fields |= {f"statistics.{name}": value for name, value in vars(statistics).items()}

@@ -37,22 +37,10 @@ def why_one_by_one(history: Multistep | None, options: Options, schedule: Schedu
 
 
 def octet_functions(functions: NativeFunctions) -> OctetFunctions:
-    """Return the functions of a run for a batch of eight members.
-
-    Raises
-    ------
-    NotCompilableError
-        If a function has no version for eight members; the message names the reason.
-    """
-    owner = functions.owner
-    found = {name: [_of_eight(native) for native in owner.get(name, [])] for name in NAMES}
-    return OctetFunctions(
-        rhs=found["rhs"][0][0],
-        inv=tuple(found["inv"]),
-        grad=tuple(found["grad"]),
-        owner=functions,
-        jacobian=found["jacobian"][0][0] if found["jacobian"] else None,
-    )
+    """Return the functions of a run for a batch of eight members; raise NotCompilableError if one has no version."""
+    rhs, inv, grad, jacobian = ([_of_eight(one) for one in functions.owner.get(name, [])] for name in NAMES)
+    moved = jacobian[0][0] if jacobian else None
+    return OctetFunctions(rhs[0][0], tuple(inv), tuple(grad), functions, moved)
 
 
 def need_compiling(functions: NativeFunctions) -> bool:
@@ -77,6 +65,8 @@ def _of_eight(native: Native) -> tuple[Any, int]:
         if not one.octet_address:
             raise NotCompilableError(f"{one.name} is a C function without a version for eight members (see CFunctions)")
         return one.octet_address, native.floats
-    from .octets.functions import compiled_for_octets  # loads Numba
+    from ..core.numba_pointers import compiled  # both load Numba
+    from .octets.type import OCTET
 
-    return compiled_for_octets(one).address, native.floats
+    # An array of n floats becomes (n, 8) doubles. The function must not branch on values or create arrays.
+    return compiled(one.fun, one.kind, one.name, OCTET).address, native.floats

@@ -56,26 +56,10 @@ class Statistics:
 
 
 def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics | None:
-    """Return the statistics over some members.
+    """Return the statistics over some members of their `states` (members, m, n), nan if there is none, at times t (m,).
 
-    Parameters
-    ----------
-    reduce : "state" or callable
-        Quantities: the states themselves, or ``reduce(t, y) -> float or (k,)``.
-    t : ndarray, shape (m,)
-        Times.
-    states : ndarray, shape (members, m, n)
-        States; nan if there is none.
-
-    Returns
-    -------
-    Statistics or None
-        None if no member has a state, so that the number of quantities is unknown.
-
-    Raises
-    ------
-    TypeError
-        If the quantities are not real numbers.
+    The quantities are the states themselves, or ``reduce(t, y) -> float or (k,)``. Return None if no member has a
+    state, so that the number of quantities is unknown.
     """
     there = ~np.isnan(states).any(axis=2)
     values = states if isinstance(reduce, str) else _values(reduce, t, states, there)
@@ -95,10 +79,7 @@ def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics 
 
 
 def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there: np.ndarray) -> np.ndarray | None:
-    """Return the values (members, m, k) of the user's function `reduce`, nan where the mask `there` is False.
-
-    Return None if `there` is False everywhere.
-    """
+    """Return the values (members, m, k) of `reduce`, nan where the mask `there` is False; None if it is everywhere."""
     out: np.ndarray | None = None
     for i, j in zip(*np.nonzero(there), strict=True):
         value = np.atleast_1d(np.asarray(reduce(float(t[j]), states[i, j].copy())))

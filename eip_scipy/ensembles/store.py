@@ -44,6 +44,7 @@ ARRAYS: dict[str, tuple[str, tuple[str, ...]]] = {
     "status": ("status", ()),
 }
 FILLED = {"message": "", "status": NOT_RUN}
+TIMES = {1: "time", 2: "times"}  # array of the times that all members have, (m,), or of each member's, (members, m)
 CODECS = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-bytes", "vlen-utf8", "zstd"}
 SAME = 1e-9
 EVENTS_IN_A_FILE = 4096
@@ -56,22 +57,12 @@ class _Store:
     """Base class of the two stores of an ensemble's finished chunks on disk.
 
     A chunk consists of successive members that are run and stored together; all chunks but the last have one size.
-
-    Attributes
-    ----------
-    path : str
-        Absolute path, or URL.
-    finished : int
-        Number of members whose results were stored at the start: complete chunks, beginning with the first.
-    statistics : Statistics or None
-        Statistics of these members, if the store contains them.
-    states, saved_values : zarr.Array or None
-        Saved states (members, n, times) and their invariants (members, l, times), if they are only in the store.
     """
 
-    path: str
-    finished = 0
-    statistics: Statistics | None = None
+    path: str  # absolute path, or URL
+    finished = 0  # number of members whose results were stored at the start: complete chunks, beginning with the first
+    statistics: Statistics | None = None  # of these members, if the store contains them
+    # Zarr arrays of saved states (members, n, times) and invariants (members, l, times), if only the store has them.
     states: Any = None
     saved_values: Any = None
     _lock: Lock | None = None
@@ -85,10 +76,7 @@ class _Store:
             self._lock.close()
 
     def _require_same(self, there: dict[str, Any], here: dict[str, Any], missing: list[str]) -> None:
-        """Raise CheckpointError if the stored identity `there` differs from `here`, or names of arrays are `missing`.
-
-        `Plan.identity` returns an identity; the names are those of arrays that should be stored and are not.
-        """
+        """Raise CheckpointError if the stored identity `there` differs from `here` or names of arrays are `missing`."""
         checkpoint.require_same(self.path, there.get("settings"), here["settings"])
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
@@ -104,16 +92,11 @@ class _Store:
 
 
 def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
-    """Compare the values of f, of the invariants and of the events at the end of a member of the last finished chunk.
+    """Raise CheckpointError if functions have other values at the end of a member of the chunk from `first` on.
 
     `there` are the stored values, `here` those of the present functions, and `sizes` the sizes relative to which they
-    are compared, see `Plan.known_by`. `first` is the number of the first member of the chunk. Values that are not
-    stored are not compared: earlier versions stored none of the events, which are the last in `here`.
-
-    Raises
-    ------
-    CheckpointError
-        If a value differs by more than `SAME` times its size, which allows for rounding errors on another machine.
+    are compared, see `Plan.known_by`. Values that are not stored are not compared: earlier versions stored none of the
+    events, which are the last in `here`. `SAME` allows for rounding errors on another machine.
     """
     here, sizes = here[: there.size], sizes[: there.size]
     if there.size and not (there.shape == here.shape and bool(np.all(np.abs(there - here) <= SAME * sizes))):
@@ -135,30 +118,10 @@ class ZarrStore(_Store):
     if it is present, the chunk is complete. (Zarr writes each file under a temporary name and renames it.) A group in
     the local file system is locked. Before each write a check makes sure that it is still the group that was opened.
 
-    Parameters
-    ----------
-    path : path-like or str
-        A folder, or the URL of a store.
-    identity : dict
-        Identity of the ensemble, see `Plan.identity`, which must agree when it is resumed.
-    resume : bool
-        Whether an existing group may be continued.
-    empty : Members
-        Buffers of one chunk, which define shapes and types.
-    times : ndarray, shape (m,) or (members, m)
-        Times of the saved states, common to all members or one row for each; empty if no states are saved.
-    members : int
-        Number of members of the ensemble.
-    events : int
-        Number of events whose times and states are stored.
-
-    Raises
-    ------
-    ImportError
-        If zarr is missing.
-    CheckpointError
-        If `path` exists and `resume` is false, is not a group written by an ensemble, belongs to another ensemble, or
-        is in use by another ensemble.
+    `path` is a folder or the URL of a store, and `identity` the output of `Plan.identity`, which must agree when the
+    ensemble is resumed. `empty` holds the buffers of one chunk, which define shapes and types, and `times` the times of
+    the saved states, (m,) for all `members` or (members, m), empty if no states are saved. `events` is the number of
+    events whose times and states are stored.
     """
 
     def __init__(
@@ -210,7 +173,7 @@ class ZarrStore(_Store):
             raise
         self._arrays = {name: group.create_array(name, **how) for name, how in self._layout(times).items()}
         if times.size:
-            self._arrays[_name_of(times)][...] = times
+            self._arrays[TIMES[times.ndim]][...] = times
         # Written last: the creation of a group without it was interrupted.
         group.attrs[LABEL] = {**checkpoint.origin(), **identity}
         return group.attrs[LABEL]
@@ -245,10 +208,9 @@ class ZarrStore(_Store):
         return found
 
     def _plain(self, name: str, there: Any, how: dict[str, Any]) -> Any:
-        """Return the array `there` of the group, after a check of its shape, chunks and codecs.
+        """Return the array `there` of the group, after a check that it is as `how` of `_layout` says.
 
-        `how` contains the arguments with which it was created, see `_layout`. Unknown codecs are refused, because
-        reading could run foreign code.
+        Unknown codecs are refused, because reading could run foreign code.
         """
         metadata = there.metadata.to_dict()
         if metadata.get("node_type") != "array":
@@ -309,7 +271,7 @@ class ZarrStore(_Store):
                 array(name, dtype, named, value.shape[1:], self._members, self._chunk)
         if times.size:
             axes = ("time",) if times.ndim == 1 else ("member", "row")
-            layout[_name_of(times)] = {"shape": times.shape, "dtype": times.dtype, "dimension_names": axes}
+            layout[TIMES[times.ndim]] = {"shape": times.shape, "dtype": times.dtype, "dimension_names": axes}
         n, state = self._empty.y.shape[1], self._empty.y.dtype
         if self._events:
             array("event_count", int, ("member", "event"), (self._events,), self._members, self._chunk)
@@ -383,10 +345,7 @@ class ZarrStore(_Store):
                 self._arrays[name][begin:end] = values
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return the values of f, the invariants and the events stored with the chunk that starts at member `first`.
-
-        A resumed call compares them with those of its own functions. The array may be empty.
-        """
+        """Return the values stored with the chunk that starts at member `first`, see `Plan.known_by`."""
         names = [name for name in ("known_by", "known_events") if name in self._arrays]
         with self._being_read(f"the values of the functions in chunk {first // self._chunk}"):
             row = np.concatenate([self._arrays[name][first // self._chunk] for name in names])
@@ -395,11 +354,7 @@ class ZarrStore(_Store):
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
-        """Write the results of a chunk that starts at member `first`.
-
-        `known_by` are the values of f, the invariants and the events with which a resumed call compares those of its
-        own functions. `whole` and `statistics` are not used.
-        """
+        """Write the results of a chunk that starts at member `first`; `known_by` is the output of `Plan.known_by`."""
         self._require_own()
         with self._written():
             if self._events:
@@ -416,20 +371,7 @@ class ZarrStore(_Store):
 class CheckpointStore(_Store):
     """A checkpoint file with the finished members and their statistics, rewritten every `every` seconds.
 
-    Parameters
-    ----------
-    path : path-like
-    identity : dict
-        Identity of the ensemble, see `Plan.identity`, which must agree when it is resumed.
-    resume : bool
-        Whether an existing file may be continued.
-    every : float
-        Seconds from one writing to the next; longer if writing would take more than 5 % of the time.
-
-    Raises
-    ------
-    CheckpointError
-        If the file exists and `resume` is false, is damaged, belongs to another ensemble, or cannot be written.
+    `identity` is the output of `Plan.identity`, which must agree when the ensemble is resumed.
     """
 
     def __init__(self, path: Any, identity: dict[str, Any], resume: bool, every: float) -> None:
@@ -469,10 +411,7 @@ class CheckpointStore(_Store):
         return Members(**arrays, message=message, happened=unflattened(flat)[first:last])
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return the values of f, the invariants and the events stored with the last chunk; `first` is not used.
-
-        A resumed call compares them with those of its own functions. The array may be empty.
-        """
+        """Return the values stored with the last chunk, see `Plan.known_by`."""
         return self._arrays["known_by"]
 
     def write(
@@ -480,12 +419,10 @@ class CheckpointStore(_Store):
     ) -> None:
         """Record that the chunk that starts at member `first` is finished; write the file if it is time to do so.
 
-        `whole` holds the results of all members, and `statistics` are those of the finished members. `known_by` are the
-        values of f, the invariants and the events with which a resumed call compares those of its own functions.
+        `whole` holds the results of all members, and `statistics` are those of the finished members.
         """
         self._waiting = first + len(members.t), known_by, whole, statistics
-        since = time.perf_counter() - self._written
-        if since >= max(self._every, LEAST_RATIO * self._cost):
+        if time.perf_counter() - self._written >= max(self._every, LEAST_RATIO * self._cost):
             self.flush()
 
     def flush(self) -> None:
@@ -515,21 +452,9 @@ Store = ZarrStore | CheckpointStore
 
 
 def _as_stored(value: Any) -> np.ndarray:
-    """Return a field of `Members` as an array with the axes of the Zarr group, or convert an array of the group back.
-
-    The last two axes of an array of three dimensions are exchanged: time is the last axis in the group, and the second
-    one in `Members`.
-    """
+    """Convert a field of `Members` to an array of the Zarr group, in which time is the last axis, or back."""
     array = np.array(value, dtype=object) if isinstance(value, list) else value
     return array.swapaxes(1, 2) if array.ndim == 3 else array
-
-
-def _name_of(times: np.ndarray) -> str:
-    """Return the name of the array of the times of saved states in the Zarr group.
-
-    It is "time" if all members have the same times (m,), and "times" if each member has a row of `times` (members, m).
-    """
-    return "time" if times.ndim == 1 else "times"
 
 
 def is_url(path: str) -> bool:

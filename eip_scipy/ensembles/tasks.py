@@ -66,85 +66,42 @@ class StoppedError(Exception):
 
 @dataclass(frozen=True)
 class Task:
-    """The part of an ensemble that all members share, in a form that can be sent to other processes.
+    """The part of an ensemble that all members share, in a form that can be sent to other processes."""
 
-    Attributes
-    ----------
-    request : Request
-        Arguments of `integrate` for one member with a valid start.
-    reduce : callable, "state" or None
-        Quantity of which `Statistics` are computed; None if there are none.
-    keep : bool
-        True if the saved states themselves are needed.
-    members : int
-        Total number of members.
-    rows : int or None
-        Largest number of saved states of a member, if members have different intervals or times.
-    """
-
-    request: Request
-    reduce: Any = None
-    keep: bool = True
-    members: int = 1
-    rows: int | None = None
+    request: Request  # arguments of `integrate` for one member with a valid start
+    reduce: Any = None  # quantity of which `Statistics` are computed: a callable, "state", or None if there are none
+    keep: bool = True  # True if the saved states themselves are needed
+    members: int = 1  # total number of members
+    rows: int | None = None  # largest number of saved states of a member, if members have different intervals or times
 
     def prepared(
         self, y0: np.ndarray, params: np.ndarray | None, own: Mapping[str, Any] = NOTHING, *, check_start: bool = False
     ) -> Prepared:
-        """Return the run of one member, prepared as `integrate` does.
+        """Return the run of one member, prepared as `integrate` does; without parameters if the request has none.
 
         `own` contains the `t_span` and `t_eval` of the member, if they differ between members.
         """
+        params = None if self.request.params is None else params
         return prepared(self.request._replace(y0=y0, params=params, **own), check_start=check_start)
 
 
 class Members(NamedTuple):
-    """Results of some members.
+    """Results of m members, see `EnsembleResult`."""
 
-    Attributes
-    ----------
-    y : ndarray, shape (m, n)
-        Last states.
-    t : ndarray, shape (m,)
-        Times of the last states.
-    status : ndarray, shape (m,)
-        As in `integrate`: 0, 1, or `FAILED`; `NOT_RUN` for members that did not run.
-    message : list of str
-        Reason for the end of each member.
-    max_defect : ndarray, shape (m, l)
-        Largest invariant errors.
-    counters : ndarray, shape (m, N_COUNTERS)
-        The engine's counters, such as that of the evaluations of f (index `NFEV`).
-    max_correction : ndarray, shape (m,)
-        Largest correction in units of the local error.
-    side_by_side : ndarray of bool, shape (m,)
-        True for members that ran in a batch with others.
-    trusted : ndarray of bool, shape (m,)
-        True for members that did not fail and are reliable.
-    saved : ndarray, shape (m, times, n)
-        States at the `times` of the plan; nan after the end of a member. Shape (m, 0, n) without times.
-    saved_values : ndarray, shape (m, times, l)
-        Values of the invariants in the saved states.
-    values, target : ndarray, shape (m, l)
-        Values of the invariants in the last states, and their targets.
-    happened : list of Happened
-        Times and states of the events of each member.
-    """
-
-    y: np.ndarray
-    t: np.ndarray
-    status: np.ndarray
+    y: np.ndarray  # (m, n): last states
+    t: np.ndarray  # (m,): their times
+    status: np.ndarray  # (m,): 0 or 1, as in `integrate`, `FAILED`, or `NOT_RUN`
     message: list[str]
-    max_defect: np.ndarray
-    counters: np.ndarray
-    max_correction: np.ndarray
-    side_by_side: np.ndarray
-    trusted: np.ndarray
-    saved: np.ndarray
-    saved_values: np.ndarray
-    values: np.ndarray
-    target: np.ndarray
-    happened: list[Happened]
+    max_defect: np.ndarray  # (m, l)
+    counters: np.ndarray  # (m, N_COUNTERS): the engine's, such as that of the evaluations of f (index `NFEV`)
+    max_correction: np.ndarray  # (m,)
+    side_by_side: np.ndarray  # (m,)
+    trusted: np.ndarray  # (m,)
+    saved: np.ndarray  # (m, times, n): states at the `times` of the plan; nan after the end of a member
+    saved_values: np.ndarray  # (m, times, l): values of the invariants in the saved states
+    values: np.ndarray  # (m, l): values of the invariants in the last states
+    target: np.ndarray  # (m, l)
+    happened: list[Happened]  # times and states of the events of each member
 
     @classmethod
     def joined(cls, parts: Sequence[Members]) -> Members:
@@ -157,10 +114,7 @@ class Members(NamedTuple):
 
     @classmethod
     def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
-        """Return the results of `m` members that did not run.
-
-        A state has `n` components, `invariants` is the number of invariants, and `times` that of saved states.
-        """
+        """Return the results of `m` members that did not run, for states with `n` components at `times` times."""
         return cls(
             y=np.full((m, n), np.nan, dtype),
             t=np.full(m, np.nan),
@@ -182,71 +136,46 @@ class Members(NamedTuple):
 class Plan:
     """A task in one process, compiled if possible, with a driver for each thread that needs one.
 
-    Attributes
-    ----------
-    task : Task
-    why_not : str or None
-        Reason why the members run interpreted; None if they are compiled.
-    one_by_one : str
-        Reason why the members run one after the other; "" if they are vectorised. Known after compilation.
-    names : tuple of str
-        Names of the l invariants.
-    component_names : tuple of str or None
-        Names of the components of the state, if a problem defines them.
-    times : ndarray, shape (rows,)
-        Times at which states are saved; empty if only the last state is needed.
-    n_steps : int or None
-        Number of steps of one member, if it is known.
-    pointers : list of PointerFunction
-        C functions given as pointers, which cannot be sent to another process.
-    variations : Variations or None
-        The derivatives that members integrate with their states.
-    described_columns : dict or None
-        The field ``columns`` of the result.
+    `why_not` is the reason why the members run interpreted, None if they are compiled, and `one_by_one` the reason why
+    they run one after the other, "" if they are vectorised; both are known after compilation.
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
         """Create the plan; `ready` is the run of the member of `task`, if it has been prepared already."""
         self.task = task
-        self._ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
-        schedule, run = self._ready.schedule, self._ready.run
+        self.ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
+        schedule, run = self.ready.schedule, self.ready.run
         self.why_not: str | None = None
         self.one_by_one = ""
-        self.names, self.component_names = tuple(run.invariants.names), self._ready.component_names
-        self.pointers = self._ready.pointers
+        self.names = tuple(run.invariants.names)
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
         self.t_bound, self.h = schedule.span.t_bound, run.stepping.h
+        # Times at which states are saved; none if only the last state is needed.
         self.times = saved_times(schedule) if task.rows is None else np.full(task.rows, np.nan)
-        self.events = len(self._ready.system.events.functions)
-        self.variations = self._ready.variations
-        self.described_columns = None if self.variations is None else self._ready.described_columns
+        self.events = len(self.ready.system.events.functions)
+        self.variations = self.ready.variations
         self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
         first = np.concatenate([run.work.K[0], run.invariants.start_values])
         self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
         self._together, self._idle = False, list[Sweeper]()
 
     def compile(self, *, progress: bool = False) -> Plan:
-        """Compile the functions and return the plan itself.
-
-        This is done before threads start, because each thread would compile them otherwise.
-        """
-        ready = self._ready
+        """Compile the functions, before threads start and would each compile them, and return the plan itself."""
+        ready, invariants = self.ready, self.ready.run.invariants
         loop = Loop(replace(ready, request=ready.request._replace(progress=progress)), Keeper())
+        own_targets = any(item.target is not None for item in invariants.items)
+        reasons = {
+            "members have different intervals or times": self.task.rows is not None,
+            "the runs have derivatives": self.variations is not None,
+            "the runs have balances": invariants.balances.items,
+            # The shifts of the differences depend on the start.
+            "the gradient of an invariant is computed by differences": invariants.by_differences,
+            "the start of each member is projected, or an invariant has a target": own_targets
+            or ready.run.identity["project_initial"],
+        }
         self.why_not = loop.why_not
-        own_targets = any(item.target is not None for item in ready.run.invariants.items)
-        own_start = ready.run.identity["project_initial"] or own_targets or self.task.rows is not None
-        by_differences = bool(ready.run.invariants.by_differences)  # their shifts depend on the start
-        carries = bool(ready.run.invariants.balances.items) or self.variations is not None
-        self._together = self.why_not is None and not (own_start or by_differences or carries)
-        if self.task.rows is not None:
-            own = "members have different intervals or times"
-        elif carries:
-            own = f"the runs have {'balances' if self.variations is None else 'derivatives'}"
-        elif by_differences:
-            own = "the gradient of an invariant is computed by differences"
-        else:
-            own = "the start of each member is projected, or an invariant has a target"
-        self.one_by_one = self.why_not or own
+        self.one_by_one = self.why_not or next((reason for reason, holds in reasons.items() if holds), "")
+        self._together = not self.one_by_one
         if self._together:
             sweeper = Sweeper(loop, self.task.members)
             self.one_by_one, self._idle = sweeper.one_by_one, [sweeper]
@@ -263,20 +192,13 @@ class Plan:
         last = np.where((members.status >= 0)[:, None], members.y, np.nan)
         return np.array([self.t_bound]), last[:, None]
 
-    def loop(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Loop:
-        """Return the `Loop` that runs a single member; `own` is that of `Task.prepared`."""
-        return Loop(self._prepared(y0, params, own), Keeper())
-
-    def _prepared(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Prepared:
-        return self.task.prepared(y0, None if self.task.request.params is None else params, own)
-
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
         """Return the data, in a form for JSON, by which a resumed ensemble is recognised as this one.
 
         They are the settings, including the number of members per chunk, `chunk`; and the first `COMPARED` of these
         numbers at the start that `task` contains: all components of f, followed by the values of the invariants.
         """
-        settings = self._ready.identity(starts, params) | {"chunk": chunk}
+        settings = self.ready.identity(starts, params) | {"chunk": chunk}
         settings |= {name: plain(value) for name, value in own.identity.items()}
         return {"settings": settings, "start": self._start_values}
 
@@ -294,7 +216,7 @@ class Plan:
         k = int(ended[0])
         t, y = float(members.t[k]), members.y[k].copy()
         try:
-            ready = self._prepared(y0s[k], params[k])
+            ready = self.task.prepared(y0s[k], params[k])
             f, invariants = ready.system.derivative(t, y.copy()), ready.run.invariants
             values, sizes = invariants.values(t, y), invariants.term_sizes(t, y, f)
             events = _of_events(ready, t, y, f)
@@ -322,10 +244,7 @@ class Plan:
 
 
 def _of_events(ready: Prepared, t: float, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of a member's events, at its start and then at its end (t, y), and their sizes.
-
-    `f` is the derivative at the end. Values that are not finite are replaced by 0.
-    """
+    """Return values and sizes of a member's events, at its start and its end (t, y); 0 if they are not finite."""
     events, begin = ready.system.events, ready.run.begin
     step = ready.run.start.tau * ready.schedule.span.sign  # into the interval: beyond it events need not be defined
     places = (begin.t, begin.y, begin.f, step), (t, y, f, -step)
@@ -339,11 +258,7 @@ def _of_events(ready: Prepared, t: float, y: np.ndarray, f: np.ndarray) -> tuple
 def saved_times(schedule: Schedule) -> np.ndarray:
     """Return the times of the rows that a run saves; empty if it saves only its two ends.
 
-    Raises
-    ------
-    ValueError
-        If the steps to be saved are adaptive, so that each member would save at different times, or if the interval is
-        infinite.
+    ValueError is raised if members would save at different times, or if the interval is infinite.
     """
     if schedule.t_eval.size:
         return schedule.t_eval.copy()
@@ -366,30 +281,10 @@ def run_members(
     stop: threading.Event | None = None,
     own: OwnTimes = SHARED,
 ) -> Members:
-    """Run members and return their results.
+    """Run members with the initial states `y0s` (m, n) and the parameters `params` (m, p), and return their results.
 
-    Parameters
-    ----------
-    plan : Plan
-    y0s : ndarray, shape (m, n)
-        Initial states, with the dtype of the plan.
-    params : ndarray, shape (m, p)
-        Parameters of each member; p = 0 if the functions have none.
-    stop : threading.Event, optional
-        If it is set, the members stop within some tenths of a second.
-    own : OwnTimes, optional
-        Intervals and times of these members.
-
-    Returns
-    -------
-    Members
-        Results in the order of the initial states. A member that fails, also by an exception in the user's functions,
-        has the status `FAILED` and a message with the reason; it does not affect the others.
-
-    Raises
-    ------
-    StoppedError
-        If `stop` is set.
+    A member that fails, also by an exception in the user's functions, has the status `FAILED` and a message with the
+    reason; it does not affect the others. If `stop` is set, StoppedError ends the members within tenths of a second.
     """
     out = plan.empty(len(y0s))
     watch = _Watch(stop)
@@ -426,11 +321,11 @@ def _alone(
 ) -> None:
     """Run member `k` as `integrate` does, and store its results in `out`; `own` is that of `Task.prepared`."""
     try:
-        loop = plan.loop(y0, params, own)
+        loop = Loop(plan.task.prepared(y0, params, own), Keeper())
     except Exception as error:
         places = slice(None) if plan.variations is None else plan.variations.columns.places
         out.y[k, places], out.t[k] = y0, own.get("t_span", (plan.t0,))[0]
-        _describe(out, k, FAILED, _reason(error))
+        out.status[k], out.message[k] = FAILED, _reason(error)
         return
     broken = False
     try:
@@ -498,12 +393,7 @@ def _store(
     out.counters[k] = work.counters
     out.max_correction[k] = loop.diagnostics.max_correction
     out.trusted[k] = driver.run.trust.trusted and status >= 0
-    _describe(out, k, status, message)
-
-
-def _describe(out: Members, k: int, status: int, message: str) -> None:
-    out.status[k] = status
-    out.message[k] = message
+    out.status[k], out.message[k] = status, message
 
 
 def _reason(error: BaseException) -> str:
@@ -514,11 +404,7 @@ class Sweeper:
     """A compiled run with its buffers, which the engine uses for all members.
 
     In the methods, `each` holds the inputs of the members and the buffers that the engine fills, and `out` the results.
-
-    Attributes
-    ----------
-    one_by_one : str
-        Reason why members run one after the other; "" if they are vectorised.
+    `one_by_one` is the reason why members run one after the other; "" if they are vectorised.
     """
 
     def __init__(self, loop: Loop, members: int) -> None:
@@ -567,13 +453,12 @@ class Sweeper:
         little = members * schedule.span.n_steps * run.y0.size < LEAST_WORK
         if not reason and little and need_compiling(driver.functions):
             reason = "compiling functions for eight members would take longer than the run"
-        if reason:
-            return reason
         try:
-            driver.engine.side_by_side(octet_functions(driver.functions))
+            if not reason:
+                driver.engine.side_by_side(octet_functions(driver.functions))
         except NotCompilableError as error:
-            return str(error)
-        return ""
+            reason = str(error)
+        return reason
 
     def _each(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> data.Members:
         """Return the inputs of the members and the buffers for their results."""
@@ -615,7 +500,7 @@ class Sweeper:
             self._arrived(np.arange(those.start + first, those.start + done), each, out)
             failed = reason is not None or code != OK
             if plan.events and (failed or done > first):
-                out.happened[those.start + first] = happened(plan.events, *self.loop.driver.events_found())
+                out.happened[those.start + first] = happened(plan.events, *self.loop.driver.interpolants.roots())
             if failed:
                 self._look_at(plan, those.start + done, code, reason, each, out, watch)
                 where[:] = done + 1, 0
@@ -675,10 +560,7 @@ class Sweeper:
         self._arrived(done, each, out)
 
     def _adapt(self, seconds: float) -> None:
-        """Choose the number of steps for the next call of the engine, so that it takes about `SWEEP_SECONDS`.
-
-        `seconds` is the duration of the last call, which made all of its steps. The number is at most doubled.
-        """
+        """Choose the number of steps, at most doubled, for about `SWEEP_SECONDS`, by the time of the last call."""
         self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / max(seconds, 1e-9))))
 
     def _look_at(
@@ -688,23 +570,15 @@ class Sweeper:
 
         `reason` is the text of an exception in the user's functions, or None.
         """
-        loop = self.loop
-        driver = loop.driver
+        loop, driver = self.loop, self.loop.driver
         if code in (DOUBTFUL, PAUSE):
             _alone(plan, k, each.starts[k], each.params[k], out, watch)
             if each.kept:
                 each.rows[k, :-1] = out.saved[k]
             return
         rows = each.rows[k if each.kept else 0, : driver.rows]
-        _store(
-            loop,
-            k,
-            FAILED,
-            reason or failure(code, driver.run, driver.schedule.clock),
-            out,
-            rows,
-            broken=reason is not None,
-        )
+        message = reason or failure(code, driver.run, driver.schedule.clock)
+        _store(loop, k, FAILED, message, out, rows, broken=reason is not None)
         if each.kept:
             each.rows[k, driver.rows :] = np.nan
 

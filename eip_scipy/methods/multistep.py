@@ -85,12 +85,8 @@ class GaussJackson(Ordered):
     error_estimator_order: int | None = field(init=False)
 
     def __post_init__(self) -> None:
-        order = self.order
-        if (
-            isinstance(order, bool)
-            or not isinstance(order, (int, np.integer))
-            or not LEAST_ORDER <= order <= LARGEST_ORDER
-        ):
+        order, known = self.order, isinstance(self.order, (int, np.integer)) and not isinstance(self.order, bool)
+        if not (known and LEAST_ORDER <= order <= LARGEST_ORDER):
             raise ValueError(f"order must be an integer from {LEAST_ORDER} to {LARGEST_ORDER}, got {order!r}.")
         object.__setattr__(self, "name", self.name or f"GJ{order}")
         object.__setattr__(self, "error_estimator_order", min(ESTIMATE, order - 2))
@@ -118,35 +114,27 @@ class GaussJackson(Ordered):
 @cache
 def _inverse_powers(power: int, terms: int) -> Series:
     """Return the first `terms` coefficients of the series of L^-power in x; `GaussJackson` defines L and x."""
-    L = [Fraction(1, k + 1) for k in range(terms)]
     inverse = [Fraction(1)]
     for k in range(1, terms):
-        inverse.append(-sum((L[k - j] * inverse[j] for j in range(k)), Fraction(0)))
-    out = inverse
-    for _ in range(power - 1):
-        out = _product(out, inverse, terms)
-    return out
+        # The coefficients of L are 1, 1/2, 1/3 ...
+        inverse.append(-sum((x / (k - j + 1) for j, x in enumerate(inverse)), Fraction(0)))
+    return inverse if power == 1 else _product(inverse, _inverse_powers(power - 1, terms))
 
 
-def _product(a: Series, b: Series, terms: int) -> Series:
-    return [sum((a[j] * b[k - j] for j in range(k + 1)), Fraction(0)) for k in range(terms)]
+def _product(a: Series, b: Series) -> Series:
+    return [sum((a[j] * b[k - j] for j in range(k + 1)), Fraction(0)) for k in range(len(a))]
 
 
 def _shifted(series: Series, back: int) -> Series:
     """Return the series times (1 - x)^back, which shifts it back by `back` steps; back = -1 is one step ahead."""
-    terms = len(series)
-    if back < 0:
-        return _product(series, [Fraction(1)] * terms, terms)
-    binomial = [Fraction((-1) ** k * comb(back, k)) for k in range(terms)]
-    return _product(series, binomial, terms)
+    binomial = [Fraction((-1) ** k * comb(back, k) if back >= 0 else 1) for k in range(len(series))]
+    return _product(series, binomial)
 
 
 def _ordinates(series: Series) -> Series:
     """Return the coefficients of a_n, a_(n-1), ... for a sum over backward differences of a_n."""
-    return [
-        (-1) ** j * sum((series[k] * comb(k, j) for k in range(j, len(series))), Fraction(0))
-        for j in range(len(series))
-    ]
+    n = len(series)
+    return [(-1) ** j * sum((series[k] * comb(k, j) for k in range(j, n)), Fraction(0)) for j in range(n)]
 
 
 def position_series(back: int, terms: int) -> Series:
@@ -183,33 +171,17 @@ def correction_weights(order: int) -> Series:
 
 
 class Weights(NamedTuple):
-    """The weights of a method as floats, from the oldest node to the newest.
+    """The weights of a method as floats, from the oldest node to the newest."""
 
-    Attributes
-    ----------
-    predict_q, predict_v : ndarray, shape (order,)
-        Weights of the predicted position and velocity.
-    states_q, states_v : ndarray, shape (order, order)
-        Row k has the weights of the position or velocity k steps before the newest node.
-    correction : ndarray, shape (order + 1,)
-        Weights of the corrected minus the predicted position.
-    shape_q, shape_v : ndarray, shape (order + 1,)
-        Weights of the differences that have the shape of the errors of position and velocity.
-    size : ndarray, shape (order + 1,)
-        Weights of the highest difference.
-    error_constant : float
-        Size of the first omitted term of the series of the predicted position.
-    """
-
-    predict_q: np.ndarray
+    predict_q: np.ndarray  # (order,): of the predicted position
     predict_v: np.ndarray
-    states_q: np.ndarray
+    states_q: np.ndarray  # (order, order): row k for the position k steps before the newest node
     states_v: np.ndarray
-    correction: np.ndarray
-    shape_q: np.ndarray
+    correction: np.ndarray  # (order + 1,): of the corrected minus the predicted position
+    shape_q: np.ndarray  # (order + 1,): of the difference that has the shape of the errors of positions
     shape_v: np.ndarray
-    size: np.ndarray
-    error_constant: float
+    size: np.ndarray  # (order + 1,): of the highest difference
+    error_constant: float  # size of the first omitted term of the series of the predicted position
 
 
 @cache
@@ -270,13 +242,10 @@ def interpolation_weights(order: int) -> np.ndarray:
     for back in range(order):
         for j in range(order):
             polynomial = [Fraction(1)]
-            for other in range(order):
-                if other != j:
-                    factor = Fraction(1, other - j)  # theta_j - theta_other = (back - j) - (back - other)
-                    zero = back - other
-                    raised = [Fraction(0), *polynomial]
-                    lower = [*(zero * c for c in polynomial), Fraction(0)]
-                    polynomial = [factor * (a - b) for a, b in zip(raised, lower, strict=True)]
+            for other in (k for k in range(order) if k != j):
+                # theta_j - theta_other = (back - j) - (back - other) = other - j
+                pairs = zip([Fraction(0), *polynomial], [*polynomial, Fraction(0)], strict=True)
+                polynomial = [(raised - (back - other) * same) / (other - j) for raised, same in pairs]
             out[back, j] = [float(c) for c in polynomial]
     return out
 
@@ -300,10 +269,7 @@ def _step_weights(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
 
 def _growth(order: int, corrected: bool, square: float, damping: complex) -> float:
-    """Return the largest growth of a mode in a step, for h^2 q'' = -square q - damping h v.
-
-    It is the largest modulus of a root of the characteristic polynomial, including the roots of the solution.
-    """
+    """Return the largest modulus of a root of the characteristic polynomial for h^2 q'' = -square q - damping h v."""
     positions, newest, others, velocities = _step_weights(order)
     predicted = square * positions + damping * np.convolve(velocities, [1.0, -1.0])
     polynomial = np.zeros(order + 3, complex)
@@ -317,14 +283,8 @@ def _growth(order: int, corrected: bool, square: float, damping: complex) -> flo
 def longest_stable(order: int, corrected: bool, fast: float, damped: float) -> float:
     """Return the largest part of a step h, at most 1, with which a method is stable.
 
-    Parameters
-    ----------
-    order, corrected : int, bool
-        As those of `GaussJackson`.
-    fast : float
-        h omega, for q'' = -omega^2 q.
-    damped : float
-        h c, for the additional term -c v (friction) or i c v (rotation).
+    `fast` is h omega, for q'' = -omega^2 q, and `damped` h c, for the additional term -c v (friction) or i c v
+    (rotation). `order` and `corrected` are those of `GaussJackson`.
     """
 
     def stable(part: float) -> bool:

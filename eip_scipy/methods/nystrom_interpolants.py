@@ -30,22 +30,14 @@ class Interpolant(NamedTuple):
     """Further stages of a step, and the polynomial through the accelerations at some of them.
 
     The rows of accelerations are those of the stages of the method, the one at the end of the step, and those of the
-    further stages, in this order.
-
-    Attributes
-    ----------
-    A : ndarray, shape (further, rows)
-        Weights of the position of a further stage over the preceding rows.
-    c : ndarray, shape (further,)
-        Nodes of the further stages.
-    legendre : ndarray, shape (k, rows)
-        Weights over all rows of the coefficients of the polynomial of degree k - 1 through the accelerations at both
-        ends and at the last k - 2 further stages, in Legendre polynomials of 2 theta - 1.
+    further stages, in this order. `legendre` has weights over all rows of the coefficients of the polynomial of degree
+    k - 1 through the accelerations at both ends and at the last k - 2 further stages, in Legendre polynomials of
+    2 theta - 1.
     """
 
-    A: Array
-    c: Array
-    legendre: Array
+    A: Array  # (further, rows): weights of the position of a further stage over the preceding rows
+    c: Array  # (further,): nodes of the further stages
+    legendre: Array  # (k, rows)
 
 
 @cache
@@ -114,19 +106,12 @@ def _stages(A: Array, c: Array, nodes: Array, order: int) -> tuple[int, Array]:
 
 
 def _smallest(rows: Array, met: Array) -> Array:
-    """Return for each node the weights of smallest norm that meet linear conditions, (nodes, stages).
-
-    `rows` (stages, conditions) are the orthonormal coefficients of the conditions, `met` (conditions, nodes) their
-    right-hand sides.
-    """
+    """Return the weights of smallest norm (nodes, stages) that meet orthonormal conditions: weights @ rows = met.T."""
     return np.array([(rows * column).sum(axis=1) for column in met.T])
 
 
 def _stage_factors(A: Array, c: Array, tree: NystromTree) -> Array:
-    """Return phi_i(tree), the factor of stage i in the order condition of a tree, for all stages; (s,).
-
-    It is c_i^leaves times the product of sum_j A_ij phi_j(subtree) over all subtrees, see `nystrom_residuals`.
-    """
+    """Return phi_i(tree), the factor of stage i in the order condition of a tree, (s,), see `nystrom_residuals`."""
     factors = c**tree.leaves
     for sub in tree.subtrees:
         factors = factors * (A.T * _stage_factors(A, c, sub)[:, None]).sum(axis=0)

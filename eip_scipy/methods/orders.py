@@ -9,10 +9,7 @@ __all__ = ["AT_REST", "AtRest", "Ordered", "named_constant"]
 
 
 def named_constant(value: Any, names: Mapping[str, Any]) -> str | None:
-    """Return the name under which `names`, the globals of a module, contain the object `value`, for pickling by name.
-
-    Return None if they do not contain it.
-    """
+    """Return the name of `value` in `names`, the globals of a module, for pickling by name; None if it is not there."""
     return next((name for name, own in names.items() if own is value), None)
 
 
@@ -43,10 +40,7 @@ class Ordered:
 
     @property
     def kappa(self) -> float:
-        """Exponent of the error metric, (p + 1) / (p_hat + 1), or 1 without an estimate.
-
-        p is the order of the step, and p_hat that of the estimate.
-        """
+        """Exponent of the error metric, (order + 1) / (order of the estimate + 1), or 1 without an estimate."""
         if self.error_estimator_order is None:
             return 1.0
         return (self.order + 1) / (self.error_estimator_order + 1)

@@ -162,8 +162,7 @@ class Tableau(Ordered):
         P: Sequence[Sequence[Number]] | None = None,
         reference: str = "",
     ) -> None:
-        if isinstance(order, bool) or not isinstance(order, int) or order < 1:
-            raise ValueError(f"{name}: order must be an integer >= 1, got {order!r}.")
+        _check_integer(name, "order", order)
         s = len(b)
         exact_A, exact_b = _stage_matrix(name, A, s), _vector(name, b)
         nodes = exact_A.sum(axis=1) if s > 1 else _vector(name, [0])
@@ -245,6 +244,11 @@ class Tableau(Ordered):
     def __repr__(self) -> str:
         estimate = f", estimate of order {self.error_estimator_order}" if self.has_estimate else ""
         return f"<Tableau {self.name}: {self.n_stages} stages, order {self.order}{estimate}>"
+
+
+def _check_integer(name: str, label: str, value: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name}: {label} must be an integer >= 1, got {value!r}.")
 
 
 def _vector(name: str, values: Sequence[Number]) -> np.ndarray:

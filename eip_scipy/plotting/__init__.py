@@ -66,10 +66,7 @@ def typeset(text: str) -> str:
 
 
 def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") -> None:
-    """Give the axis `along` a log scale with few ticks, and widen its range if that is below two powers of ten.
-
-    The labels of the two axes are set to `x` and `y`.
-    """
+    """Give the axis `along` a log scale with few ticks over two powers of ten at least, and label both axes."""
     axis.set(**{f"{along}scale": "log"})
     low, high = axis.get_ylim() if along == "y" else axis.get_xlim()
     # A range below two powers of ten would have too few labelled ticks.

@@ -56,10 +56,7 @@ def stability_map(
 
 
 def draw_stability(axis: Axes, x: Any, y: Any, megno: Any, most: float) -> Any:
-    """Draw the cells of a stability map, and return them as the QuadMesh for a colour bar.
-
-    The arguments after `axis` are those of `stability_map`.
-    """
+    """Draw the cells of a `stability_map`, and return them as the QuadMesh for a colour bar."""
     x, y, values = (np.asarray(item, dtype=float) for item in (x, y, megno))
     if values.shape != (y.size, x.size):
         raise ValueError(
@@ -72,21 +69,7 @@ def draw_stability(axis: Axes, x: Any, y: Any, megno: Any, most: float) -> Any:
 
 
 def indicator_figure(t: Any, curves: Mapping[str, Any], *, ylabel: str, level: float | None = None) -> Figure:
-    """Draw indicators against time.
-
-    Parameters
-    ----------
-    t : array_like, shape (m,)
-    curves : mapping of str to array_like, shape (m,)
-        Values of each indicator at the times `t`, by the name of the indicator in the legend.
-    ylabel : str
-    level : float, optional
-        Value to mark by a horizontal line.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw indicators at times `t` (m,), `curves` of (m,) values by name; a line marks the value `level`."""
     figure = shown_figure(5.6, 4.0)
     axis = figure.add_subplot()
     for (name, values), style in zip(curves.items(), method_styles(curves).values(), strict=True):

@@ -44,25 +44,10 @@ def ensemble_figure(
 ) -> Figure:
     """Draw an ensemble.
 
-    Parameters
-    ----------
-    times : array_like, shape (m,), or None
-        Times; None for last states, which are drawn as one box for each component.
-    components : mapping of str to array_like, shape (members, m)
-        Values of each component, nan if a member has none. The magnitude of complex components is drawn.
-    members : array_like, shape (k,)
-        Indices of the members whose errors are drawn.
-    errors : mapping of str to array_like, shape (k,)
-        Largest error of each invariant in these members.
-    failed : array_like of bool, shape (k,)
-        True for members that failed.
-    counts : mapping of str to int
-        Number of members that ended in each of the ways in `ENDS`.
-    title : str, optional
-
-    Returns
-    -------
-    Figure
+    `components` has the values (members, m) of each component at `times` (m,), nan if a member has none; the magnitude
+    of complex ones is drawn. If `times` is None, they are last states, drawn as one box for each component. `errors`
+    has the largest error (k,) of each invariant in the `members` with these k indices, `failed` is a mask of those that
+    failed, and `counts` has the number of members that ended in each of the ways in `ENDS`.
     """
     shown = dict(list(components.items())[:MOST])
     widths = [1.25, *([1.0] if errors else []), 0.75]
@@ -166,14 +151,8 @@ def _draw_counts(axis: Axes, counts: Mapping[str, int]) -> None:
     largest = max(1, *counts.values())
     for k, name in enumerate(names):
         axis.barh(k, counts[name], height=0.6, color=ENDS[name])
-        axis.annotate(
-            str(counts[name]),
-            (counts[name], k),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize="small",
-        )
+        place: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+        axis.annotate(str(counts[name]), (counts[name], k), fontsize="small", **place)
     axis.set_yticks(range(len(names)), names, fontsize="small")
     axis.set_ylim(max(len(ENDS), len(names)) - 0.5, -0.5)
     axis.set_xlim(0, 1.25 * largest)

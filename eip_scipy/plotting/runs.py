@@ -35,23 +35,9 @@ def run_figure(
 ) -> Figure:
     """Draw one run: paths or components, errors of the invariants in time, largest corrections.
 
-    Parameters
-    ----------
-    t : array_like, shape (m,)
-    components : mapping of str to array_like, shape (m,)
-        Values of each component; the magnitude of complex components is drawn.
-    paths : mapping of str to (array_like, array_like)
-        x and y of each body, both of shape (m,). If the mapping is not empty, paths are drawn instead of components.
-    errors : mapping of str to array_like, shape (m,)
-        Errors of each invariant. If the mapping is empty, their panel is omitted.
-    corrections : mapping of str to float
-        Largest correction for each invariant, in units of the local error. If the mapping is empty, their panel is
-        omitted.
-    title : str, optional
-
-    Returns
-    -------
-    Figure
+    By name, `components` has the values (m,) of each component, of whose complex values the magnitude is drawn, `paths`
+    x and y of each body, which replace the components if there are any, `errors` the errors (m,) of each invariant, and
+    `corrections` the largest correction for each, in units of the local error. Panels of empty mappings are omitted.
     """
     widths = [1.0, *([1.0] if errors else []), *([0.6] if corrections else [])]
     figure = shown_figure(4.4 * sum(widths) + 0.6, 4.2)
@@ -78,16 +64,7 @@ def run_figure(
 def draw_run(
     axis: Axes, t: Any, components: Mapping[str, Any], paths: Mapping[str, tuple[Any, Any]], title: str = ""
 ) -> None:
-    """Draw the paths of a run, or its components if there are none, into given axes.
-
-    Parameters
-    ----------
-    axis : matplotlib.axes.Axes
-    t, components, paths
-        As for `run_figure`.
-    title : str, optional
-        Title, used if the axes have none.
-    """
+    """Draw the paths of a run, or else its components, into axes, and give them a title if they have none."""
     if paths:
         _draw_paths(axis, paths)
     else:

@@ -63,17 +63,7 @@ _windows: list[weakref.ref[ShownFigure]] = []
 
 
 def shown_figure(width: float, height: float) -> ShownFigure:
-    """Create an empty figure, which pyplot shows if the backend can show figures.
-
-    Parameters
-    ----------
-    width, height : float
-        Size in inches.
-
-    Returns
-    -------
-    ShownFigure
-    """
+    """Create an empty figure of a size in inches, which pyplot shows if the backend can show figures."""
     backend = _backend()
     if backend in backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE):
         return ShownFigure(figsize=(width, height), dpi=DPI, layout="constrained")

@@ -86,10 +86,7 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
 
 
 def _observed(one: IntegrationResult, two: IntegrationResult, new: slice) -> dict[str, Any]:
-    """Return the outputs and multipliers of two joined runs, as far as the first one has them, as fields of a result.
-
-    `new` selects the times of the second run that the first one does not have.
-    """
+    """Return outputs and multipliers of two joined runs as fields; `new` selects times that the first does not have."""
     two._observe()
     found: dict[str, Any] = {}
     if "outputs" in one:

@@ -77,8 +77,7 @@ class Driver:
     def sweep(self, members: Members, steps: int) -> int:
         """Run members of an ensemble, starting at `members.where`, for `steps` steps in total, on this run's buffers.
 
-        Return the code `OK` if all members have ended or if more calls of `sweep` are needed. Otherwise return the code
-        of what happened to the current member.
+        Return `OK`, also if more calls are needed, or the code of what happened to the current member.
         """
         with self.own_errors():
             code = int(self.engine.sweep(members, steps, self.state, self.new, self.t))
@@ -95,10 +94,7 @@ class Driver:
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:
-        """Replace a `FailedCallError` raised inside the block by the exception of the Numba function that failed.
-
-        If a C function failed, replace it by an error that names the function and its status.
-        """
+        """Replace a `FailedCallError` raised in the block by the exception of the Numba or C function that failed."""
         try:
             yield
         except FailedCallError as error:
@@ -137,40 +133,23 @@ class Driver:
         return float(self.schedule.clock[TIME_NEW if pending else TIME]), self.new if pending else self.state
 
     def parts(self) -> dict[str, np.ndarray]:
-        """Return the buffers that determine the remaining steps, and the counters, by name.
-
-        All other buffers are filled before they are read.
-        """
-        w, schedule = self.run.work, self.schedule
-        history = self.run.method.multistep
-        nodes = (
-            {}
-            if history is None
-            else {"nodes": history.nodes, "sums": history.sums, "node": history.place, "levels": history.levels}
-        )
+        """Return the counters and the buffers, by name, that determine the remaining steps."""
+        w, schedule, history = self.run.work, self.schedule, self.run.method.multistep
+        found = {"place": schedule.place, "clock": schedule.clock, "y": self.state, "slope": w.K[0], "g": schedule.g}
+        if schedule.g.size:
+            found["rate"] = schedule.rate
+        found["target"] = self.run.options.target
+        balanced = w.level.size > 0
+        if balanced:
+            found |= {"level": w.level, "level_carry": w.level_carry, "slow": w.slow, "balance_rate": w.rates[0]}
+        if history is not None:
+            found |= {"rates": history.rates, "rate_sums": history.rate_sums} if balanced else {}
+            found |= {"nodes": history.nodes, "sums": history.sums, "node": history.place, "levels": history.levels}
         kept = ("carry", "err_sum", "sigma", "memory", "defect", "max_defect", "max_correction", "trust", "counters")
-        return {
-            "place": schedule.place,
-            "clock": schedule.clock,
-            "y": self.state,
-            "slope": w.K[0],
-            **({"g": schedule.g, "rate": schedule.rate} if schedule.g.size else {"g": schedule.g}),
-            "target": self.run.options.target,
-            **({name: getattr(w, name) for name in ("level", "level_carry", "slow")} if w.level.size else {}),
-            **({"balance_rate": w.rates[0]} if w.level.size else {}),
-            **(
-                {"rates": history.rates, "rate_sums": history.rate_sums} if w.level.size and history is not None else {}
-            ),
-            **nodes,
-            **{name: getattr(w, name) for name in kept},
-        }
+        return found | {name: getattr(w, name) for name in kept}
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Return copies of the buffers of `parts` after the last accepted step.
-
-        If this step is pending, which means that the loop has paused in it, the copies are updated as the loop would
-        update the buffers.
-        """
+        """Return copies of the buffers of `parts` after the last accepted step, in which the loop may have paused."""
         copies = {name: part.copy() for name, part in self.parts().items()}
         if self.schedule.place[PENDING] == 1:
             copies["place"][PENDING] = 0
@@ -217,13 +196,7 @@ class Driver:
         self.save(t, y)
 
     def grow(self) -> None:
-        """Double the buffers of rows or interpolants that are full.
-
-        Raises
-        ------
-        MemoryError
-            If the larger buffers would need more memory than `max_bytes` allows.
-        """
+        """Double the buffers of rows or interpolants that are full; raise MemoryError beyond `max_bytes`."""
         if self._kept and self._kept == len(self._pieces):
             self._pieces = np.concatenate([self._pieces, self._more_pieces(self._kept)])
         if self.rows + 2 > self.t.size:
@@ -237,12 +210,8 @@ class Driver:
 
     def _more_pieces(self, count: int) -> np.ndarray:
         floats = 0 if self._interpolants is None else self._interpolants.floats
-        require_memory(
-            (self._kept + count) * 8.0 * floats,
-            "dense_output=True",
-            self._max_bytes,
-            "use t_eval, or increase max_bytes",
-        )
+        needed = (self._kept + count) * 8.0 * floats
+        require_memory(needed, "dense_output=True", self._max_bytes, "use t_eval, or increase max_bytes")
         return np.empty((count, floats))
 
     @property
@@ -250,17 +219,16 @@ class Driver:
         """Number of interpolants stored so far."""
         return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
 
-    def pending_events(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the indices and times of the events in the pending step, if the loop left them to the caller."""
-        assert self._interpolants is not None  # the loop pauses for nothing else
-        return self._interpolants.pending()
+    @property
+    def interpolants(self) -> Interpolants:
+        """Return the interpolants of a run that has events or times between steps, or stores its steps."""
+        assert self._interpolants is not None
+        return self._interpolants
 
     def dense(self) -> DenseOutput:
         """Return the dense output over the pending step."""
-        interpolants = self._interpolants
-        assert interpolants is not None  # the loop pauses for nothing else
-        piece = self._pieces[self._kept - 1] if self._kept else interpolants.record.piece.copy()
-        return ManifoldDenseOutput(interpolants, piece)
+        piece = self._pieces[self._kept - 1] if self._kept else self.interpolants.record.piece.copy()
+        return ManifoldDenseOutput(self.interpolants, piece)
 
     def warn(self) -> None:
         """Warn about states between steps that the loop could not project."""
@@ -274,10 +242,7 @@ class Driver:
         return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
 
     def note(self, values: np.ndarray) -> None:
-        """Update the largest invariant errors (l,) with the `values` (l, m) of the invariants at the m saved states.
-
-        Values at the start do not count.
-        """
+        """Update the largest invariant errors (l,) with the `values` (l, m) at the saved states except the start."""
         largest, target = self.run.work.max_defect, self.run.invariants.fixed_target
         later = values[:, np.count_nonzero(self.t[: self.rows] == self.schedule.span.t0) :]
         np.fmax(largest, np.fmax.reduce(np.abs(later - target[:, None]), axis=1, initial=0.0), out=largest)
@@ -292,11 +257,6 @@ class Driver:
         with self.own_errors():
             self.engine.values(t, y, out, *params)
         return out
-
-    def events_found(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the indices, times and states of the events that the loop has found since the last call."""
-        assert self._interpolants is not None  # a run with events has them
-        return self._interpolants.roots()
 
 
 def _first(size: int) -> int:

@@ -40,20 +40,7 @@ class ContinuedEvents(tuple):
 class Events:
     """The events of a run, and the times and states at which they happened.
 
-    Parameters
-    ----------
-    events : callable or sequence of callable or None
-        ``event(t, y[, params]) -> float``, with the attributes ``terminal`` (bool, or the number of times after which
-        the run ends) and ``direction`` of SciPy's `solve_ivp`.
-    extra : tuple
-        Further arguments of the events: ``(params,)``, the `args` of `integrate`, or nothing.
-
-    Raises
-    ------
-    TypeError
-        If an event is not callable.
-    ValueError
-        If ``terminal`` is not a number of times, or ``direction`` is not a number.
+    `events` are those of `integrate`, and `extra` their further arguments: ``(params,)``, ``args``, or nothing.
     """
 
     def __init__(self, events: Any, extra: tuple = ()) -> None:
@@ -78,12 +65,10 @@ class Events:
     def calls(self) -> tuple[Call, ...]:
         """Return the events in the form that the engine calls."""
 
-        def one(k: int) -> Call:
-            return call(
-                self.functions[k], self._extra, (), lambda value, t: np.array(self._number(k, t, value)), real=True
-            )
+        def one(k: int, event: Any) -> Call:
+            return call(event, self._extra, (), lambda value, t: np.array(self._number(k, t, value)), real=True)
 
-        return tuple(map(one, range(len(self.functions))))
+        return tuple(one(k, event) for k, event in enumerate(self.functions))
 
     @property
     def ends(self) -> list[tuple[float, float]]:
@@ -110,19 +95,9 @@ class Events:
         self.y[k].append(y)
         self.last = t, y
 
-    def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
-        """Fill `values` with the values of all events at (t, y).
-
-        `params` is not used, because the events have their own further arguments.
-        """
-        for k in range(len(self.functions)):
-            values[k] = self._value(k, t, y.copy())
-
     def values(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the values of all events at (t, y)."""
-        values = np.empty(len(self.functions))
-        self.fill(t, y, values)
-        return values
+        return np.array([self._value(k, t, y.copy()) for k in range(len(self.functions))], float)
 
     def sizes(self, t: float, y: np.ndarray, f: np.ndarray, step: float) -> np.ndarray:
         """Return the sizes of the events' values at (t, y), relative to which rounding errors are small.
@@ -152,17 +127,8 @@ class Events:
     def handle(self, which: np.ndarray, times: np.ndarray, sol: DenseOutput) -> float | None:
         """Record the events with indices `which` that happen at `times`, in this order, until one ends the run.
 
-        The states are those of the interpolation `sol` of the step.
-
-        Returns
-        -------
-        float or None
-            The time at which the run ends; None if no event ends it.
-
-        Raises
-        ------
-        ValueError
-            If an event changes its sign without a root, because it is NaN in between.
+        The states are those of the interpolation `sol` of the step. Return the time at which the run ends, or None.
+        ValueError is raised if an event changes its sign without a root, because it is NaN in between.
         """
         for k, t in zip(which.tolist(), times.tolist(), strict=True):
             if math.isnan(t):
@@ -197,13 +163,7 @@ class Events:
 
 
 def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
-    """Return one event or a sequence of events as a tuple; C function pointers are wrapped for Python.
-
-    Raises
-    ------
-    TypeError
-        If an event is not callable.
-    """
+    """Return one event or a sequence of events as a tuple, after checks; C function pointers are wrapped for Python."""
     if events is None:
         return ()
     if callable(events) or is_pointer(events):
@@ -213,19 +173,15 @@ def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
     except TypeError:
         what = f"{shown(events)}{address_hint(events)}"
         raise TypeError(f"events must be callable, or a sequence of callables, got {what}.") from None
-    items = tuple(_adapted(event, k) for k, event in enumerate(given))
-    for item in items:
-        if not callable(item):
-            raise TypeError(f"events must be callable, got {shown(item)}{address_hint(item)}.")
+    items = []
+    for k, event in enumerate(given):
+        found = by_pointer(event, f"event {k}", shape=())
+        if found is not event:
+            found.terminal, found.direction = getattr(event, "terminal", None), getattr(event, "direction", 0)
+        if not callable(found):
+            raise TypeError(f"events must be callable, got {shown(found)}{address_hint(found)}.")
+        items.append(found)
     return replaced(events, items)
-
-
-def _adapted(event: Any, k: int) -> Any:
-    """Return an event; if it is a C function pointer, wrap it for Python, with its `terminal` and `direction`."""
-    found = by_pointer(event, f"event {k}", shape=())
-    if found is not event:
-        found.terminal, found.direction = getattr(event, "terminal", None), getattr(event, "direction", 0)
-    return found
 
 
 def _direction(direction: Any) -> float:

@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, Unpack
 
@@ -214,20 +214,16 @@ def integrate(
     ((4, 68), True)
     """
     asked = dict(locals())  # the fields of Request have the same names and defaults
-    _check_names(projection)
-    request = Request(*map(asked.__getitem__, Request._fields))
-    keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
-    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
-        return Loop(prepared(request), keeper).run()
-
-
-def _check_names(projection: Iterable[str]) -> None:
     known = ProjectionOptions.names()
     for name in projection:
         if name not in known:
             own = (name for name in Request._fields if name != "projection")
             others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
+    request = Request(*map(asked.__getitem__, Request._fields))
+    keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
+    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
+        return Loop(prepared(request), keeper).run()
 
 
 class Loop:
@@ -236,15 +232,11 @@ class Loop:
     An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
-    def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
-        """Prepare the run; `keeper` writes its checkpoints, if there are any.
-
-        `compiled` replaces the option `compiled` of the request, unless it is None.
-        """
+    def __init__(self, prepared: Prepared, keeper: _resume.Keeper) -> None:
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
-        self.rhs, self.events, self.diagnostics = system.rhs, system.events, prepared.diagnostics
+        self.events, self.diagnostics = system.events, prepared.diagnostics
         self.callback, self.progress = request.callback, request.progress
         if keeper.keeps:
             if run.tableau.drives:
@@ -254,7 +246,7 @@ class Loop:
                 )
             identity = prepared.identity(run.begin.y, system.parameters)
             keeper.identify(identity, run, system.derivative, system.events)
-        wanted = request.compiled if compiled is None else compiled
+        wanted = request.compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
             self.driver = Driver(
@@ -301,10 +293,7 @@ class Loop:
         return result
 
     def steps(self, bar: Any) -> tuple[int, str]:
-        """Run to the end of the interval, or until something ends the run earlier; return status and message.
-
-        Afterwards `told` is True if the run has not failed but is not reliable.
-        """
+        """Run until something ends the run; return status and message, and set `told` if it is not reliable."""
         self._doubtful = False
         status, message = self._steps(bar)
         self.driver.run.trust.failed = status < 0
@@ -315,16 +304,10 @@ class Loop:
     def _look(self, *, ended: bool = False) -> None:
         driver = self.driver
         t, y = driver.now
-
-        def derivative(t: float, y: np.ndarray) -> np.ndarray:
-            f = np.empty_like(y)
-            self.rhs(t, y, f, driver.params)
-            return f
-
-        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy(), derivative)
+        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy(), self.prepared.system.derivative)
 
     def _steps(self, bar: Any) -> tuple[int, str]:
-        driver = self.driver
+        driver, schedule = self.driver, self.driver.schedule
         if driver.step == 0:
             driver.save_start()
             if self._stopped_by_callback(0):
@@ -339,18 +322,21 @@ class Loop:
             driver.warn()
             self._tell_why_slow(seconds)
             ended = self._ended(code)
-            bar.update(self._progress(bar.n, k))
+            if schedule.span.h != 0.0:
+                bar.update(driver.step - k)
+            else:
+                bar.update(abs(driver.now[0] - schedule.span.t0) - bar.n)
             if self._stopped_by_callback(rows):
                 return 1, STOPPED
             if ended:
                 return 1, ENDED_BY_EVENT
             if code not in (OK, PAUSE, ENDED, FULL):
-                return -1, failure(code, driver.run, driver.schedule.clock)
+                return -1, failure(code, driver.run, schedule.clock)
             if is_check_due(driver.step) or driver.suspects:
                 self._look()
             if code == FULL:
                 driver.grow()
-            elif code == OK and driver.schedule.clock[TIME] == driver.schedule.span.t_bound:
+            elif code == OK and schedule.clock[TIME] == schedule.span.t_bound:
                 return 0, ARRIVED
             if code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
@@ -369,18 +355,8 @@ class Loop:
                 stacklevel=5,
             )
 
-    def _progress(self, shown: float, k: int) -> float:
-        """Return the advance of the progress bar: steps since step `k`, or if adaptive the time beyond `shown`."""
-        schedule = self.driver.schedule
-        if schedule.span.h != 0.0:
-            return self.driver.step - k
-        return abs(self.driver.now[0] - schedule.span.t0) - shown
-
     def _ended(self, code: int) -> bool:
-        """Return True if an event ends the run; `code` is the loop's status code.
-
-        If the loop has paused in a step, first save the states at `t_eval` in this step and record its events.
-        """
+        """Return True if an event ends the run, by the loop's `code`, and handle a step that has paused."""
         driver, schedule = self.driver, self.driver.schedule
         self._event_ended = self._pause() if code == PAUSE else code == ENDED
         if self._event_ended and schedule.t_eval.size == 0:
@@ -388,13 +364,10 @@ class Loop:
         return self._event_ended
 
     def _pause(self) -> bool:
-        """Save the states at `t_eval` in the step in which the loop has paused, and record the events in this step.
-
-        Return True if an event ends the run.
-        """
+        """Save states at `t_eval` and record events in a step that has paused; return True if one ends the run."""
         driver, schedule = self.driver, self.driver.schedule
         sol = driver.dense()
-        end = self.events.handle(*driver.pending_events(), sol)
+        end = self.events.handle(*driver.interpolants.pending(), sol)
         limit = sol.t if end is None else end
         while driver.rows < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[driver.rows] - limit) <= 0:
             t = float(schedule.t_eval[driver.rows])
@@ -439,7 +412,7 @@ class Loop:
         return False
 
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
-        driver = self.driver
+        driver, problem = self.driver, self.prepared.problem
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
         values = self._values(broken)
         driver.note(values)
@@ -466,8 +439,8 @@ class Loop:
             method=self.method,
             h=abs(driver.schedule.span.h) or None,
             component_names=self.prepared.component_names,
-            units=self.prepared.units,
-            epoch=self.prepared.epoch,
+            units="" if problem is None else problem.units,
+            epoch=None if problem is None else problem.epoch,
         )
         t, y = events.last if self._event_ended else driver.now
         asked, variations = self.prepared.asked, self.prepared.variations
@@ -508,10 +481,7 @@ class Loop:
         return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:
-        """Return the invariants (l, m) of the saved states.
-
-        If an error has ended the run (`broken`) and an invariant raises one again, all values are NaN.
-        """
+        """Return the invariants (l, m) of the saved states; NaN if an error has `broken` the run and occurs again."""
         try:
             return self.driver.values()
         except BaseException:
@@ -526,11 +496,7 @@ def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
-    """Return True if a jitted right-hand side is called from Python only because invariants are not compiled.
-
-    `fun` is the right-hand side as the user gave it, `functions` are those that the loop of steps calls, and `run` is
-    the `Run` with the invariants.
-    """
+    """Return True if a jitted `fun` is called from Python only because invariants are not compiled."""
     if not (isinstance(functions, PythonFunctions) and is_jitted(fun)):
         return False
     kept = [found for item in run.invariants.items for found in (item.function, item.gradient)]
@@ -560,16 +526,13 @@ def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
         return nullcontext(_NoBar())
     from tqdm import tqdm
 
-    fixed = schedule.span.h != 0.0
-    total: float | None
-    if fixed:
-        total = schedule.span.n_steps if schedule.span.n_steps < UNBOUNDED else None
-    else:
-        total = abs(schedule.span.t_bound - schedule.span.t0) if math.isfinite(schedule.span.t_bound) else None
-    unit = "step" if fixed else "time"
-    # Above 0 if the run is resumed.
-    initial = int(schedule.place[STEP]) if fixed else abs(float(schedule.clock[TIME]) - schedule.span.t0)
-    return tqdm(total=total, initial=initial, desc=label, unit=unit, unit_scale=True, smoothing=0.05)
+    span, shown = schedule.span, {"desc": label, "unit_scale": True, "smoothing": 0.05}
+    # `initial` is above 0 if the run is resumed.
+    if span.h != 0.0:
+        total = span.n_steps if span.n_steps < UNBOUNDED else None
+        return tqdm(total=total, initial=int(schedule.place[STEP]), unit="step", **shown)
+    length = abs(span.t_bound - span.t0) if math.isfinite(span.t_bound) else None
+    return tqdm(total=length, initial=abs(float(schedule.clock[TIME]) - span.t0), unit="time", **shown)
 
 
 @contextmanager
@@ -583,29 +546,18 @@ def _start_kept(request: Request) -> Iterator[None]:
             with suppress(TypeError, ValueError):  # the initial state itself cannot be read
                 t0, start = started_at(request)
                 error.partial = IntegrationResult(  # type: ignore[attr-defined]
-                    t=np.array([t0]),
-                    y=start[:, None],
-                    invariants=np.zeros((0, 1)),
-                    target=np.zeros(0),
+                    {"t": np.array([t0]), "y": start[:, None], "invariants": np.zeros((0, 1)), "target": np.zeros(0)},
                     max_defect=np.zeros(0),
                     diagnostics=Diagnostics(),
-                    t_events=None,
-                    y_events=None,
-                    sol=None,
-                    nfev=0,
-                    njev=0,
-                    nlu=0,
+                    **dict.fromkeys(("t_events", "y_events", "sol")),
+                    **dict.fromkeys(("nfev", "njev", "nlu"), 0),
                     status=-1,
                     message=f"interrupted by {type(error).__name__} at the start",
-                    success=False,
-                    trusted=False,
+                    **dict.fromkeys(("success", "trusted"), False),
                     wall_time=time.perf_counter() - begin,
                     compiled=False,
                     calls={},
                     method=getattr(request.method, "__name__", str(request.method)),
-                    h=None,
-                    component_names=None,
-                    units="",
-                    epoch=None,
+                    **{"h": None, "component_names": None, "units": "", "epoch": None},
                 )
         raise

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from ..core.states import as_derivative
 from ..core.steppers import check_halves
 from ..engine.native import LibraryFunction
 
-__all__ = ["FORMS", "INTERPRETED"]
+__all__ = ["FORMS", "interpreted"]
 
 FORMS = {  # (given as an acceleration, in place) -> name of the form of the user's function
     (False, False): "value",
@@ -24,15 +23,29 @@ FORMS = {  # (given as an acceleration, in place) -> name of the form of the use
 }
 
 
-def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun") -> Callable[..., None]:
-    """Return an in-place right-hand side that calls the user's function `fun` and checks its value.
+def interpreted(form: str, fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+    """Return ``rhs(t, y, out)``, which calls the user's function `fun` of a form in `FORMS` and checks its value.
 
-    `extra` are the arguments of `fun` after t and y, `y0` has the shape and dtype of a value, and `name` is the name of
-    `fun` in messages.
+    `extra` are the last arguments of `fun`, and `y0` has the shape and dtype of a state.
     """
+    checked = _in_place if "in place" in form else _value
+    if not form.startswith("acceleration"):
+        return checked(fun, extra, y0, "fun")
+    check_halves(y0.size)
+    half = y0.size // 2
+    acc = checked(fun, extra, y0[:half], "acceleration")
+
+    def rhs(t: float, y: np.ndarray, out: np.ndarray) -> None:
+        out[:half] = y[half:]
+        acc(t, y[:half], out[half:])
+
+    return rhs
+
+
+def _value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str) -> Callable[..., None]:
     n, dtype, shape = y0.size, y0.dtype, y0.shape
 
-    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
+    def rhs(t: float, y: np.ndarray, out: np.ndarray) -> None:
         f = fun(t, y.copy(), *extra)
         known = type(f) is np.ndarray and f.shape == shape and f.dtype == dtype
         out[:] = f if known else as_derivative(f, n, dtype, t, name)
@@ -40,19 +53,15 @@ def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, na
     return rhs
 
 
-def _interpreted_in_place(
-    fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun"
-) -> Callable[..., None]:
-    """Return an in-place right-hand side that checks the user's in-place function `fun` in its first call.
-
-    `extra` are the arguments of `fun` after t, y and out, and `name` is the name of `fun` in messages.
+def _in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str) -> Callable[..., None]:
+    """Return `fun` after a check of its first call, which functions of the package's problems do not need.
 
     `out` is filled with NaN before each call: the first call raises an error if the function leaves components
-    unfilled, and later ones leave NaN there. Functions of the package's problems are not checked.
+    unfilled, and later ones leave NaN there.
     """
     first = not isinstance(fun, LibraryFunction)
 
-    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
+    def rhs(t: float, y: np.ndarray, out: np.ndarray) -> None:
         nonlocal first
         if first:
             first = False
@@ -62,30 +71,3 @@ def _interpreted_in_place(
             fun(t, y.copy(), out, *extra)
 
     return rhs
-
-
-def _second_order(
-    interpreted: Callable[..., Callable[..., None]], fun: Callable[..., Any], extra: tuple, y0: np.ndarray
-) -> Callable[..., None]:
-    """Return the in-place right-hand side of y = (q, v) for the acceleration `fun`.
-
-    `interpreted` is the function of this module that makes `fun` in-place and checks its values, and `extra` are the
-    last arguments of `fun`.
-    """
-    check_halves(y0.size)
-    half = y0.size // 2
-    acc = interpreted(fun, extra, y0[:half], "acceleration")
-
-    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
-        out[:half] = y[half:]
-        acc(t, y[:half], out[half:], params)
-
-    return rhs
-
-
-INTERPRETED: dict[str, Callable[..., Callable[..., None]]] = {
-    "value": _interpreted_value,
-    "in place": _interpreted_in_place,
-    "acceleration": partial(_second_order, _interpreted_value),
-    "acceleration in place": partial(_second_order, _interpreted_in_place),
-}

@@ -52,15 +52,10 @@ def kept_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def ended_by_sigterm(wanted: bool) -> Iterator[None]:
-    """Let SIGTERM end the block by an exception, and then the process, as its sender expects.
+    """Let SIGTERM end the block by an exception, and then the process, as its sender expects, if that is `wanted`.
 
     The notes of this exception are printed to the standard error stream. All of this applies only in the main thread
     and without a user-defined handler, where SIGTERM would end the process at once. A second SIGTERM is ignored.
-
-    Parameters
-    ----------
-    wanted : bool
-        True if something must be done before the end; otherwise SIGTERM has its usual effect.
     """
     if not (wanted and _is_ours(signal.SIGTERM, signal.SIG_DFL)):
         yield
@@ -80,13 +75,7 @@ def ended_by_sigterm(wanted: bool) -> Iterator[None]:
 
 
 def look_for_signals() -> None:
-    """Raise the exception of a signal if it was dropped; otherwise do nothing.
-
-    Raises
-    ------
-    KeyboardInterrupt, TerminatedError
-        In the main thread, after a signal that did not end the block of `kept_ctrl_c` or `ended_by_sigterm`.
-    """
+    """Raise, in the main thread, the exception of a signal that did not end `kept_ctrl_c` or `ended_by_sigterm`."""
     if not (_Came.ctrl_c or _Came.sigterm) or threading.current_thread() is not threading.main_thread():
         return
     _Came.put_off = None
@@ -94,10 +83,7 @@ def look_for_signals() -> None:
 
 
 def _is_ours(number: int, usual: object) -> bool:
-    """Return True if signal `number` may be handled here: in the main thread, and without a user-defined handler.
-
-    `usual` is the handler that the signal has if the user has not defined one.
-    """
+    """Return True if signal `number` may be handled here: in the main thread, and if its handler is the `usual` one."""
     return threading.current_thread() is threading.main_thread() and _signal.getsignal(number) == usual
 
 

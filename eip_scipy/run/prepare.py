@@ -33,7 +33,7 @@ from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
 from .events import Events, as_events, replaced
-from .interpreted_functions import FORMS, INTERPRETED
+from .interpreted_functions import FORMS, interpreted
 from .memory import check_bytes
 from .resume import plain, settings
 
@@ -147,11 +147,7 @@ class System:
             raise TypeError(
                 f"jacobian must be a function jacobian(t, q, dq, out[, params]), got {shown(self.jacobian)}."
             )
-        self.rhs: Callable[..., None]
-
-    def bind(self, y0: np.ndarray) -> None:
-        """Make `rhs` for states of the shape and type of y0."""
-        self.rhs = INTERPRETED[self.form](self.fun, self.extra, y0)
+        self.rhs: Callable[..., None]  # for states of the shape and type of y0, set when these are known
 
     @property
     def name(self) -> str:
@@ -169,7 +165,7 @@ class System:
         """Return the derivative at (t, y) as a new array; raise TypeError if the function takes other arguments."""
         out = np.empty_like(y)
         try:
-            self.rhs(t, y, out, self.parameters)
+            self.rhs(t, y, out)
         except TypeError:
             third = ("out",) if "in place" in self.form else ()
             state, called = ("y", CALLED) if self.name == "fun" else ("q", CALLED_ACCELERATION)
@@ -178,10 +174,7 @@ class System:
         return out
 
     def product(self) -> Callable[..., np.ndarray] | None:
-        """Return the function ``product(t, q, dq)``, the Jacobian of the accelerations times dq.
-
-        A `Deferred` Jacobian is made here. Without the option `jacobian` the result is None.
-        """
+        """Return the option `jacobian`, made now if it is `Deferred`, as ``product(t, q, dq)``; None without it."""
         self.jacobian = made(self.jacobian)
         return None if self.jacobian is None else times(self.jacobian, *self.extra)
 
@@ -301,8 +294,8 @@ class Prepared:
     def described_columns(self) -> dict[str, Any]:
         """Return the field ``columns`` of a result of this run, which carries derivatives."""
         assert self.variations is not None
-        columns, problem = self.variations.columns, self.asked.fun
-        known = dict(enumerate(problem.parameters)) if isinstance(problem, Problem) else {}
+        columns = self.variations.columns
+        known = {} if self.problem is None else dict(enumerate(self.problem.parameters))
         return {
             "state": columns.is_transition,
             "parameters": len(columns.parameters),
@@ -312,20 +305,15 @@ class Prepared:
         }
 
     @property
+    def problem(self) -> Problem | None:
+        """Return the problem, if one was given instead of a function."""
+        return self.asked.fun if isinstance(self.asked.fun, Problem) else None
+
+    @property
     def component_names(self) -> tuple[str, ...] | None:
         """Names of the components from the problem, or None if it has none for this state."""
-        names = self.asked.fun.component_names if isinstance(self.asked.fun, Problem) else None
+        names = None if self.problem is None else self.problem.component_names
         return names if names is not None and len(names) == self.n else None
-
-    @property
-    def units(self) -> str:
-        """Units of the problem."""
-        return self.asked.fun.units if isinstance(self.asked.fun, Problem) else ""
-
-    @property
-    def epoch(self) -> tuple[float, float] | None:
-        """Epoch of the problem, a Julian date (TDB) in two parts, or None if it has none."""
-        return self.asked.fun.epoch if isinstance(self.asked.fun, Problem) else None
 
     @property
     def pointers(self) -> list[PointerFunction]:
@@ -336,10 +324,7 @@ class Prepared:
         return [function for function in functions if isinstance(function, PointerFunction)]
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
-        """Return all settings, except functions, that determine the result of a run from `y0` to the last bit.
-
-        The keys of the dict are the names of arguments and options that users know.
-        """
+        """Return all settings except functions, by users' names, that determine the result of a run to the last bit."""
         found = settings(self.label, y0, params, self.run, self.schedule, self.system.events)
         if self.variations is not None:
             found |= {name: plain(value) for name, value in self.variations.columns.identity.items()}
@@ -369,7 +354,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     y0 = _state(request.y0)
     n = y0.size if variations is None else variations.columns.n
     stepping = request.steps.checked(request.method.__name__, method, t0, t_bound, n, stacklevel=4)
-    system.bind(y0)
+    system.rhs = interpreted(form, system.fun, system.extra, y0)
     calls = Counted(system.derivative)
     spec = _spec(asked.fun, request, system, calls, stepping)
     if variations is not None:
@@ -384,7 +369,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     # `attach` sets all attributes of a new record.
     record = Diagnostics.__new__(Diagnostics) if request.diagnostics is None else request.diagnostics
     run.attach(record)
-    system.events.fill(t0, run.y0, schedule.g)
+    schedule.g[:] = system.events.values(t0, run.y0)
     run.work.K[0] = run.start.f
     system.events.leave(t0, run.y0, run.work.K[0], run.start.tau * schedule.span.sign, schedule.g)
     run.work.counters[NFEV] = calls.count
@@ -392,10 +377,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
 
 
 def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
-    """Return the specification of the run.
-
-    `given` is the function or the problem as given, and `calls` the right-hand side, which counts its calls.
-    """
+    """Return the specification of the run; `given` is the function or problem as given, `calls` the right-hand side."""
     problem = given if isinstance(given, Problem) else None
     return RunSpec(
         name=request.method.__name__,
@@ -416,10 +398,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
 
 
 def _variations(given: Any, request: Request, form: str) -> Variations | None:
-    """Return the `Variations` for the option `variations` of the request, or None if it was not given.
-
-    `given` is the function or the problem as given, and `form` the form of `request.fun`, a name in `FORMS`.
-    """
+    """Return the `Variations` for the option `variations` of the request, or None if it was not given."""
     if request.variations is None:
         if request.jvp is not None or request.symplectic is not None:
             raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
@@ -448,10 +427,7 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
 
 
 def _widened(request: Request, variations: Variations) -> Request:
-    """Return the request for the state followed by its columns of derivatives.
-
-    It has the functions, events and invariants of `variations`, which take this longer state.
-    """
+    """Return the request for the state followed by its columns of derivatives, with functions for this longer state."""
     extra = extra_arguments(request.args, request.params)
     return request._replace(
         fun=variations.rhs,
@@ -474,10 +450,7 @@ def started_at(request: Request) -> tuple[float, np.ndarray]:
 
 
 def _plain(request: Request) -> Request:
-    """Return the request with durations, units and names of parameters replaced by plain numbers.
-
-    Only a `Problem` knows its units and parameters; with another function the request is returned unchanged.
-    """
+    """Return the request with plain numbers for durations, units and names of parameters, which a `Problem` knows."""
     problem = request.fun
     if not isinstance(problem, Problem):
         return request
@@ -489,15 +462,11 @@ def _plain(request: Request) -> Request:
 
 
 def _second_order_hint(fun: Any) -> str:
-    """Return advice on how to write the problem in (q, v) or how to pass an acceleration, for the end of a message.
-
-    The text is empty if the problem has no such form.
-    """
+    """Return advice on how to write the problem in (q, v) or how to pass an acceleration, for the end of a message."""
     if not isinstance(fun, Problem):
         return f". If fun is the acceleration a(t, q), {BY_NAME}"
-    return (
-        "; problem.second_order() returns this problem in that form, for a start (q, v)" if fun.has_second_order else ""
-    )
+    hint = "; problem.second_order() returns this problem in that form, for a start (q, v)"
+    return hint if fun.has_second_order else ""
 
 
 def _method(method: Any) -> Any:
@@ -507,17 +476,12 @@ def _method(method: Any) -> Any:
             "fixed steps, or EIPRKN12 for q'' = a(t, q); eip_scipy.recommend(...) finds method and step."
         )
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
+        hint = "" if (name := class_named(method)) is None else f". Give the class: from eip_scipy import {name}"
         raise TypeError(
             f"integrate: method must be an EIP class such as EIPRK4, or a class made by eip_method; got {method!r}"
-            f"{_class_of(method)}."
+            f"{hint}."
         )
     return method.TABLEAU
-
-
-def _class_of(method: Any) -> str:
-    """Return a hint that names the EIP class if `method` is its name or that of a method of SciPy, otherwise ""."""
-    name = class_named(method)
-    return "" if name is None else f". Give the class: from eip_scipy import {name}"
 
 
 def _check_choices(request: Request) -> None:
@@ -551,10 +515,7 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
 
 
 def _with_problem(request: Request) -> tuple[Request, str]:
-    """Return the request, completed by the attributes of its `Problem` if it has one, and the form of its function.
-
-    The form is a name in `FORMS`.
-    """
+    """Return the request, completed by the attributes of its `Problem`, and its function's form, a name in `FORMS`."""
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
     problem, in_place = request.fun, flag("in_place", request.in_place)
@@ -590,10 +551,7 @@ def _with_problem(request: Request) -> tuple[Request, str]:
 
 
 def _without_own(projection: Mapping[str, Any], *extra: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the option `invariants`, in which an invariant whose args equal one of `extra` has no args.
-
-    The run passes these arguments on itself. The result is empty if the option was not given.
-    """
+    """Return the option `invariants`, if given, without args that equal one of `extra`, which the run passes on."""
     if "invariants" not in projection:
         return {}
     items = as_invariants(projection["invariants"])

@@ -171,14 +171,11 @@ def _problem(
 
 
 def _made(fun: Any, t_span: Any, y0: Any, common: dict[str, Any]) -> Problem:
-    """Return a problem made from a function, with `in_place` removed from the options in `common`.
-
-    For an in-place function, `params` also moves from the options to the problem.
-    """
-    if not callable(by_pointer(fun, "fun")):
+    """Return a problem made from a function; `in_place`, and if it is True `params`, are removed from `common`."""
+    pointer = by_pointer(fun, "fun")
+    if not callable(pointer):
         raise TypeError(f"recommend: fun must be callable or a Problem, got {shown(fun)}.")
     name = getattr(getattr(fun, "acceleration", fun), "__name__", "problem")
-    pointer = by_pointer(fun, "fun")
     if not (flag("in_place", common.pop("in_place", False)) or isinstance(pointer, PointerFunction)):
         return Problem(name=name, fun=fun, y0=y0, t_span=t_span)
     params = common.pop("params", None)

@@ -121,11 +121,8 @@ def _shown(value: Any) -> str:
         return value.__name__
     if isinstance(value, float):
         return f"{value:g}"
-    return repr(value) if isinstance(value, (str, int)) or value is None or _empty(value) else "..."
-
-
-def _empty(value: Any) -> bool:
-    return isinstance(value, tuple) and not value
+    plain = isinstance(value, (str, int)) or value is None or (isinstance(value, tuple) and not value)
+    return repr(value) if plain else "..."
 
 
 def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
@@ -136,24 +133,20 @@ def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
         if output:
             cost += f" {trial.cost if trial.output else '-':>11}"
         trouble = textwrap.shorten(trial.trouble, WIDTH, placeholder=" ...")
-        rows.append(("->" if trial is chosen else "", _telling(trial.options), cost, f"  {trouble}".rstrip()))
+        # `atol` and `compensated` follow from the others.
+        others = {name: x for name, x in trial.options.items() if name not in ("method", "atol", "compensated")}
+        name = f"{trial.options['method'].__name__}, {called(others)}"
+        rows.append(("->" if trial is chosen else "", name, cost, f"  {trouble}".rstrip()))
     width = max(len(row[1]) for row in rows)
     yield f"     {'trials':<{width}}     error evaluations{' with output' if output else ''}"
     for mark, name, cost, trouble in rows:
         yield f"  {mark:>2} {name:<{width}} {cost}{trouble}"
 
 
-def _telling(options: Mapping[str, Any]) -> str:
-    """Return the method and its options as text, without `atol` and `compensated`, which follow from the others."""
-    others = {name: value for name, value in options.items() if name not in ("method", "atol", "compensated")}
-    return f"{options['method'].__name__}, {called(others)}"
-
-
 def _one_each(trials: tuple[Trial, ...], chosen: Trial) -> list[Trial]:
     """Return one trial of each group of trials that differ only in the values of `h`, or of `rtol` and `atol`.
 
-    It is `chosen` if this trial belongs to the group, else the last trial whose `Trial.good` is True, or the last trial
-    if there is none.
+    It is `chosen` if this trial belongs to the group, else the last good trial, or the last one if there is none.
     """
     ways: dict[str, Trial] = {}
     for trial in trials:

@@ -18,27 +18,13 @@ __all__ = ["Fields", "IntegrationResult", "Origin", "WithColumns"]
 
 
 class Origin(NamedTuple):
-    """Origin of a result, from which its run can be continued.
+    """Origin of a result, from which its run can be continued."""
 
-    Attributes
-    ----------
-    request : Request
-        Arguments of `integrate`.
-    t : float
-        Time of the last state.
-    y : ndarray, shape (n,)
-        Last state of the run, saved or not.
-    sign : float
-        Direction of time, 1 or -1.
-    kept : callable
-        ``kept()`` returns the invariants of the run, with the kept values as their targets.
-    """
-
-    request: Any
-    t: float
-    y: np.ndarray
-    sign: float
-    kept: Callable[[], Any]
+    request: Any  # `Request`: the arguments of `integrate`
+    t: float  # time of the last state
+    y: np.ndarray  # (n,): last state of the run, saved or not
+    sign: float  # direction of time, 1 or -1
+    kept: Callable[[], Any]  # returns the invariants of the run, with the kept values as their targets
 
 
 if TYPE_CHECKING:
@@ -345,10 +331,7 @@ class IntegrationResult(WithColumns):
         return cls(found)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Compute the outputs and multipliers of the problem, if it has any, and return the content of a pickle.
-
-        They are usually computed when they are first requested; an unpickled result has no functions for that.
-        """
+        """Compute outputs and multipliers, for which an unpickled result has no functions; return what is pickled."""
         self._observe()
         return super().__reduce_ex__(protocol)
 

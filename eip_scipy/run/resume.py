@@ -37,6 +37,9 @@ LEAST_OF_RATES = 1e-6
 SHORT = 16
 STEP = 0
 
+Arrays = dict[str, np.ndarray]
+Derivative = Callable[[float, np.ndarray], np.ndarray]
+
 
 class Keeper:
     """Interface between a run and its checkpoint. This class stores nothing; it serves runs without a checkpoint."""
@@ -49,17 +52,10 @@ class Keeper:
         """Additions to the message of the result."""
         return ()
 
-    def identify(
-        self,
-        settings: dict[str, Any],
-        run: Run,
-        derivative: Callable[[float, np.ndarray], np.ndarray],
-        events: Events,
-    ) -> None:
+    def identify(self, settings: dict[str, Any], run: Run, derivative: Derivative, events: Events) -> None:
         """Record what identifies the run, before anything is compiled: its settings and functions.
 
-        `derivative` is the right-hand side, and `events` are those of the run. A run that is resumed must agree with
-        its file, otherwise CheckpointError is raised.
+        A run that is resumed must agree with its file, otherwise CheckpointError is raised.
         """
 
     def begin(self, driver: Any) -> None:
@@ -77,17 +73,7 @@ class Keeper:
 
 @contextmanager
 def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper]:
-    """Yield the keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
-
-    Raises
-    ------
-    TypeError
-        If `path` is not a path.
-    ValueError
-        If another value is wrong, `resume` is True without a path, or `dense_output` is True with one.
-    CheckpointError
-        If the file exists and `resume` is False, cannot be read, or is used by another run.
-    """
+    """Yield the keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`."""
     if not isinstance(resume, (bool, np.bool_)):
         raise ValueError(f"resume must be True or False, got {resume!r}.")
     refuse_units(checkpoint_every=every)
@@ -167,7 +153,7 @@ def _digest(values: Iterable[Any]) -> str:
 class _Snapshot(NamedTuple):
     """State of a run after an accepted step: its small arrays, how often each event has happened, and the run time."""
 
-    arrays: dict[str, np.ndarray]
+    arrays: Arrays
     happened: list[int]
     seconds: float
 
@@ -182,68 +168,50 @@ class _FileKeeper(Keeper):
 
     keeps = True
 
-    def __init__(
-        self, name: str, every: float, found: tuple[dict[str, Any], dict[str, np.ndarray]] | None, origin: str
-    ) -> None:
+    def __init__(self, name: str, every: float, found: tuple[dict[str, Any], Arrays] | None, origin: str) -> None:
         self._name, self._every, self._read = name, every, found
         self._origin = origin
         self._failure = ""
         self._ended: Any = None
 
-    def identify(
-        self,
-        settings: dict[str, Any],
-        run: Run,
-        derivative: Callable[[float, np.ndarray], np.ndarray],
-        events: Events,
-    ) -> None:
-        self._settings, self._names, self._derivative = settings, run.invariants.names, derivative
-        self._events = events
+    def identify(self, settings: dict[str, Any], run: Run, derivative: Derivative, events: Events) -> None:
+        self._settings, self._run, self._derivative, self._events = settings, run, derivative, events
+        self._names = run.invariants.names
         t0, y0, f0 = run.begin[:3]
-        self._start = self._known_by("start", run, t0, y0, f0, run.invariants.start_values)
+        self._start = self._known_by("start", t0, y0, f0, run.invariants.start_values)
         if self._read is None:
             return
         header, arrays = self._read
         checkpoint.require_same(self._name, header.get("settings"), settings)
-        self._require_same_functions(run, arrays, self._start, t0, y0, "at the start")
+        self._require_same_functions(arrays, self._start, t0, y0, "at the start")
         self._require_fitting(arrays, {"y": y0, "clock": np.zeros(NEXT_LENGTH + 1)})
         if "state_f" in arrays:
             t, y = float(arrays["clock"][TIME]), arrays["y"]
-            here = self._known_by_at(run, t, y)
-            self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it was saved,")
+            where = f"at t = {t:.10g}, where it was saved,"
+            self._require_same_functions(arrays, self._known_by_at(t, y), t, y, where)
         checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
 
-    def _known_by_at(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
+    def _known_by_at(self, t: float, y: np.ndarray) -> Arrays:
         """Return the values at the state y of the run at t that identify the functions."""
-        return self._known_by("state", run, t, y, self._derivative(t, y.copy()), run.invariants.values(t, y))
+        return self._known_by("state", t, y, self._derivative(t, y.copy()), self._run.invariants.values(t, y))
 
-    def _known_by(
-        self, where: str, run: Run, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray
-    ) -> dict[str, np.ndarray]:
+    def _known_by(self, where: str, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray) -> Arrays:
         """Return the values at (t, y) that identify the functions, by the names of their arrays in the file.
 
         They are the derivative `f`, the `values` of the invariants, the rates of balances, and the values of events.
         The names begin with `where`.
         """
         known_by = {f"{where}_f": f, f"{where}_values": values}
-        further = {"rates": run.invariants.balances.given(t, y, f), "events": self._events.values(t, y)}
+        further = {"rates": self._run.invariants.balances.given(t, y, f), "events": self._events.values(t, y)}
         return known_by | {f"{where}_{name}": found for name, found in further.items() if found.size}
 
-    def _require_same_functions(
-        self,
-        run: Run,
-        arrays: dict[str, np.ndarray],
-        known_by: dict[str, np.ndarray],
-        t: float,
-        y: np.ndarray,
-        where: str,
-    ) -> None:
+    def _require_same_functions(self, arrays: Arrays, known_by: Arrays, t: float, y: np.ndarray, where: str) -> None:
         # Earlier versions stored no values of events.
         known_by = {name: a for name, a in known_by.items() if name in arrays or not name.endswith("_events")}
         self._require_fitting(arrays, known_by)
         there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
         with np.errstate(invalid="ignore"):
-            labels, sizes = self._described(run, known_by, t, y)
+            labels, sizes = self._described(known_by, t, y)
             same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
         if not same.all():
             k = int(np.flatnonzero(~same)[0])
@@ -252,13 +220,9 @@ class _FileKeeper(Keeper):
                 f"and is {here[k]:.12g} now. Resume with the functions of that run, or use another file for a new run."
             )
 
-    def _described(
-        self, run: Run, known_by: dict[str, np.ndarray], t: float, y: np.ndarray
-    ) -> tuple[list[str], np.ndarray]:
-        """Return a name of the function and a size for each of the values at (t, y) in `known_by`.
-
-        Values are compared relative to their sizes.
-        """
+    def _described(self, known_by: Arrays, t: float, y: np.ndarray) -> tuple[list[str], np.ndarray]:
+        """Return a name of the function and a size, for comparisons, of each of the values at (t, y) in `known_by`."""
+        run = self._run
         parts = {name.partition("_")[2]: values for name, values in known_by.items()}
         f, places = parts["f"], run.invariants.balances.given_places
         labels = ["fun"] * f.size + [f"invariant {name!r}" for name in self._names]
@@ -274,7 +238,7 @@ class _FileKeeper(Keeper):
             sizes.append(self._events.sizes(t, y, f, step))
         return labels, np.concatenate(sizes)
 
-    def _require_fitting(self, arrays: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    def _require_fitting(self, arrays: Arrays, expected: Arrays) -> None:
         for name, a in expected.items():
             found = arrays.get(name)
             if found is None or (found.dtype, found.shape) != (a.dtype, a.shape):
@@ -295,7 +259,7 @@ class _FileKeeper(Keeper):
         if found is None:
             self._write(None, "running")
 
-    def _restore(self, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    def _restore(self, header: dict[str, Any], arrays: Arrays) -> None:
         """Fill the buffers of the run after all arrays have been checked."""
         driver, events = self._driver, self._events
         parts = driver.parts()
@@ -351,14 +315,11 @@ class _FileKeeper(Keeper):
             f"the checkpoint {self._name!r} holds {self._written}: the same call with resume=True continues from there"
         )
 
-    def _state(self) -> dict[str, np.ndarray]:
-        """Return the values that identify the functions at the snapshot; {} if a function raises an error.
-
-        The evaluations are not counted.
-        """
+    def _state(self) -> Arrays:
+        """Return the values that identify the functions at the snapshot; {} if a function raises an error."""
         arrays = self._snapshot.arrays
         try:
-            return self._known_by_at(self._driver.run, float(arrays["clock"][TIME]), arrays["y"])
+            return self._known_by_at(float(arrays["clock"][TIME]), arrays["y"])
         except Exception:  # a function may raise again what has ended the run; the checkpoint is written all the same
             return {}
 
@@ -381,11 +342,8 @@ class _FileKeeper(Keeper):
         except CheckpointError as error:
             self._due = time.perf_counter() + self._every
             self._failure = f"{error}; it still holds {self._written}"
-            then = (
-                f"The run continues and tries again in {self._every:g} s."
-                if status is None
-                else "The result is complete."
-            )
+            again = f"The run continues and tries again in {self._every:g} s."
+            then = again if status is None else "The result is complete."
             warnings.warn(f"{self._failure}. {then}", RuntimeWarning, stacklevel=users_level())
 
     def _write(self, status: int | None, message: str) -> None:

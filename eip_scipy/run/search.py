@@ -106,13 +106,20 @@ class Search:
         """Return the cheapest method with its options and the reason; raise ValueError if none has the wanted error."""
         chosen = self._cheapest()
         if chosen is None and self.keeps:
-            self._leave_out_invariants()
+            self.keeps = False
+            why = self._smallest("with the projection the error stays at")
+            self.message = f"the invariants are left out because no trial that keeps them has the wanted error: {why}"
             chosen = self._cheapest()
         if chosen is None:
-            raise ValueError(self._unreached())
+            raise ValueError(
+                f"recommend: no trial has an error of {self.wanted:g}: {self._smallest('the smallest was')}. Allow a "
+                "larger error or a shorter interval."
+            )
         if self.keeps:
             chosen = self._other_metric(chosen)
-            self._say_what_projection_does(chosen)
+            plain = self._trial({**chosen.options, **PLAIN})
+            if math.isfinite(plain.error):
+                self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
         stiff = self._say_that_it_is_stiff(chosen)
         if not stiff:
             self._say_what_binds(chosen)
@@ -137,15 +144,10 @@ class Search:
     # --- preparation: size, steps, a reference solution ---
 
     def _look(self, max_nfev: int | None) -> Look:
-        """Run once by `EIPDOP853` without projection, and return the `Look`.
+        """Run once by `EIPDOP853` without projection, and return the `Look`; raise ValueError if the run fails.
 
         The run stops after about 1 / `FIRST_PART` of the evaluations that one trial may take (`max_nfev`, or else
         `MOST_NFEV`). If it stops before the end of the interval, all later trials end there too.
-
-        Raises
-        ------
-        ValueError
-            If the run fails.
         """
         bench, problem = self.bench, self.bench.problem
         rtol = min(max(self.wanted, 1e-10), 1e-4)
@@ -174,10 +176,7 @@ class Search:
         return Look(size, float(np.median(lengths)), float(long / short), velocities)
 
     def _find_truth(self) -> None:
-        """Store in `bench` the reference states: those of the tighter of two runs that agree well enough.
-
-        Raise ValueError if no two runs agree well enough.
-        """
+        """Store the reference states, of the tighter of two runs that agree; raise ValueError if no two do."""
         size, plain = self.look.size, Kind(EIPDOP853, size=self.look.size, options=PLAIN)
         found, enough = [self._reference(plain, REFERENCE_START * self.wanted)], AGREEMENT * self.wanted
         method, options = (EIPRKN12, LONG) if self.look.velocities is False else (EIPDOP853, {})
@@ -234,10 +233,7 @@ class Search:
         return chosen
 
     def _others(self, rtol: float) -> list[tuple[Kind, float]]:
-        """Return each `Kind` to try after `EIPDOP853`, with the step or tolerance at which its search starts.
-
-        `rtol` is this tolerance for kinds with adaptive steps.
-        """
+        """Return each `Kind` to try after `EIPDOP853`, with the step or `rtol` at which its search starts."""
         look, found = self.look, []
         if look.velocities is False:
             found += [(self._kind(EIPRKN8, **LONG), rtol), (self._kind(EIPRKN12, **LONG), rtol)]
@@ -259,10 +255,9 @@ class Search:
         return Kind(method, fixed, self.look.size, length / LEAST_STEPS if fixed else COARSEST_RTOL, options)
 
     def _tuned(self, kind: Kind, value: float, bound: float = math.inf) -> Trial | None:
-        """Return the cheapest trial of a kind, from `value` of its step or tolerance on.
+        """Return the cheapest trial of a kind, from `value` of its step or tolerance on; None if none is good enough.
 
-        The search ends if the kind costs much more than `bound` evaluations. Return None if no trial has the wanted
-        error.
+        The search ends if the kind costs much more than `bound` evaluations.
         """
         tried = tune(kind, value, self.wanted, self._trial, bound)
         for trial in tried:
@@ -271,10 +266,7 @@ class Search:
         return None if chosen is None else self._with_output(chosen)
 
     def _with_output(self, chosen: Trial) -> Trial:
-        """Replace `chosen` in `trials` by its copy from `Bench.with_output`, and return the copy.
-
-        The copy also counts the evaluations that saving states at the times `bench.output` needs.
-        """
+        """Replace `chosen` in `trials` by its copy from `Bench.with_output`, and return the copy."""
         counted = self.bench.with_output(chosen)
         self.trials[[trial is chosen for trial in self.trials].index(True)] = counted
         self.kinds[id(counted)] = self.kinds.pop(id(chosen))  # an object that is gone may pass its id on
@@ -310,18 +302,6 @@ class Search:
         return [*found, {"metric": "euclidean"}]
 
     # --- remarks ---
-
-    def _leave_out_invariants(self) -> None:
-        """Let the further trials run without projection, and record the reason in `message`."""
-        self.keeps = False
-        good = [trial.error for trial in self.trials if trial.good]
-        why = f"with the projection the error stays at {min(good):.1e}" if good else self.trials[-1].trouble
-        self.message = f"the invariants are left out because no trial that keeps them has the wanted error: {why}"
-
-    def _say_what_projection_does(self, chosen: Trial) -> None:
-        plain = self._trial({**chosen.options, **PLAIN})
-        if math.isfinite(plain.error):
-            self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
 
     def _say_that_it_is_stiff(self, chosen: Trial) -> bool:
         """Return True if an implicit method needs at most 1 / `STIFF` of the evaluations of `chosen`, and add a remark.
@@ -375,12 +355,10 @@ class Search:
         kind = self.kinds.get(id(trial))
         return "" if kind is None else kind.name
 
-    def _unreached(self) -> str:
+    def _smallest(self, words: str) -> str:
+        """Return the smallest error of the trials after these words, or the trouble of the last trial if all failed."""
         good = [trial.error for trial in self.trials if trial.good]
-        found = f"the smallest was {min(good):.1e}" if good else self.trials[-1].trouble
-        return (
-            f"recommend: no trial has an error of {self.wanted:g}: {found}. Allow a larger error or a shorter interval."
-        )
+        return f"{words} {min(good):.1e}" if good else self.trials[-1].trouble
 
 
 def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:

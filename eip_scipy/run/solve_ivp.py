@@ -215,11 +215,7 @@ def solve_ivp(
 def _solve(
     method: type[EIPSolver], function: Any, t_span: Any, y0: Any, common: dict[str, Any], options: dict[str, Any]
 ) -> OdeResult:
-    """Return the result of a run with an EIP method.
-
-    `function` is the right-hand side, `common` has the options of SciPy's solve_ivp itself, and `options` those of the
-    method, ``variations`` and ``jvp``.
-    """
+    """Return the result of a run with an EIP method; `common` has the options of SciPy's solve_ivp itself."""
     common["args"], extra = _unpacked(common["args"])
     variations, jvp = options.pop("variations", None), options.pop("jvp", None)
     if "invariants" in options and extra:
@@ -234,7 +230,8 @@ def _solve(
     wide = None
     if variations is not None:
         wide = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
-        method, function, y0 = _carrying(method, wide), wide.derivative, wide.columns.wide(initial_state(y0), NOTHING)
+        function, y0 = wide.derivative, wide.columns.wide(initial_state(y0), NOTHING)
+        method = _subclass(method, _COLUMNS=wide.columns)
         options["invariants"] = wide.invariants
         if (events := common["events"]) is not None:
             common["events"] = wide.events((events,) if callable(events) else events)
@@ -256,10 +253,7 @@ def _solve(
 def _variations(
     method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, asked: Any, extra: tuple, items: Any, jvp: Any
 ) -> Variations:
-    """Return the `Variations` for the option `variations` (`asked`): functions of the state followed by its columns.
-
-    `extra` are the further arguments of `fun` and `jvp`, from ``args``. The invariants `items` have theirs bound.
-    """
+    """Return the `Variations` for the option `variations` (`asked`): functions of the state followed by its columns."""
     require_tableau(method)
     start, t0 = initial_state(y0), interval(t_span)[0]
     columns = asked_columns(asked, start, NOTHING, (), method.TABLEAU.of_second_order)
@@ -267,9 +261,9 @@ def _variations(
     return Variations.of(columns, products, t0, start, (), as_invariants(items), in_python=True)
 
 
-def _carrying(method: type[EIPSolver], wide: Variations) -> Any:
-    """Return a subclass of `method` for states that are followed by the columns of `wide`."""
-    return SolverClass(method.__name__, (method,), {"_COLUMNS": wide.columns, "__doc__": method.__doc__})
+def _subclass(method: type[EIPSolver], **attributes: Any) -> Any:
+    """Return a subclass of `method` with its name and docstring, and with these attributes."""
+    return SolverClass(method.__name__, (method,), {**attributes, "__doc__": method.__doc__})
 
 
 def _split(sol: Any, wide: Variations) -> None:
@@ -284,10 +278,7 @@ def _split(sol: Any, wide: Variations) -> None:
 
 
 def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
-    """Return `fun`, or the right-hand side that belongs to `acceleration`.
-
-    Raise a TypeError if both are given, or if one of the arguments that a run needs is missing.
-    """
+    """Return `fun`, or the right-hand side that belongs to `acceleration`, after checks of the arguments."""
     name, given = ("fun", fun) if acceleration is None else ("acceleration", acceleration)
     if acceleration is not None and fun is not None:
         raise TypeError("solve_ivp: give fun or acceleration, not both.")
@@ -302,10 +293,7 @@ def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
 
 
 def _with_projection(method: Any, given: list[str]) -> Any:
-    """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself.
-
-    `given` has the names of these options.
-    """
+    """Return the EIP method on a method of SciPy if options of EIP methods are `given`; otherwise the method itself."""
     known = class_named(method)
     if isinstance(method, str) and known is not None and method.upper() == known.upper():
         raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {known}`.")
@@ -347,5 +335,5 @@ def _noting(method: type[EIPSolver], start: np.ndarray | None) -> tuple[type[EIP
         if start is not None:
             start[:] = self.y
 
-    noting: Any = SolverClass(method.__name__, (method,), {"__init__": __init__, "__doc__": method.__doc__})
+    noting = _subclass(method, __init__=__init__)
     return noting, solvers

@@ -37,22 +37,9 @@ class _TooManyError(Exception):
 def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> ImplicitRun | None:
     """Run the problem of a `Bench` by `EIPRadau` over the interval of its trials, with smaller and smaller tolerances.
 
-    Parameters
-    ----------
-    bench : Bench
-        The problem with the reference states.
-    wanted : float
-        Wanted error at the last time of the bench.
-    most : int
-        Largest number of evaluations of a run.
-    keeps : bool
-        Whether to keep the invariants.
-
-    Returns
-    -------
-    ImplicitRun or None
-        The first run with the wanted error. None if no run has it, a run fails or needs more than `most` evaluations,
-        or the state has more than `LARGEST` components.
+    Return the first run with the error `wanted` at the last time of the bench. Return None if no run has it, a run
+    fails or needs more than `most` evaluations, or the state has more than `LARGEST` components. If `keeps`, the
+    invariants are kept.
     """
     y0, times = bench.problem.y0, bench.times
     if y0.size > LARGEST:

@@ -124,8 +124,11 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     except ModuleNotFoundError as error:
         raise _missing("pandas", error) from error
     if of_members(result):
+        columns = dict(zip(component_names(result, names, result.y.shape[1]), result.y.T, strict=True))
+        columns |= {"t_end": result.t, "status": result.status, "message": result.message, "trusted": result.trusted}
+        columns |= {f"{name} max_defect": result.max_defect[:, k] for k, name in enumerate(result.names)}
         members = pandas.Index(result.first + np.arange(len(result.y)), name="member")
-        return pandas.DataFrame(_member_columns(result, names), index=members)
+        return pandas.DataFrame(columns, index=members)
     columns = dict(zip(component_names(result, names), np.asarray(result.y), strict=True))
     for name, (values, errors) in invariant_rows(result).items():
         label = f"invariant {name}" if name in columns else name
@@ -144,13 +147,6 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
 def of_members(result: Any) -> bool:
     """Return True if a result is that of an ensemble, whose states are (members, components)."""
     return "trajectories" in result
-
-
-def _member_columns(result: Any, names: Any) -> dict[str, np.ndarray]:
-    labels = component_names(result, names, result.y.shape[1])
-    columns = dict(zip(labels, result.y.T, strict=True))
-    columns |= {"t_end": result.t, "status": result.status, "message": result.message, "trusted": result.trusted}
-    return columns | {f"{name} max_defect": result.max_defect[:, k] for k, name in enumerate(result.names)}
 
 
 def invariant_rows(result: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -130,7 +130,6 @@ class Bench:
     def _with_equal_steps(self, asked: dict[str, Any]) -> Outcome:
         """Run with equal steps, and return the outcome with the states at the times of the bench.
 
-        `asked` contains all options of the run, those in `common` included.
         A one-step method continues its run from each of these times to the next. A multistep method makes a single run
         with ``t_eval``, because each of its starts costs about 200 evaluations.
         """
@@ -155,25 +154,20 @@ class Bench:
         except (ValueError, ArithmeticError) as error:
             return Trial(options, math.nan, 0, 0.0, f"{error}")
         found = self.judged(options, done, self.truth)
-        return (
-            replace(found, error=max(found.error, self.doubt)) if found.good else found
-        )  # it may be the reference run
+        # This may be the reference run itself.
+        return replace(found, error=max(found.error, self.doubt)) if found.good else found
 
     def with_output(self, trial: Trial) -> Trial:
         """Return the trial with the further evaluations of a run that saves states at the times `self.output`."""
         if self.output is None:
             return trial
         end = self.times[-1]
-        asked = {
-            **self.common,
-            **trial.options,
-            "t_eval": self.output[np.abs(self.output - self.t0) <= abs(end - self.t0)],
-        }
-        if asked["t_eval"].size == 0:
+        times = self.output[np.abs(self.output - self.t0) <= abs(end - self.t0)]
+        if times.size == 0:
             return trial
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            run = integrate(self.problem, (self.t0, end), **asked)
+            run = integrate(self.problem, (self.t0, end), **{**self.common, **trial.options, "t_eval": times})
         return replace(trial, output=round(run.nfev / self.share) - trial.nfev)
 
     def judged(self, options: Mapping[str, Any], done: Outcome, truth: np.ndarray) -> Trial:
@@ -186,9 +180,8 @@ class Bench:
             return Trial(options, float(errors[0]), nfev, done.seconds, done.trouble)
         power, trouble = _power(errors), done.trouble
         if power > WILD_POWER:
-            trouble = (
-                trouble or f"its error grows faster than the {WILD_POWER:g}th power of time; the motion may be chaotic"
-            )
+            wild = f"its error grows faster than the {WILD_POWER:g}th power of time; the motion may be chaotic"
+            trouble = trouble or wild
         power = min(max(power, LEAST_POWER), LARGEST_POWER)
         return Trial(options, float(errors.max()) / self.share**power, nfev, done.seconds, trouble, power)
 
@@ -208,10 +201,7 @@ def difference(y: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _power(errors: np.ndarray) -> float:
-    """Return the power of time with which errors at equidistant times grow.
-
-    It is the slope of the running maximum on logarithmic axes.
-    """
+    """Return the power of time with which errors at equidistant times grow: the slope of the logarithms."""
     largest = np.maximum.accumulate(errors)
     seen = largest > 0
     if seen.sum() < 2:

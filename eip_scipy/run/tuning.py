@@ -62,12 +62,10 @@ class Kind:
 
     def settings(self, value: float) -> dict[str, Any]:
         """Return the options of `integrate` for a value of the step or tolerance."""
-        if self.fixed:
-            return {"method": self.method, "h": value, **self.options}
+        atol = _short(ATOL_PER_RTOL * value * self.size, 2)
         return {
             "method": self.method,
-            "rtol": value,
-            "atol": _short(ATOL_PER_RTOL * value * self.size, 2),
+            **({"h": value} if self.fixed else {"rtol": value, "atol": atol}),
             **self.options,
         }
 
@@ -78,10 +76,6 @@ class Kind:
         """
         value = min(value, self.coarsest)
         return _short(value, 3) if self.fixed else _short(max(value, FINEST_RTOL), 2)
-
-    def dearness(self, trial: Trial, wanted: float) -> float:
-        """Return an estimate, from one trial, of the evaluations of the right-hand side for the error `wanted`."""
-        return trial.nfev * (trial.error / wanted) ** (1 / self.order)
 
 
 def tune(
@@ -103,9 +97,9 @@ def tune(
             break
         x, trial = math.log10(value), run(kind.settings(value))
         tried[value] = trial
-        if trial.good and WINDOW * wanted <= trial.error <= wanted:
-            break
-        if trial.good and kind.dearness(trial, wanted) > TOO_DEAR * bound:
+        # An estimate of the evaluations for the error `wanted`.
+        cost = trial.nfev * (trial.error / wanted) ** (1 / kind.order)
+        if trial.good and (WINDOW * wanted <= trial.error <= wanted or cost > TOO_DEAR * bound):
             break
         if not any(other.good for other in tried.values()) and len(tried) == MOST_FAILURES:
             break

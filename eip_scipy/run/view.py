@@ -98,10 +98,7 @@ def page(result: Any, *, names: Any = None, reference: Any = None) -> str:
 
 
 def _frames(rows: int, columns: int) -> np.ndarray:
-    """Return the indices of the saved states that the page shows, including the first and the last.
-
-    `rows` is the number of saved states, and `columns` that of the numbers shown for each.
-    """
+    """Return the indices of the rows of `columns` numbers that the page shows, including the first and the last."""
     most = min(rows, FRAMES, max(100, NUMBERS // max(columns, 1)))
     return np.unique(np.linspace(0, rows - 1, most).round().astype(int))
 
@@ -112,10 +109,7 @@ def _numbers(values: Any, digits: int = 5) -> list[float | None]:
 
 
 def _state(y: np.ndarray, labels: tuple[str, ...], bodies: dict[str, tuple[int, int]], frames: np.ndarray) -> Any:
-    """Return the data of the animation: bodies in the plane, two components, curves in time, or a profile.
-
-    `labels` are the names of the components, `bodies` the result of `planes`, and `frames` that of `_frames`.
-    """
+    """Return the data of the animation: bodies in the plane, two components, curves in time, or a profile."""
     real = np.abs(y) if np.iscomplexobj(y) else y
     if not bodies and len(y) == 2 and not np.iscomplexobj(y):
         bodies = {f"{labels[1]} over {labels[0]}": (0, 1)}
@@ -154,11 +148,7 @@ def _largest(row: np.ndarray, frames: np.ndarray) -> list[float | None]:
 
 
 def _distances(difference: np.ndarray, labels: tuple[str, ...], bodies: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return the position error (m,) of each body by name, from the differences (n, m) of states at the saved times.
-
-    `labels` are the names of the components, and `bodies` is the result of `planes`. The error includes z if the body
-    has such a component. Without bodies it is the largest component of the difference.
-    """
+    """Return the position error (m,) of each body by name, from differences (n, m); without bodies, the largest one."""
     if not bodies:
         return {"largest component": np.abs(difference).max(axis=0)}
     place = {name: k for k, name in enumerate(labels)}
@@ -170,10 +160,7 @@ def _distances(difference: np.ndarray, labels: tuple[str, ...], bodies: dict[str
 
 
 def _reference(result: Any, given: Any) -> np.ndarray | None:
-    """Return the reference states at the saved times, (n, m), NaN where they are unknown; None without a reference.
-
-    `given` is the argument `reference` of `view`.
-    """
+    """Return the reference states at the saved times, (n, m), NaN where they are unknown; None without a reference."""
     t, shape = np.asarray(result.t), np.shape(result.y)
     if given is None:
         given = _own_reference(result)

@@ -69,20 +69,24 @@ def _cast_number(context, builder, from_type, to_type, value):  # emits LLVM
     return _spread(builder, context.cast(builder, value, from_type, types.float64))
 
 
-def _define(function: Any, arguments: int, emit: Callable[..., Any]) -> None:  # emits LLVM
-    """Define the types and the LLVM code of a function of vectors, any argument of which may be a plain number.
+def _declare(function: Any, arguments: int, *, by_lanes: bool) -> None:  # emits LLVM
+    """Declare the types of a function of vectors, any argument of which may be a plain number.
 
-    `arguments` is the number of its arguments, and ``emit(builder, *vectors)`` writes its code.
+    If `by_lanes`, plain numbers keep their types, otherwise they become vectors.
     """
 
     @infer_global(function)
     class _Template(AbstractTemplate):
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            if len(args) != arguments or OCTET not in args:
+            known = all(a is OCTET or isinstance(a, types.Float | types.Integer) for a in args)
+            if len(args) != arguments or OCTET not in args or not known:
                 return None
-            if all(a is OCTET or isinstance(a, types.Float | types.Integer) for a in args):
-                return signature(OCTET, *[OCTET] * arguments)
-            return None
+            return signature(OCTET, *(args if by_lanes else [OCTET] * arguments))
+
+
+def _define(function: Any, arguments: int, emit: Callable[..., Any]) -> None:  # emits LLVM
+    """Define a function of `arguments` vectors, whose LLVM code ``emit(builder, *vectors)`` writes."""
+    _declare(function, arguments, by_lanes=False)
 
     @lower_builtin(function, *[Octet] * arguments)
     def _lower(context, builder, sig, args):
@@ -113,32 +117,13 @@ _define(math.sqrt, 1, _intrinsic("sqrt"))
 _define(math.copysign, 2, _intrinsic("copysign"))
 
 
-def _larger(builder: Any, a: Any, b: Any) -> Any:  # emits LLVM
-    return builder.select(builder.fcmp_ordered(">", b, a), b, a)
-
-
-def _smaller(builder: Any, a: Any, b: Any) -> Any:  # emits LLVM
-    return builder.select(builder.fcmp_ordered("<", b, a), b, a)
-
-
-_define(max, 2, _larger)
-_define(min, 2, _smaller)
+_define(max, 2, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
+_define(min, 2, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", b, a), b, a))
 
 
 def _define_by_lanes(function: Any, arguments: int) -> None:  # emits LLVM
-    """Define a function without a vector instruction: it is called as a function of floats for each lane.
-
-    `arguments` is the number of its arguments.
-    """
-
-    @infer_global(function)
-    class _Template(AbstractTemplate):
-        def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            if len(args) != arguments or OCTET not in args:
-                return None
-            if all(a is OCTET or isinstance(a, types.Float | types.Integer) for a in args):
-                return signature(OCTET, *args)
-            return None
+    """Define a function without a vector instruction: it is called as a function of floats for each lane."""
+    _declare(function, arguments, by_lanes=True)
 
     def lower(context, builder, sig, args):
         kinds = tuple(types.float64 if a is OCTET else types.unliteral(a) for a in sig.args)
