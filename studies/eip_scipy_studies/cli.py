@@ -34,20 +34,11 @@ class _Version(argparse.Action):
 
 
 def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
-    """Run one command.
+    """Run one command with the arguments `argv` (default: those of the process), and return the exit status.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments; default: those of the process.
-    **settings
-        Settings of the command, in place of its own defaults.
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 1 a check inside the command failed or a run is not reliable, 2 wrong usage, 3 the
-        text could not be printed, though the files are written, 130 interrupted.
+    The status is 0 done, 1 a check inside the command failed or a run is not reliable, 2 wrong usage, 3 the text could
+    not be printed, though the files are written, 130 interrupted. `settings` are those of the command, in place of its
+    own defaults.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     name = next((name for name in _longest_first() if words[: name.count(" ") + 1] == name.split()), None)

@@ -51,13 +51,7 @@ class Checkpoints:
 
 
 def positive(text: str) -> float:
-    """Return `text` as a finite positive number.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If `text` is not such a number.
-    """
+    """Return `text` as a finite positive number, or raise an ArgumentTypeError."""
     try:
         value = float(text)
     except ValueError:

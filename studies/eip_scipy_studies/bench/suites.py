@@ -28,18 +28,10 @@ MEMBERS, TURNS = 256, 10
 
 @dataclass(frozen=True)
 class Suite:
-    """A group of problems.
+    """A group of problems for a task of the worker: "precision", "first", "asked" or "overhead".
 
-    Attributes
-    ----------
-    name, title : str
-    task : str
-        Task of the worker: "precision", "first", "asked" or "overhead".
-    make : callable
-        ``make()(peer)`` returns the records that the method `peer` runs, with the settings of this method; an empty
-        list if it runs none.
-    note : str
-        Explanation that the report prints.
+    ``make()(peer)`` returns the records that the method `peer` runs, with the settings of this method; an empty list if
+    it runs none. `note` is the explanation that the report prints.
     """
 
     name: str

@@ -130,19 +130,10 @@ def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
 
 
 class Trial:
-    """A problem with the results of its runs.
+    """A problem with its exact state (n,) at the end, and the results of its runs.
 
-    Parameters
-    ----------
-    problem : FieldProblem
-    exact : ndarray, shape (n,)
-        Exact state at the end.
-
-    Attributes
-    ----------
-    rows : dict
-        For each (name of a method, h) a dict with the results of this run: "method", "h", the entries of the dict that
-        `errors` returns, "seconds", "pairs" (the number of pairs of transforms) and "remark".
+    For each (name of a method, h) `rows` has a dict with the results of this run: "method", "h", the entries of the
+    dict that `errors` returns, "seconds", "pairs" (the number of pairs of transforms) and "remark".
     """
 
     def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:
@@ -230,18 +221,10 @@ Found = dict[str, Trial]
 
 @dataclass(frozen=True, kw_only=True)
 class Efficiency(Study[Found]):
-    """``reproduce fig-efficiency``: all methods on both waves.
+    """``reproduce fig-efficiency``: all methods on both waves, with `points` points along each axis.
 
-    Attributes
-    ----------
-    points : int
-        Number of points along each axis.
-    repeats : int
-        Number of runs of each method and step; the least time counts.
-    orders : mapping of str to int
-        Expected slopes, the orders of the methods, by the methods' names.
-    stem : str
-        Stem of the names of the files that the command writes.
+    The least time of `repeats` runs of each method and step counts. `orders` are the expected slopes, the orders of the
+    methods, and `stem` is that of the names of the files.
     """
 
     points: int = 64

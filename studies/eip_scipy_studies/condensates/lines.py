@@ -42,17 +42,9 @@ class VortexLines(QuenchStudy):
     The trap is round. The stationary state at the slower rotation therefore continues to rotate at this rate, and lags
     behind the frame that rotates faster.
 
-    Attributes
-    ----------
-    points : int
-        Number of points along each axis.
-    saved : float
-        Time between two saved states.
-    energies_known : float
-        Allowed error of the known energies, of the start (a saddle) and of the lower state.
-    turn_known : float
-        Allowed error of the angle of the lines [rad], which is 0.1 of the distance between two points of the grid
-        there.
+    There are `points` points along each axis, and `saved` is the time between two saved states. `energies_known` is the
+    allowed error of the known energies, of the start (a saddle) and of the lower state, and `turn_known` that of the
+    angle of the lines [rad], which is 0.1 of the distance between two points of the grid there.
     """
 
     points: int = LINE_POINTS

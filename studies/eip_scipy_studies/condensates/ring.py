@@ -31,14 +31,8 @@ class Ring(QuenchStudy):
     The tightened ring contracts, keeps its angular momentum, and so turns faster than the rotating frame, in which its
     vortices turn anticlockwise: `sense` is 1, see `Quench`.
 
-    Attributes
-    ----------
-    condensate : callable
-        ``condensate(kappa, points)`` returns the equation, see `ring_condensate`.
-    kappas : (float, float)
-        Values of kappa, which determines the trap, before and after the quench, the sudden change of the trap at t = 0.
-    saved : float
-        Time between two saved states.
+    ``condensate(kappa, points)`` returns the equation, see `ring_condensate`. `kappas` determine the trap before and
+    after the quench, the sudden change of the trap at t = 0, and `saved` is the time between two saved states.
     """
 
     start: Path | None = option(

@@ -43,23 +43,12 @@ class FieldCheck(NamedTuple):
 class Quench:
     """A condensate whose trap or rotation changes at t = 0, and the settings of its report.
 
-    Attributes
-    ----------
-    name : str
-        Stem of the names of the files.
-    title : str
-    problem : FieldProblem
-        Problem after the quench, with the step of RK4. It starts from the stationary state before the quench.
-    reference_step : float
-        Step of the reference, a run by EIPDOP853 with which the other runs are compared.
-    interval : float
-        Time between two saved states, short enough to follow the vortices.
-    snapshots : tuple of float
-        Times at which fields are drawn and vortices are counted.
-    sense : int
-        Direction in which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
-    energy_kept : float
-        Bound on the absolute error of the energy in runs that keep it.
+    `name` is the stem of the names of the files. `problem` is the one after the quench, with the step of RK4; it starts
+    from the stationary state before the quench. The reference, with which the other runs are compared, is a run by
+    EIPDOP853 with `reference_step`. `interval` is the time between two saved states, short enough to follow the
+    vortices. At the times `snapshots` fields are drawn and vortices are counted. `sense` is the direction in which the
+    vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise. `energy_kept` is the bound on the absolute error
+    of the energy in runs that keep it.
     """
 
     name: str
@@ -95,21 +84,11 @@ class Quench:
 
 @dataclass(frozen=True, eq=False)
 class FieldRun:
-    """One method's run.
+    """One method's run: saved times (m,), absolute errors (m,), seconds, and evaluations of the right-hand side.
 
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-        Saved times.
-    mass_error, energy_error, field_error : ndarray, shape (m,)
-        Absolute errors: of mass and energy the change since the start, of the field the norm of the difference from
-        the reference.
-    wall_time : float
-        Seconds spent in the run.
-    nfev : int
-        Number of evaluations of the right-hand side.
-    n_rank_reduced : int
-        Number of projections in which the gradients were parallel, as at a stationary state.
+    The errors of mass and energy are their changes since the start, that of the field is the norm of the difference
+    from the reference. `n_rank_reduced` is the number of projections in which the gradients were parallel, as at a
+    stationary state.
     """
 
     t: np.ndarray
@@ -123,21 +102,11 @@ class FieldRun:
 
 @dataclass(eq=False)
 class QuenchRuns:
-    """The runs of a quench: those of `METHODS` that were done.
+    """The runs of a quench: those of `METHODS` that were done, by name (`lines`).
 
-    Attributes
-    ----------
-    quench : Quench
-    lines : dict of str to FieldRun
-        The runs by the names of their methods.
-    reference, fields : ndarray, shape (n, m), or None
-        States of the reference, and of the method `SHOWN`, whose fields are drawn.
-    moved : Motion or None
-        The vortices in the run of `SHOWN`.
-    more : list of FieldCheck
-        Checks in addition to those of all quenches.
-    notes : list of str
-        Lines for the head of the table.
+    `reference` and `fields` are the states (n, m) of the reference and of the method `SHOWN`, whose fields are drawn,
+    and `moved` are the vortices in the run of `SHOWN`. `more` are checks in addition to those of all quenches, and
+    `notes` lines for the head of the table.
     """
 
     quench: Quench
@@ -151,16 +120,10 @@ class QuenchRuns:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The vortices in time; in three dimensions their positions in the middle plane.
+    """The vortices at the times `t` (m,); in three dimensions their positions in the middle plane.
 
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-    vortices : list of Vortices
-        One entry for each time.
-    angle : ndarray, shape (m,)
-        Angle by which the vortices have turned about the centre since the start, positive anticlockwise [rad]: the sum
-        of the medians of their turns from one state to the next.
+    `angle` (m,) is the angle by which the vortices have turned about the centre since the start, positive anticlockwise
+    [rad]: the sum of the medians of their turns from one state to the next.
     """
 
     t: np.ndarray
@@ -215,20 +178,10 @@ def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
 
 
 def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
-    """Find the vortices in all states, and the angle by which they have turned.
+    """Find the vortices in all states `fields` (n, m) at the times `t` (m,), and the angle by which they have turned.
 
     From one state to the next, the angle of each vortex is extrapolated and matched with the nearest one; the angle of
     `Motion` increases by the median of the turns.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-    t : ndarray, shape (m,)
-    fields : ndarray, shape (n, m)
-
-    Returns
-    -------
-    Motion
     """
     found = [vortices(gpe, y) for y in fields.T]
     angles = [np.arctan2(*v.positions.T[::-1]) for v in found]
@@ -331,12 +284,8 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
     def do_runs(self, quench: Quench, session: Session) -> QuenchRuns:
         """Run the reference and each of `METHODS`, and follow the vortices in the run of `SHOWN`.
 
-        Raises
-        ------
-        RuntimeError
-            If a run fails.
-        PartlyDone
-            If the user interrupts the runs after at least one of `METHODS` is completed; the error holds these.
+        A RuntimeError is raised if a run fails, and PartlyDone with the completed runs if the user interrupts them
+        after at least one of `METHODS`.
         """
         made = QuenchRuns(quench)
         run = partial(_run, quench, session.shown, self.checkpoint_options)

@@ -66,14 +66,8 @@ Ends = tuple[float, float, float, float]
 class Found:
     """A stationary state, and the start from which it was found.
 
-    Attributes
-    ----------
-    label : str
-        Property that distinguishes the start or, in the trap, the equation from the others; heads a row of the table.
-    equation : GrossPitaevskii
-    state : GroundState
-    published : float or None
-        Published energy.
+    `label` is the property that distinguishes the start or, in the trap, the equation from the others; it heads a row
+    of the table. `published` is the published energy, if there is one.
     """
 
     label: str
@@ -404,17 +398,7 @@ def kept_state(
 ) -> np.ndarray:
     """Return the initial field: with ``--resume`` the one in the folder of the checkpoints, else that of `search`.
 
-    Parameters
-    ----------
-    settings : Checkpoints
-    session : Session
-    gpe : GrossPitaevskii
-    search : callable
-        ``search(update)`` returns the state; `update` takes the words to be shown.
-
-    Returns
-    -------
-    ndarray, shape (J, K[, L])
+    ``search(update)`` returns the state; `update` takes the words to be shown.
     """
     kept = None if settings.checkpoint is None else settings.checkpoint / "state.npz"
     if kept is not None and settings.resume and kept.exists():
@@ -429,10 +413,7 @@ def kept_state(
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
     """Read the field of a state that `save_state` has written, which must belong to `gpe`.
 
-    Raises
-    ------
-    UsageError
-        If the file cannot be read, or holds a state of another grid or equation.
+    A UsageError is raised if the file cannot be read, or holds a state of another grid or equation.
     """
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:

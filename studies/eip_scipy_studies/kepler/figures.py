@@ -43,14 +43,9 @@ KNOWN = (
 
 @dataclass(frozen=True, eq=False)
 class KeplerRun:
-    """One method's run, saved at each step.
+    """One method's run, saved at each step: times (m,), states (4, m) and absolute errors (m,).
 
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-    y : ndarray, shape (4, m)
-    energy_error, momentum_error, position_error : ndarray, shape (m,)
-        Absolute errors; that of the position is the distance from the reference.
+    The error of the position is its distance from the reference.
     """
 
     t: np.ndarray

@@ -18,14 +18,9 @@ TURNS, TOLERANCE = 10, 1e-10
 class Speed(NamedTuple):
     """Processor time: microseconds of a right-hand side, and seconds from a model to its first result.
 
-    Attributes
-    ----------
-    compiled : float
-        Microseconds of the compiled right-hand side: the time of a run without projection, divided by its calls.
-    lambdified : float
-        Microseconds of the right-hand side as users write it, with lambdify(cse=True) and numpy.linalg.solve.
-    first : float
-        Seconds from a SymPy model whose equations are derived to the last state of a run, in a new process.
+    `compiled` is the time of a run without projection, divided by its calls; `lambdified` is that of the right-hand
+    side as users write it, with lambdify(cse=True) and numpy.linalg.solve. `first` is the time from a SymPy model whose
+    equations are derived to the last state of a run, in a new process.
     """
 
     compiled: float

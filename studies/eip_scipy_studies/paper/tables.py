@@ -41,18 +41,10 @@ WIDE, NARROW, DIGITS = 12, 9, 8  # columns of the printed tables
 
 @dataclass(frozen=True)
 class Value:
-    """A number of the paper, and the same number computed by this package.
+    """A number of the paper as printed, its misprints corrected, and the same number computed by this package.
 
-    Attributes
-    ----------
-    paper : str
-        The number as printed, its misprints corrected.
-    ours, mpmath : float
-        The same number from this package in double precision, and computed in 50 digits (nan if this takes too long).
-    roundoff : float
-        Largest change of the number that round-off may cause.
-    printed : str or None
-        The misprint of the paper, if there is one.
+    `ours` is in double precision, and `mpmath` in 50 digits (nan if this takes too long). `roundoff` is the largest
+    change of the number that round-off may cause, and `printed` the misprint of the paper, if there is one.
     """
 
     paper: str

@@ -194,22 +194,8 @@ def rows(found: ParticleStudy) -> Iterator[dict[str, Any]]:
 def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -> Iterator[tuple[str, Any]]:
     """Make the figures one by one: one for the uniform field, and one for both orbits in the tokamak.
 
-    Parameters
-    ----------
-    studies : mapping of str to ParticleStudy
-        Runs by problem.
-    paper_only : bool, optional
-        Draw only the rows of the paper's figures: RK4 and EIP-HL, and EIP-H in the uniform field.
-
-    Yields
-    ------
-    (str, Figure)
-        File name without its ending, and figure.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib is not installed.
+    `studies` are the runs by problem. With `paper_only` only the rows of the paper's figures are drawn: RK4 and EIP-HL,
+    and EIP-H in the uniform field. File names are without their ending.
     """
     from ..plotting import particle_figure
 

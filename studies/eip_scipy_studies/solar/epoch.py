@@ -35,19 +35,8 @@ class Epoch(NamedTuple):
 def parse_epoch(text: str) -> Epoch:
     """Read an epoch without loss: both parts are the numbers nearest to the text.
 
-    Parameters
-    ----------
-    text : str
-        A date of the proleptic Gregorian calendar with or without time, or a Julian date; "TDB" may follow.
-
-    Returns
-    -------
-    Epoch
-
-    Raises
-    ------
-    ValueError
-        If the text has another form; the message lists the accepted forms.
+    The text is a date of the proleptic Gregorian calendar with or without time, or a Julian date; "TDB" may follow.
+    Other texts raise a ValueError, whose message lists the accepted forms.
 
     Examples
     --------

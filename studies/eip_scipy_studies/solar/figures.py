@@ -23,19 +23,9 @@ ELLIPSES = 40
 
 
 def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, Any]]:
-    """Make figures one by one.
+    """Make those `FIGURES` that are in the slice `part` one by one, and yield file names and figures.
 
-    Parameters
-    ----------
-    study : SolarRuns
-        The runs, including the reference run; the last figure also needs the timings.
-    part : slice, optional
-        Slice of `FIGURES`: the figures to make.
-
-    Yields
-    ------
-    (str, Figure)
-        File name and figure.
+    The runs must include the reference run; the last figure also needs the timings.
     """
     # A method has one style in all figures; timed methods come last, so that the runs look the same without them.
     styles = method_styles(dict.fromkeys([*(run.name for run in study.runs), *(item.method for item in study.cost)]))
@@ -46,15 +36,7 @@ def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, 
 def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities of each planet relative to the centre of mass of all bodies before it.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    y : ndarray, shape (60, m)
-
-    Returns
-    -------
-    position, velocity : ndarray, shape (9, 3, m)
-        AU and AU/yr, ecliptic axes.
+    `y` are states (60, m). The results (9, 3, m) are in AU and AU/yr, in ecliptic axes.
     """
     q, v = y.reshape(2, -1, 3, y.shape[1])
     gm = scene.data.gm[:, None, None]
@@ -65,17 +47,8 @@ def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def osculating_orbits(scene: SolarScene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
     """Compute the osculating ellipses: the orbit of each planet if all bodies before it were a single one.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    y : ndarray, shape (60, m)
-    n_points : int, optional
-        Points on an ellipse.
-
-    Returns
-    -------
-    ndarray, shape (9, m, 2, n_points)
-        AU, in the plane of the ecliptic; nan for a planet that is not on an ellipse.
+    `y` are states (60, m). The result (9, m, 2, n_points) is in AU, in the plane of the ecliptic; nan for a planet that
+    is not on an ellipse.
     """
     r, v = (np.moveaxis(x, 1, -1) for x in jacobi(scene, y))
     mu = np.cumsum(scene.data.gm)[1:, None, None] * YEAR_D**2

@@ -28,20 +28,10 @@ LEVELS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 
 def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | None) -> dict[str, Any]:
-    """Return the methods to time, with steps in years or tolerances.
+    """Return the methods to time on the ten bodies in AU and years, with steps in years or tolerances.
 
-    Parameters
-    ----------
-    problem : Problem
-        The ten bodies, in AU and years.
-    years : float
-    peer, heyoka : callable or None
-        The functions ``run`` for REBOUND and for heyoka, if these packages are installed.
-
-    Returns
-    -------
-    dict of str to (callable, sequence of float)
-        Functions and steps or tolerances by method, as for `work_precision`.
+    `peer` and `heyoka` are the functions ``run`` for REBOUND and for heyoka, if these packages are installed. The
+    result is as for `work_precision`.
     """
 
     def own(method: Any, *steps: float, **options: Any) -> tuple[Runner, Sequence[float]]:

@@ -61,19 +61,10 @@ POWERS = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 
 @dataclass(frozen=True, eq=False)
 class SolarScene:
-    """Common input of all methods: the problem, its data, and the times at which states are saved.
+    """Common input of all methods: the problem in AU and Julian years, its data, and the times of saved states.
 
-    Attributes
-    ----------
-    problem : Problem
-        Problem in AU and Julian years; its `h` divides the time between saves.
-    data : SolarSystemData
-    years, h : float
-        Length and step of the runs in Julian years.
-    n_saves : int
-        Number of equally spaced states that are saved after the start.
-    every : int
-        Number of steps between two saved states.
+    The length `years` and the step `h` are in Julian years. `n_saves` equally spaced states are saved after the start,
+    with `every` steps between two of them; `h` divides the time between saves.
     """
 
     problem: Problem
@@ -98,23 +89,10 @@ class SolarScene:
 class MethodRun:
     """One method's run; states that are not finite are left out.
 
-    Attributes
-    ----------
-    name : str
-    head : tuple of str
-        The name, divided into the lines of a table's head.
-    step : float or None
-        Step in years; None if the method chooses its steps.
-    wall_time : float
-        Seconds of the run, without compilation and without reading states.
-    t : ndarray, shape (m,)
-        Times in Julian years.
-    y : ndarray, shape (60, m)
-        States in AU and AU/yr.
-    energy_error, momentum_error : ndarray, shape (m,)
-        ``|H - H(0)| / |H(0)|`` and ``|L - L(0)| / |L(0)|``.
-    failure : str
-        Reason why the run did not reach its end; empty if it did.
+    `head` is the name, divided into the lines of a table's head. `step` is in years, None if the method chooses its
+    steps. `wall_time` are the seconds of the run, without compilation and without reading states. The states `y` (60,
+    m), in AU and AU/yr, are those at the times `t` (m,) in Julian years. The errors (m,) are ``|H - H(0)| / |H(0)|``
+    and ``|L - L(0)| / |L(0)|``. `failure` is the reason why the run did not reach its end, empty if it did.
     """
 
     name: str
@@ -140,26 +118,12 @@ class PendingRun(NamedTuple):
 
 
 def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScene:
-    """Make the problem for a run of `years` years.
+    """Make the problem for a run of `years` Julian years, > 0.
 
-    Parameters
-    ----------
-    data : str or SolarSystemData
-        One of `eip_scipy.problems.gravity.solar_data.available()`, or data for another epoch.
-    years : float
-        Length of the run in Julian years, > 0.
-    h : float
-        Upper bound of the step in years; the step divides the time between saved states and is shortened if necessary.
-
-    Returns
-    -------
-    SolarScene
-
-    Raises
-    ------
-    ValueError
-        If the step is longer than the run or too small to change the time in floating-point arithmetic, or if the data
-        are unknown.
+    `data` is one of `eip_scipy.problems.gravity.solar_data.available()`, or data for another epoch. `h` is the upper
+    bound of the step in years; the step divides the time between saved states and is shortened if necessary. A
+    ValueError is raised if the step is longer than the run or too small to change the time in floating-point
+    arithmetic, or if the data are unknown.
     """
     FixedSteps.of((0.0, years), h, None)
     n_saves = whole_number(years / max(_save_interval(years), h))
@@ -196,21 +160,9 @@ def plan(
 ) -> list[PendingRun]:
     """Return the runs of the comparison: first that of `method`, last the most accurate one, which is the reference.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    method : type
-        `EIPRK1` ... `EIPRK5` or another fixed-step class.
-    metric : {"error", "euclidean"}
-        Metric of the projection.
-    peer : callable or None
-        REBOUND's `run`, if REBOUND is installed.
-    checkpoint_of : callable, optional
-        ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
-
-    Returns
-    -------
-    list of PendingRun
+    `method` is `EIPRK1` ... `EIPRK5` or another fixed-step class, `metric` ("error" or "euclidean") that of its
+    projection, and `peer` REBOUND's `run`, if REBOUND is installed. ``checkpoint_of(name)`` returns the options of
+    `integrate` that keep checkpoints of the run of that name.
     """
     metrics = {metric_of(method, metric), metric_of(method, "error"), "euclidean"}
     ordered = sorted(metrics, key=lambda m: m != metric_of(method, metric))

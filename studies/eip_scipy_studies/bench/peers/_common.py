@@ -22,27 +22,14 @@ Solve = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Peer:
-    """A method of a package with the kind of function that it takes.
+    """A method of a package with the kind of function that it takes: `PYTHON`, `COMPILED` or `OWN`.
 
-    Attributes
-    ----------
-    name : str
-        Name of the method in tables.
-    distribution : str
-        Name of the package with pip.
-    takes : str
-        `PYTHON`, `COMPILED` or `OWN`.
-    prepare : callable
-        ``prepare(scene, **extra) -> solve`` imports the package and does the work that is needed once.
-        ``solve(setting)`` returns the state at the end (n,). `extra` are further arguments of the package's own call.
-    steps : bool
-        True if the setting is a number of steps, not a tolerance.
-    scenes : tuple of str
-        Values of `Scene.equations` for which the method is run; empty: all except "members".
-    warm : bool
-        True if each setting compiles its own code, so that an uncounted run comes first.
-    projects : bool
-        True for a method of another package that is given the problem's invariants too.
+    `name` is that of the method in tables, and `distribution` that of the package with pip. ``prepare(scene, **extra)``
+    imports the package, does the work that is needed once, and returns ``solve(setting)``, which returns the state at
+    the end (n,); `extra` are further arguments of the package's own call. `steps` is True if the setting is a number of
+    steps, not a tolerance. The method is run for the values of `Scene.equations` in `scenes`; if it is empty, for all
+    except "members". `warm` is True if each setting compiles its own code, so that an uncounted run comes first.
+    `projects` is True for a method of another package that is given the problem's invariants too.
     """
 
     name: str
