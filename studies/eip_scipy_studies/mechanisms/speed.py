@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import NamedTuple
 
-from ..beside import Beside
+from ..beside import workers
 from ..timing import least, many_calls
 from .examples import four_bar, four_bar_model
 from .ways import kept, lambdified
@@ -40,9 +40,8 @@ def speed() -> Speed:
         return (time.process_time() - began) / calls
 
     times = least({"compiled": compiled, "lambdified": many_calls(lambda: plain(0.0, state))}, turns=TURNS)
-    with Beside() as process:
-        process.start(first_result)
-        first = process.result()
+    with workers(1) as start:
+        first = start(first_result)()
     return Speed(1e6 * times["compiled"], 1e6 * times["lambdified"], first)
 
 
