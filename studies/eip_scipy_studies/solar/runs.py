@@ -164,30 +164,31 @@ def plan(
     projection, and `peer` REBOUND's `run`, if REBOUND is installed. ``checkpoint_of(name)`` returns the options of
     `integrate` that keep checkpoints of the run of that name.
     """
-    metrics = {metric_of(method, metric), metric_of(method, "error"), "euclidean"}
-    ordered = sorted(metrics, key=lambda m: m != metric_of(method, metric))
-    names = [eip_name(method, m) for m in ordered]
-    tasks = [
-        PendingRun(name, partial(_eip, scene, method, m, **checkpoint_of(name)), True)
-        for name, m in zip(names, ordered, strict=True)
-    ]
+    tasks = []
+
+    def add(name: str, method: type[EIPSolver], head: tuple[str, str], per_save: int | None, **options: Any) -> None:
+        options |= checkpoint_of(name)
+        tasks.append(PendingRun(name, partial(_own, scene, name, method, head, per_save, **options), True))
+
+    for m in dict.fromkeys([metric_of(method, metric), metric_of(method, "error"), "euclidean"]):
+        add(eip_name(method, m), method, (method.__name__, "euclid." if m == "euclidean" else m), None, metric=m)
     name = method.TABLEAU.name
-    tasks.append(PendingRun(name, partial(_plain, scene, method, **checkpoint_of(name)), True))
+    add(name, method, (name, "alone"), None, invariants=())
     tasks.append(PendingRun("SV", lambda progress: _verlet(scene), False))
-    tasks.append(
-        PendingRun(
-            HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **checkpoint_of(HIGH_ORDER)), True
-        )
-    )
-    tasks.append(PendingRun(MULTISTEP, partial(_multistep, scene, **checkpoint_of(MULTISTEP)), True))
-    tasks.append(PendingRun(BALANCED, partial(_balanced, scene, **checkpoint_of(BALANCED)), True))
+    high_order, multistep = (whole_number(scene.interval / h) for h in (HIGH_ORDER_STEP, MULTISTEP_STEP))
+    add(HIGH_ORDER, EIPRKN12, (HIGH_ORDER, "every 10"), high_order, **KEPT)
+    add(MULTISTEP, EIPGJ14, (MULTISTEP, "auto"), multistep)
+    add(BALANCED, EIPGJ14, (MULTISTEP, "balances"), multistep, **orbits_kept(scene.data))
     if peer is None:
         tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **checkpoint_of(TIGHT)), True))
         return tasks
     per_save = max(1, round(scene.interval * YEAR_D / WHFAST_DAYS))
-    for name, integrator, steps in (("WHFast", "whfast", per_save), ("WHFast (c17)", "whfast-c17", per_save)):
+    for name, integrator, steps in (
+        ("WHFast", "whfast", per_save),
+        ("WHFast (c17)", "whfast-c17", per_save),
+        ("IAS15", "ias15", 1),
+    ):
         tasks.append(PendingRun(name, partial(rebound_run, scene, peer, name, integrator, steps), False))
-    tasks.append(PendingRun("IAS15", partial(rebound_run, scene, peer, "IAS15", "ias15", 1), False))
     return tasks
 
 
@@ -201,50 +202,27 @@ def eip_name(method: type[EIPSolver], metric: str) -> str:
     return f"{method.__name__} ({metric})"
 
 
-def _eip(scene: SolarScene, method: type[EIPSolver], metric: Any, progress: bool, **checkpoint: Any) -> MethodRun:
-    name = eip_name(method, metric)
-    head = (method.__name__, "euclid." if metric == "euclidean" else metric)
+def _own(
+    scene: SolarScene,
+    name: str,
+    method: type[EIPSolver],
+    head: tuple[str, str],
+    per_save: int | None,
+    progress: bool,
+    **options: Any,
+) -> MethodRun:
+    """Run a method of this package, with `per_save` steps between two saved states, or the steps of the scene."""
+    step, every = (scene.h, scene.every) if per_save is None else (scene.interval / per_save, per_save)
     result = integrate(
-        scene.problem,
-        method=named(method, name),
-        metric=metric,
-        save_every=scene.every,
-        progress=progress,
-        **checkpoint,
+        scene.problem, method=named(method, name), h=step, save_every=every, progress=progress, **options
     )
-    return _finished(scene, name, head, scene.h, result, "" if result.success else result.message)
-
-
-def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **checkpoint: Any) -> MethodRun:
-    name = method.TABLEAU.name
-    result = integrate(
-        scene.problem,
-        method=named(method, name),
-        invariants=(),
-        save_every=scene.every,
-        progress=progress,
-        **checkpoint,
-    )
-    return _finished(scene, name, (name, "alone"), scene.h, result, "" if result.success else result.message)
+    return _finished(scene, name, head, step, result, "" if result.success else result.message)
 
 
 def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
     """Run the most accurate method that needs no REBOUND: EIPRKN12 with half of its usual step."""
-    return _high_order(scene, TIGHT, "tight", 2, progress, **checkpoint)
-
-
-def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run EIPRKN12, the method for small errors over long times, with its usual step divided by `shorter`.
-
-    `name` is the name of the run, and `word` the second line of the name in a table's head.
-    """
-    per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
-    return _long(scene, EIPRKN12, name, word, per_save, progress, **KEPT, **checkpoint)
-
-
-def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    per_save = whole_number(scene.interval / MULTISTEP_STEP)
-    return _long(scene, EIPGJ14, MULTISTEP, "auto", per_save, progress, **checkpoint)
+    per_save = 2 * whole_number(scene.interval / HIGH_ORDER_STEP)
+    return _own(scene, TIGHT, EIPRKN12, (HIGH_ORDER, "tight"), per_save, progress, **KEPT, **checkpoint)
 
 
 def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
@@ -254,23 +232,6 @@ def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
     """
     problem = solar_system(data, balances="kepler")
     return {"invariants": problem.invariants, "frame": problem.frame}
-
-
-def _balanced(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run EIPGJ14 with the options of `orbits_kept`, which keep each planet's energy about the Sun as a `Balance`."""
-    per_save = whole_number(scene.interval / MULTISTEP_STEP)
-    return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **orbits_kept(scene.data), **checkpoint)
-
-
-def _long(
-    scene: SolarScene, method: type[EIPSolver], name: str, word: str, per_save: int, progress: bool, **options: Any
-) -> MethodRun:
-    step = scene.interval / per_save
-    result = integrate(
-        scene.problem, method=named(method, name), h=step, save_every=per_save, progress=progress, **options
-    )
-    head = (method.__name__, word)
-    return _finished(scene, name, head, step, result, "" if result.success else result.message)
 
 
 def _verlet(scene: SolarScene) -> MethodRun:
