@@ -1,17 +1,13 @@
-"""Common part of the adapters: the record of a method, and the search for its package."""
+"""Common part of the adapters: the record of a method."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 
-from ..equations import Scene
-
-__all__ = ["ATOL", "COMPILED", "OWN", "PYTHON", "Peer", "package", "plain_fun"]
+__all__ = ["ATOL", "COMPILED", "OWN", "PYTHON", "Peer", "Solve"]
 
 PYTHON, COMPILED, OWN = "plain Python function", "function compiled by Numba", "equations in the package's own form"
 ATOL = 1e-3  # ratio of the absolute tolerance to the relative one, for all
@@ -50,13 +46,3 @@ class Peer:
     def ours(self) -> bool:
         """Return True if the method belongs to this package."""
         return self.distribution == "eip_scipy"
-
-
-def package(name: str) -> Any:
-    """Import and return the module `name`; this function is called only in the process that runs the package."""
-    return import_module(name)
-
-
-def plain_fun(scene: Scene) -> Any:
-    """Return the right-hand side ``fun(t, y)`` of a problem as a plain Python function, as a user writes it."""
-    return scene.plain().fun
