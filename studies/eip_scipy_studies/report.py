@@ -285,15 +285,10 @@ def check_target(path: Path) -> None:
         raise UsageError(f"cannot write {str(path)!r}: {_reason(error)}") from error
 
 
-def check_outputs(folder: Path, target: Path | None) -> None:
-    """Check the folder of a command's files and the file of its JSON, if one is wanted, before it computes.
-
-    Raises
-    ------
-    UsageError
-        If one of them cannot be written.
-    """
-    check_folder(folder)
+def check_outputs(folder: Path | None, target: Path | None) -> None:
+    """Check the folder of a command's files and the file of its JSON, as far as they are wanted, before it computes."""
+    if folder is not None:
+        check_folder(folder)
     if target is not None:
         check_target(target)
 

@@ -20,8 +20,7 @@ from eip_scipy.checkpoint import CheckpointError
 from .commands import CHECK_FAILED, DONE, INTERRUPTED, nearest
 from .report import (
     UsageError,
-    check_folder,
-    check_target,
+    check_outputs,
     describe_machine,
     document,
     say,
@@ -258,10 +257,7 @@ class Study(Command, Generic[Found]):
     def run(self, session: Session) -> int:
         """Check the settings and the files to write, and then do what `perform` does; return the exit status."""
         self.check_settings()
-        if self.writes_files:
-            check_folder(session.out)
-        if session.json is not None:
-            check_target(session.json)
+        check_outputs(session.out if self.writes_files else None, session.json)
         return perform(self, session)[0]
 
 

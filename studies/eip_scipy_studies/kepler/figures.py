@@ -54,6 +54,11 @@ class KeplerRun:
     momentum_error: np.ndarray
     position_error: np.ndarray
 
+    @property
+    def orbit(self) -> np.ndarray:
+        """Return the positions up to `ORBIT_END`, which are drawn."""
+        return self.y[:2, self.t <= ORBIT_END]
+
 
 class KnownValue(NamedTuple):
     """Check of an error: the value that is known to two digits, and the measured one (`ours`)."""
@@ -148,17 +153,10 @@ class KeplerFigures(Study[Found]):
         return {"fig-kepler.csv": lines}
 
     def figures(self, found: Found) -> Figures:
-        from ..plotting import KeplerRun, paper_kepler_figure
+        from ..plotting import paper_kepler_figure
 
         for file, (title, methods) in FIGURES.items():
-            runs = {}
-            for name in methods:
-                line = found[name]
-                shown = line.t <= ORBIT_END
-                runs[name] = KeplerRun(
-                    line.t, line.energy_error, line.momentum_error, line.position_error, line.y[:2, shown]
-                )
-            yield file, paper_kepler_figure(runs, title=title)
+            yield file, paper_kepler_figure({name: found[name] for name in methods}, title=title)
 
 
 def _line(method: type[EIPSolver], kept: str, problem: Any, span: tuple[float, float], tight: np.ndarray) -> KeplerRun:
