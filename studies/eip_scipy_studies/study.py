@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from eip_scipy.checkpoint import CheckpointError
 
@@ -39,7 +39,6 @@ __all__ = [
     "Rows",
     "Session",
     "Study",
-    "Verdict",
     "one_of",
     "option",
     "perform",
@@ -89,25 +88,22 @@ def some_of(what: str, known: Collection[str]) -> Any:
     return option(None, text, action="append", type=one_of(what, known), metavar="NAME")
 
 
-class Verdict(Protocol):
-    """Interface that the runner needs of a check."""
-
-    @property
-    def passed(self) -> bool:
-        """Return whether the check holds."""
-        ...
-
-
 class Check(NamedTuple):
-    """Check of a command: its text, and whether it holds."""
+    """Check of a command: its text, whether it holds, and its entry in the JSON file, if that has more than these."""
 
     text: str
     passed: bool
+    record: Mapping[str, Any] = {}
 
     @property
     def line(self) -> str:
         """Return the check as a line of text."""
         return f"{'ok' if self.passed else 'FAILED':<6} {self.text}"
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Return the entry for the JSON file."""
+        return dict(self.record) or {"text": self.text, "passed": self.passed}
 
 
 class PartlyDone(KeyboardInterrupt):
@@ -229,7 +225,7 @@ class Study(Command, Generic[Found]):
         """Return the rows of CSV files, by the names of the files."""
         return {}
 
-    def checks(self, found: Found) -> Sequence[Verdict]:
+    def checks(self, found: Found) -> Sequence[Check]:
         """Return the checks that decide on the exit status."""
         return ()
 

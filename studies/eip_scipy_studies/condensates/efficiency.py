@@ -25,10 +25,10 @@ from eip_scipy.problems.gross_pitaevskii import make_transforms
 
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..report import describe_machine, table
-from ..study import Figures, Rows, Session, Study, option
+from ..study import Check, Figures, Rows, Session, Study, option
 from ..work_precision import cost_to_reach, work_precision
 
-__all__ = ["METHODS", "AllRuns", "Efficiency", "Slope", "Trial"]
+__all__ = ["METHODS", "AllRuns", "Efficiency", "Trial"]
 
 T_END = 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
@@ -201,19 +201,11 @@ class Trial:
         return float(np.polyfit(np.log(h[clean]), np.log(error[clean]), 1)[0]) if clean.size > 1 else float("nan")
 
 
-class Slope(NamedTuple):
-    """Check of a slope or an invariant error: expected (`known`) and measured (`ours`) value, allowed difference."""
-
-    wave: str
-    quantity: str
-    known: float
-    ours: float
-    slack: float
-
-    @property
-    def passed(self) -> bool:
-        """Return True if the measured value agrees with the expected one."""
-        return abs(self.ours - self.known) <= self.slack
+def _checked(wave: str, quantity: str, known: float, ours: float, slack: float) -> Check:
+    """Return the check that a slope or an invariant error differs from the expected one by at most `slack`."""
+    matched = abs(ours - known) <= slack
+    record = {"wave": wave, "quantity": quantity, "known": known, "ours": ours, "matched": matched}
+    return Check(f"{wave}, {quantity}: {ours:.3g}, known {known:.3g}", matched, record)
 
 
 Found = dict[str, Trial]
@@ -244,19 +236,19 @@ class Efficiency(Study[Found]):
                 trial.measure(self.repeats, bar.update)
         return trials
 
-    def checks(self, found: Found) -> list[Slope]:
+    def checks(self, found: Found) -> list[Check]:
         """Compare slopes with the orders of the methods, and invariant errors of EIP-ME on the modulated wave with 0.
 
         Slopes that are nan are not compared.
         """
         slopes = [
-            Slope(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
+            _checked(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
             for wave, trial in found.items()
             for name, order in self.orders.items()
         ]
         left = max(float(found[WAVES[1]].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
-        known = [slope for slope in slopes if not np.isnan(slope.ours)]
-        return [*known, Slope(WAVES[1], "mass and energy of EIP-ME", 0.0, left, LEFT)]
+        known = [slope for slope in slopes if not np.isnan(slope.record["ours"])]
+        return [*known, _checked(WAVES[1], "mass and energy of EIP-ME", 0.0, left, LEFT)]
 
     def text(self, found: Found) -> str:
         parts = [describe_machine()]
@@ -271,17 +263,11 @@ class Efficiency(Study[Found]):
         checks = self.checks(found)
         failed = [check for check in checks if not check.passed]
         parts.append(f"{len(checks) - len(failed)} of {len(checks)} slopes and invariants are as they should be.")
-        parts += [f"FAILED {c.wave}, {c.quantity}: {c.ours:.3g}, known {c.known:.3g}" for c in failed]
+        parts += [check.line for check in failed]
         return "\n\n".join(parts)
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        names = ("wave", "quantity", "known", "ours")
-        return {
-            "checks": [
-                {**{name: getattr(check, name) for name in names}, "matched": check.passed}
-                for check in self.checks(found)
-            ]
-        }
+        return {"checks": [check.entry for check in self.checks(found)]}
 
     def tables(self, found: Found) -> dict[str, Rows]:
         return {

@@ -11,8 +11,8 @@ from eip_scipy.problems import GrossPitaevskii
 from eip_scipy.problems.gross_pitaevskii import density_surface, line_condensate, rotated, vortices
 
 from ..report import compact, warn
-from ..study import Figures, Session
-from .runs import REFERENCE, SHOWN, FieldCheck, Motion, Quench, QuenchRuns, QuenchStudy
+from ..study import Check, Figures, Session
+from .runs import REFERENCE, SHOWN, Motion, Quench, QuenchRuns, QuenchStudy, field_check
 from .states import (
     LINE_POINTS,
     LINES,
@@ -80,21 +80,21 @@ class VortexLines(QuenchStudy):
         made.notes = [*_state_notes(before, start, lower), _grid_note(before, made, made.moved.t)]
         return made
 
-    def _state_checks(self, gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[FieldCheck]:
+    def _state_checks(self, gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[Check]:
         saddle, count, state = gpe.energy(start), len(vortices(gpe, start).charges), lower.state
         below = state.converged and abs(state.energy - LINES_ENERGY) < self.energies_known
         return [
-            FieldCheck(f"E of the start {SADDLE_ENERGY}", saddle, abs(saddle - SADDLE_ENERGY) < self.energies_known),
-            FieldCheck(f"lines of the start, {SADDLE_LINES}", count, count == SADDLE_LINES),
-            FieldCheck(f"E below that saddle {LINES_ENERGY}", state.energy, below),
-            FieldCheck(f"lines there, {LINES}", lower.count, lower.count == LINES),
+            field_check(f"E of the start {SADDLE_ENERGY}", saddle, abs(saddle - SADDLE_ENERGY) < self.energies_known),
+            field_check(f"lines of the start, {SADDLE_LINES}", count, count == SADDLE_LINES),
+            field_check(f"E below that saddle {LINES_ENERGY}", state.energy, below),
+            field_check(f"lines there, {LINES}", lower.count, lower.count == LINES),
         ]
 
-    def _turn_check(self, moved: Motion) -> FieldCheck:
+    def _turn_check(self, moved: Motion) -> Check:
         """Check the angle by which the lines turn, which should be the difference of the rotations times t."""
         slower = OMEGA_BEFORE - OMEGA_AFTER
         off = float(np.abs(moved.angle - slower * moved.t).max())
-        return FieldCheck(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
+        return field_check(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
 
     def pictures(self, found: QuenchRuns) -> Figures:
         """Draw the plane z = 0, and surfaces of equal density."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import Checkpoints, named
 from ..report import compact, describe_machine, table
-from ..study import Figures, PartlyDone, Rows, Session, Study, option
+from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
 
-__all__ = ["METHODS", "SHOWN", "FieldCheck", "FieldRun", "Motion", "Quench", "QuenchRuns", "QuenchStudy", "motion"]
+__all__ = ["METHODS", "SHOWN", "FieldRun", "Motion", "Quench", "QuenchRuns", "QuenchStudy", "field_check", "motion"]
 
 METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
 SHOWN = "EIP-ME"  # fields of this method are kept, for the figures
@@ -31,12 +31,9 @@ AXES = "seen from above, with x to the right and y up"
 SENSES = {1: "anticlockwise", -1: "clockwise"}
 
 
-class FieldCheck(NamedTuple):
-    """A check: its condition in words, the measured value, and whether it holds."""
-
-    what: str
-    value: Any
-    passed: bool
+def field_check(what: str, value: Any, passed: bool) -> Check:
+    """Return a check with its condition in words and the measured value."""
+    return Check(f"{what}: {_value(value)}", passed, {"what": what, "value": value, "passed": passed})
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +111,7 @@ class QuenchRuns:
     reference: np.ndarray | None = None
     fields: np.ndarray | None = None
     moved: Motion | None = None
-    more: list[FieldCheck] = field(default_factory=list)
+    more: list[Check] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -204,26 +201,26 @@ def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
     return guess + float(np.median(difference[np.arange(old.size), nearest]))
 
 
-def _checks(made: QuenchRuns) -> list[FieldCheck]:
+def _checks(made: QuenchRuns) -> list[Check]:
     """Check that vortices keep their number and turn as expected, and that each preserved invariant is kept."""
     found, quench, moved = [], made.quench, made.moved
     if moved is not None:
         at = quench.shown(moved.t)
         counts = [len(moved.vortices[k].charges) for k in at]
-        found.append(FieldCheck("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
+        found.append(field_check("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
         if len(at) > 1:
             turned = float(moved.angle[at[-1]])
             sense = f"vortices turn {SENSES[quench.sense]}, angle at t = {moved.t[at[-1]]:g} [rad]"
-            found.append(FieldCheck(sense, turned, quench.sense * turned > 0))
+            found.append(field_check(sense, turned, quench.sense * turned > 0))
     for name, line in made.lines.items():
         for item, bound in (("mass", MASS_KEPT), ("energy", quench.energy_kept)):
             if item in METHODS[name]:
                 error = float(getattr(line, f"{item}_error").max())
-                found.append(FieldCheck(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
+                found.append(field_check(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
     return found
 
 
-def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
+def _text(made: QuenchRuns, found: Sequence[Check]) -> str:
     """Return the errors, the vortices and the checks as text."""
     quench, moved = made.quench, made.moved
     head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
@@ -251,8 +248,7 @@ def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
             table([["number"], ["mean radius"], ["turned [rad]"]], where),
             "",
         ]
-    for item in found:
-        out.append(f"{'ok' if item.passed else 'FAILED':<6} {item.what}: {_value(item.value)}")
+    out += [check.line for check in found]
     if moved is not None and len(quench.shown(moved.t)) < 2:
         before = f"the run ends before t = {quench.snapshots[1]:g}"
         out.append(f"{'-':<6} not checked: in which sense the vortices turn, for {before}")
@@ -307,7 +303,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
     def text(self, found: QuenchRuns) -> str:
         return _text(found, self.checks(found))
 
-    def checks(self, found: QuenchRuns) -> list[FieldCheck]:
+    def checks(self, found: QuenchRuns) -> list[Check]:
         return [*_checks(found), *found.more]
 
     def tables(self, found: QuenchRuns) -> dict[str, Rows]:
@@ -318,7 +314,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
             "errors": _rows(found),
             "wall_time_s": {name: line.wall_time for name, line in found.lines.items()},
             "rank_reduced": {name: line.n_rank_reduced for name, line in found.lines.items()},
-            "checks": [check._asdict() for check in self.checks(found)],
+            "checks": [check.entry for check in self.checks(found)],
         }
         if found.moved is not None:
             numbers |= {"vortices": [len(v.charges) for v in found.moved.vortices], "turned_rad": found.moved.angle}

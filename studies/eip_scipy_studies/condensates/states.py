@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from eip_scipy.problems.gross_pitaevskii import (
 
 from ..long_runs import Checkpoints
 from ..report import UsageError, compact, describe_machine, table, write_file
-from ..study import Figures, Rows, Session, Study, option, some_of
+from ..study import Check, Figures, Rows, Session, Study, option, some_of
 
 __all__ = [
     "LINES",
@@ -39,7 +39,6 @@ __all__ = [
     "SCENES",
     "Found",
     "GroundStates",
-    "KnownState",
     "kept_state",
     "leave_saddle",
     "load_state",
@@ -170,27 +169,10 @@ TITLES = {
 Results = dict[str, list[Found]]
 
 
-class KnownState(NamedTuple):
-    """Check of a quantity of a state: its known value, the computed one (`ours`), and whether the check `passed`."""
-
-    quantity: str
-    known: float
-    ours: float
-    passed: bool
-    note: str = ""
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """Return the entry for the JSON file."""
-        known = {"quantity": self.quantity, "known": self.known, "ours": self.ours}
-        return {**known, "matched": self.passed, "note": self.note}
-
-    @property
-    def line(self) -> str:
-        """Return the check as a line of text."""
-        note = f" ({self.note})" if self.note else ""
-        verdict = "ok" if self.passed else "FAILED"
-        return f"{verdict:<6} {self.quantity} {self.known:.10g}, ours {self.ours:.10g}{note}"
+def _known(quantity: str, known: float, ours: float, matched: bool, note: str = "") -> Check:
+    """Return the check of a quantity of a state, whose known value is `known`."""
+    text = f"{quantity} {known:.10g}, ours {ours:.10g}{f' ({note})' if note else ''}"
+    return Check(text, matched, {"quantity": quantity, "known": known, "ours": ours, "matched": matched, "note": note})
 
 
 def _count(text: str) -> int:
@@ -227,7 +209,7 @@ class GroundStates(Study[Results]):
         with searching(session) as update:
             return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
 
-    def checks(self, found: Results) -> list[KnownState]:
+    def checks(self, found: Results) -> list[Check]:
         """Compare energies and numbers of vortex lines with known ones.
 
         In the trap, a lower energy than the published one is not a failure.
@@ -237,19 +219,19 @@ class GroundStates(Study[Results]):
             known, ours = self.published[item.equation.Omega], item.state.energy
             below = ours < known - PUBLISHED_DIGITS
             matched = item.state.converged and (below or abs(ours - known) <= PUBLISHED_DIGITS)
-            checks.append(KnownState(f"trap, {item.label}: E", known, ours, matched, "lower" if below else ""))
+            checks.append(_known(f"trap, {item.label}: E", known, ours, matched, "lower" if below else ""))
         for item in found.get("ring", ()):
             good = item.state.converged and item.state.energy <= RING_ENERGY
-            checks.append(KnownState("ring: E at most", RING_ENERGY, item.state.energy, good))
+            checks.append(_known("ring: E at most", RING_ENERGY, item.state.energy, good))
         if "lines" in found:
             best = min(found["lines"], key=lambda item: item.state.energy)
             good = best.state.converged and abs(best.state.energy - LINES_ENERGY) < 1e-4
-            checks.append(KnownState("lines: lowest E", LINES_ENERGY, best.state.energy, good))
-            checks.append(KnownState("lines: of the lowest", LINES, best.count, best.count == LINES))
+            checks.append(_known("lines: lowest E", LINES_ENERGY, best.state.energy, good))
+            checks.append(_known("lines: of the lowest", LINES, best.count, best.count == LINES))
             saddle = found["lines"][-1]
             good = saddle.state.converged and abs(saddle.state.energy - SADDLE_ENERGY) < 1e-4
-            checks.append(KnownState("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
-            checks.append(KnownState("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
+            checks.append(_known("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
+            checks.append(_known("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
         return checks
 
     def text(self, found: Results) -> str:
@@ -268,7 +250,7 @@ class GroundStates(Study[Results]):
         return {"ground-states.csv": _rows(found)}
 
     def numbers(self, found: Results) -> dict[str, Any]:
-        return {"states": _rows(found), "checks": [check.record for check in self.checks(found)]}
+        return {"states": _rows(found), "checks": [check.entry for check in self.checks(found)]}
 
     def figures(self, found: Results) -> Figures:
         """Write the lowest states of the ring and of the lines as npz files, and draw densities and vortices.

@@ -375,7 +375,7 @@ class HardCases(Study[list[Comparison]]):
         return {f"{self._stem}.csv": rows(found)}
 
     def numbers(self, found: list[Comparison]) -> dict[str, Any]:
-        checks = [check._asdict() for check in self.checks(found)]
+        checks = [check.entry for check in self.checks(found)]
         return {"cases": rows(found), "summary": summary(found), "checks": checks}
 
     def figures(self, found: list[Comparison]) -> Figures:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from eip_scipy.problems import kepler
 from eip_scipy.solvers import EIPSolver
 
 from ..report import compact, table
-from ..study import Figures, Rows, Session, Study
+from ..study import Check, Figures, Rows, Session, Study
 
-__all__ = ["KeplerFigures", "KeplerRun", "KnownValue"]
+__all__ = ["KeplerFigures", "KeplerRun"]
 
 STEP = 0.03
 ORBIT_END = 100.0
@@ -60,26 +60,6 @@ class KeplerRun:
         return self.y[:2, self.t <= ORBIT_END]
 
 
-class KnownValue(NamedTuple):
-    """Check of an error: the value that is known to two digits, and the measured one (`ours`)."""
-
-    method: str
-    quantity: str
-    known: str
-    ours: float
-
-    @property
-    def passed(self) -> bool:
-        """Return whether the measured value agrees with the known one to two digits."""
-        return compact(self.ours) == self.known
-
-    @property
-    def line(self) -> str:
-        """Return the check as a line of text."""
-        verdict = "ok" if self.passed else "FAILED"
-        return f"{verdict:<6} {self.method}, {self.quantity}: {compact(self.ours)}, known {compact(float(self.known))}"
-
-
 Found = dict[str, KeplerRun]
 
 
@@ -109,7 +89,7 @@ class KeplerFigures(Study[Found]):
             for name, (method, kept) in methods.items()
         }
 
-    def checks(self, found: Found) -> list[KnownValue]:
+    def checks(self, found: Found) -> list[Check]:
         """Compare with the known values, to their two digits."""
         checks = []
         for name, error, quantity, kind, known in self.known:
@@ -117,7 +97,10 @@ class KeplerFigures(Study[Found]):
             values = getattr(line, error)
             at = int(np.searchsorted(line.t, self.t_end)) if kind == "end" else slice(None)
             ours = float(np.max(values[at])) if line.t[-1] >= self.t_end * (1 - 1e-12) else float("nan")
-            checks.append(KnownValue(name, quantity, known, ours))
+            text = f"{name}, {quantity}: {compact(ours)}, known {compact(float(known))}"
+            matched = compact(ours) == known
+            record = {"method": name, "quantity": quantity, "known": float(known), "ours": ours, "matched": matched}
+            checks.append(Check(text, matched, record))
         return checks
 
     def text(self, found: Found) -> str:
@@ -133,8 +116,7 @@ class KeplerFigures(Study[Found]):
         return "\n".join([title, "", table(head, body), "", *(check.line for check in self.checks(found))])
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        checks = self.checks(found)
-        return {"checks": [{**c._asdict(), "known": float(c.known), "matched": c.passed} for c in checks]}
+        return {"checks": [check.entry for check in self.checks(found)]}
 
     def tables(self, found: Found) -> dict[str, Rows]:
         lines = [

@@ -188,5 +188,5 @@ def json_content(study: SolarRuns) -> dict[str, Any]:
             "error_others": "largest error of another planet's position [AU]",
             "points": cost_rows(study),
         },
-        "checks": [check._asdict() for check in study.checks()],
+        "checks": [check.entry for check in study.checks()],
     }
