@@ -13,8 +13,6 @@ from typing import Any
 
 from .report import UsageError
 
-__all__ = ["workers"]
-
 
 @contextlib.contextmanager
 def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:

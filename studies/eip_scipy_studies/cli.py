@@ -12,8 +12,6 @@ from typing import Any, NoReturn
 
 from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, NOT_PRINTED, WRONG_USAGE, nearest
 
-__all__ = ["main"]
-
 PROGRAM = "eip-scipy"
 
 

@@ -19,8 +19,6 @@ from eip_scipy.problems import kepler, solar_system
 from .report import compact, describe_machine, table, warn
 from .study import Check, Session, Study
 
-__all__ = ["Doctor"]
-
 DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
 

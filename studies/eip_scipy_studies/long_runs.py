@@ -14,8 +14,6 @@ from eip_scipy.solvers import EIPSolver
 from .report import UsageError, check_folder
 from .study import option
 
-__all__ = ["Checkpoints", "named", "positive"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoints:

@@ -23,29 +23,6 @@ import numpy as np
 
 from eip_scipy import show_config
 
-__all__ = [
-    "UsageError",
-    "check_folder",
-    "check_outputs",
-    "check_target",
-    "compact",
-    "cores",
-    "describe_machine",
-    "document",
-    "ended_by_sigterm",
-    "listening",
-    "machine",
-    "needed",
-    "printing",
-    "say",
-    "table",
-    "versions",
-    "warn",
-    "write_csv",
-    "write_file",
-    "write_json",
-]
-
 _untrusted: list[str] = []  # messages about unreliable runs since `listening` began
 _unsaid: list[str] = []  # reasons why stdout took no text, since `printing` began
 

@@ -30,21 +30,6 @@ from .report import (
     write_json,
 )
 
-__all__ = [
-    "Check",
-    "Command",
-    "Figures",
-    "Measurement",
-    "PartlyDone",
-    "Rows",
-    "Session",
-    "Study",
-    "one_of",
-    "option",
-    "perform",
-    "some_of",
-]
-
 # Packages whose comparison is not among the integrations.
 PEERS = {"heyoka": "eip_scipy_studies.heyoka_runs"}
 

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, TypeVar
 
-__all__ = ["clocked", "least", "many_calls"]
-
 Name = TypeVar("Name", bound=Hashable)
 Action = Callable[[], float]
 FEWEST = 3

@@ -11,8 +11,6 @@ import numpy as np
 
 from .report import compact, describe_machine
 
-__all__ = ["Curve", "Runner", "WorkPoint", "WorkPrecision", "cost_to_reach", "costs_at", "curves", "work_precision"]
-
 Runner = Callable[[float], tuple[float, np.ndarray]]
 """``run(step) -> (wall_time, y)``."""
 Curve = tuple[list[float], list[float]]

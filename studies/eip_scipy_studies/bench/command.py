@@ -20,8 +20,6 @@ from .peers import PEERS, Peer
 from .process import ask
 from .suites import SUITES, Suite
 
-__all__ = ["Bench", "Found"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Study[Found]):

@@ -9,8 +9,6 @@ from typing import NamedTuple
 from ..work_precision import cost_to_reach
 from .peers import COMPILED, OWN, PEERS, PYTHON
 
-__all__ = ["LEVELS", "REASONS", "Row", "Standing", "groups", "reason", "standings"]
-
 LEVELS = (1e-6, 1e-9)
 
 

@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["EQUATIONS", "Functions", "Scene", "scene_from"]
-
 
 class Functions(NamedTuple):
     """Functions of a problem: right-hand side ``fun(t, y)``, invariants ``values(t, y)``, their ``gradients(t, y)``.

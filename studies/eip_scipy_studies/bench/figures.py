@@ -11,8 +11,6 @@ from .compare import LEVELS, Row, groups
 from .peers import COMPILED, OWN, PEERS, PYTHON
 from .suites import SUITES
 
-__all__ = ["Where", "drawn"]
-
 Where = tuple[str, str, str]
 """Suite, problem and kind of function."""
 SHORT = {PYTHON: "python", COMPILED: "compiled", OWN: "own"}

@@ -16,8 +16,6 @@ from .figures import Where
 from .peers import PEERS
 from .suites import SUITES
 
-__all__ = ["Found", "html", "markdown", "text"]
-
 
 @dataclass
 class Found:

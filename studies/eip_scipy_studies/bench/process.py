@@ -14,8 +14,6 @@ from threading import Timer
 from time import perf_counter
 from typing import Any
 
-__all__ = ["Reply", "ask"]
-
 WORKER = "eip_scipy_studies.bench.worker"
 
 

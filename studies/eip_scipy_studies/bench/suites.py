@@ -18,8 +18,6 @@ from eip_scipy.problems import solar_system, soliton
 from ..hard_cases import hard_cases, stored_cases
 from .peers import COMPILED, OWN, PEERS, PYTHON, Peer
 
-__all__ = ["SUITES", "Suite"]
-
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-13)
 TIGHTEST = 1e-12  # for LSODA, which takes hundreds of times longer at smaller tolerances
 HARD = ("kepler_e09", "arenstorf", "schwarzschild", "spherical_pendulum", "heisenberg", "three_wave")

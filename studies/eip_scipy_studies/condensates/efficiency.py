@@ -28,8 +28,6 @@ from ..report import describe_machine, table
 from ..study import Check, Figures, Rows, Session, Study, option
 from ..work_precision import cost_to_reach, work_precision
 
-__all__ = ["METHODS", "AllRuns", "Efficiency", "Trial"]
-
 T_END = 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
 LONG = tuple(T_END / n for n in (25, 50, 100, 200, 400, 800, 1600, 3200, 6400))

@@ -27,8 +27,6 @@ from .states import (
     searching,
 )
 
-__all__ = ["VortexLines"]
-
 OMEGA_BEFORE, OMEGA_AFTER = 0.7, 0.9
 LEVEL = 1e-3  # of the paper's surfaces
 SLICE = 5.0  # half the side of the paper's slices

@@ -19,8 +19,6 @@ from ..study import Figures, Session, option
 from .runs import SHOWN, Motion, Quench, QuenchRuns, QuenchStudy
 from .states import cropped, kept_state, load_state, search_ring
 
-__all__ = ["Ring"]
-
 FRAMES_PER_SECOND = 8
 
 

@@ -20,8 +20,6 @@ from ..long_runs import Checkpoints, named
 from ..report import compact, describe_machine, table
 from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
 
-__all__ = ["METHODS", "SHOWN", "FieldRun", "Motion", "Quench", "QuenchRuns", "QuenchStudy", "field_check", "motion"]
-
 METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
 SHOWN = "EIP-ME"  # fields of this method are kept, for the figures
 REFERENCE = "EIPDOP853"

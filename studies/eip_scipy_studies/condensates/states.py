@@ -31,23 +31,6 @@ from ..long_runs import Checkpoints
 from ..report import UsageError, compact, describe_machine, table, write_file
 from ..study import Check, Figures, Rows, Session, Study, option, some_of
 
-__all__ = [
-    "LINES",
-    "LINES_ENERGY",
-    "SADDLE_ENERGY",
-    "SADDLE_LINES",
-    "SCENES",
-    "Found",
-    "GroundStates",
-    "kept_state",
-    "leave_saddle",
-    "load_state",
-    "save_state",
-    "search_ring",
-    "search_saddle",
-    "searching",
-]
-
 # V = r^2 / 2, beta = 100: angular velocity and published energy.
 PUBLISHED = {0.0: 3.9459469, 0.65: 3.6506129, 0.71: 3.4997148, 0.76: 3.3475310, 0.80: 3.1904172}
 PUBLISHED_DIGITS = 1e-5

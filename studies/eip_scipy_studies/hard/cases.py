@@ -21,8 +21,6 @@ from ..long_runs import named
 from ..report import compact, table
 from ..study import Check, Figures, Rows, Session, Study, option
 
-__all__ = ["CaseOutcome", "Comparison", "HardCases", "adaptive_methods", "bars", "compare"]
-
 TOLERANCES = {"EIPDOP853": 1e-9}
 USUAL_TOLERANCE = 1e-6
 ATOL_PER_RTOL = 1e-3

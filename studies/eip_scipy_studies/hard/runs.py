@@ -33,8 +33,6 @@ from eip_scipy.solvers import EIPSolver
 from ..long_runs import named
 from ..work_precision import work_precision
 
-__all__ = ["SCENES", "Contender", "HardScene", "Outcome", "Point", "Spread", "measure", "methods", "scene"]
-
 # Settings of IAS15, by its step criterion; each starts where the steps are about as long as its corrector can handle.
 EPSILONS = {"prs23": (1e-4, 1e-5, 1e-6, 1e-7, 1e-9), "global": (1e-2, 1e-3, 1e-4, 1e-6, 1e-9)}
 ATOL_PER_RTOL = 1e-3

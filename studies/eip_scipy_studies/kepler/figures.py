@@ -15,8 +15,6 @@ from eip_scipy.solvers import EIPSolver
 from ..report import compact, table
 from ..study import Check, Figures, Rows, Session, Study
 
-__all__ = ["KeplerFigures", "KeplerRun"]
-
 STEP = 0.03
 ORBIT_END = 100.0
 REFINEMENT = 6  # number of steps of the reference in one step

@@ -43,8 +43,6 @@ from .relativity import speed_of_light
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
 
-__all__ = ["SYSTEMS", "Balances"]
-
 TURN = 2 * math.pi
 # Km and s. Drag per squared speed at 400 km: half of 3e-12 kg/m^3 times 0.022 m^2/kg.
 EARTH: dict[str, Any] = {"mu": 398600.4418, "radius": 6378.137, "j2": 1.08262668e-3}

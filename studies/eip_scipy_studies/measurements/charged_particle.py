@@ -36,8 +36,6 @@ from ..timing import clocked, least
 from ..work_precision import curves
 from .references import particle_equations
 
-__all__ = ["ParticleCost"]
-
 TAIL = 60  # states of the reference, three gyrations, at the end of the interval
 SPEED_STEPS, SOLVE_IVP_STEPS = 200_000, 5000
 ROUNDS = 5

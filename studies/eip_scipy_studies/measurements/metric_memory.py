@@ -28,8 +28,6 @@ from ..mechanisms.examples import andrews
 from ..report import needed, table
 from ..study import Session, Study, option
 
-__all__ = ["MetricMemory"]
-
 njit = needed("numba", '"eip_scipy[numba]"').njit
 METHODS = (EIPRK4, EIPRK5, EIPRK45, EIPDOP853)
 FACTOR, TOLERANCE = 3.0, 1e-9

@@ -24,8 +24,6 @@ from ..report import table
 from ..study import Session, Study, option
 from .multistep import known_end
 
-__all__ = ["MetricTable"]
-
 STEP = 0.002
 SAVE_EVERY = 20
 GRAVITATION = 6.6743e-11  # converts G m [m^3/s^2] to masses [kg] for the row in SI momenta

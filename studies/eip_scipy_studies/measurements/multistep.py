@@ -34,8 +34,6 @@ from ..study import Measurement, Session, option
 from ..work_precision import cost_to_reach
 from .orbits import Methods, Row, by_rebound, daily, orbit_table, rows, yearly
 
-__all__ = ["Multistep"]
-
 ROTATIONS = 6
 REPEATS = 200  # for runs of milliseconds
 END, WANTED = 600.0, 1e-9

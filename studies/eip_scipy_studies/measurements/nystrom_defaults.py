@@ -36,8 +36,6 @@ from ..report import table
 from ..study import Measurement, Session, option
 from ..timing import clocked, least
 
-__all__ = ["NystromDefaults"]
-
 WAYS: dict[str, dict[str, Any]] = {
     "each": {"every": 1, "compensated": False},
     "auto": {"every": "auto", "compensated": False},

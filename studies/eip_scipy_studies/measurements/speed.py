@@ -27,8 +27,6 @@ from ..report import needed, table
 from ..study import Measurement, Session, option
 from ..timing import clocked, least
 
-__all__ = ["Speed"]
-
 njit = needed("numba", '"eip_scipy[numba]"').njit
 
 

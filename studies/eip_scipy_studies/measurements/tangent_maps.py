@@ -32,8 +32,6 @@ from ..report import needed, table
 from ..study import Figures, Measurement, Rows, Session, option
 from ..timing import clocked, least
 
-__all__ = ["TangentMaps"]
-
 PERIOD = 2 * math.pi
 E = 0.6
 PERICENTRE = np.array([1 - E, 0.0, 0.0, math.sqrt((1 + E) / (1 - E))])

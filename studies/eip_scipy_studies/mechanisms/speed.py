@@ -10,8 +10,6 @@ from ..timing import least, many_calls
 from .examples import four_bar, four_bar_model
 from .ways import kept, lambdified
 
-__all__ = ["Speed", "first_result", "speed"]
-
 TURNS, TOLERANCE = 10, 1e-10
 
 

@@ -28,8 +28,6 @@ from ..beside import workers
 from ..report import cores
 from ..study import Check, Rows, Session, Study
 
-__all__ = ["TABLES", "Cell", "PaperTable", "Value"]
-
 TABLES = ("table1", "table2", "table3", "table4", "table5")
 LONGEST = 5  # the table that takes minutes
 OMEGA = 10.0

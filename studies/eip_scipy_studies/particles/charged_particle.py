@@ -14,8 +14,6 @@ from ..study import Check, Figures, Rows, Session, Study, option
 from . import report
 from .runs import METHODS, PAPER_METHODS, SCENES, ParticleStudy, study
 
-__all__ = ["ChargedParticle", "Tokamak", "Uniform"]
-
 Found = dict[str, ParticleStudy]
 
 

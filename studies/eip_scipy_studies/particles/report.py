@@ -13,8 +13,6 @@ from ..report import compact, table
 from ..study import Check
 from .runs import PAPER_METHODS, ParticleRun, ParticleStudy
 
-__all__ = ["checks", "figures", "range_check", "rows", "text"]
-
 CURVE_POINTS = 40_000  # largest number of points, approximately, of an orbit's curve in a figure
 ROWS = 1000  # number of rows of each run in the CSV file
 ROUND_OFF = 1e-9  # relative bound for H and L to count as kept

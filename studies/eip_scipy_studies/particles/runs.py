@@ -18,8 +18,6 @@ from eip_scipy.solvers import EIPSolver
 from ..comparators import boris, implicit_midpoint
 from ..long_runs import named
 
-__all__ = ["METHODS", "PAPER_METHODS", "SCENES", "ParticleRun", "ParticleStudy", "scene", "study"]
-
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False}
 REFINEMENT = 4  # number of steps of the reference in one step
 LAST_TURN = 100

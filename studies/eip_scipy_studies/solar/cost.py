@@ -31,19 +31,6 @@ from .runs import (
     whole_number,
 )
 
-__all__ = [
-    "ENOUGH_SECONDS",
-    "MERCURY",
-    "TimedRun",
-    "by_peer",
-    "by_us",
-    "by_verlet",
-    "cost",
-    "cost_methods",
-    "panels",
-    "timed",
-]
-
 ENOUGH_SECONDS = 0.2  # disturbances of so long a run are invisible on axes of many powers of ten
 MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first number would be unstable
 MERCURY = 0  # number among the planets, which follow the Sun

@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 from ..report import UsageError
 from ..study import option
 
-__all__ = ["AnyEpoch", "Epoch", "kernels", "one_line", "parse_epoch"]
-
 FORMS = '"2014-02-02T20:18", "2000-01-01" (both TDB, Gregorian calendar), "JD2451545.0" or "2451545.0"'
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?)?")
 _JULIAN_DATE = re.compile(r"(?:JD ?)?(-?\d{1,8}(?:\.\d*)?)", re.IGNORECASE)

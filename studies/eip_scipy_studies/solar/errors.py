@@ -9,10 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..study import Check
-from .cost import MERCURY, TimedRun
+from .cost import TimedRun
 from .runs import TIGHT, MethodRun, SolarScene, report_times, stored_state
-
-__all__ = ["MERCURY", "PointErrors", "SolarRuns", "ecliptic", "errors_at", "longitude_errors"]
 
 OBLIQUITY = math.radians(84381.448 / 3600)  # IAU 1976, as the paper's data: from the axes of the ICRF to the ecliptic
 # A turn is counted right if the longitude error changes by less than half a turn between saved states. Two ellipses as

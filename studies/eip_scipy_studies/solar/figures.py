@@ -12,11 +12,9 @@ from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from .. import plotting
 from ..report import describe_machine
-from .cost import ENOUGH_SECONDS, panels
-from .errors import MERCURY, SolarRuns, ecliptic, longitude_errors
+from .cost import ENOUGH_SECONDS, MERCURY, panels
+from .errors import SolarRuns, ecliptic, longitude_errors
 from .runs import MethodRun, SolarScene
-
-__all__ = ["figures", "jacobi", "osculating_orbits"]
 
 OUTER, INNER = slice(4, 9), slice(0, 4)
 ELLIPSES = 40

@@ -21,8 +21,6 @@ from ..work_precision import Runner, costs_at, curves
 from .cost import MERCURY, TimedRun, by_peer, by_us, by_verlet, panels, timed
 from .runs import KEPT, Peer, orbits_kept, whole_number
 
-__all__ = ["Found", "Frontier", "methods"]
-
 PATIENCE = 30.0  # longer runs, in seconds, are not repeated
 LEVELS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 

@@ -15,8 +15,6 @@ from ..report import compact, table
 from .errors import PointErrors, SolarRuns
 from .runs import BALANCED, HIGH_ORDER, MULTISTEP, TIGHT, MethodRun, report_times
 
-__all__ = ["cost_rows", "csv_rows", "json_content", "text"]
-
 
 def text(study: SolarRuns, settings: Any) -> str:
     """Lay out the head, the table, the notes and the checks, 90 characters wide with the usual names of methods.

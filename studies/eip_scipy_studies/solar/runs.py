@@ -23,28 +23,6 @@ from eip_scipy.solvers import EIPSolver
 from ..comparators import StormerVerletResult, stormer_verlet
 from ..long_runs import named
 
-__all__ = [
-    "HIGH_ORDER",
-    "KEPT",
-    "MULTISTEP",
-    "TIGHT",
-    "MethodRun",
-    "Peer",
-    "PendingRun",
-    "SolarScene",
-    "eip_name",
-    "leapfrog",
-    "make_scene",
-    "metric_of",
-    "orbits_kept",
-    "plan",
-    "rebound_run",
-    "report_times",
-    "stored_state",
-    "tight_run",
-    "whole_number",
-]
-
 Peer = Callable[..., Any]
 """`eip_scipy.integrations.rebound.run`."""
 

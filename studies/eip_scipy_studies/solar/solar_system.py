@@ -23,8 +23,6 @@ from .epoch import AnyEpoch, kernels, one_line
 from .errors import SolarRuns
 from .runs import MethodRun, Peer, make_scene, plan
 
-__all__ = ["Found", "SolarSystem"]
-
 DATA = "de440"
 TEN_BODIES = [
     name for name in available() if len(load(name).bodies) == 10

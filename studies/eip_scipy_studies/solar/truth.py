@@ -20,8 +20,6 @@ from ..study import Check, Figures, PartlyDone, Rows, Session, Study, one_of, op
 from .epoch import AnyEpoch, kernels, one_line
 from .runs import whole_number
 
-__all__ = ["Found", "Model", "ModelRun", "Truth", "errors", "models", "run_model"]
-
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 STEP = 0.001
 MOON = "moon"  # a body, not a force, but chosen together with the forces

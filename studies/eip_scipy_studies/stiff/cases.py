@@ -14,8 +14,6 @@ from eip_scipy import Invariant
 
 from .mechanisms import chain, chain_by_angles, governor, governor_by_angles
 
-__all__ = ["CASES", "Case", "chain_case", "governor_case"]
-
 Array = np.ndarray
 TIGHT = 1e-11
 

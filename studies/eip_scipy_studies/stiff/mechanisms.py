@@ -10,8 +10,6 @@ import numpy as np
 
 from eip_scipy import Invariant
 
-__all__ = ["Natural", "chain", "chain_by_angles", "governor", "governor_by_angles"]
-
 Array = np.ndarray
 GRAVITY = 9.81
 # The governor of the multibody benchmark library (A05), SI units: distance of the rods' joints from the axis, length

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["ATOL", "COMPILED", "OWN", "PYTHON", "Peer", "Solve"]
-
 PYTHON, COMPILED, OWN = "plain Python function", "function compiled by Numba", "equations in the package's own form"
 ATOL = 1e-3  # ratio of the absolute tolerance to the relative one, for all
 

@@ -11,8 +11,6 @@ import numpy as np
 from ..equations import Scene
 from ._common import ATOL, COMPILED, Peer, Solve
 
-__all__ = ["PEERS"]
-
 
 def _cyrk(method: str, scene: Scene, **extra: Any) -> Solve:
     cyrk, numba, filling, n = import_module("CyRK"), import_module("numba"), scene.compiled().fun, scene.y0.size

@@ -12,8 +12,6 @@ import numpy as np
 from ..equations import EQUATIONS, Scene
 from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve
 
-__all__ = ["PEERS"]
-
 MEMBERS = ("members",)
 LANES = 4  # width of heyoka's batches: four doubles are a vector of AVX2
 

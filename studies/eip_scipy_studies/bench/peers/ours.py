@@ -12,8 +12,6 @@ import numpy as np
 from ..equations import EQUATIONS, Functions, Scene
 from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve
 
-__all__ = ["PEERS"]
-
 SECOND_ORDER = ("kepler", "henon_heiles", "bodies")
 
 

@@ -11,8 +11,6 @@ import numpy as np
 from ..equations import EQUATIONS, Scene
 from ._common import ATOL, OWN, Peer, Solve
 
-__all__ = ["PEERS"]
-
 
 def _heyoka(scene: Scene, **extra: Any) -> Solve:
     heyoka = import_module("heyoka")

@@ -11,8 +11,6 @@ import numpy as np
 from ..equations import Scene
 from ._common import ATOL, COMPILED, PYTHON, Peer, Solve
 
-__all__ = ["PEERS"]
-
 
 def _by_solve_ivp(solve_ivp: Any, method: Any, fun: Any, scene: Scene, extra: dict[str, Any]) -> Solve:
     def solve(setting: float) -> np.ndarray:
