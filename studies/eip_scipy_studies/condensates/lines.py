@@ -12,7 +12,7 @@ from eip_scipy.problems.gross_pitaevskii import density_surface, line_condensate
 
 from ..report import compact, warn
 from ..study import Check, Figures, Session
-from .runs import REFERENCE, SHOWN, Motion, Quench, QuenchRuns, QuenchStudy, field_check
+from .runs import REFERENCE, SHOWN, Motion, QuenchRuns, QuenchStudy, field_check
 from .states import (
     LINE_POINTS,
     LINES,
@@ -40,21 +40,26 @@ class VortexLines(QuenchStudy):
     The trap is round. The stationary state at the slower rotation therefore continues to rotate at this rate, and lags
     behind the frame that rotates faster.
 
-    There are `points` points along each axis, and `saved` is the time between two saved states. `energies_known` is the
-    allowed error of the known energies, of the start (a saddle) and of the lower state, and `turn_known` that of the
-    angle of the lines [rad], which is 0.1 of the distance between two points of the grid there.
+    There are `points` points along each axis. `energies_known` is the allowed error of the known energies, of the start
+    (a saddle) and of the lower state, and `turn_known` that of the angle of the lines [rad], which is 0.1 of the
+    distance between two points of the grid there.
     """
 
     points: int = LINE_POINTS
     t_end: float = 20.0
+    stem: str = "vortex-lines"
     step: float = 5e-3
+    reference_step: float = 1e-2
     saved: float = 1.0
     snapshots: tuple[float, ...] = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0)
+    sense: int = -1
+    energy_kept: float = 1e-13
     energies_known: float = 1e-4
     turn_known: float = 0.02
 
-    def arguments(self) -> dict[str, Any]:
-        return {"h": self.step, "t_end": self.t_end}
+    @property
+    def title(self) -> str:
+        return f"Vortex lines, Omega = {OMEGA_BEFORE:g} -> {OMEGA_AFTER:g}"
 
     def measure(self, session: Session) -> QuenchRuns:
         """Find the stationary state, show that it is a saddle of the energy, and do all runs from it."""
@@ -62,17 +67,7 @@ class VortexLines(QuenchStudy):
         start = kept_state(self, session, before, lambda update: search_saddle(self.points, update))
         with searching(session) as update:
             lower = leave_saddle(before, start, self.seed, update)
-        quench = Quench(
-            name="vortex-lines",
-            title=f"Vortex lines, Omega = {OMEGA_BEFORE:g} -> {OMEGA_AFTER:g}",
-            problem=after.problem(start, self.t_end, self.step, name="vortex-lines"),
-            reference_step=1e-2,
-            interval=self.saved,
-            snapshots=self.snapshots,
-            sense=-1,
-            energy_kept=1e-13,
-        )
-        made = self.do_runs(quench, session)
+        made = self.do_runs(after, start, session)
         assert made.moved is not None
         made.more = [*self._state_checks(before, start, lower), self._turn_check(made.moved)]
         made.notes = [*_state_notes(before, start, lower), _grid_note(before, made, made.moved.t)]
@@ -100,7 +95,7 @@ class VortexLines(QuenchStudy):
 
         moved = found.moved
         assert moved is not None
-        title, times = f"{found.quench.title}, {SHOWN}", found.quench.shown(moved.t)
+        title, times = f"{self.title}, {SHOWN}", self.shown(moved.t)
         slices = {f"t = {moved.t[k]:g}": _slice(found, moved, k) for k in times}
         yield (
             "vortex-lines-slices.png",
@@ -130,7 +125,7 @@ def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
     rotation, of which the start is a stationary state.
     """
     assert made.reference is not None
-    start = made.quench.problem.y0
+    start = made.problem.y0
     mu, turn = before.chemical_potential(start), OMEGA_AFTER - OMEGA_BEFORE
     exact = rotated(before, start, turn * t[-1]).reshape(-1) * np.exp(-1j * mu * t[-1])
     off = np.sqrt(before.mass(made.reference[:, -1] - exact))
@@ -142,7 +137,7 @@ def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
 def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
     from ..plotting import FieldPanel
 
-    grid = made.quench.equation.grid
+    grid = made.equation.grid
     density = np.abs(_field(made, k)[:, :, grid.shape[2] // 2]) ** 2
     shown = cropped(density, grid, (0, 1), SLICE)
     return FieldPanel(*shown, ("x", "y"), moved.vortices[k].positions, moved.followed(k))
@@ -155,7 +150,7 @@ def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
     """
     from ..plotting import SurfacePanel
 
-    surface = density_surface(made.quench.equation, _field(made, k), LEVEL)
+    surface = density_surface(made.equation, _field(made, k), LEVEL)
     x, y, _ = surface.corners.mean(axis=1).T
     followed = np.abs(moved.off(k, x, y)) < np.pi / len(moved.vortices[k].charges)
     return SurfacePanel(surface.corners, np.where(surface.inside, 1 + followed, 0))
@@ -163,4 +158,4 @@ def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
 
 def _field(made: QuenchRuns, k: int) -> np.ndarray:
     assert made.fields is not None
-    return made.quench.equation.as_field(made.fields[:, k])
+    return made.equation.as_field(made.fields[:, k])
