@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from eip_scipy.problems import Problem
+
 from .report import compact, describe_machine
 
 Runner = Callable[[float], tuple[float, np.ndarray]]
@@ -87,6 +89,14 @@ def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
             part = math.log(errors[k - 1] / level) / math.log(errors[k - 1] / errors[k])
             return float(costs[k - 1] * (costs[k] / costs[k - 1]) ** part)
     return math.nan
+
+
+def known_end(problem: Problem) -> np.ndarray:
+    """Return the problem's reference state at the end of its interval, which must be known."""
+    assert problem.reference is not None
+    truth = problem.reference(problem.t_span[1])
+    assert truth is not None
+    return truth
 
 
 def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -> dict[str, Curve]:

@@ -31,7 +31,7 @@ from eip_scipy.problems import (
 from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import named
-from ..work_precision import work_precision
+from ..work_precision import known_end, work_precision
 
 # Settings of IAS15, by its step criterion; each starts where the steps are about as long as its corrector can handle.
 EPSILONS = {"prs23": (1e-4, 1e-5, 1e-6, 1e-7, 1e-9), "global": (1e-2, 1e-3, 1e-4, 1e-6, 1e-9)}
@@ -77,10 +77,7 @@ class HardScene:
     @property
     def end(self) -> np.ndarray:
         """Return the exact state at the end."""
-        assert self.problem.reference is not None
-        state = self.problem.reference(self.problem.t_span[1])
-        assert state is not None
-        return state
+        return known_end(self.problem)
 
     @property
     def dimensions(self) -> int:
