@@ -39,17 +39,14 @@ def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
     own defaults.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    name = next((name for name in _longest_first() if words[: name.count(" ") + 1] == name.split()), None)
+    longest_first = sorted(COMMANDS, key=lambda name: -name.count(" "))
+    name = next((name for name in longest_first if words[: name.count(" ") + 1] == name.split()), None)
     try:
         if name is None:
             return _no_command(words)
         return _run(name, words[name.count(" ") + 1 :], settings)
     except SystemExit as leave:  # argparse, for --help, --version and errors
         return int(leave.code or DONE)
-
-
-def _longest_first() -> list[str]:
-    return sorted(COMMANDS, key=lambda name: -name.count(" "))
 
 
 def _no_command(words: list[str]) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ from eip_scipy.problems.gross_pitaevskii import (
     with_noise,
 )
 
-from ..long_runs import Checkpoints
+from ..long_runs import Checkpoints, number
 from ..report import UsageError, compact, describe_machine, table, write_file
 from ..study import Check, Figures, Rows, Session, Study, option, some_of
 
@@ -40,6 +39,7 @@ RING_POINTS, LINE_POINTS = 256, 64
 TRAP_TOLERANCE, RING_TOLERANCE, LINES_TOLERANCE, SADDLE_TOLERANCE = 1e-6, 1e-8, 1e-5, 1e-8
 MOST_LINES, LINES_RADIUS, LINES_ITERATIONS = 4, 1.5, 1000
 VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the margin around it
+COUNT = number("an integer >= 1", lambda value: value >= 1, int)
 Update = Callable[[str], Any]
 Ends = tuple[float, float, float, float]
 
@@ -158,16 +158,6 @@ def _known(quantity: str, known: float, ours: float, matched: bool, note: str = 
     return Check(text, matched, {"quantity": quantity, "known": known, "ours": ours, "matched": matched, "note": note})
 
 
-def _count(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected an integer >= 1, got {text!r}")
-    return value
-
-
 @dataclass(frozen=True, kw_only=True)
 class GroundStates(Study[Results]):
     """Command ``eip-scipy gpe ground-state``.
@@ -178,7 +168,10 @@ class GroundStates(Study[Results]):
 
     scene: Sequence[str] | None = some_of("scene", SCENES)
     starts: int = option(
-        4, "starts for each angular velocity in the trap (default: %(default)s)", type=_count, metavar="N"
+        4,
+        "starts for each angular velocity in the trap (default: %(default)s)",
+        type=COUNT,
+        metavar="N",
     )
     seed: int = option(0, "seed of the random starts (default: %(default)s)", type=int, metavar="N")
     scenes: Mapping[str, Scene] = field(default_factory=lambda: SCENES)

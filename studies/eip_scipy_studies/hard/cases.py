@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,13 +16,14 @@ from eip_scipy.solvers import EIPSolver
 
 from ..hard_cases import HardCase, hard_cases
 from ..listing import METRICS, fixed_step_methods
-from ..long_runs import named
+from ..long_runs import named, number
 from ..report import compact, table
 from ..study import Check, Figures, Rows, Session, Study, option
 
 TOLERANCES = {"EIPDOP853": 1e-9}
 USUAL_TOLERANCE = 1e-6
 ATOL_PER_RTOL = 1e-3
+TOLERANCE = number("a number from 1e-13 to 0.1", lambda value: 1e-13 <= value <= 0.1)
 
 # Bounds, set for one tolerance of two methods; the last three for the error metric only.
 SETTINGS = {("EIPRK45", 1e-6), ("EIPDOP853", 1e-9)}
@@ -101,16 +101,6 @@ def adaptive_methods() -> dict[str, type[EIPSolver]]:
         for name, method in fixed_step_methods().items()
         if method.TABLEAU.has_estimate and not method.TABLEAU.of_second_order
     }
-
-
-def _tolerance(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 1e-13 <= value <= 0.1:
-        raise argparse.ArgumentTypeError(f"expected a number from 1e-13 to 0.1, got {text!r}")
-    return value
 
 
 def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | None) -> CaseOutcome:
@@ -340,7 +330,9 @@ class HardCases(Study[list[Comparison]]):
 
     method: str = option("EIPRK45", "the adaptive method (default: %(default)s)", choices=list(adaptive_methods()))
     rtol: float | None = option(
-        None, "relative tolerance (default: 1e-9 for EIPDOP853, else 1e-6); atol is 0.001 of it", type=_tolerance
+        None,
+        "relative tolerance (default: 1e-9 for EIPDOP853, else 1e-6); atol is 0.001 of it",
+        type=TOLERANCE,
     )
     metric: str = option("error", "metric of the projection (default: %(default)s)", choices=METRICS)
     cases: Sequence[HardCase] = field(default_factory=hard_cases)

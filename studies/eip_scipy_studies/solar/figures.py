@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from .cost import ENOUGH_SECONDS, MERCURY, panels
 from .errors import SolarRuns, ecliptic, longitude_errors
 from .runs import MethodRun, SolarScene
 
-OUTER, INNER = slice(4, 9), slice(0, 4)
 ELLIPSES = 40
 
 
@@ -129,15 +129,7 @@ def _sample(run: MethodRun) -> np.ndarray:
     return np.unique(np.append((golden * run.t.size).astype(int), [0, run.t.size - 1]))
 
 
-def _outer_figure(study: SolarRuns, styles: Any) -> Any:
-    return _orbits_figure(study, OUTER, "Outer planets and Pluto")
-
-
-def _inner_figure(study: SolarRuns, styles: Any) -> Any:
-    return _orbits_figure(study, INNER, "Inner planets")
-
-
-def _orbits_figure(study: SolarRuns, which: slice, title: str) -> Any:
+def _orbits_figure(which: slice, title: str, study: SolarRuns, styles: Any) -> Any:
     scene = study.scene
     panels = {}
     for name, run in _shown(study).items():
@@ -175,11 +167,11 @@ def _cost_figure(study: SolarRuns, styles: Any) -> Any:
     )
 
 
-FIGURES = {
+FIGURES: dict[str, Callable[[SolarRuns, Any], Any]] = {
     "invariant-errors.png": _errors_figure,
     "longitude-errors.png": _longitude_figure,
-    "orbits-outer.png": _outer_figure,
-    "orbits-inner.png": _inner_figure,
+    "orbits-outer.png": partial(_orbits_figure, slice(4, 9), "Outer planets and Pluto"),
+    "orbits-inner.png": partial(_orbits_figure, slice(0, 4), "Inner planets"),
     "orbit-mercury.png": _mercury_figure,
     "error-against-cost.png": _cost_figure,
 }
