@@ -114,17 +114,19 @@ def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Ou
             )  # fmt: skip
 
 
-def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """Return the right-hand side of y = (q, v) with unit masses, and a tuple with its energy v^2/2 + U(q).
+def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
+    """Return the right-hand side of y = (q, v) with unit masses and the force -grad U, and a tuple with its energy.
 
-    ``force(q, out)`` fills in the force, ``energy(q)`` returns U, and ``slope(q, out)`` fills in grad U.
+    ``energy(q)`` returns U, and ``slope(q, out)`` fills in grad U.
     """
 
     @njit
     def fun(t, y, out):
         n = y.size // 2
         out[:n] = y[n:]
-        force(y[:n], out[n:])
+        slope(y[:n], out[n:])
+        for k in range(n, 2 * n):
+            out[k] = -out[k]
 
     @njit
     def value(t, y):
@@ -141,21 +143,6 @@ def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invari
         out[n:] = y[n:]
 
     return fun, (Invariant(value, grad=gradient, in_place=True, name="energy"),)
-
-
-def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """Return the result of `second_order` for the force -grad U.
-
-    ``energy(q)`` returns U, and ``slope(q, out)`` fills in grad U.
-    """
-
-    @njit
-    def force(q, out):
-        slope(q, out)
-        for k in range(out.size):
-            out[k] = -out[k]
-
-    return second_order(force, energy, slope)
 
 
 def discs(seed: int, cut: float = 2.5) -> Case:
