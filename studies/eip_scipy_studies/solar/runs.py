@@ -189,7 +189,7 @@ def _own(
     progress: bool,
     **options: Any,
 ) -> MethodRun:
-    """Run a method of this package, with `per_save` steps between two saved states, or the steps of the scene."""
+    """Run a method of this package, with `per_save` steps between two saved states, or the step of the problem."""
     step, every = (scene.h, scene.every) if per_save is None else (scene.interval / per_save, per_save)
     result = integrate(
         scene.problem, method=named(method, name), h=step, save_every=every, progress=progress, **options
