@@ -12,8 +12,6 @@ from typing import Any, NoReturn
 
 from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, NOT_PRINTED, WRONG_USAGE, nearest
 
-__all__ = ["main"]
-
 PROGRAM = "eip-scipy"
 
 
@@ -34,33 +32,21 @@ class _Version(argparse.Action):
 
 
 def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
-    """Run one command.
+    """Run one command with the arguments `argv` (default: those of the process), and return the exit status.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments; default: those of the process.
-    **settings
-        Settings of the command, in place of its own defaults.
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 1 a check inside the command failed or a run is not reliable, 2 wrong usage, 3 the
-        text could not be printed, though the files are written, 130 interrupted.
+    The status is 0 done, 1 a check inside the command failed or a run is not reliable, 2 wrong usage, 3 the text could
+    not be printed, though the files are written, 130 interrupted. `settings` are those of the command, in place of its
+    own defaults.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    name = next((name for name in _longest_first() if words[: name.count(" ") + 1] == name.split()), None)
+    longest_first = sorted(COMMANDS, key=lambda name: -name.count(" "))
+    name = next((name for name in longest_first if words[: name.count(" ") + 1] == name.split()), None)
     try:
         if name is None:
             return _no_command(words)
         return _run(name, words[name.count(" ") + 1 :], settings)
     except SystemExit as leave:  # argparse, for --help, --version and errors
         return int(leave.code or DONE)
-
-
-def _longest_first() -> list[str]:
-    return sorted(COMMANDS, key=lambda name: -name.count(" "))
 
 
 def _no_command(words: list[str]) -> int:

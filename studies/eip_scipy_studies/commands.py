@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-__all__ = ["CHECK_FAILED", "COMMANDS", "DONE", "INTERRUPTED", "MOVED", "NOT_PRINTED", "WRONG_USAGE", "Entry", "nearest"]
-
 DONE, CHECK_FAILED, WRONG_USAGE, NOT_PRINTED, INTERRUPTED = 0, 1, 2, 3, 130
 
 

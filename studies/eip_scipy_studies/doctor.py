@@ -17,9 +17,7 @@ from eip_scipy import EIPRK4, EIPRKN12, ensemble, integrate, show_config
 from eip_scipy.problems import kepler, solar_system
 
 from .report import compact, describe_machine, table, warn
-from .study import Session, Study
-
-__all__ = ["Doctor"]
+from .study import Check, Session, Study
 
 DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
@@ -134,8 +132,8 @@ class Doctor(Study[Examined]):
         trials = [{**trial._asdict(), "passed": trial.passed} for trial in found.trials]
         return {"installation": found.installed, "checks": trials}
 
-    def checks(self, found: Examined) -> Sequence[Trial]:
-        return found.trials
+    def checks(self, found: Examined) -> list[Check]:
+        return [Check(trial.name, trial.passed) for trial in found.trials]
 
 
 def _text(trials: Sequence[Trial]) -> str:

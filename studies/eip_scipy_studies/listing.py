@@ -14,8 +14,6 @@ from . import comparators, hard_cases
 from .commands import COMMANDS
 from .study import Session, Study
 
-__all__ = ["METRICS", "Listing", "fixed_step_methods"]
-
 METRICS = ("error", "euclidean")
 
 Found = dict[str, dict[str, str]]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,6 @@ from eip_scipy.solvers import EIPSolver
 
 from .report import UsageError, check_folder
 from .study import option
-
-__all__ = ["Checkpoints", "named", "positive"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,21 +50,19 @@ class Checkpoints:
         return f"the same command with --resume goes on from the checkpoints in {str(self.checkpoint)!r}"
 
 
-def positive(text: str) -> float:
-    """Return `text` as a finite positive number.
+def number(what: str, fits: Callable[[Any], bool], convert: Callable[[str], Any] = float) -> Callable[[str], Any]:
+    """Make the ``type`` of an option that accepts the numbers that `fits` accepts; `what` names them in messages."""
 
-    Raises
-    ------
-    ArgumentTypeError
-        If `text` is not such a number.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
-    return value
+    def read(text: str) -> Any:
+        with suppress(ValueError):
+            if fits(value := convert(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"expected {what}, got {text!r}")
+
+    return read
+
+
+positive = number("a positive number", lambda value: 0 < value < math.inf)
 
 
 def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:

@@ -242,31 +242,14 @@ def orbit_in_time_figure(panels: Mapping[str, tuple[Any, Any]], *, unit: str, ti
     return figure
 
 
-class KeplerRun(NamedTuple):
-    """A run of the perturbed Kepler problem by one method.
-
-    Attributes
-    ----------
-    t : array_like, shape (m,)
-    energy_error, momentum_error, position_error : array_like, shape (m,)
-        Absolute errors.
-    orbit : array_like, shape (2, k)
-        Positions to draw.
-    """
-
-    t: Any
-    energy_error: Any
-    momentum_error: Any
-    position_error: Any
-    orbit: Any
-
-
-def paper_kepler_figure(runs: Mapping[str, KeplerRun], *, title: str = "") -> Figure:
+def paper_kepler_figure(runs: Mapping[str, Any], *, title: str = "") -> Figure:
     """Draw orbits, energy, momentum and position errors, a row for each method, as the paper's figures 1 and 2 do.
 
     Parameters
     ----------
-    runs : mapping of str to KeplerRun
+    runs : mapping of str to object
+        Runs by method, with attributes `t` (m,), `energy_error`, `momentum_error` and `position_error` (m,), which are
+        absolute errors, and `orbit` (2, k), the positions to draw.
     title : str, optional
 
     Returns

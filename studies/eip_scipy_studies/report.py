@@ -23,29 +23,6 @@ import numpy as np
 
 from eip_scipy import show_config
 
-__all__ = [
-    "UsageError",
-    "check_folder",
-    "check_outputs",
-    "check_target",
-    "compact",
-    "cores",
-    "describe_machine",
-    "document",
-    "ended_by_sigterm",
-    "listening",
-    "machine",
-    "needed",
-    "printing",
-    "say",
-    "table",
-    "versions",
-    "warn",
-    "write_csv",
-    "write_file",
-    "write_json",
-]
-
 _untrusted: list[str] = []  # messages about unreliable runs since `listening` began
 _unsaid: list[str] = []  # reasons why stdout took no text, since `printing` began
 
@@ -83,25 +60,11 @@ def _processor() -> str:
 
 
 def needed(module: str, install: str = "") -> Any:
-    """Import a module that a study needs.
+    """Import and return a module that a study needs.
 
-    Parameters
-    ----------
-    module : str
-    install : str, optional
-        Argument of ``pip install``. It may be omitted if the error of the import says what to install, as those of the
-        package's integrations do.
-
-    Returns
-    -------
-    module
-
-    Raises
-    ------
-    UsageError
-        If the module is not installed; the message says how to install it.
-    ImportError
-        If a part of this package cannot be imported, which is a fault of the package.
+    `install` is the argument of ``pip install``; it may be omitted if the error of the import says what to install, as
+    those of the package's integrations do. If the module is not installed, a UsageError says how to install it; if a
+    part of this package cannot be imported, which is a fault of the package, the ImportError is raised.
     """
     try:
         return import_module(module)
@@ -127,19 +90,8 @@ def versions() -> dict[str, str | None]:
 def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """Return a command's numbers for `write_json`, with the options, the date, the versions and the machine.
 
-    The result also says whether all runs since `listening` began are reliable.
-
-    Parameters
-    ----------
-    command : str
-    arguments : mapping
-        The options of the command, by name.
-    **content
-        The command's numbers, by the names that they have in the file.
-
-    Returns
-    -------
-    dict
+    The result also says whether all runs since `listening` began are reliable. `arguments` are the options of the
+    command, and `content` its numbers, both by the names that they have in the file.
     """
     return {
         "command": command,
@@ -174,19 +126,10 @@ def compact(value: float | None, digits: int = 2) -> str:
 
 
 def table(head: Sequence[Sequence[str]], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Lay out a table with one column of labels and right-aligned cells.
+    """Lay out a table with one column of labels and right-aligned cells, without a newline at the end.
 
-    Parameters
-    ----------
-    head : sequence of sequences of str
-        The lines of each column's head, one sequence for each column.
-    rows : iterable of (str, sequence of str)
-        Label and cells; a row without cells is a heading.
-
-    Returns
-    -------
-    str
-        The table without a newline at the end.
+    `head` has the lines of each column's head, one sequence for each column. `rows` are pairs (label, cells); a row
+    without cells is a heading.
     """
     body = list(rows)
     first = max(len(label) for label, cells in body if cells)
@@ -237,30 +180,17 @@ def warn(message: str) -> None:
 
 @contextmanager
 def printing() -> Iterator[list[str]]:
-    """Collect the reasons for which `say` could not print.
-
-    Yields
-    ------
-    list of str
-        The reasons, added as text is printed.
-    """
+    """Collect the reasons for which `say` could not print, in the list that is yielded."""
     _unsaid.clear()
     yield _unsaid
 
 
 @contextmanager
 def listening(kind: type[Warning]) -> Iterator[list[str]]:
-    """Collect warnings of one class (`ProjectionWarning`), each text once, instead of showing them.
+    """Collect warnings of the class `kind` (`ProjectionWarning`), each text once, instead of showing them.
 
-    Parameters
-    ----------
-    kind : type
-        The class; other warnings are not affected.
-
-    Yields
-    ------
-    list of str
-        The texts of the warnings, added as they come; `document` reads the list, too.
+    Other warnings are not affected. The texts are added to the list that is yielded as they come; `document` reads this
+    list, too.
     """
     _untrusted.clear()
     with warnings.catch_warnings():
@@ -314,13 +244,7 @@ def ended_by_sigterm() -> Iterator[None]:
 
 
 def check_folder(folder: Path) -> None:
-    """Make `folder` if necessary and check that files can be written there.
-
-    Raises
-    ------
-    UsageError
-        If the folder cannot be made, or no file can be written there.
-    """
+    """Make `folder` if necessary; raise a UsageError if that fails or no file can be written there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _try_to_write(folder)
@@ -329,13 +253,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Check that a file can be written at `path`; its folder must exist.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be written.
-    """
+    """Raise a UsageError if no file can be written at `path`; its folder must exist."""
     if path.is_dir():
         raise UsageError(f"cannot write {str(path)!r}: it is a folder; give the name of a file")
     try:
@@ -344,15 +262,10 @@ def check_target(path: Path) -> None:
         raise UsageError(f"cannot write {str(path)!r}: {_reason(error)}") from error
 
 
-def check_outputs(folder: Path, target: Path | None) -> None:
-    """Check the folder of a command's files and the file of its JSON, if one is wanted, before it computes.
-
-    Raises
-    ------
-    UsageError
-        If one of them cannot be written.
-    """
-    check_folder(folder)
+def check_outputs(folder: Path | None, target: Path | None) -> None:
+    """Check the folder of a command's files and the file of its JSON, as far as they are wanted, before it computes."""
+    if folder is not None:
+        check_folder(folder)
     if target is not None:
         check_target(target)
 
@@ -381,23 +294,10 @@ def _whole(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, write: Callable[[Path], Any]) -> Path:
-    """Let `write` fill a temporary file that then replaces `path`; an interruption leaves no incomplete file.
+    """Let `write` fill a temporary file that then replaces `path`, and return `path`.
 
-    Parameters
-    ----------
-    path : Path
-    write : callable
-        ``write(temporary_path)``; the temporary path has the suffix of `path`.
-
-    Returns
-    -------
-    Path
-        `path`.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be written.
+    ``write(temporary_path)`` gets a path with the suffix of `path`. An interruption leaves no incomplete file. If the
+    file cannot be written, a UsageError is raised.
     """
     with _whole(path) as temporary:
         write(temporary)

@@ -13,15 +13,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from eip_scipy.checkpoint import CheckpointError
 
 from .commands import CHECK_FAILED, DONE, INTERRUPTED, nearest
 from .report import (
     UsageError,
-    check_folder,
-    check_target,
+    check_outputs,
     describe_machine,
     document,
     say,
@@ -30,22 +29,6 @@ from .report import (
     write_file,
     write_json,
 )
-
-__all__ = [
-    "Check",
-    "Command",
-    "Figures",
-    "Measurement",
-    "PartlyDone",
-    "Rows",
-    "Session",
-    "Study",
-    "Verdict",
-    "one_of",
-    "option",
-    "perform",
-    "some_of",
-]
 
 # Packages whose comparison is not among the integrations.
 PEERS = {"heyoka": "eip_scipy_studies.heyoka_runs"}
@@ -60,18 +43,8 @@ Figures = Iterable[tuple[str, Any]]
 def option(default: Any, text: str, **settings: Any) -> Any:
     """Make a field of a command that is an option of the command line, ``--its-name``.
 
-    Parameters
-    ----------
-    default : object
-        False makes a flag.
-    text : str
-        Text of ``--help``.
-    **settings
-        As for `argparse.ArgumentParser.add_argument`; ``positional=True`` makes it a positional argument.
-
-    Returns
-    -------
-    dataclasses.Field
+    The default False makes a flag. `text` is that of ``--help``, and `settings` are as for
+    `argparse.ArgumentParser.add_argument`; ``positional=True`` makes it a positional argument.
     """
     return field(default=default, metadata={"help": text, **settings})
 
@@ -79,15 +52,7 @@ def option(default: Any, text: str, **settings: Any) -> Any:
 def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
     """Make the ``type`` of an option that accepts one of the `known` names, and suggests a similar one for others.
 
-    Parameters
-    ----------
-    what : str
-        Kind of the names, for messages.
-    known : collection of str
-
-    Returns
-    -------
-    callable
+    `what` is the kind of the names, for messages.
     """
 
     def read(text: str) -> str:
@@ -100,42 +65,30 @@ def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
 
 
 def some_of(what: str, known: Collection[str]) -> Any:
-    """Make a field of a command for an option that may be repeated, each time with one of the `known` names.
+    """Make a field for an option that may be repeated, each time with one of the `known` names; None means all.
 
-    Parameters
-    ----------
-    what : str
-        Kind of the names.
-    known : collection of str
-
-    Returns
-    -------
-    dataclasses.Field
-        A field; its value None means all.
+    `what` is the kind of the names.
     """
     text = f"one {what}, may be repeated; default: all ({', '.join(known)})"
     return option(None, text, action="append", type=one_of(what, known), metavar="NAME")
 
 
-class Verdict(Protocol):
-    """Interface that the runner needs of a check."""
-
-    @property
-    def passed(self) -> bool:
-        """Return whether the check holds."""
-        ...
-
-
 class Check(NamedTuple):
-    """Check of a command: its text, and whether it holds."""
+    """Check of a command: its text, whether it holds, and its entry in the JSON file, if that has more than these."""
 
     text: str
     passed: bool
+    record: Mapping[str, Any] = {}
 
     @property
     def line(self) -> str:
         """Return the check as a line of text."""
         return f"{'ok' if self.passed else 'FAILED':<6} {self.text}"
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Return the entry for the JSON file."""
+        return dict(self.record) or {"text": self.text, "passed": self.passed}
 
 
 class PartlyDone(KeyboardInterrupt):
@@ -150,24 +103,10 @@ class PartlyDone(KeyboardInterrupt):
 class Session:
     """Context of a command: folder of its files, its output, and the packages for comparison.
 
-    Attributes
-    ----------
-    name : str
-        Name of the command, such as "gpe ring".
-    out : Path
-        Folder of figures and CSV files.
-    json : Path or None
-        File to which the result of `Study.numbers` is written; None if there is none.
-    quiet : bool
-        Print nothing but errors.
-    absent : list of str
-        Lines about packages that are not installed, printed at the end.
-    written : set of Path
-        Files that were made.
-    unnamed : list of Path
-        Files of `written` whose names have not been printed yet.
-    open : ExitStack
-        Resources to be closed when the command ends.
+    `name` is that of the command, such as "gpe ring", and `out` the folder of figures and CSV files. The result of
+    `Study.numbers` is written to `json`, if there is one. With `quiet` only errors are printed. `absent` has lines
+    about packages that are not installed, printed at the end; `written` has the files that were made, and `unnamed`
+    those of them whose names have not been printed yet. `open` has what is to be closed when the command ends.
     """
 
     name: str
@@ -197,17 +136,8 @@ class Session:
     def peer(self, name: str, methods: str) -> Any:
         """Import the adapter to another package: its module in `PEERS`, or else the integration with this name.
 
-        If the package is missing, return None, and print a line about it at the end of the command.
-
-        Parameters
-        ----------
-        name : str
-        methods : str
-            Methods that are then missing from the comparison.
-
-        Returns
-        -------
-        module or None
+        If the package is missing, return None, and print a line at the end of the command which says that `methods` are
+        missing from the comparison.
         """
         try:
             return import_module(PEERS.get(name, f"eip_scipy.integrations.{name}"))
@@ -280,7 +210,7 @@ class Study(Command, Generic[Found]):
         """Return the rows of CSV files, by the names of the files."""
         return {}
 
-    def checks(self, found: Found) -> Sequence[Verdict]:
+    def checks(self, found: Found) -> Sequence[Check]:
         """Return the checks that decide on the exit status."""
         return ()
 
@@ -308,10 +238,7 @@ class Study(Command, Generic[Found]):
     def run(self, session: Session) -> int:
         """Check the settings and the files to write, and then do what `perform` does; return the exit status."""
         self.check_settings()
-        if self.writes_files:
-            check_folder(session.out)
-        if session.json is not None:
-            check_target(session.json)
+        check_outputs(session.out if self.writes_files else None, session.json)
         return perform(self, session)[0]
 
 
@@ -337,15 +264,7 @@ class Measurement(Study[Found]):
 def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
     """Measure, print, write, check: the common part of all commands.
 
-    Parameters
-    ----------
-    study : Study
-    session : Session
-
-    Returns
-    -------
-    int, dict
-        Exit status: 0 done, 1 a check failed, 130 interrupted; and the result of `study.numbers`.
+    Return the exit status (0 done, 1 a check failed, 130 interrupted) and the result of `study.numbers`.
     """
     with session.open:
         interrupted = ""

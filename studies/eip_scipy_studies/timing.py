@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, TypeVar
 
-__all__ = ["clocked", "least", "many_calls"]
-
 Name = TypeVar("Name", bound=Hashable)
 Action = Callable[[], float]
 FEWEST = 3
@@ -48,18 +46,9 @@ def many_calls(call: Callable[[], Any]) -> Action:
 def least(actions: Mapping[Name, Action], *, turns: int = 1, seconds: float = 0.0) -> dict[Name, float]:
     """Call all actions in turn several times, and return the least time of each; inf if there were no calls.
 
-    Parameters
-    ----------
-    actions : mapping of hashable to callable
-        Functions that return the time that they took, in seconds.
-    turns : int, optional
-        Number of calls of each action. All are called in turn, so that other load affects all equally.
-    seconds : float, optional
-        If it is not 0: ignore `turns`, take at least 3 turns, and continue until this number of seconds has passed.
-
-    Returns
-    -------
-    dict of hashable to float
+    Actions return the seconds that they took. There are `turns` calls of each action, in turn, so that other load
+    affects all equally. If `seconds` is not 0, `turns` is ignored: there are at least 3, until this number of seconds
+    has passed.
     """
     best = dict.fromkeys(actions, math.inf)
     end, done = time.perf_counter() + seconds, 0

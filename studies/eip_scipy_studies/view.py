@@ -13,8 +13,6 @@ from eip_scipy.results import view
 from .report import UsageError
 from .study import Check, Figures, Session, Study, option
 
-__all__ = ["View"]
-
 
 class Movie(NamedTuple):
     """A run, and the HTML text of the page that plays it."""

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .report import compact, describe_machine
+from eip_scipy.problems import Problem
 
-__all__ = ["Curve", "Runner", "WorkPoint", "WorkPrecision", "cost_to_reach", "costs_at", "curves", "work_precision"]
+from .report import compact, describe_machine
 
 Runner = Callable[[float], tuple[float, np.ndarray]]
 """``run(step) -> (wall_time, y)``."""
@@ -20,17 +20,7 @@ Curve = tuple[list[float], list[float]]
 
 
 class WorkPoint(NamedTuple):
-    """One method at one step.
-
-    Attributes
-    ----------
-    method : str
-    step : float
-    wall_time : float
-        Seconds, the least of several runs.
-    error : float
-        nan for a run that did not reach the end.
-    """
+    """One method at one step: the least time of several runs in seconds, and the error, nan if it was not finished."""
 
     method: str
     step: float
@@ -40,16 +30,9 @@ class WorkPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class WorkPrecision:
-    """Result of `work_precision`.
+    """Result of `work_precision`: the points, in the order of the methods and of their steps, and the machine.
 
-    Attributes
-    ----------
-    points : tuple of WorkPoint
-        Points in the order of the methods and of their steps.
-    states : tuple of ndarray
-        Final state of the run at each point.
-    machine : str
-        Machine on which the times were measured.
+    `states` has the final state of the run at each point.
     """
 
     points: tuple[WorkPoint, ...]
@@ -68,30 +51,12 @@ def work_precision(
 ) -> WorkPrecision:
     """Run methods at several steps and measure error and time.
 
-    Parameters
-    ----------
-    methods : mapping of str to (callable, sequence of float)
-        For each method the function ``run(step) -> (wall_time, y)``, and the steps. `run` returns the seconds without
-        compilation and the final state, which is nan if the run failed.
-    error : callable
-        ``error(y) -> float``, the error of a final state.
-    repeats : int, optional
-        Number of runs of each point, of which the least time counts: disturbances make a timing longer, never shorter.
-    enough_seconds : float, optional
-        A point (method and step) whose fastest run took more than this number of seconds is not run again.
-    in_all : float, optional
-        A point whose runs together took more than this number of seconds is not run again.
-    callback : callable, optional
-        ``callback()`` after each of the ``repeats`` runs of each point, including those that are left out.
-
-    Returns
-    -------
-    WorkPrecision
-
-    Raises
-    ------
-    ValueError
-        If `repeats` is not positive.
+    `methods` has for each method the function ``run(step) -> (wall_time, y)``, and the steps. `run` returns the seconds
+    without compilation and the final state, which is nan if the run failed; ``error(y)`` is the error of a final state.
+    The least time of `repeats` runs (at least 1, or a ValueError is raised) counts: disturbances make a timing longer,
+    never shorter. A point (method and step) is not run again if its fastest run took more than `enough_seconds`, or its
+    runs together more than `in_all`. ``callback()`` is called after each of the `repeats` runs of each point, including
+    those that are left out.
     """
     if repeats < 1:
         raise ValueError(f"repeats must be at least 1, got {repeats!r}.")
@@ -114,17 +79,8 @@ def work_precision(
 def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
     """Interpolate the cost at which a method's error falls to `level`, on log axes.
 
-    Parameters
-    ----------
-    costs, errors : array_like, shape (m,)
-        Costs and errors of the method's runs, in ascending cost.
-    level : float
-
-    Returns
-    -------
-    float
-        The cost. If the cheapest run has a smaller error already, its cost, which is an upper bound. If no run has an
-        error of at most `level`, nan.
+    `costs` and `errors` (m,) are those of the method's runs, in ascending cost. If the cheapest run has a smaller error
+    already, the result is its cost, an upper bound; if no run has an error of at most `level`, it is nan.
     """
     if errors[0] <= level:
         return float(costs[0])
@@ -135,20 +91,19 @@ def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
     return math.nan
 
 
+def known_end(problem: Problem) -> np.ndarray:
+    """Return the problem's reference state at the end of its interval, which must be known."""
+    assert problem.reference is not None
+    truth = problem.reference(problem.t_span[1])
+    assert truth is not None
+    return truth
+
+
 def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -> dict[str, Curve]:
     """Gather the costs and errors of runs by their methods, in the order of the runs.
 
-    Parameters
-    ----------
-    runs : iterable
-        Runs with ``method`` and the two named attributes, such as `WorkPoint`, each method's in ascending cost.
-    cost, error : str, optional
-        Names of the attributes.
-
-    Returns
-    -------
-    dict of str to Curve
-        For each method two lists, the costs and the errors of its runs.
+    `runs` have ``method`` and the attributes named by `cost` and `error`, such as `WorkPoint`, each method's in
+    ascending cost. The result has two lists for each method, the costs and the errors of its runs.
     """
     found: dict[str, Curve] = {}
     for run in runs:

@@ -67,7 +67,7 @@ def found(energy, Omega=0.8, converged=True, points=16):
 def test_checks_of_the_trap():
     def matched(*args, **kwargs):
         (check,) = gpe_states.GroundStates().checks({"trap": [found(*args, **kwargs)]})
-        return check.passed, check.note
+        return check.passed, check.record["note"]
 
     assert matched(3.1904172 + 9e-6) == (True, "")
     assert matched(3.1904172 + 2e-5) == (False, "")

@@ -70,7 +70,7 @@ def test_command(trials, tmp_path, capsys, monkeypatch):
 
 def test_a_wrong_slope_is_a_failure(trials):
     study = gpe_efficiency.Efficiency(orders={**gpe_efficiency.ORDERS, "CN": 3})
-    failed = [check for check in study.checks(trials) if check.quantity == "slope of CN"]
+    failed = [check for check in study.checks(trials) if check.record["quantity"] == "slope of CN"]
     assert [check.passed for check in failed] == [False, False]
     assert "FAILED modulated wave, slope of CN: 2, known 3" in study.text(trials)
 

@@ -138,7 +138,7 @@ def test_known_values_are_compared_to_their_digits(lines):
     study = kepler_figures.KeplerFigures(t_end=T_END, known=known)
     checks = study.checks(lines)
     assert [check.passed for check in checks] == [True, False, True]
-    assert [check.ours for check in checks] == [at_end, at_end, largest]
+    assert [check.record["ours"] for check in checks] == [at_end, at_end, largest]
     assert study.text(lines).splitlines()[-2].startswith("FAILED EIP-H")
 
 

@@ -12,7 +12,7 @@ from eip_scipy_studies.cli import main
 from eip_scipy_studies.particles import charged_particle
 from eip_scipy_studies.particles import report as particle_report
 from eip_scipy_studies.particles import runs as particle_runs
-from eip_scipy_studies.particles.report import RangeCheck
+from eip_scipy_studies.particles.report import range_check
 
 PNG = b"\x89PNG\r\n\x1a\n"
 STEPS = 60
@@ -72,7 +72,7 @@ def test_checks_fail_on_a_run_too_short_for_them(short):
     for found in short.values():
         checks = particle_report.checks(found)
         assert not all(check.passed for check in checks)
-        assert all(check.passed for check in checks if "relative error" in check.what)
+        assert all(check.passed for check in checks if "relative error" in check.text)
         text = particle_report.text(found)
         assert text.count("\nFAILED ") == sum(not check.passed for check in checks)
         assert text.count("\nok ") == sum(check.passed for check in checks)
@@ -80,11 +80,11 @@ def test_checks_fail_on_a_run_too_short_for_them(short):
 
 def test_checks_and_their_words():
     nan = float("nan")
-    assert not RangeCheck("s", "w", nan, 0.0, 1.0).passed
-    assert RangeCheck("s", "tips", 8, 8, 8).text == "ok     tips: 8, expected 8"
-    assert RangeCheck("s", "error", 0.5, 0.0, 0.1).text == "FAILED error: 0.5000, at most 0.10"
-    assert RangeCheck("s", "error", 0.5, 0.1, np.inf).text == "ok     error: 0.5000, at least 0.10"
-    assert "between 1.0093 and 1.0097" in RangeCheck("s", "R of the tip", 1.0095, 1.0093, 1.0097).text
+    assert not range_check("s", "w", nan, 0.0, 1.0).passed
+    assert range_check("s", "tips", 8, 8, 8).line == "ok     tips: 8, expected 8"
+    assert range_check("s", "error", 0.5, 0.0, 0.1).line == "FAILED error: 0.5000, at most 0.10"
+    assert range_check("s", "error", 0.5, 0.1, np.inf).line == "ok     error: 0.5000, at least 0.10"
+    assert "between 1.0093 and 1.0097" in range_check("s", "R of the tip", 1.0095, 1.0093, 1.0097).text
 
 
 @pytest.mark.nightly

@@ -20,27 +20,15 @@ from .peers import PEERS, Peer
 from .process import ask
 from .suites import SUITES, Suite
 
-__all__ = ["Bench", "Found"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Study[Found]):
     """Command ``eip-scipy bench``.
 
-    Attributes
-    ----------
-    repeats : int
-        Largest number of timed runs at each setting; the least time counts.
-    enough : float
-        Total seconds of the runs at one setting after which it is not run again.
-    patience : float
-        Seconds: after a longer run, finer settings of the same method and problem are left out.
-    limit : float
-        Seconds after which the process of a method is stopped.
-    suites : mapping of str to Suite
-        The suites by their names, from which ``suite`` chooses.
-    field_of_peers : mapping of str to Peer
-        All methods of all packages, from which ``peers`` chooses; those of this package are always run.
+    There are at most `repeats` timed runs at each setting, of which the least time counts, and none after `enough`
+    seconds in all. After a run longer than `patience` seconds finer settings of the same method and problem are left
+    out, and after `limit` seconds the process of a method is stopped. The option ``suite`` chooses from `suites`, and
+    ``peers`` from `field_of_peers`, all methods of all packages; those of this package are always run.
     """
 
     suite: Sequence[str] = option(

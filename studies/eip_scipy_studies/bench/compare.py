@@ -9,28 +9,17 @@ from typing import NamedTuple
 from ..work_precision import cost_to_reach
 from .peers import COMPILED, OWN, PEERS, PYTHON
 
-__all__ = ["LEVELS", "REASONS", "Row", "Standing", "groups", "reason", "standings"]
-
 LEVELS = (1e-6, 1e-9)
 
 
 class Row(NamedTuple):
     """Result of a method of one package on a problem at one setting, or its failure; a line of the CSV file.
 
-    Attributes
-    ----------
-    suite, scene, takes, peer : str
-        Name of the suite, title of the problem, kind of function that the method takes (see `Peer`), and name of the
-        method.
-    setting : float or None
-        Relative tolerance or number of steps.
-    seconds : float or None
-        Least time of a run; in the suite "overhead" the time that is added to each evaluation, in "first-use" the time
-        from the start of the process to its first answer.
-    error, drift : float or None
-        Error of the final state, see `Scene.error`, and largest relative change of an invariant, see `Scene.drift`.
-    said : str
-        The first line of an error, or another remark; empty if there is none.
+    The fields are the name of the suite, the title of the problem, the kind of function that the method takes (see
+    `Peer`), the name of the method, and its relative tolerance or number of steps. `seconds` is the least time of a
+    run; in the suite "overhead" the time that is added to each evaluation, in "first-use" the time from the start of
+    the process to its first answer. `error` and `drift` are defined by `Scene`. `said` is the first line of an error,
+    or another remark.
     """
 
     suite: str
@@ -45,24 +34,12 @@ class Row(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """Comparison of another package's method with our best method at one error.
+    """Comparison of another package's method (`peer`) with our best method at the error `level` of the final state.
 
-    Attributes
-    ----------
-    suite, scene, takes, peer : str
-        As in `Row`; `peer` is the method of the other package.
-    level : float
-        Error of the final state at which times are compared.
-    seconds : float
-        Time of the other package's method to reach this error; nan if none of its runs did.
-    best : str
-        Name of our method that is fastest at this error; "none of ours" if none of our runs reached it.
-    ours : float
-        Time of our method in seconds; inf if none of our runs reached this error.
-    tried : float
-        Seconds of the longest run of the other package's method.
-    bound : bool
-        True if `seconds` is an upper bound, because the method's first run is at least as accurate as `level`.
+    The first four fields are those of `Row`. `seconds` is the time of the other method to reach this error, nan if none
+    of its runs did. `best` is the name of our method that is fastest at this error ("none of ours" if none of our runs
+    reached it), and `ours` its time in seconds, or inf. `tried` are the seconds of the longest run of the other method.
+    `bound` is True if `seconds` is an upper bound, because the method's first run is at least as accurate as `level`.
     """
 
     suite: str

@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["EQUATIONS", "Functions", "Scene", "scene_from"]
-
 
 class Functions(NamedTuple):
     """Functions of a problem: right-hand side ``fun(t, y)``, invariants ``values(t, y)``, their ``gradients(t, y)``.
@@ -128,15 +126,9 @@ EQUATIONS: Mapping[str, Callable[[Any], Functions]] = {
 class Scene:
     """A problem as a worker receives it.
 
-    Attributes
-    ----------
-    title, equations : str
-        `equations` is a key of `EQUATIONS`, "members" (of Kepler's problem), "bodies", "nls" or "case" (a hard case).
-    y0, end : ndarray, shape (n,)
-        State at t = 0, and the exact state at `t_end`; shape (members, n) for "members".
-    t_end : float
-    params : dict
-        "gm" (G times the masses) for "bodies", "name" for "case", "length" of the ring for "nls".
+    `equations` is a key of `EQUATIONS`, "members" (of Kepler's problem), "bodies", "nls" or "case" (a hard case). `y0`
+    and `end` (n,) are the state at t = 0, and the exact state at `t_end`; for "members" they are (members, n). `params`
+    has "gm" (G times the masses) for "bodies", "name" for "case", and "length" of the ring for "nls".
     """
 
     title: str

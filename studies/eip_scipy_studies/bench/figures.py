@@ -11,8 +11,6 @@ from .compare import LEVELS, Row, groups
 from .peers import COMPILED, OWN, PEERS, PYTHON
 from .suites import SUITES
 
-__all__ = ["Where", "drawn"]
-
 Where = tuple[str, str, str]
 """Suite, problem and kind of function."""
 SHORT = {PYTHON: "python", COMPILED: "compiled", OWN: "own"}
@@ -47,8 +45,5 @@ def drawn(rows: list[Row], machine: str) -> Iterator[tuple[Where, str, Any]]:
 
 
 def _arrays(runs: list[Row]) -> dict[str, list[float]]:
-    return {
-        "seconds": [math.nan if row.seconds is None else row.seconds for row in runs],
-        "error": [math.nan if row.error is None else row.error for row in runs],
-        "drift": [math.nan if row.drift is None else row.drift for row in runs],
-    }
+    values = {key: [getattr(row, key) for row in runs] for key in ("seconds", "error", "drift")}
+    return {key: [math.nan if value is None else value for value in column] for key, column in values.items()}

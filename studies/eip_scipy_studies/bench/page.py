@@ -16,25 +16,13 @@ from .figures import Where
 from .peers import PEERS
 from .suites import SUITES
 
-__all__ = ["Found", "html", "markdown", "text"]
-
 
 @dataclass
 class Found:
-    """Everything that was measured.
+    """Everything that was measured on one machine at a date, year-month-day: runs and failures of all methods.
 
-    Attributes
-    ----------
-    machine, date : str
-        Description of the machine, and the day of the measurement as year-month-day.
-    rows : list of Row
-        The runs and failures of all methods.
-    versions : dict
-        Versions of the packages, including ours, by their names with pip.
-    absent : dict
-        Reasons why packages did not run, by their names with pip.
-    took : dict
-        Seconds that each method took, by suite and name of the method.
+    `versions` of the packages, including ours, and `absent`, the reasons why packages did not run, are by their names
+    with pip; `took` has the seconds that each method took, by suite and name of the method.
     """
 
     machine: str

@@ -14,25 +14,16 @@ from threading import Timer
 from time import perf_counter
 from typing import Any
 
-__all__ = ["Reply", "ask"]
-
 WORKER = "eip_scipy_studies.bench.worker"
 
 
 @dataclass(frozen=True)
 class Reply:
-    """Answers of a worker.
+    """Answers of a worker, given until its end or until it was stopped.
 
-    Attributes
-    ----------
-    answers : list of dict
-        Answers that it gave until its end, or until it was stopped.
-    version : str or None
-        Version of the package; None if the worker did not report it.
-    first : float or None
-        Seconds from the start of the process to its first answer; None if there was none.
-    failed : str
-        Reason why the worker did not finish; empty if it did.
+    `version` is that of the package, None if the worker did not report it. `first` are the seconds from the start of
+    the process to its first answer, None if there was none. `failed` is the reason why the worker did not finish, empty
+    if it did.
     """
 
     answers: list[dict[str, Any]]
@@ -44,18 +35,8 @@ class Reply:
 def ask(request: Mapping[str, Any], limit: float, worker: str = WORKER) -> Reply:
     """Start a worker, hand it the request, and read until it ends or `limit` seconds have passed.
 
-    Parameters
-    ----------
-    request : mapping
-        The request, in the form that the module `worker` describes.
-    limit : float
-        Seconds after which the process is stopped.
-    worker : str, optional
-        Name of the module that is run as the process.
-
-    Returns
-    -------
-    Reply
+    The request has the form that the module `worker` describes. The argument `worker` is the name of the module that is
+    run as the process.
     """
     begin = perf_counter()
     # One thread for all: this is a fair comparison, and a problem with threads cannot distort it.

@@ -24,8 +24,6 @@ import numpy as np
 from .equations import Functions, Scene, scene_from
 from .peers import PEERS, Peer
 
-__all__ = ["TASKS", "first_line", "main"]
-
 Answers = Iterator[dict[str, Any]]
 
 

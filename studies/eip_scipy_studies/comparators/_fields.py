@@ -50,16 +50,7 @@ class FieldResult:
 class FieldScheme:
     """Base class of a scheme and its state during a run; subclasses implement `restart` and `step`.
 
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-
-    Attributes
-    ----------
-    psi : ndarray, shape (n,)
-        The state, flat.
-    nfev : int
-        Number of pairs of transforms since `start`.
+    `psi` (n,) is the state, flat, and `nfev` the number of pairs of transforms since `start`.
     """
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
@@ -106,18 +97,13 @@ class FieldScheme:
 class FixedPoint:
     """Solver of ``m = psi - i c (K + W(m)) m``: K and a constant w are implicit, W - w comes from the previous iterate.
 
-    The iteration ``m <- (1 + i c (K + w))^-1 rhs(m)``, ``rhs(m) = psi - i c (W(m) - w) m``, contracts by about
-    ``c max|W - w|`` if W is pointwise. The change of `rhs` from one iterate to the next is the residual of the equation
-    itself, not of the preconditioned one, and costs no transform.
+    The iteration ``m <- (1 + i c (K + w))^-1 rhs(m)``, ``rhs(m) = psi - i c (W(m) - w) m``, contracts by about ``c
+    max|W - w|`` if W is pointwise; it converges fastest if w is the middle of the range of W. The change of `rhs` from
+    one iterate to the next is the residual of the equation itself, not of the preconditioned one, and costs no
+    transform.
 
-    Parameters
-    ----------
-    scheme : FieldScheme
-        The scheme whose transforms and K are used, and whose ``nfev`` counts the iterations.
-    tol : float
-        Bound on the norm of the residual relative to that of the state.
-    c, w : float
-        Constants of the equation; the iteration converges fastest if w is the middle of the range of W.
+    The transforms and K are those of `scheme`, whose ``nfev`` counts the iterations. `tol` is the bound on the norm of
+    the residual relative to that of the state.
     """
 
     def __init__(self, scheme: FieldScheme, tol: float, c: float, w: float) -> None:
@@ -127,20 +113,11 @@ class FixedPoint:
         self._means: list[np.ndarray] = []
 
     def solve(self, rhs: Callable[[np.ndarray, np.ndarray], float], guess: np.ndarray) -> tuple[np.ndarray, str]:
-        """Find m. The array that is returned is overwritten in the third call after this one.
+        """Find m (n,), and return it with the reason why the iteration failed, or "".
 
-        Parameters
-        ----------
-        rhs : callable
-            ``rhs(m, values)`` replaces `values` (n,) by the right-hand side at m, and returns the norm of their change.
-        guess : ndarray, shape (n,)
-            First iterate, used until three solutions are known; then a parabola through these is extrapolated.
-
-        Returns
-        -------
-        m : ndarray, shape (n,)
-        failure : str
-            Reason why the iteration failed; empty if it converged.
+        The array that is returned is overwritten in the third call after this one. ``rhs(m, values)`` replaces `values`
+        (n,) by the right-hand side at m, and returns the norm of their change. The first iterate is `guess` (n,) until
+        three solutions are known; then a parabola through these is extrapolated.
         """
         scheme, values = self.scheme, self._rhs
         if len(self._means) < 3:
@@ -171,15 +148,8 @@ class Implicit(FieldScheme):
     """Base class of schemes whose step solves, by `FixedPoint`, for the mean of two states that are 2 c apart in time.
 
     The mean fulfils ``mean = start - i c (K + W - Omega Lz) mean`` with a pointwise potential W, which subclasses
-    compute.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-    psi : ndarray, shape (n,)
-        A typical state, from which the constant w of `FixedPoint` is computed.
-    tol : float
-        See `FixedPoint`.
+    compute. `psi` (n,) is a typical state, from which the constant w of `FixedPoint` is computed; `tol` is that of
+    `FixedPoint`.
     """
 
     def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray, tol: float) -> None:
@@ -217,26 +187,14 @@ class Implicit(FieldScheme):
 
 
 def check_tol(tol: Any) -> float:
-    """Return `tol` as a float.
-
-    Raises
-    ------
-    ValueError
-        If it is not a number from 1e-15 to 1, exclusive of 1.
-    """
+    """Return `tol` as a float, or raise a ValueError if it is not a number from 1e-15 to 1, exclusive of 1."""
     if isinstance(tol, bool) or not isinstance(tol, (int, float, np.integer, np.floating)) or not 1e-15 <= tol < 1:
         raise ValueError(f"tol must be a number from 1e-15 to 1, exclusive of 1, got {tol!r}")
     return float(tol)
 
 
 def check_equation(gpe: Any) -> GrossPitaevskii:
-    """Return `gpe` if it is a `GrossPitaevskii`, and raise an error otherwise.
-
-    Raises
-    ------
-    TypeError
-        If it is not a `GrossPitaevskii`.
-    """
+    """Return `gpe` if it is a `GrossPitaevskii`, or raise a TypeError."""
     if not isinstance(gpe, GrossPitaevskii):
         raise TypeError(
             f"gpe must be a GrossPitaevskii, got {type(gpe).__name__}; for a problem, pass problem.equation"

@@ -25,10 +25,8 @@ from eip_scipy.problems.gross_pitaevskii import make_transforms
 
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..report import describe_machine, table
-from ..study import Figures, Rows, Session, Study, option
-from ..work_precision import cost_to_reach, work_precision
-
-__all__ = ["METHODS", "AllRuns", "Efficiency", "Slope", "Trial"]
+from ..study import Check, Figures, Rows, Session, Study, option
+from ..work_precision import cost_to_reach, known_end, work_precision
 
 T_END = 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
@@ -130,19 +128,10 @@ def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
 
 
 class Trial:
-    """A problem with the results of its runs.
+    """A problem with its exact state (n,) at the end, and the results of its runs.
 
-    Parameters
-    ----------
-    problem : FieldProblem
-    exact : ndarray, shape (n,)
-        Exact state at the end.
-
-    Attributes
-    ----------
-    rows : dict
-        For each (name of a method, h) a dict with the results of this run: "method", "h", the entries of the dict that
-        `errors` returns, "seconds", "pairs" (the number of pairs of transforms) and "remark".
+    For each (name of a method, h) `rows` has a dict with the results of this run: "method", "h", the entries of the
+    dict that `errors` returns, "seconds", "pairs" (the number of pairs of transforms) and "remark".
     """
 
     def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:
@@ -210,19 +199,11 @@ class Trial:
         return float(np.polyfit(np.log(h[clean]), np.log(error[clean]), 1)[0]) if clean.size > 1 else float("nan")
 
 
-class Slope(NamedTuple):
-    """Check of a slope or an invariant error: expected (`known`) and measured (`ours`) value, allowed difference."""
-
-    wave: str
-    quantity: str
-    known: float
-    ours: float
-    slack: float
-
-    @property
-    def passed(self) -> bool:
-        """Return True if the measured value agrees with the expected one."""
-        return abs(self.ours - self.known) <= self.slack
+def _checked(wave: str, quantity: str, known: float, ours: float, slack: float) -> Check:
+    """Return the check that a slope or an invariant error differs from the expected one by at most `slack`."""
+    matched = abs(ours - known) <= slack
+    record = {"wave": wave, "quantity": quantity, "known": known, "ours": ours, "matched": matched}
+    return Check(f"{wave}, {quantity}: {ours:.3g}, known {known:.3g}", matched, record)
 
 
 Found = dict[str, Trial]
@@ -230,18 +211,10 @@ Found = dict[str, Trial]
 
 @dataclass(frozen=True, kw_only=True)
 class Efficiency(Study[Found]):
-    """``reproduce fig-efficiency``: all methods on both waves.
+    """``reproduce fig-efficiency``: all methods on both waves, with `points` points along each axis.
 
-    Attributes
-    ----------
-    points : int
-        Number of points along each axis.
-    repeats : int
-        Number of runs of each method and step; the least time counts.
-    orders : mapping of str to int
-        Expected slopes, the orders of the methods, by the methods' names.
-    stem : str
-        Stem of the names of the files that the command writes.
+    The least time of `repeats` runs of each method and step counts. `orders` are the expected slopes, the orders of the
+    methods, and `stem` is that of the names of the files.
     """
 
     points: int = 64
@@ -251,29 +224,26 @@ class Efficiency(Study[Found]):
 
     def measure(self, session: Session) -> Found:
         plane = plane_wave((self.points, self.points), t_end=T_END, fft=make_transforms().name)
-        assert plane.reference is not None
-        exact = plane.reference(T_END)
-        assert exact is not None
-        trials = dict(zip(WAVES, (Trial(plane, exact), Trial(*modulated_wave(self.points))), strict=True))
+        trials = dict(zip(WAVES, (Trial(plane, known_end(plane)), Trial(*modulated_wave(self.points))), strict=True))
         total = self.repeats * sum(len(steps) for trial in trials.values() for _, steps in trial.methods().values())
         with session.bar(total, "fig-efficiency") as bar:
             for trial in trials.values():
                 trial.measure(self.repeats, bar.update)
         return trials
 
-    def checks(self, found: Found) -> list[Slope]:
+    def checks(self, found: Found) -> list[Check]:
         """Compare slopes with the orders of the methods, and invariant errors of EIP-ME on the modulated wave with 0.
 
         Slopes that are nan are not compared.
         """
         slopes = [
-            Slope(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
+            _checked(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
             for wave, trial in found.items()
             for name, order in self.orders.items()
         ]
         left = max(float(found[WAVES[1]].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
-        known = [slope for slope in slopes if not np.isnan(slope.ours)]
-        return [*known, Slope(WAVES[1], "mass and energy of EIP-ME", 0.0, left, LEFT)]
+        known = [slope for slope in slopes if not np.isnan(slope.record["ours"])]
+        return [*known, _checked(WAVES[1], "mass and energy of EIP-ME", 0.0, left, LEFT)]
 
     def text(self, found: Found) -> str:
         parts = [describe_machine()]
@@ -288,17 +258,11 @@ class Efficiency(Study[Found]):
         checks = self.checks(found)
         failed = [check for check in checks if not check.passed]
         parts.append(f"{len(checks) - len(failed)} of {len(checks)} slopes and invariants are as they should be.")
-        parts += [f"FAILED {c.wave}, {c.quantity}: {c.ours:.3g}, known {c.known:.3g}" for c in failed]
+        parts += [check.line for check in failed]
         return "\n\n".join(parts)
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        names = ("wave", "quantity", "known", "ours")
-        return {
-            "checks": [
-                {**{name: getattr(check, name) for name in names}, "matched": check.passed}
-                for check in self.checks(found)
-            ]
-        }
+        return {"checks": [check.entry for check in self.checks(found)]}
 
     def tables(self, found: Found) -> dict[str, Rows]:
         return {

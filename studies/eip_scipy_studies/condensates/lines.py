@@ -11,8 +11,8 @@ from eip_scipy.problems import GrossPitaevskii
 from eip_scipy.problems.gross_pitaevskii import density_surface, line_condensate, rotated, vortices
 
 from ..report import compact, warn
-from ..study import Figures, Session
-from .runs import REFERENCE, SHOWN, FieldCheck, Motion, Quench, QuenchRuns, QuenchStudy
+from ..study import Check, Figures, Session
+from .runs import REFERENCE, SHOWN, Motion, QuenchRuns, QuenchStudy, field_check
 from .states import (
     LINE_POINTS,
     LINES,
@@ -27,8 +27,6 @@ from .states import (
     searching,
 )
 
-__all__ = ["VortexLines"]
-
 OMEGA_BEFORE, OMEGA_AFTER = 0.7, 0.9
 LEVEL = 1e-3  # of the paper's surfaces
 SLICE = 5.0  # half the side of the paper's slices
@@ -42,29 +40,26 @@ class VortexLines(QuenchStudy):
     The trap is round. The stationary state at the slower rotation therefore continues to rotate at this rate, and lags
     behind the frame that rotates faster.
 
-    Attributes
-    ----------
-    points : int
-        Number of points along each axis.
-    saved : float
-        Time between two saved states.
-    energies_known : float
-        Allowed error of the known energies, of the start (a saddle) and of the lower state.
-    turn_known : float
-        Allowed error of the angle of the lines [rad], which is 0.1 of the distance between two points of the grid
-        there.
+    There are `points` points along each axis. `energies_known` is the allowed error of the known energies, of the start
+    (a saddle) and of the lower state, and `turn_known` that of the angle of the lines [rad], which is 0.1 of the
+    distance between two points of the grid there.
     """
 
     points: int = LINE_POINTS
     t_end: float = 20.0
+    stem: str = "vortex-lines"
     step: float = 5e-3
+    reference_step: float = 1e-2
     saved: float = 1.0
     snapshots: tuple[float, ...] = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0)
+    sense: int = -1
+    energy_kept: float = 1e-13
     energies_known: float = 1e-4
     turn_known: float = 0.02
 
-    def arguments(self) -> dict[str, Any]:
-        return {"h": self.step, "t_end": self.t_end}
+    @property
+    def title(self) -> str:
+        return f"Vortex lines, Omega = {OMEGA_BEFORE:g} -> {OMEGA_AFTER:g}"
 
     def measure(self, session: Session) -> QuenchRuns:
         """Find the stationary state, show that it is a saddle of the energy, and do all runs from it."""
@@ -72,37 +67,27 @@ class VortexLines(QuenchStudy):
         start = kept_state(self, session, before, lambda update: search_saddle(self.points, update))
         with searching(session) as update:
             lower = leave_saddle(before, start, self.seed, update)
-        quench = Quench(
-            name="vortex-lines",
-            title=f"Vortex lines, Omega = {OMEGA_BEFORE:g} -> {OMEGA_AFTER:g}",
-            problem=after.problem(start, self.t_end, self.step, name="vortex-lines"),
-            reference_step=1e-2,
-            interval=self.saved,
-            snapshots=self.snapshots,
-            sense=-1,
-            energy_kept=1e-13,
-        )
-        made = self.do_runs(quench, session)
+        made = self.do_runs(after, start, session)
         assert made.moved is not None
         made.more = [*self._state_checks(before, start, lower), self._turn_check(made.moved)]
         made.notes = [*_state_notes(before, start, lower), _grid_note(before, made, made.moved.t)]
         return made
 
-    def _state_checks(self, gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[FieldCheck]:
+    def _state_checks(self, gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[Check]:
         saddle, count, state = gpe.energy(start), len(vortices(gpe, start).charges), lower.state
         below = state.converged and abs(state.energy - LINES_ENERGY) < self.energies_known
         return [
-            FieldCheck(f"E of the start {SADDLE_ENERGY}", saddle, abs(saddle - SADDLE_ENERGY) < self.energies_known),
-            FieldCheck(f"lines of the start, {SADDLE_LINES}", count, count == SADDLE_LINES),
-            FieldCheck(f"E below that saddle {LINES_ENERGY}", state.energy, below),
-            FieldCheck(f"lines there, {LINES}", lower.count, lower.count == LINES),
+            field_check(f"E of the start {SADDLE_ENERGY}", saddle, abs(saddle - SADDLE_ENERGY) < self.energies_known),
+            field_check(f"lines of the start, {SADDLE_LINES}", count, count == SADDLE_LINES),
+            field_check(f"E below that saddle {LINES_ENERGY}", state.energy, below),
+            field_check(f"lines there, {LINES}", lower.count, lower.count == LINES),
         ]
 
-    def _turn_check(self, moved: Motion) -> FieldCheck:
+    def _turn_check(self, moved: Motion) -> Check:
         """Check the angle by which the lines turn, which should be the difference of the rotations times t."""
         slower = OMEGA_BEFORE - OMEGA_AFTER
         off = float(np.abs(moved.angle - slower * moved.t).max())
-        return FieldCheck(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
+        return field_check(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
 
     def pictures(self, found: QuenchRuns) -> Figures:
         """Draw the plane z = 0, and surfaces of equal density."""
@@ -110,7 +95,7 @@ class VortexLines(QuenchStudy):
 
         moved = found.moved
         assert moved is not None
-        title, times = f"{found.quench.title}, {SHOWN}", found.quench.shown(moved.t)
+        title, times = f"{self.title}, {SHOWN}", self.shown(moved.t)
         slices = {f"t = {moved.t[k]:g}": _slice(found, moved, k) for k in times}
         yield (
             "vortex-lines-slices.png",
@@ -140,7 +125,7 @@ def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
     rotation, of which the start is a stationary state.
     """
     assert made.reference is not None
-    start = made.quench.problem.y0
+    start = made.problem.y0
     mu, turn = before.chemical_potential(start), OMEGA_AFTER - OMEGA_BEFORE
     exact = rotated(before, start, turn * t[-1]).reshape(-1) * np.exp(-1j * mu * t[-1])
     off = np.sqrt(before.mass(made.reference[:, -1] - exact))
@@ -152,7 +137,7 @@ def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
 def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
     from ..plotting import FieldPanel
 
-    grid = made.quench.equation.grid
+    grid = made.equation.grid
     density = np.abs(_field(made, k)[:, :, grid.shape[2] // 2]) ** 2
     shown = cropped(density, grid, (0, 1), SLICE)
     return FieldPanel(*shown, ("x", "y"), moved.vortices[k].positions, moved.followed(k))
@@ -165,7 +150,7 @@ def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
     """
     from ..plotting import SurfacePanel
 
-    surface = density_surface(made.quench.equation, _field(made, k), LEVEL)
+    surface = density_surface(made.equation, _field(made, k), LEVEL)
     x, y, _ = surface.corners.mean(axis=1).T
     followed = np.abs(moved.off(k, x, y)) < np.pi / len(moved.vortices[k].charges)
     return SurfacePanel(surface.corners, np.where(surface.inside, 1 + followed, 0))
@@ -173,4 +158,4 @@ def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
 
 def _field(made: QuenchRuns, k: int) -> np.ndarray:
     assert made.fields is not None
-    return made.quench.equation.as_field(made.fields[:, k])
+    return made.equation.as_field(made.fields[:, k])

@@ -16,10 +16,8 @@ from eip_scipy.problems.gross_pitaevskii import ring_condensate
 from ..long_runs import positive
 from ..report import UsageError
 from ..study import Figures, Session, option
-from .runs import SHOWN, Motion, Quench, QuenchRuns, QuenchStudy
+from .runs import SHOWN, Motion, QuenchRuns, QuenchStudy
 from .states import cropped, kept_state, load_state, search_ring
-
-__all__ = ["Ring"]
 
 FRAMES_PER_SECOND = 8
 
@@ -29,16 +27,10 @@ class Ring(QuenchStudy):
     """Command ``eip-scipy gpe ring``.
 
     The tightened ring contracts, keeps its angular momentum, and so turns faster than the rotating frame, in which its
-    vortices turn anticlockwise: `sense` is 1, see `Quench`.
+    vortices turn anticlockwise: `sense` is 1.
 
-    Attributes
-    ----------
-    condensate : callable
-        ``condensate(kappa, points)`` returns the equation, see `ring_condensate`.
-    kappas : (float, float)
-        Values of kappa, which determines the trap, before and after the quench, the sudden change of the trap at t = 0.
-    saved : float
-        Time between two saved states.
+    ``condensate(kappa, points)`` returns the equation, see `ring_condensate`. `kappas` determine the trap before and
+    after the quench.
     """
 
     start: Path | None = option(
@@ -54,11 +46,12 @@ class Ring(QuenchStudy):
     condensate: Callable[[float, int], GrossPitaevskii] = ring_condensate
     points: int = 256
     kappas: tuple[float, float] = (0.3, 0.7)
+    stem: str = "ring"
     step: float = 2e-4
     reference_step: float = 5e-4
     saved: float = 0.02
     snapshots: tuple[float, ...] = (0.0, 0.24, 0.44, 0.72, 0.8, 1.0)
-    sense: int = 1
+    energy_kept: float = 1e-12
 
     def check_settings(self) -> None:
         """Raise an error if the run is shorter than a step of the reference."""
@@ -67,8 +60,9 @@ class Ring(QuenchStudy):
             raise UsageError(f"--t-end: expected at least {least}, got {self.t_end:g}")
         super().check_settings()
 
-    def arguments(self) -> dict[str, Any]:
-        return {"h": self.step, "t_end": self.t_end}
+    @property
+    def title(self) -> str:
+        return f"Ring, kappa = {self.kappas[0]:g} -> {self.kappas[1]:g}"
 
     def measure(self, session: Session) -> QuenchRuns:
         """Do all runs from the ground state.
@@ -80,30 +74,20 @@ class Ring(QuenchStudy):
             start = load_state(self.start, before)
         else:
             start = kept_state(self, session, before, partial(search_ring, self.seed))
-        quench = Quench(
-            name="ring",
-            title=f"Ring, kappa = {self.kappas[0]:g} -> {self.kappas[1]:g}",
-            problem=after.problem(start, self.t_end, self.step, name="ring"),
-            reference_step=self.reference_step,
-            interval=self.saved,
-            snapshots=self.snapshots,
-            sense=self.sense,
-            energy_kept=1e-12,
-        )
-        return self.do_runs(quench, session)
+        return self.do_runs(after, start, session)
 
     def pictures(self, found: QuenchRuns) -> Figures:
         """Draw density and vortices at the times `snapshots` and, if `movie`, at all saved times as a movie."""
         from ..plotting import fields_figure, fields_movie
 
-        quench, fields, moved = found.quench, found.fields, found.moved
+        fields, moved = found.fields, found.moved
         assert fields is not None
         assert moved is not None
-        every = _panels(quench.equation, fields, moved)
-        shown = {f"t = {moved.t[k]:.2f}": every[k] for k in quench.shown(moved.t)}
+        every = _panels(found.equation, fields, moved)
+        shown = {f"t = {moved.t[k]:.2f}": every[k] for k in self.shown(moved.t)}
         yield (
             "ring-snapshots.png",
-            fields_figure(shown, title=f"{quench.title}: density and vortices, {SHOWN}", shared=True),
+            fields_figure(shown, title=f"{self.title}: density and vortices, {SHOWN}", shared=True),
         )
         if self.movie:
             titles = [f"t = {t:.2f}" for t in moved.t]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,9 +19,7 @@ from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import Checkpoints, named
 from ..report import compact, describe_machine, table
-from ..study import Figures, PartlyDone, Rows, Session, Study, option
-
-__all__ = ["METHODS", "SHOWN", "FieldCheck", "FieldRun", "Motion", "Quench", "QuenchRuns", "QuenchStudy", "motion"]
+from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
 
 METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
 SHOWN = "EIP-ME"  # fields of this method are kept, for the figures
@@ -31,85 +30,18 @@ AXES = "seen from above, with x to the right and y up"
 SENSES = {1: "anticlockwise", -1: "clockwise"}
 
 
-class FieldCheck(NamedTuple):
-    """A check: its condition in words, the measured value, and whether it holds."""
-
-    what: str
-    value: Any
-    passed: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Quench:
-    """A condensate whose trap or rotation changes at t = 0, and the settings of its report.
-
-    Attributes
-    ----------
-    name : str
-        Stem of the names of the files.
-    title : str
-    problem : FieldProblem
-        Problem after the quench, with the step of RK4. It starts from the stationary state before the quench.
-    reference_step : float
-        Step of the reference, a run by EIPDOP853 with which the other runs are compared.
-    interval : float
-        Time between two saved states, short enough to follow the vortices.
-    snapshots : tuple of float
-        Times at which fields are drawn and vortices are counted.
-    sense : int
-        Direction in which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
-    energy_kept : float
-        Bound on the absolute error of the energy in runs that keep it.
-    """
-
-    name: str
-    title: str
-    problem: FieldProblem
-    reference_step: float
-    interval: float
-    snapshots: tuple[float, ...]
-    sense: int
-    energy_kept: float
-
-    @property
-    def equation(self) -> GrossPitaevskii:
-        """Return the equation after the quench."""
-        assert self.problem.equation is not None
-        return self.problem.equation
-
-    @property
-    def step(self) -> float:
-        """Return the step of RK4."""
-        assert self.problem.h is not None
-        return self.problem.h
-
-    @property
-    def t_end(self) -> float:
-        """Return the time at which the run ends."""
-        return self.problem.t_span[1]
-
-    def shown(self, t: np.ndarray) -> list[int]:
-        """Return the indices in the saved times `t` of those snapshots that the run has reached."""
-        return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
+def field_check(what: str, value: Any, passed: bool) -> Check:
+    """Return a check with its condition in words and the measured value."""
+    return Check(f"{what}: {_value(value)}", passed, {"what": what, "value": value, "passed": passed})
 
 
 @dataclass(frozen=True, eq=False)
 class FieldRun:
-    """One method's run.
+    """One method's run: saved times (m,), absolute errors (m,), seconds, and evaluations of the right-hand side.
 
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-        Saved times.
-    mass_error, energy_error, field_error : ndarray, shape (m,)
-        Absolute errors: of mass and energy the change since the start, of the field the norm of the difference from
-        the reference.
-    wall_time : float
-        Seconds spent in the run.
-    nfev : int
-        Number of evaluations of the right-hand side.
-    n_rank_reduced : int
-        Number of projections in which the gradients were parallel, as at a stationary state.
+    The errors of mass and energy are their changes since the start, that of the field is the norm of the difference
+    from the reference. `n_rank_reduced` is the number of projections in which the gradients were parallel, as at a
+    stationary state.
     """
 
     t: np.ndarray
@@ -123,44 +55,35 @@ class FieldRun:
 
 @dataclass(eq=False)
 class QuenchRuns:
-    """The runs of a quench: those of `METHODS` that were done.
+    """The runs of a quench: those of `METHODS` that were done, by name (`lines`).
 
-    Attributes
-    ----------
-    quench : Quench
-    lines : dict of str to FieldRun
-        The runs by the names of their methods.
-    reference, fields : ndarray, shape (n, m), or None
-        States of the reference, and of the method `SHOWN`, whose fields are drawn.
-    moved : Motion or None
-        The vortices in the run of `SHOWN`.
-    more : list of FieldCheck
-        Checks in addition to those of all quenches.
-    notes : list of str
-        Lines for the head of the table.
+    `problem` is the one after the quench, with the step of RK4; it starts from the stationary state before the quench.
+    `reference` and `fields` are the states (n, m) of the reference and of the method `SHOWN`, whose fields are drawn,
+    and `moved` are the vortices in the run of `SHOWN`. `more` are checks in addition to those of all quenches, and
+    `notes` lines for the head of the table.
     """
 
-    quench: Quench
+    problem: FieldProblem
     lines: dict[str, FieldRun] = field(default_factory=dict)
     reference: np.ndarray | None = None
     fields: np.ndarray | None = None
     moved: Motion | None = None
-    more: list[FieldCheck] = field(default_factory=list)
+    more: list[Check] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def equation(self) -> GrossPitaevskii:
+        """Return the equation after the quench."""
+        assert self.problem.equation is not None
+        return self.problem.equation
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The vortices in time; in three dimensions their positions in the middle plane.
+    """The vortices at the times `t` (m,); in three dimensions their positions in the middle plane.
 
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-    vortices : list of Vortices
-        One entry for each time.
-    angle : ndarray, shape (m,)
-        Angle by which the vortices have turned about the centre since the start, positive anticlockwise [rad]: the sum
-        of the medians of their turns from one state to the next.
+    `angle` (m,) is the angle by which the vortices have turned about the centre since the start, positive anticlockwise
+    [rad]: the sum of the medians of their turns from one state to the next.
     """
 
     t: np.ndarray
@@ -182,32 +105,7 @@ class Motion:
         return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
 
 
-def _run(
-    quench: Quench,
-    progress: bool,
-    checkpoint_of: Callable[[str], dict[str, Any]],
-    name: str,
-    method: type[EIPSolver],
-    h: float,
-    invariants: Sequence[str],
-) -> Any:
-    chosen = quench.equation.invariants(invariants)
-    run = integrate(
-        quench.problem,
-        method=named(method, name),
-        h=h,
-        invariants=chosen,
-        save_every=round(quench.interval / h),
-        progress=progress,
-        **checkpoint_of(name),
-    )
-    if not run.success:
-        raise RuntimeError(f"{name} failed: {run.message}")
-    return run
-
-
-def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
-    gpe = quench.equation
+def _line(gpe: GrossPitaevskii, run: Any, reference: np.ndarray) -> FieldRun:
     mass, energy = (np.array([value(y) for y in run.y.T]) for value in (gpe.mass, gpe.energy))
     difference = np.sqrt([gpe.mass(y - tight) for y, tight in zip(run.y.T, reference.T, strict=True)])
     errors = np.abs(mass - mass[0]), np.abs(energy - energy[0])
@@ -215,20 +113,10 @@ def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
 
 
 def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
-    """Find the vortices in all states, and the angle by which they have turned.
+    """Find the vortices in all states `fields` (n, m) at the times `t` (m,), and the angle by which they have turned.
 
     From one state to the next, the angle of each vortex is extrapolated and matched with the nearest one; the angle of
     `Motion` increases by the median of the turns.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-    t : ndarray, shape (m,)
-    fields : ndarray, shape (n, m)
-
-    Returns
-    -------
-    Motion
     """
     found = [vortices(gpe, y) for y in fields.T]
     angles = [np.arctan2(*v.positions.T[::-1]) for v in found]
@@ -251,61 +139,6 @@ def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
     return guess + float(np.median(difference[np.arange(old.size), nearest]))
 
 
-def _checks(made: QuenchRuns) -> list[FieldCheck]:
-    """Check that vortices keep their number and turn as expected, and that each preserved invariant is kept."""
-    found, quench, moved = [], made.quench, made.moved
-    if moved is not None:
-        at = quench.shown(moved.t)
-        counts = [len(moved.vortices[k].charges) for k in at]
-        found.append(FieldCheck("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
-        if len(at) > 1:
-            turned = float(moved.angle[at[-1]])
-            sense = f"vortices turn {SENSES[quench.sense]}, angle at t = {moved.t[at[-1]]:g} [rad]"
-            found.append(FieldCheck(sense, turned, quench.sense * turned > 0))
-    for name, line in made.lines.items():
-        for item, bound in (("mass", MASS_KEPT), ("energy", quench.energy_kept)):
-            if item in METHODS[name]:
-                error = float(getattr(line, f"{item}_error").max())
-                found.append(FieldCheck(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
-    return found
-
-
-def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
-    """Return the errors, the vortices and the checks as text."""
-    quench, moved = made.quench, made.moved
-    head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
-    head += [["error of", "psi"], ["rank", "reduced"]]
-    body = [(name, _cells(line)) for name, line in made.lines.items()]
-    out = [
-        f"{quench.title}, RK4, h = {quench.step:g}, to t = {quench.t_end:g}",
-        describe_machine(),
-        f"Largest errors, absolute; that of psi is the norm of the difference from {REFERENCE}, "
-        f"h = {quench.reference_step:g}",
-        *made.notes,
-        "",
-        table(head, body),
-        "",
-    ]
-    if moved is not None:
-        where = [
-            (f"t = {moved.t[k]:.2f}", [str(len(v.charges)), _radius(v), f"{moved.angle[k]:+.3f}"])
-            for k in quench.shown(moved.t)
-            for v in (moved.vortices[k],)
-        ]
-        out += [
-            f"Vortices, in the rotating frame; turned: positive anticlockwise, {AXES}",
-            "",
-            table([["number"], ["mean radius"], ["turned [rad]"]], where),
-            "",
-        ]
-    for item in found:
-        out.append(f"{'ok' if item.passed else 'FAILED':<6} {item.what}: {_value(item.value)}")
-    if moved is not None and len(quench.shown(moved.t)) < 2:
-        before = f"the run ends before t = {quench.snapshots[1]:g}"
-        out.append(f"{'-':<6} not checked: in which sense the vortices turn, for {before}")
-    return "\n".join(out)
-
-
 def _value(value: Any) -> str:
     """Format the value of a check: floats below `SMALL`, which are errors, with 3 digits, other floats with 6."""
     if isinstance(value, float):
@@ -324,27 +157,51 @@ def _radius(found: Vortices) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class QuenchStudy(Checkpoints, Study[QuenchRuns]):
-    """Base class of the commands on quenches."""
+    """Base class of the commands on condensates whose trap or rotation changes at t = 0, a quench.
+
+    `stem` is that of the names of the files. The runs by RK4 have the step `step`; the reference, with which they are
+    compared, is a run by EIPDOP853 with `reference_step`. `saved` is the time between two saved states, short enough to
+    follow the vortices. At the times `snapshots` fields are drawn and vortices are counted. `sense` is the direction in
+    which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise. `energy_kept` is the bound on the
+    absolute error of the energy in runs that keep it.
+    """
 
     seed: int = option(0, "seed of the random starts (default: %(default)s)", type=int, metavar="N")
+    if TYPE_CHECKING:
+        t_end: float
+    stem: str = ""
+    step: float = math.nan
+    reference_step: float = math.nan
+    saved: float = math.nan
+    snapshots: tuple[float, ...] = ()
+    sense: int = 1
+    energy_kept: float = math.nan
 
-    def do_runs(self, quench: Quench, session: Session) -> QuenchRuns:
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """Return the title of the table and the figures."""
+
+    def arguments(self) -> dict[str, Any]:
+        return {"h": self.step, "t_end": self.t_end}
+
+    def shown(self, t: np.ndarray) -> list[int]:
+        """Return the indices in the saved times `t` of those snapshots that the run has reached."""
+        return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
+
+    def do_runs(self, gpe: GrossPitaevskii, start: np.ndarray, session: Session) -> QuenchRuns:
         """Run the reference and each of `METHODS`, and follow the vortices in the run of `SHOWN`.
 
-        Raises
-        ------
-        RuntimeError
-            If a run fails.
-        PartlyDone
-            If the user interrupts the runs after at least one of `METHODS` is completed; the error holds these.
+        `gpe` is the equation after the quench, and `start` the stationary state before it. A RuntimeError is raised if
+        a run fails, and PartlyDone with the completed runs if the user interrupts them after at least one of `METHODS`.
         """
-        made = QuenchRuns(quench)
-        run = partial(_run, quench, session.shown, self.checkpoint_options)
+        made = QuenchRuns(gpe.problem(start, self.t_end, self.step, name=self.stem))
+        run = partial(self._run, made, session.shown)
         try:
-            made.reference = run(REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN]).y
+            made.reference = run(REFERENCE, EIPDOP853, self.reference_step, METHODS[SHOWN]).y
             for name, invariants in METHODS.items():
-                done = run(name, EIPRK4, quench.step, invariants)
-                made.lines[name] = _line(quench, done, made.reference)
+                done = run(name, EIPRK4, self.step, invariants)
+                made.lines[name] = _line(gpe, done, made.reference)
                 if name == SHOWN:
                     made.fields = done.y
         except KeyboardInterrupt:
@@ -355,21 +212,81 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         made.moved = _moved(made)
         return made
 
-    def text(self, found: QuenchRuns) -> str:
-        return _text(found, self.checks(found))
+    def _run(
+        self, made: QuenchRuns, progress: bool, name: str, method: type[EIPSolver], h: float, kept: Sequence[str]
+    ) -> Any:
+        run = integrate(
+            made.problem,
+            method=named(method, name),
+            h=h,
+            invariants=made.equation.invariants(kept),
+            save_every=round(self.saved / h),
+            progress=progress,
+            **self.checkpoint_options(name),
+        )
+        if not run.success:
+            raise RuntimeError(f"{name} failed: {run.message}")
+        return run
 
-    def checks(self, found: QuenchRuns) -> list[FieldCheck]:
-        return [*_checks(found), *found.more]
+    def checks(self, found: QuenchRuns) -> list[Check]:
+        """Check that vortices keep their number and turn as expected, and that each preserved invariant is kept."""
+        checks, moved = [], found.moved
+        if moved is not None:
+            at = self.shown(moved.t)
+            counts = [len(moved.vortices[k].charges) for k in at]
+            checks.append(field_check("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
+            if len(at) > 1:
+                turned = float(moved.angle[at[-1]])
+                sense = f"vortices turn {SENSES[self.sense]}, angle at t = {moved.t[at[-1]]:g} [rad]"
+                checks.append(field_check(sense, turned, self.sense * turned > 0))
+        for name, line in found.lines.items():
+            for item, bound in (("mass", MASS_KEPT), ("energy", self.energy_kept)):
+                if item in METHODS[name]:
+                    error = float(getattr(line, f"{item}_error").max())
+                    checks.append(field_check(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
+        return [*checks, *found.more]
+
+    def text(self, found: QuenchRuns) -> str:
+        moved = found.moved
+        head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
+        head += [["error of", "psi"], ["rank", "reduced"]]
+        out = [
+            f"{self.title}, RK4, h = {self.step:g}, to t = {self.t_end:g}",
+            describe_machine(),
+            f"Largest errors, absolute; that of psi is the norm of the difference from {REFERENCE}, "
+            f"h = {self.reference_step:g}",
+            *found.notes,
+            "",
+            table(head, [(name, _cells(line)) for name, line in found.lines.items()]),
+            "",
+        ]
+        if moved is not None:
+            where = [
+                (f"t = {moved.t[k]:.2f}", [str(len(v.charges)), _radius(v), f"{moved.angle[k]:+.3f}"])
+                for k in self.shown(moved.t)
+                for v in (moved.vortices[k],)
+            ]
+            out += [
+                f"Vortices, in the rotating frame; turned: positive anticlockwise, {AXES}",
+                "",
+                table([["number"], ["mean radius"], ["turned [rad]"]], where),
+                "",
+            ]
+        out += [check.line for check in self.checks(found)]
+        if moved is not None and len(self.shown(moved.t)) < 2:
+            before = f"the run ends before t = {self.snapshots[1]:g}"
+            out.append(f"{'-':<6} not checked: in which sense the vortices turn, for {before}")
+        return "\n".join(out)
 
     def tables(self, found: QuenchRuns) -> dict[str, Rows]:
-        return {f"{found.quench.name}.csv": _rows(found)}
+        return {f"{self.stem}.csv": _rows(found)}
 
     def numbers(self, found: QuenchRuns) -> dict[str, Any]:
         numbers: dict[str, Any] = {
             "errors": _rows(found),
             "wall_time_s": {name: line.wall_time for name, line in found.lines.items()},
             "rank_reduced": {name: line.n_rank_reduced for name, line in found.lines.items()},
-            "checks": [check._asdict() for check in self.checks(found)],
+            "checks": [check.entry for check in self.checks(found)],
         }
         if found.moved is not None:
             numbers |= {"vortices": [len(v.charges) for v in found.moved.vortices], "turned_rad": found.moved.angle}
@@ -379,17 +296,17 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         """Draw the errors against time, and the fields (see `pictures`)."""
         from ..plotting import ErrorSeries, errors_figure
 
-        quench = found.quench
-        mass, energy = (abs(value(quench.problem.y0)) for value in (quench.equation.mass, quench.equation.energy))
+        start = found.problem.y0
+        mass, energy = abs(found.equation.mass(start)), abs(found.equation.energy(start))
         series = {
             name: ErrorSeries(
                 line.t, {"mass": line.mass_error / mass, "energy": line.energy_error / energy}, line.field_error
             )
             for name, line in found.lines.items()
         }
-        title = f"{quench.title}, RK4, h = {quench.step:g}"
+        title = f"{self.title}, RK4, h = {self.step:g}"
         figure = errors_figure(series, time="t", trajectory=r"error of $\psi$ (norm)", title=title)
-        yield f"{quench.name}-errors.png", figure
+        yield f"{self.stem}-errors.png", figure
         yield from self.pictures(found)
 
     @abstractmethod
@@ -398,19 +315,14 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
 
 
 def _moved(made: QuenchRuns) -> Motion | None:
-    return None if made.fields is None else motion(made.quench.equation, made.lines[SHOWN].t, made.fields)
+    return None if made.fields is None else motion(made.equation, made.lines[SHOWN].t, made.fields)
 
 
 def _rows(made: QuenchRuns) -> Rows:
     """Make the lines of the CSV file."""
+    names = ("t", "mass_error", "energy_error", "field_error")
     return [
-        {
-            "method": name,
-            "t": line.t[k],
-            "mass_error": line.mass_error[k],
-            "energy_error": line.energy_error[k],
-            "field_error": line.field_error[k],
-        }
-        for name, line in made.lines.items()
+        {"method": method, **{name: getattr(line, name)[k] for name in names}}
+        for method, line in made.lines.items()
         for k in range(line.t.size)
     ]

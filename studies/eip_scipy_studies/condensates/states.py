@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,27 +26,9 @@ from eip_scipy.problems.gross_pitaevskii import (
     with_noise,
 )
 
-from ..long_runs import Checkpoints
+from ..long_runs import Checkpoints, number
 from ..report import UsageError, compact, describe_machine, table, write_file
-from ..study import Figures, Rows, Session, Study, option, some_of
-
-__all__ = [
-    "LINES",
-    "LINES_ENERGY",
-    "SADDLE_ENERGY",
-    "SADDLE_LINES",
-    "SCENES",
-    "Found",
-    "GroundStates",
-    "KnownState",
-    "kept_state",
-    "leave_saddle",
-    "load_state",
-    "save_state",
-    "search_ring",
-    "search_saddle",
-    "searching",
-]
+from ..study import Check, Figures, Rows, Session, Study, option, some_of
 
 # V = r^2 / 2, beta = 100: angular velocity and published energy.
 PUBLISHED = {0.0: 3.9459469, 0.65: 3.6506129, 0.71: 3.4997148, 0.76: 3.3475310, 0.80: 3.1904172}
@@ -58,6 +39,7 @@ RING_POINTS, LINE_POINTS = 256, 64
 TRAP_TOLERANCE, RING_TOLERANCE, LINES_TOLERANCE, SADDLE_TOLERANCE = 1e-6, 1e-8, 1e-5, 1e-8
 MOST_LINES, LINES_RADIUS, LINES_ITERATIONS = 4, 1.5, 1000
 VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the margin around it
+COUNT = number("an integer >= 1", lambda value: value >= 1, int)
 Update = Callable[[str], Any]
 Ends = tuple[float, float, float, float]
 
@@ -66,14 +48,8 @@ Ends = tuple[float, float, float, float]
 class Found:
     """A stationary state, and the start from which it was found.
 
-    Attributes
-    ----------
-    label : str
-        Property that distinguishes the start or, in the trap, the equation from the others; heads a row of the table.
-    equation : GrossPitaevskii
-    state : GroundState
-    published : float or None
-        Published energy.
+    `label` is the property that distinguishes the start or, in the trap, the equation from the others; it heads a row
+    of the table. `published` is the published energy, if there is one.
     """
 
     label: str
@@ -176,37 +152,10 @@ TITLES = {
 Results = dict[str, list[Found]]
 
 
-class KnownState(NamedTuple):
-    """Check of a quantity of a state: its known value, the computed one (`ours`), and whether the check `passed`."""
-
-    quantity: str
-    known: float
-    ours: float
-    passed: bool
-    note: str = ""
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """Return the entry for the JSON file."""
-        known = {"quantity": self.quantity, "known": self.known, "ours": self.ours}
-        return {**known, "matched": self.passed, "note": self.note}
-
-    @property
-    def line(self) -> str:
-        """Return the check as a line of text."""
-        note = f" ({self.note})" if self.note else ""
-        verdict = "ok" if self.passed else "FAILED"
-        return f"{verdict:<6} {self.quantity} {self.known:.10g}, ours {self.ours:.10g}{note}"
-
-
-def _count(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected an integer >= 1, got {text!r}")
-    return value
+def _known(quantity: str, known: float, ours: float, matched: bool, note: str = "") -> Check:
+    """Return the check of a quantity of a state, whose known value is `known`."""
+    text = f"{quantity} {known:.10g}, ours {ours:.10g}{f' ({note})' if note else ''}"
+    return Check(text, matched, {"quantity": quantity, "known": known, "ours": ours, "matched": matched, "note": note})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +168,10 @@ class GroundStates(Study[Results]):
 
     scene: Sequence[str] | None = some_of("scene", SCENES)
     starts: int = option(
-        4, "starts for each angular velocity in the trap (default: %(default)s)", type=_count, metavar="N"
+        4,
+        "starts for each angular velocity in the trap (default: %(default)s)",
+        type=COUNT,
+        metavar="N",
     )
     seed: int = option(0, "seed of the random starts (default: %(default)s)", type=int, metavar="N")
     scenes: Mapping[str, Scene] = field(default_factory=lambda: SCENES)
@@ -233,7 +185,7 @@ class GroundStates(Study[Results]):
         with searching(session) as update:
             return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
 
-    def checks(self, found: Results) -> list[KnownState]:
+    def checks(self, found: Results) -> list[Check]:
         """Compare energies and numbers of vortex lines with known ones.
 
         In the trap, a lower energy than the published one is not a failure.
@@ -243,19 +195,19 @@ class GroundStates(Study[Results]):
             known, ours = self.published[item.equation.Omega], item.state.energy
             below = ours < known - PUBLISHED_DIGITS
             matched = item.state.converged and (below or abs(ours - known) <= PUBLISHED_DIGITS)
-            checks.append(KnownState(f"trap, {item.label}: E", known, ours, matched, "lower" if below else ""))
+            checks.append(_known(f"trap, {item.label}: E", known, ours, matched, "lower" if below else ""))
         for item in found.get("ring", ()):
             good = item.state.converged and item.state.energy <= RING_ENERGY
-            checks.append(KnownState("ring: E at most", RING_ENERGY, item.state.energy, good))
+            checks.append(_known("ring: E at most", RING_ENERGY, item.state.energy, good))
         if "lines" in found:
             best = min(found["lines"], key=lambda item: item.state.energy)
             good = best.state.converged and abs(best.state.energy - LINES_ENERGY) < 1e-4
-            checks.append(KnownState("lines: lowest E", LINES_ENERGY, best.state.energy, good))
-            checks.append(KnownState("lines: of the lowest", LINES, best.count, best.count == LINES))
+            checks.append(_known("lines: lowest E", LINES_ENERGY, best.state.energy, good))
+            checks.append(_known("lines: of the lowest", LINES, best.count, best.count == LINES))
             saddle = found["lines"][-1]
             good = saddle.state.converged and abs(saddle.state.energy - SADDLE_ENERGY) < 1e-4
-            checks.append(KnownState("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
-            checks.append(KnownState("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
+            checks.append(_known("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
+            checks.append(_known("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
         return checks
 
     def text(self, found: Results) -> str:
@@ -274,7 +226,7 @@ class GroundStates(Study[Results]):
         return {"ground-states.csv": _rows(found)}
 
     def numbers(self, found: Results) -> dict[str, Any]:
-        return {"states": _rows(found), "checks": [check.record for check in self.checks(found)]}
+        return {"states": _rows(found), "checks": [check.entry for check in self.checks(found)]}
 
     def figures(self, found: Results) -> Figures:
         """Write the lowest states of the ring and of the lines as npz files, and draw densities and vortices.
@@ -404,17 +356,7 @@ def kept_state(
 ) -> np.ndarray:
     """Return the initial field: with ``--resume`` the one in the folder of the checkpoints, else that of `search`.
 
-    Parameters
-    ----------
-    settings : Checkpoints
-    session : Session
-    gpe : GrossPitaevskii
-    search : callable
-        ``search(update)`` returns the state; `update` takes the words to be shown.
-
-    Returns
-    -------
-    ndarray, shape (J, K[, L])
+    ``search(update)`` returns the state; `update` takes the words to be shown.
     """
     kept = None if settings.checkpoint is None else settings.checkpoint / "state.npz"
     if kept is not None and settings.resume and kept.exists():
@@ -429,10 +371,7 @@ def kept_state(
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
     """Read the field of a state that `save_state` has written, which must belong to `gpe`.
 
-    Raises
-    ------
-    UsageError
-        If the file cannot be read, or holds a state of another grid or equation.
+    A UsageError is raised if the file cannot be read, or holds a state of another grid or equation.
     """
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:

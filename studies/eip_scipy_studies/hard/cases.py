@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,15 +16,14 @@ from eip_scipy.solvers import EIPSolver
 
 from ..hard_cases import HardCase, hard_cases
 from ..listing import METRICS, fixed_step_methods
-from ..long_runs import named
+from ..long_runs import named, number
 from ..report import compact, table
 from ..study import Check, Figures, Rows, Session, Study, option
-
-__all__ = ["CaseOutcome", "Comparison", "HardCases", "adaptive_methods", "bars", "compare"]
 
 TOLERANCES = {"EIPDOP853": 1e-9}
 USUAL_TOLERANCE = 1e-6
 ATOL_PER_RTOL = 1e-3
+TOLERANCE = number("a number from 1e-13 to 0.1", lambda value: 1e-13 <= value <= 0.1)
 
 # Bounds, set for one tolerance of two methods; the last three for the error metric only.
 SETTINGS = {("EIPRK45", 1e-6), ("EIPDOP853", 1e-9)}
@@ -55,20 +53,13 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """Result of one run.
+    """Result of one run; `failure` is the reason why it did not reach its end, empty if it did.
 
-    Attributes
-    ----------
-    error : float
-        Relative error of the final state, see `HardCase.error`; nan for a run that did not reach the end.
-    drift : float
-        Largest relative change of an invariant, see `HardCase.drift`; nan for a run that raised an error.
-    steps, nfev : int
-        Numbers of steps and of evaluations of the right-hand side; 0 for a run that raised an error.
-    failure : str
-        Reason why the run did not reach its end; empty if it did.
-    rank_reduced, rejected_projections : int
-        Numbers of projections with linearly dependent gradients, and of projections that failed.
+    `error` is the relative error of the final state, see `HardCase.error`, nan for a run that did not reach the end.
+    `drift` is the largest relative change of an invariant, see `HardCase.drift`. For a run that raised an error it is
+    nan, and the numbers of steps and evaluations of the right-hand side are 0. `rank_reduced` and
+    `rejected_projections` are the numbers of projections with linearly dependent gradients, and of projections that
+    failed.
     """
 
     error: float
@@ -84,13 +75,8 @@ class CaseOutcome:
 class Comparison:
     """A case without and with projection.
 
-    Attributes
-    ----------
-    case : HardCase
-    plain, projected : CaseOutcome
-    nearby : tuple of float
-        For a case that gets worse by projection, three values of `gain`: at rtol times sqrt(10), at rtol divided by
-        sqrt(10), and at rtol with the euclidean metric. Empty for other cases.
+    For a case that gets worse by projection, `nearby` has three values of `gain`: at rtol times sqrt(10), at rtol
+    divided by sqrt(10), and at rtol with the euclidean metric.
     """
 
     case: HardCase
@@ -117,31 +103,10 @@ def adaptive_methods() -> dict[str, type[EIPSolver]]:
     }
 
 
-def _tolerance(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 1e-13 <= value <= 0.1:
-        raise argparse.ArgumentTypeError(f"expected a number from 1e-13 to 0.1, got {text!r}")
-    return value
-
-
 def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | None) -> CaseOutcome:
-    """Run one case with one method.
+    """Run one case with one method; the `metric` None means no projection.
 
-    Parameters
-    ----------
-    case : HardCase
-    method : type
-    rtol : float
-    metric : str or None
-        Metric of the projection; None: no projection.
-
-    Returns
-    -------
-    CaseOutcome
-        A run that raises an error is returned as well, with the error as its `failure`.
+    A run that raises an error is returned as well, with the error as its `failure`.
     """
     problem, record = case.problem, Diagnostics()
     options: dict[str, Any] = {} if metric is None else {"invariants": problem.invariants, "metric": metric}
@@ -181,22 +146,9 @@ def compare(
     metric: str,
     callback: Callable[[], Any] = lambda: None,
 ) -> list[Comparison]:
-    """Run cases with and without projection.
+    """Run cases with and without projection, and call `callback()` after each case.
 
     A case whose error the projection increases is also run at neighbouring tolerances and in the euclidean metric.
-
-    Parameters
-    ----------
-    cases : iterable of HardCase
-    method : type
-    rtol : float
-    metric : {"error", "euclidean"}
-    callback : callable, optional
-        ``callback()`` after each case.
-
-    Returns
-    -------
-    list of Comparison
     """
     done = []
     for case in cases:
@@ -234,19 +186,8 @@ def summary(results: Sequence[Comparison]) -> dict[str, Any]:
 def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -> list[Check]:
     """Check the results against bars: bounds on the number of failures, the drift and the errors.
 
-    Bars on drift and errors are set for EIPRK45 at rtol = 1e-6 and EIPDOP853 at 1e-9 only.
-
-    Parameters
-    ----------
-    results : sequence of Comparison
-    method : str
-    rtol : float
-    metric : {"error", "euclidean"}
-        Bars on errors are set for "error".
-
-    Returns
-    -------
-    list of Check
+    Bars on drift and errors are set for EIPRK45 at rtol = 1e-6 and EIPDOP853 at 1e-9 only, those on errors for the
+    metric "error".
     """
     known = summary(results)
     found = [Check(f"every run with projection reaches its end: {known['n_failed']} did not", known["n_failed"] == 0)]
@@ -389,7 +330,9 @@ class HardCases(Study[list[Comparison]]):
 
     method: str = option("EIPRK45", "the adaptive method (default: %(default)s)", choices=list(adaptive_methods()))
     rtol: float | None = option(
-        None, "relative tolerance (default: 1e-9 for EIPDOP853, else 1e-6); atol is 0.001 of it", type=_tolerance
+        None,
+        "relative tolerance (default: 1e-9 for EIPDOP853, else 1e-6); atol is 0.001 of it",
+        type=TOLERANCE,
     )
     metric: str = option("error", "metric of the projection (default: %(default)s)", choices=METRICS)
     cases: Sequence[HardCase] = field(default_factory=hard_cases)
@@ -422,7 +365,7 @@ class HardCases(Study[list[Comparison]]):
         return {f"{self._stem}.csv": rows(found)}
 
     def numbers(self, found: list[Comparison]) -> dict[str, Any]:
-        checks = [check._asdict() for check in self.checks(found)]
+        checks = [check.entry for check in self.checks(found)]
         return {"cases": rows(found), "summary": summary(found), "checks": checks}
 
     def figures(self, found: list[Comparison]) -> Figures:

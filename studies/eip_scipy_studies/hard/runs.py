@@ -31,9 +31,7 @@ from eip_scipy.problems import (
 from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import named
-from ..work_precision import work_precision
-
-__all__ = ["SCENES", "Contender", "HardScene", "Outcome", "Point", "Spread", "measure", "methods", "scene"]
+from ..work_precision import known_end, work_precision
 
 # Settings of IAS15, by its step criterion; each starts where the steps are about as long as its corrector can handle.
 EPSILONS = {"prs23": (1e-4, 1e-5, 1e-6, 1e-7, 1e-9), "global": (1e-2, 1e-3, 1e-4, 1e-6, 1e-9)}
@@ -48,17 +46,10 @@ FAR = 1e6
 class Spread:
     """Settings of all methods, from coarse to fine, and the number of repeats.
 
-    Attributes
-    ----------
-    tolerances : tuple of float
-        Relative tolerances of the adaptive methods.
-    steps_per_turn : tuple of int
-        Steps per turn of the orbit in fictitious time (see `time_transformed`).
-    epsilons : mapping of str to tuple of float
-        Tolerances of IAS15, by its step criterion.
-    repeats : int
-        Maximum number of timed runs of each point, of which the least time counts; long runs are repeated less. A short
-        run is timed often, so that one of them fits between two disturbances by other processes.
+    `tolerances` are the relative ones of the adaptive methods, `steps_per_turn` the steps per turn of the orbit in
+    fictitious time (see `time_transformed`), and `epsilons` the tolerances of IAS15 by its step criterion. Each point
+    is timed at most `repeats` times, of which the least time counts; long runs are repeated less. A short run is timed
+    often, so that one of them fits between two disturbances by other processes.
     """
 
     tolerances: tuple[float, ...] = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -71,16 +62,9 @@ class Spread:
 class HardScene:
     """A problem with a known state at its end, and the data that the methods need.
 
-    Attributes
-    ----------
-    name, title : str
-    problem : Problem
-    g : callable
-        Time per unit of fictitious time, as a function of the state; see `time_transformed`.
-    steps : tuple of int
-        Numbers of fixed steps in the whole run, for EIPRKN12.
-    level : float
-        Error at which costs are compared: sufficient for a user, and reached by most methods.
+    `g` is the time per unit of fictitious time, as a function of the state; see `time_transformed`. `steps` are numbers
+    of fixed steps in the whole run, for EIPRKN12. `level` is the error at which costs are compared: sufficient for a
+    user, and reached by most methods.
     """
 
     name: str
@@ -93,10 +77,7 @@ class HardScene:
     @property
     def end(self) -> np.ndarray:
         """Return the exact state at the end."""
-        assert self.problem.reference is not None
-        state = self.problem.reference(self.problem.t_span[1])
-        assert state is not None
-        return state
+        return known_end(self.problem)
 
     @property
     def dimensions(self) -> int:
@@ -186,18 +167,9 @@ def scene(name: str) -> HardScene:
 
 
 class Outcome(NamedTuple):
-    """Result of one run.
+    """Result of one run: saved states (n, m), the last one at the end, evaluations, seconds, reason for a failure.
 
-    Attributes
-    ----------
-    y : ndarray, shape (n, m)
-        Saved states, the last at the end.
-    nfev : int
-        Number of evaluations of the right-hand side; 0 for IAS15 unless `look` of `Contender.run` is true.
-    wall_time : float
-        Seconds.
-    failure : str
-        Reason why the run did not reach its end; empty if it did.
+    `nfev` is 0 for IAS15 unless `look` of `Contender.run` is true. `failure` is empty if the run reached its end.
     """
 
     y: np.ndarray
@@ -207,17 +179,10 @@ class Outcome(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """A method with its settings for one problem.
+    """A method with its settings for one problem, from coarse to fine.
 
-    Attributes
-    ----------
-    setting : str
-        Name of the setting: "rtol", "h", "ds" (a step of fictitious time) or "epsilon" (of IAS15).
-    settings : tuple of float
-        Values of the setting, from coarse to fine.
-    run : callable
-        ``run(setting, look) -> Outcome``; if `look` is true, the states of all steps are saved, and the time is
-        meaningless.
+    `setting` is their name: "rtol", "h", "ds" (a step of fictitious time) or "epsilon" (of IAS15). ``run(setting,
+    look)`` returns an `Outcome`; if `look` is true, the states of all steps are saved, and the time is meaningless.
     """
 
     setting: str
@@ -226,23 +191,11 @@ class Contender(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Result of a method on a problem at one setting.
+    """Result of a method on a problem at one setting, whose name and value are `setting` and `value`.
 
-    Attributes
-    ----------
-    scene, method, setting : str
-        Names of the problem, of the method, and of the setting (see `Contender`).
-    value : float
-        Value of the setting.
-    nfev : int
-        Number of evaluations of the right-hand side.
-    wall_time : float
-        Seconds, the least of several runs.
-    error : float
-        Largest distance of a body from its true position at the end; nan if the run failed.
-    energy_error, momentum_error : float
-        Largest error along the run, see `HardScene.invariant_errors`.
-    failure : str
+    `wall_time` is the least of several runs in seconds. `error` is the largest distance of a body from its true
+    position at the end, nan if the run failed; `energy_error` and `momentum_error` are those of
+    `HardScene.invariant_errors`.
     """
 
     scene: str
@@ -260,17 +213,8 @@ class Point(NamedTuple):
 def methods(of: HardScene, spread: Spread, rebound: Any = None) -> dict[str, Contender]:
     """Return the methods for a problem, by their names.
 
-    Parameters
-    ----------
-    of : HardScene
-    spread : Spread
-    rebound : module, optional
-        `eip_scipy.integrations.rebound`; without it there is no IAS15.
-
-    Returns
-    -------
-    dict of str to Contender
-        "DOP853" is EIPDOP853 without invariants, which is SciPy's DOP853 compiled.
+    `rebound` is `eip_scipy.integrations.rebound`; without it there is no IAS15. "DOP853" is EIPDOP853 without
+    invariants, which is SciPy's DOP853 compiled.
     """
     transformed, end = time_transformed(of.problem, FAR, of.g), reaches(of.problem.t_span[1])
     in_s = tuple(2 * math.pi / n for n in spread.steps_per_turn)
@@ -292,20 +236,10 @@ def methods(of: HardScene, spread: Spread, rebound: Any = None) -> dict[str, Con
 def measure(
     of: HardScene, spread: Spread, rebound: Any = None, callback: Callable[[], Any] = lambda: None
 ) -> list[Point]:
-    """Run all methods on a problem.
+    """Run all methods on a problem; `rebound` is as for `methods`.
 
-    Parameters
-    ----------
-    of : HardScene
-    spread : Spread
-    rebound : module, optional
-    callback : callable, optional
-        ``callback()`` is called once for each of the ``spread.repeats`` runs of each method at each setting, also for
-        runs that are left out.
-
-    Returns
-    -------
-    list of Point
+    ``callback()`` is called once for each of the ``spread.repeats`` runs of each method at each setting, also for runs
+    that are left out.
     """
     contenders = methods(of, spread, rebound)
     failures: dict[tuple[str, float], str] = {}

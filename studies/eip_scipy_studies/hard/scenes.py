@@ -13,8 +13,6 @@ from ..study import Figures, Rows, Session, Study, some_of
 from ..work_precision import cost_to_reach, curves
 from .runs import ATOL_PER_RTOL, SCENES, HardScene, Point, Spread, measure, methods, scene
 
-__all__ = ["Found", "HardScenes"]
-
 Results = dict[str, tuple[HardScene, list[Point]]]
 
 

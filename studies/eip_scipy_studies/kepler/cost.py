@@ -19,8 +19,6 @@ from ..report import compact, table
 from ..study import Figures, Rows, Session, Study
 from ..work_precision import Curve, Runner, cost_to_reach, costs_at, curves, work_precision
 
-__all__ = ["Found", "KeplerCost", "KeplerPoint"]
-
 FIXED: dict[type[EIPSolver], tuple[int, ...]] = {
     # Numbers of steps in the whole run.
     EIPRK2: (10_000, 30_000, 100_000, 300_000, 1_000_000),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,7 @@ from eip_scipy.problems import kepler
 from eip_scipy.solvers import EIPSolver
 
 from ..report import compact, table
-from ..study import Figures, Rows, Session, Study
-
-__all__ = ["KeplerFigures", "KeplerRun", "KnownValue"]
+from ..study import Check, Figures, Rows, Session, Study
 
 STEP = 0.03
 ORBIT_END = 100.0
@@ -43,14 +41,9 @@ KNOWN = (
 
 @dataclass(frozen=True, eq=False)
 class KeplerRun:
-    """One method's run, saved at each step.
+    """One method's run, saved at each step: times (m,), states (4, m) and absolute errors (m,).
 
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-    y : ndarray, shape (4, m)
-    energy_error, momentum_error, position_error : ndarray, shape (m,)
-        Absolute errors; that of the position is the distance from the reference.
+    The error of the position is its distance from the reference.
     """
 
     t: np.ndarray
@@ -59,25 +52,10 @@ class KeplerRun:
     momentum_error: np.ndarray
     position_error: np.ndarray
 
-
-class KnownValue(NamedTuple):
-    """Check of an error: the value that is known to two digits, and the measured one (`ours`)."""
-
-    method: str
-    quantity: str
-    known: str
-    ours: float
-
     @property
-    def passed(self) -> bool:
-        """Return whether the measured value agrees with the known one to two digits."""
-        return compact(self.ours) == self.known
-
-    @property
-    def line(self) -> str:
-        """Return the check as a line of text."""
-        verdict = "ok" if self.passed else "FAILED"
-        return f"{verdict:<6} {self.method}, {self.quantity}: {compact(self.ours)}, known {compact(float(self.known))}"
+    def orbit(self) -> np.ndarray:
+        """Return the positions up to `ORBIT_END`, which are drawn."""
+        return self.y[:2, self.t <= ORBIT_END]
 
 
 Found = dict[str, KeplerRun]
@@ -109,7 +87,7 @@ class KeplerFigures(Study[Found]):
             for name, (method, kept) in methods.items()
         }
 
-    def checks(self, found: Found) -> list[KnownValue]:
+    def checks(self, found: Found) -> list[Check]:
         """Compare with the known values, to their two digits."""
         checks = []
         for name, error, quantity, kind, known in self.known:
@@ -117,7 +95,10 @@ class KeplerFigures(Study[Found]):
             values = getattr(line, error)
             at = int(np.searchsorted(line.t, self.t_end)) if kind == "end" else slice(None)
             ours = float(np.max(values[at])) if line.t[-1] >= self.t_end * (1 - 1e-12) else float("nan")
-            checks.append(KnownValue(name, quantity, known, ours))
+            text = f"{name}, {quantity}: {compact(ours)}, known {compact(float(known))}"
+            matched = compact(ours) == known
+            record = {"method": name, "quantity": quantity, "known": float(known), "ours": ours, "matched": matched}
+            checks.append(Check(text, matched, record))
         return checks
 
     def text(self, found: Found) -> str:
@@ -133,8 +114,7 @@ class KeplerFigures(Study[Found]):
         return "\n".join([title, "", table(head, body), "", *(check.line for check in self.checks(found))])
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        checks = self.checks(found)
-        return {"checks": [{**c._asdict(), "known": float(c.known), "matched": c.passed} for c in checks]}
+        return {"checks": [check.entry for check in self.checks(found)]}
 
     def tables(self, found: Found) -> dict[str, Rows]:
         lines = [
@@ -153,17 +133,10 @@ class KeplerFigures(Study[Found]):
         return {"fig-kepler.csv": lines}
 
     def figures(self, found: Found) -> Figures:
-        from ..plotting import KeplerRun, paper_kepler_figure
+        from ..plotting import paper_kepler_figure
 
         for file, (title, methods) in FIGURES.items():
-            runs = {}
-            for name in methods:
-                line = found[name]
-                shown = line.t <= ORBIT_END
-                runs[name] = KeplerRun(
-                    line.t, line.energy_error, line.momentum_error, line.position_error, line.y[:2, shown]
-                )
-            yield file, paper_kepler_figure(runs, title=title)
+            yield file, paper_kepler_figure({name: found[name] for name in methods}, title=title)
 
 
 def _line(method: type[EIPSolver], kept: str, problem: Any, span: tuple[float, float], tight: np.ndarray) -> KeplerRun:

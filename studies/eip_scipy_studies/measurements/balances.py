@@ -38,12 +38,10 @@ from eip_scipy.problems.gravity.orbits import orbital_balances
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
 
 from ..report import needed, table
-from ..study import Figures, Rows, Session, Study, option, some_of
+from ..study import Rows, Session, Study, option, some_of
 from .relativity import speed_of_light
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
-
-__all__ = ["SYSTEMS", "Balances"]
 
 TURN = 2 * math.pi
 # Km and s. Drag per squared speed at 400 km: half of 3e-12 kg/m^3 times 0.022 m^2/kg.
@@ -51,7 +49,6 @@ EARTH: dict[str, Any] = {"mu": 398600.4418, "radius": 6378.137, "j2": 1.08262668
 AIR: dict[str, Any] = {"drag": 0.5 * 3e-12 * 0.022 * 1e3, "height": 400.0, "scale_height": 60.0}
 LUNAR_MONTH = 27.321661 / YEAR_D
 KM_S = 86400 * YEAR_D / 149597870.7  # AU/yr
-SHOWN = 200
 MOST_TIMES, MOST_UNWARNED, LEAST_GAIN = 1.5, 3.0, 100.0
 
 
@@ -77,15 +74,13 @@ class System(NamedTuple):
     ``make(rotation, number)`` returns the `Case` for a rotation matrix (3, 3) and its number 0, 1, ..., from which
     phases and starts are made. `unit` is the unit of the error. If `helps`, the error with balances must be at most
     `MOST_TIMES` that without; otherwise a run with more than `MOST_UNWARNED` times the error must come with a warning.
-    If `gains`, the error must be `LEAST_GAIN` times smaller. `drawn` is the label of the error in the figure; a system
-    with "" is not drawn. `times` is the factor that converts errors to `unit`.
+    If `gains`, the error must be `LEAST_GAIN` times smaller. `times` is the factor that converts errors to `unit`.
     """
 
     make: Callable[[np.ndarray, int], Case]
     unit: str
     helps: bool
     gains: bool = False
-    drawn: str = ""
     times: float = 1.0
 
 
@@ -129,9 +124,7 @@ def spin(t, y, c):
 
 @njit
 def spin_loss(t, y, c):
-    return np.array(
-        [-c * (y[1] * y[5] - y[2] * y[4]), -c * (y[2] * y[3] - y[0] * y[5]), -c * (y[0] * y[4] - y[1] * y[3])]
-    )
+    return -c * spin(t, y, c)
 
 
 @njit
@@ -325,11 +318,8 @@ def electric_power(t, y, a, b, c, omega):
 def particle(turned: np.ndarray, turn: int) -> Case:
     """Return the case of a charged particle over 500 gyrations with 16 steps each."""
     y0 = np.concatenate([turned @ [1.0, 0, 0], turned @ [0, 0.5, 0.25]])
-    run = runner(
-        fun=charge, t_span=(0, 500 * TURN), y0=y0, args=(*turned[:, 2].tolist(), 0.01)
-    )  # fmt: skip
-    energy = Balance(kinetic_energy, electric_power, name="E")
-    sets = {"kinetic energy": energy}
+    run = runner(fun=charge, t_span=(0, 500 * TURN), y0=y0, args=(*turned[:, 2].tolist(), 0.01))
+    sets = {"kinetic energy": Balance(kinetic_energy, electric_power, name="E")}
     return Case(run, sets, {"h": TURN / 16}, 16, (slice(0, 3),))
 
 
@@ -479,11 +469,9 @@ def chaos(turned: np.ndarray, turn: int) -> Case:
 
 
 SYSTEMS = {
-    "drag 1e-6, e = 0.2, 1000 revolutions": System(
-        drag(1e-6, 1000), "", True, True, "error of place [semi-major axes]"
-    ),
-    "satellite, J2 and drag, 10 days": System(leo(10), "m", True, True, times=1e3),
-    "satellite, J2 and drag, 100 days": System(leo(100), "m", True, True, "error of place [m]", 1e3),
+    "drag 1e-6, e = 0.2, 1000 revolutions": System(drag(1e-6, 1000), "", True, True),
+    "satellite, J2 and drag, 10 days": System(leo(10), "m", True, True, 1e3),
+    "satellite, J2 and drag, 100 days": System(leo(100), "m", True, True, 1e3),
     "four planets, 1PN, 200 years": System(
         bodies(("Sun", "Mercury", "Venus", "EMB", "Mars"), 200, 1 / 70, 16, relativity=True), "AU", True, True
     ),
@@ -548,18 +536,9 @@ class Row(NamedTuple):
     said: str
 
 
-class Found(NamedTuple):
-    """All rows, and for each system that is drawn its times, errors without balances and errors with balances (m,)."""
-
-    rows: list[Row]
-    curves: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
-
-
 def finer_steps(case: Case, share: float = 1.0) -> dict[str, Any]:
     """Return the options of the reference, or of a run with `share` times the steps or tolerances of the reference."""
     exact = {"invariants": (), "compensated": True}
-    if "h" in case.steps:
-        return {**exact, "h": case.steps["h"] * share / case.finer}
     return {**exact, **{name: value * share / case.finer for name, value in case.steps.items()}}
 
 
@@ -584,8 +563,7 @@ def measured(name: str, system: System, turned: np.ndarray, turn: int) -> list[R
             run = case.run(**case.steps, invariants=items)
         said = [str(item.message) for item in caught] + ([] if run.trusted else [run.message])
         slow = run.diagnostics.slowness
-        errors = (system.times * float(distance(case, y, right)) for y in (plain.y[:, -1], run.y[:, -1]))
-        without, within = errors
+        without, within = (system.times * float(distance(case, y, right)) for y in (plain.y[:, -1], run.y[:, -1]))
         within = within if run.success else math.inf
         own = system.times * float(of_reference)
         rows.append(
@@ -595,21 +573,8 @@ def measured(name: str, system: System, turned: np.ndarray, turn: int) -> list[R
     return rows
 
 
-def curve(system: System, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return saved times (m,) of the run, and the errors (m,) there without and with the first set of balances."""
-    case = system.make(turned, 0)
-    every = 16 * max(1, round(case.run(**case.steps, invariants=()).nfev / 12 / 16 / SHOWN))
-    right = case.run(**finer_steps(case), save_every=every * case.finer)
-    found = [
-        case.run(**case.steps, invariants=items, save_every=every) for items in ((), next(iter(case.sets.values())))
-    ]
-    n = min(right.t.size, found[0].t.size) - 1  # the last states may belong to shorter steps
-    errors = [system.times * distance(case, run.y[:, 1:n], right.y[:, 1:n]) for run in found]
-    return right.t[1:n], errors[0], errors[1]
-
-
 @dataclass(frozen=True, kw_only=True)
-class Balances(Study[Found]):
+class Balances(Study[list[Row]]):
     """Command ``eip-scipy study balances``."""
 
     rotations: int = option(
@@ -617,7 +582,7 @@ class Balances(Study[Found]):
     )
     system: Sequence[str] | None = some_of("system", SYSTEMS)
 
-    def measure(self, session: Session) -> Found:
+    def measure(self, session: Session) -> list[Row]:
         turns = [np.eye(3), *Rotation.random(max(self.rotations - 1, 0), rng=1).as_matrix()]
         chosen = {name: system for name, system in SYSTEMS.items() if not self.system or name in self.system}
         rows: list[Row] = []
@@ -626,13 +591,12 @@ class Balances(Study[Found]):
                 for turn, turned in enumerate(turns):
                     rows += measured(name, system, turned, turn)
                 bar.update()
-        curves = {name: curve(system, turns[-1]) for name, system in chosen.items() if system.drawn}
-        return Found(rows, curves)
+        return rows
 
-    def text(self, found: Found) -> str:
+    def text(self, found: list[Row]) -> str:
         head = [["calls"], ["error", "without"], ["error", "with"], ["without /", "with"], ["with /", "without"],
                 ["slowness"], ["warned"], ["error of", "reference"]]  # fmt: skip
-        groups = grouped(found.rows)
+        groups = grouped(found)
         body: list[tuple[str, list[str]]] = []
         for helps, title in ((True, "where they should help"), (False, "where they should not, or could hurt")):
             own = [(key, rows) for key, rows in groups.items() if SYSTEMS[key[0]].helps == helps]
@@ -648,31 +612,11 @@ class Balances(Study[Found]):
                 ))  # fmt: skip
         return "\n\n".join([table(head, body), "\n".join(bars(groups))])
 
-    def numbers(self, found: Found) -> dict[str, Any]:
-        return {"rows": [row._asdict() for row in found.rows]}
+    def numbers(self, found: list[Row]) -> dict[str, Any]:
+        return {"rows": [row._asdict() for row in found]}
 
-    def tables(self, found: Found) -> Mapping[str, Rows]:
-        return {"balances.csv": [row._asdict() for row in found.rows]}
-
-    def figures(self, found: Found) -> Figures:
-        from eip_scipy.plotting import PALETTE
-
-        from ..plotting import blank_figure
-
-        if not found.curves:
-            return
-        figure = blank_figure(4.8 * len(found.curves), 3.6)
-        for axes, (name, (t, without, within)) in zip(
-            np.atleast_1d(figure.subplots(1, len(found.curves))), found.curves.items(), strict=True
-        ):
-            unit, label = (86400, "days") if SYSTEMS[name].unit == "m" else (TURN, "revolutions at the start")
-            axes.loglog(t / unit, without, color=PALETTE[2], lw=1.2, label="without")
-            axes.loglog(t / unit, within, color=PALETTE[0], lw=1.2, label="energy as a balance")
-            axes.set(xlabel=label, ylabel=SYSTEMS[name].drawn, title=name)
-            axes.title.set_fontsize("medium")
-            axes.grid(alpha=0.3)
-            axes.legend(frameon=False, loc="upper left")
-        yield "balances.png", figure
+    def tables(self, found: list[Row]) -> Mapping[str, Rows]:
+        return {"balances.csv": [row._asdict() for row in found]}
 
 
 def grouped(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:

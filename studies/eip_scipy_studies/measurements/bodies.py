@@ -28,8 +28,6 @@ from ..report import needed, table
 from ..study import Measurement, Session, option
 from ..timing import clocked, least
 
-__all__ = ["Bodies"]
-
 REPEATS, SECONDS = 3, 4.0
 PERIOD = 2 * np.pi
 STEPS, COARSE, REFERENCE = 25, 4, 50

@@ -26,7 +26,6 @@ from scipy.integrate import solve_ivp
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, integrate
 from eip_scipy.problems import ParticleProblem, tokamak
 from eip_scipy.problems.particle_orbits import ParticleOrbit
-from eip_scipy.solvers import EIPSolver
 
 from ..comparators import boris, implicit_midpoint
 from ..particles.runs import SCENES, scene
@@ -35,8 +34,6 @@ from ..study import Figures, Measurement, Rows, Session, option
 from ..timing import clocked, least
 from ..work_precision import curves
 from .references import particle_equations
-
-__all__ = ["ParticleCost"]
 
 TAIL = 60  # states of the reference, three gyrations, at the end of the interval
 SPEED_STEPS, SOLVE_IVP_STEPS = 200_000, 5000
@@ -131,19 +128,18 @@ def cases(problem: ParticleProblem, other: ParticleProblem, with_heyoka: bool) -
     """
     fine, wide, wider = (1.0, 0.5, 0.25, 0.125), (2.0, 1.0, 0.5, 0.25), (4.0, 2.0, 1.0, 0.5)
     for name, method, factors in (("RK4", EIPRK4, fine), ("RK45", EIPRK45, wide), ("DOP853", EIPDOP853, wider)):
-        for factor in factors:
-            yield fixed(f"EIP-HL, {name}", problem, method, problem.invariants, factor)
-        if name != "RK45":
-            for factor in factors:
-                yield fixed(name, problem, method, (), factor)
+        ways = {f"EIP-HL, {name}": problem.invariants} | ({} if name == "RK45" else {name: ()})
+        for label, kept in ways.items():
+            own = partial(integrate, problem, method=method, invariants=kept)
+            yield from (stepped(label, problem, own, factor) for factor in factors)
     for rtol in (1e-6, 1e-8, 1e-10, 1e-12):
         yield adaptive(problem, rtol)
     assert problem.rhs is not None
     for factor in (1.0, 0.5, 0.25):
         run = partial(implicit_midpoint, problem.rhs, problem.t_span, problem.y0, params=problem.params)
-        yield compared("implicit midpoint", problem, run, factor)
+        yield stepped("implicit midpoint", problem, run, factor)
     for factor in (1.0, 0.5, 0.25, 0.125, 0.0625):
-        yield compared("Boris", other, partial(boris, other.field.fill, other.t_span, other.y0), factor)
+        yield stepped("Boris", other, partial(boris, other.field.fill, other.t_span, other.y0), factor)
     for tolerance in (1e-6, 1e-9, 1e-12, 1e-15) if with_heyoka else ():
         yield taylor(other, tolerance)
 
@@ -156,9 +152,10 @@ def spacing(factor: float) -> int:
     return max(round(1 / factor), 1)
 
 
-def fixed(name: str, problem: ParticleProblem, method: type[EIPSolver], kept: Any, factor: float) -> Case:
+def stepped(name: str, problem: ParticleProblem, method: Callable[..., Any], factor: float) -> Case:
+    """Return the case of ``method(h=..., save_every=...)`` with `factor` times the paper's step."""
     assert problem.h is not None
-    run = partial(integrate, problem, method=method, invariants=kept, h=factor * problem.h)
+    run = partial(method, h=factor * problem.h)
     return Case(
         name, factor, lambda: clocked(run, thread_time)(), lambda: states_of(run(save_every=spacing(factor))), problem
     )
@@ -166,14 +163,6 @@ def fixed(name: str, problem: ParticleProblem, method: type[EIPSolver], kept: An
 
 def states_of(run: Any) -> tuple[np.ndarray, np.ndarray]:
     return run.t, run.y
-
-
-def compared(name: str, problem: ParticleProblem, method: Callable[..., Any], factor: float) -> Case:
-    assert problem.h is not None
-    run = partial(method, h=factor * problem.h)
-    return Case(
-        name, factor, lambda: clocked(run, thread_time)(), lambda: states_of(run(save_every=spacing(factor))), problem
-    )
 
 
 def adaptive(problem: ParticleProblem, rtol: float) -> Case:

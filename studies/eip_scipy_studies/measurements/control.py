@@ -31,8 +31,6 @@ from ..report import table
 from ..study import Measurement, Session, some_of
 from ..work_precision import cost_to_reach
 
-__all__ = ["Control"]
-
 NAMES = (
     *("kepler_e06", "kepler_e09", "outer_solar_system", "pythagorean_t10", "arenstorf", "henon_heiles_regular"),
     *("spherical_pendulum", "euler_top", "boris_2d", "schwarzschild", "heisenberg", "three_wave"),

@@ -28,8 +28,6 @@ from eip_scipy.problems import kepler
 from ..report import needed, table
 from ..study import Figures, Measurement, Rows, Session, option
 
-__all__ = ["Ensembles", "starts"]
-
 H = 0.03
 PEAK_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes in a unit of ru_maxrss
 MEMORY = """

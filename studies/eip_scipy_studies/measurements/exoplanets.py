@@ -26,8 +26,6 @@ from ..study import Measurement, Session, option
 from .orbits import Methods, Row, by_rebound, one_each, orbit_table, rows
 from .relativity import potential, reference, speed_of_light
 
-__all__ = ["SYSTEMS", "Exoplanets"]
-
 REPEATS = 3
 GM_SUN = 4 * math.pi**2  # AU^3/yr^2, to four digits
 EARTH = 3.003e-6  # solar masses

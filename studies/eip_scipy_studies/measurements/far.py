@@ -22,8 +22,6 @@ from ..study import Measurement, Session, option
 from .growth import distances
 from .orbits import rebound_states
 
-__all__ = ["Far"]
-
 FINEST = "EIPGJ14, balances, 1/1024 yr"
 MERCURY, OTHERS = 1, slice(2, None)
 DECADES = (100.0, 1000.0, 10_000.0, 100_000.0)

@@ -24,8 +24,6 @@ from ..report import table
 from ..study import Figures, Measurement, Session, option
 from ..timing import clocked, least, many_calls
 
-__all__ = ["EquationCost"]
-
 Shape = tuple[int, ...]
 Times = dict[tuple[str, str], float]
 FLAT: tuple[Shape, ...] = tuple((n, n) for n in (64, 128, 256, 512, 1024))

@@ -24,8 +24,6 @@ from ..report import table
 from ..study import Measurement, Rows, Session, option
 from ..work_precision import WorkPoint, cost_to_reach, curves, work_precision
 
-__all__ = ["BaseMethods"]
-
 KEPT = ("mass", "energy")
 LEVELS = (1e-5, 1e-6, 1e-7)
 REFERENCE_STEP = 2.5e-4

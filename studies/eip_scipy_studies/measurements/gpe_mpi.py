@@ -20,8 +20,6 @@ from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
 from ..report import needed, table
 from ..study import Measurement, Session, option
 
-__all__ = ["RanksCost"]
-
 SHAPES = ((256, 256), (64, 64, 64), (128, 128, 128))
 QUICK_SHAPES = ((32, 32), (16, 16, 16))
 SECONDS = 30.0  # for each shape

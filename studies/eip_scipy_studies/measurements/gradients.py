@@ -20,8 +20,6 @@ from ..report import needed, table
 from ..study import Measurement, Session, option
 from ..timing import least
 
-__all__ = ["Gradients"]
-
 njit = needed("numba", '"eip_scipy[numba]"').njit
 STEPS, H = 50_000, 0.01
 

@@ -26,8 +26,6 @@ from ..solar.runs import orbits_kept
 from ..study import Figures, Measurement, Rows, Session, option
 from .orbits import ORDERS, rebound_states, reordered
 
-__all__ = ["Growth"]
-
 BODIES = {"Mercury": 1, "Earth-Moon": 3, "Jupiter": 5}
 NYSTROM = {"method": EIPRKN12, "h": 1 / 64}
 ORDER_STEPS = 512, 1024  # steps per year, in all orders of the axes

@@ -17,8 +17,6 @@ from statistics import median
 from ..report import table
 from ..study import Measurement, Session, option
 
-__all__ = ["ImportTime"]
-
 REFERENCE = "import scipy.integrate"
 IMPORTS = (
     REFERENCE,

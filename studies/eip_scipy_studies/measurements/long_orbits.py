@@ -21,8 +21,6 @@ from ..solar.cost import TimedRun, by_us, timed
 from ..study import Measurement, Session, option
 from .orbits import Methods, by_rebound
 
-__all__ = ["LongOrbits"]
-
 PLANETS = ("Mercury", "Venus", "EMB", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
 REPEATS = 3
 STEPS = (1 / 128, 0.01, 1 / 64, 0.02)

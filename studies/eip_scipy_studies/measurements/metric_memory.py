@@ -14,19 +14,19 @@ are chaotic, the command also counts how often errors become three times larger 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, Invariant, integrate
+from eip_scipy.problems import MechanicsProblem, mechanism
 
+from ..mechanisms.examples import andrews
 from ..report import needed, table
 from ..study import Session, Study, option
-
-__all__ = ["MetricMemory"]
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
 METHODS = (EIPRK4, EIPRK5, EIPRK45, EIPDOP853)
@@ -40,13 +40,12 @@ class Case:
 
     group: str
     name: str
-    fun: Callable[..., Any]
-    invariants: tuple[Invariant, ...]
+    fun: Any
+    invariants: tuple[Any, ...]
     y0: np.ndarray
     end: float
     steps: tuple[float, ...] = ()
     methods: tuple[Any, ...] = METHODS
-    options: dict[str, Any] = field(default_factory=dict)
     in_place: bool = True
     reference_options: dict[str, Any] = field(default_factory=lambda: {"rtol": 1e-12, "atol": 1e-13})
     known: np.ndarray | None = None
@@ -57,9 +56,8 @@ class Case:
         """Return the exact state at the end: `known`, or the result of EIPDOP853 with `reference_options`."""
         if self.known is not None:
             return self.known
-        run = integrate(
-            self.fun, (0, self.end), self.y0, method=EIPDOP853, in_place=self.in_place, **self.reference_options
-        )
+        given = {"method": EIPDOP853, "in_place": self.in_place, **self.reference_options}
+        run = integrate(self.fun, (0, self.end), self.y0, invariants=(), **given)
         return run.y[:, -1]
 
     def error(self, y: np.ndarray) -> float:
@@ -106,16 +104,9 @@ def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Ou
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
                 if key not in plain:
-                    plain[key] = case.error(integrate(case.fun, (0, case.end), case.y0, **given).y[:, -1])
-                run = integrate(
-                    case.fun,
-                    (0, case.end),
-                    case.y0,
-                    invariants=case.invariants,
-                    **given,
-                    **case.options,
-                    **options,
-                )
+                    free = integrate(case.fun, (0, case.end), case.y0, invariants=(), **given)
+                    plain[key] = case.error(free.y[:, -1])
+                run = integrate(case.fun, (0, case.end), case.y0, invariants=case.invariants, **given, **options)
             failed = run.status < 0
             yield Outcome(
                 case.name, case.group, method.__name__, step, failed, not failed and not run.trusted,
@@ -123,17 +114,19 @@ def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Ou
             )  # fmt: skip
 
 
-def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """Return the right-hand side of y = (q, v) with unit masses, and a tuple with its energy v^2/2 + U(q).
+def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
+    """Return the right-hand side of y = (q, v) with unit masses and the force -grad U, and a tuple with its energy.
 
-    ``force(q, out)`` fills in the force, ``energy(q)`` returns U, and ``slope(q, out)`` fills in grad U.
+    ``energy(q)`` returns U, and ``slope(q, out)`` fills in grad U.
     """
 
     @njit
     def fun(t, y, out):
         n = y.size // 2
         out[:n] = y[n:]
-        force(y[:n], out[n:])
+        slope(y[:n], out[n:])
+        for k in range(n, 2 * n):
+            out[k] = -out[k]
 
     @njit
     def value(t, y):
@@ -150,21 +143,6 @@ def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invari
         out[n:] = y[n:]
 
     return fun, (Invariant(value, grad=gradient, in_place=True, name="energy"),)
-
-
-def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """Return the result of `second_order` for the force -grad U.
-
-    ``energy(q)`` returns U, and ``slope(q, out)`` fills in grad U.
-    """
-
-    @njit
-    def force(q, out):
-        slope(q, out)
-        for k in range(out.size):
-            out[k] = -out[k]
-
-    return second_order(force, energy, slope)
 
 
 def discs(seed: int, cut: float = 2.5) -> Case:
@@ -458,368 +436,81 @@ def trap(name: str, exponent: int) -> Case:
     )  # fmt: skip
 
 
-def constrained(
-    mass: Callable[..., Any], forces: Callable[..., Any], jacobian: Callable[..., Any], bias: Callable[..., Any]
-) -> Callable[..., Any]:
-    """Return the right-hand side of (q, u): q' = u, M u' + G^T l = F and G u' = -bias, with multipliers l.
+def constrained(name: str, problem: MechanicsProblem, end: float) -> tuple[Case, Case]:
+    """Return a mechanism as two cases: with its constraints kept, and with its energy as well.
 
-    The arguments are the functions ``M(q)``, ``F(q, u)``, ``G(q)`` and ``bias(q, u)``.
+    The metric has a weight for each component, in place of the two blocks of the problem. If the last position is
+    known, the errors are those of the position.
     """
-
-    def fun(t: float, y: np.ndarray) -> np.ndarray:
-        n = y.size // 2
-        q, u = y[:n], y[n:]
-        G = jacobian(q)
-        m = len(G)
-        matrix = np.zeros((n + m, n + m))
-        matrix[:n, :n], matrix[:n, n:], matrix[n:, :n] = mass(q), G.T, G
-        right = np.concatenate([forces(q, u), -bias(q, u)])
-        return np.concatenate([u, np.linalg.solve(matrix, right)[:n]])
-
-    return fun
-
-
-def levels(
-    constraints: Callable[..., Any], jacobian: Callable[..., Any], rates: Callable[..., Any], count: int
-) -> tuple[Invariant, ...]:
-    """Return two invariants of y = (q, u): the `count` constraints g(q) = 0, and their rates G(q) u = 0.
-
-    `constraints` is g, `jacobian` is G = dg/dq, and ``rates(q, u)`` is the derivative of G u by q.
-    """
-
-    def places(t: float, y: np.ndarray) -> np.ndarray:
-        return constraints(y[: y.size // 2])
-
-    def place_slopes(t: float, y: np.ndarray) -> np.ndarray:
-        G = jacobian(y[: y.size // 2])
-        return np.hstack([G, np.zeros_like(G)])
-
-    def speeds(t: float, y: np.ndarray) -> np.ndarray:
-        n = y.size // 2
-        return jacobian(y[:n]) @ y[n:]
-
-    def speed_slopes(t: float, y: np.ndarray) -> np.ndarray:
-        n = y.size // 2
-        return np.hstack([rates(y[:n], y[n:]), jacobian(y[:n])])
-
+    known = None if problem.reference is None else problem.reference(end)
+    common: dict[str, Any] = {"methods": (EIPDOP853,), "in_place": False, "steps": ADAPTIVE, "known": known}
+    common["seen"] = slice(None if known is None else known.size)
+    problem, kept = replace(problem, blocks=None), problem.constraints
     return (
-        Invariant(places, grad=place_slopes, target=np.zeros(count), name="g", size=count),
-        Invariant(speeds, grad=speed_slopes, target=np.zeros(count), name="g'", size=count),
+        Case("mechanisms", f"{name}, c", problem, kept, problem.y0, end, **common),
+        Case("mechanisms", f"{name}, c + E", problem, (*kept, problem.energy), problem.y0, end, **common),
     )
 
 
-def pendulum(links: int) -> tuple[Case, Case]:
-    """Return a chain of massless rods in Cartesian coordinates as two cases: without and with the energy kept."""
-    n = 2 * links
+def pendulum(links: int) -> MechanicsProblem:
+    """Return a chain of massless rods in Cartesian coordinates."""
 
-    def differences(q: np.ndarray) -> np.ndarray:
-        return np.diff(np.vstack([np.zeros(2), q.reshape(links, 2)]), axis=0)
-
-    def constraints(q: np.ndarray) -> np.ndarray:
-        return 0.5 * ((differences(q) ** 2).sum(axis=1) - 1.0)
-
-    def jacobian(q: np.ndarray) -> np.ndarray:
-        d, G = differences(q), np.zeros((links, links, 2))
-        for k in range(links):
-            G[k, k] = d[k]
-            if k:
-                G[k, k - 1] = -d[k]
-        return G.reshape(links, n)
-
-    def bias(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return (differences(u) ** 2).sum(axis=1)
-
-    def forces(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.tile([0.0, -9.81], links)
-
-    def energy(t: float, y: np.ndarray) -> float:
-        return 0.5 * y[n:] @ y[n:] + 9.81 * y[1:n:2].sum()
-
-    def energy_slope(t: float, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.tile([0.0, 9.81], links), y[n:]])
+    def lengths(t: Any, q: Any) -> np.ndarray:
+        ends = np.vstack([np.zeros(2), q.reshape(links, 2)])
+        return 0.5 * (((ends[1:] - ends[:-1]) ** 2).sum(axis=1) - 1.0)
 
     angles = np.array([1.2, 0.9, 0.5])[:links]
     q0 = np.cumsum(np.column_stack([np.sin(angles), -np.cos(angles)]), axis=0).ravel()
-    fun = constrained(lambda q: np.eye(n), forces, jacobian, bias)
-    kept = levels(constraints, jacobian, lambda q, u: jacobian(u), links)
-    return _with_energy(f"pendulum of {links}", fun, kept, Invariant(energy, grad=energy_slope, name="energy"),
-                        np.concatenate([q0, np.zeros(n)]), 10.0)  # fmt: skip
+    weights = np.tile([0.0, -9.81], links)
+    return mechanism(np.ones(q0.size), weights, lengths, q0=q0, u0=0 * q0, potential=lambda t, q: -weights @ q)
 
 
-def _with_energy(
-    name: str, fun: Any, kept: tuple[Invariant, ...], energy: Invariant, y0: np.ndarray, end: float, **more: Any
-) -> tuple[Case, Case]:
-    common: dict[str, Any] = {"methods": (EIPDOP853,), "in_place": False, "steps": ADAPTIVE}
-    return (
-        Case("mechanisms", f"{name}, c", fun, kept, y0, end, **common, **more),
-        Case("mechanisms", f"{name}, c + E", fun, (*kept, energy), y0, end, **common, **more),
-    )
-
-
-def knife_edge() -> tuple[Case, Case]:
+def knife_edge() -> MechanicsProblem:
     """Return a knife edge on an inclined plane, (x, y, angle), with a non-holonomic constraint.
 
-    It is Chaplygin's sleigh with the edge at its centre. The two cases are without and with the energy kept.
+    It is Chaplygin's sleigh with the edge at its centre.
     """
-
-    def jacobian(q: np.ndarray) -> np.ndarray:
-        return np.array([[-np.sin(q[2]), np.cos(q[2]), 0.0]])
-
-    def bias(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.array([-u[2] * (np.cos(q[2]) * u[0] + np.sin(q[2]) * u[1])])
-
-    fun = constrained(lambda q: np.eye(3), lambda q, u: np.array([5.0, 0.0, 0.0]), jacobian, bias)
-
-    def speed(t: float, y: np.ndarray) -> float:
-        return float(-np.sin(y[2]) * y[3] + np.cos(y[2]) * y[4])
-
-    def speed_slope(t: float, y: np.ndarray) -> np.ndarray:
-        s, c = np.sin(y[2]), np.cos(y[2])
-        return np.array([0.0, 0.0, -c * y[3] - s * y[4], -s, c, 0.0])
-
-    energy = Invariant(
-        lambda t, y: 0.5 * y[3:] @ y[3:] - 5.0 * y[0],
-        grad=lambda t, y: np.concatenate([[-5.0, 0.0, 0.0], y[3:]]),
-        name="energy",
+    return mechanism(
+        np.ones(3),
+        [5.0, 0.0, 0.0],
+        velocity_constraints=lambda t, q, u: [np.cos(q[2]) * u[1] - np.sin(q[2]) * u[0]],
+        q0=np.zeros(3),
+        u0=[1.0, 0.0, 2.0],
+        potential=lambda t, q: -5.0 * q[0],
     )
-    kept = (Invariant(speed, grad=speed_slope, target=0.0, name="knife"),)
-    return _with_energy("knife edge", fun, kept, energy, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 2.0]), 10.0)
 
 
-class Andrews:
-    """Andrews' squeezing mechanism (test set for initial value problem solvers)."""
+def disc() -> MechanicsProblem:
+    """Return a thin disc of mass and radius 1 that wobbles and rolls without slipping.
 
-    m = (0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498)
-    i = (2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5)
-    xa, ya, xb, yb, xc, yc = -0.06934, -0.00227, -0.03635, 0.03273, 0.014, 0.072
-    c0, lo, d, da, e, ea = 4530.0, 0.07785, 0.028, 0.0115, 0.02, 0.01421
-    rr, ra, ss, sa, sb, sc, sd = 0.007, 0.00092, 0.035, 0.01874, 0.01043, 0.018, 0.02
-    ta, tb, u, ua, ub, zf, zt, fa, mom = 0.02308, 0.00916, 0.04, 0.01228, 0.00449, 0.02, 0.04, 0.01421, 0.033
-    start = (
-        -0.0617138900142764496358948458001, 0.0, 0.455279819163070380255912382449, 0.222668390165885884674473185609,
-        0.487364979543842550225598953530, -0.222668390165885884674473185609, 1.23054744454982119249735015568,
-    )  # fmt: skip
-    end = (
-        15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948, 0.5244099658805304,
-        0.5347301163226948, 1.048080741042263,
-    )  # fmt: skip
-
-    @classmethod
-    def mass(cls, q: np.ndarray) -> np.ndarray:
-        m1, m2, m3, m4, m5, m6, m7 = cls.m
-        i1, i2, i3, i4, i5, i6, i7 = cls.i
-        _, th, _, ph, _, om, _ = q
-        M = np.zeros((7, 7))
-        M[0, 0] = m1 * cls.ra**2 + m2 * (cls.rr**2 - 2 * cls.da * cls.rr * np.cos(th) + cls.da**2) + i1 + i2
-        M[1, 0] = m2 * (cls.da**2 - cls.da * cls.rr * np.cos(th)) + i2
-        M[1, 1] = m2 * cls.da**2 + i2
-        M[2, 2] = m3 * (cls.sa**2 + cls.sb**2) + i3
-        M[3, 3] = m4 * (cls.e - cls.ea) ** 2 + i4
-        M[4, 3] = m4 * ((cls.e - cls.ea) ** 2 + cls.zt * (cls.e - cls.ea) * np.sin(ph)) + i4
-        M[4, 4] = (
-            m4 * (cls.zt**2 + 2 * cls.zt * (cls.e - cls.ea) * np.sin(ph) + (cls.e - cls.ea) ** 2)
-            + m5 * (cls.ta**2 + cls.tb**2) + i4 + i5
-        )  # fmt: skip
-        M[5, 5] = m6 * (cls.zf - cls.fa) ** 2 + i6
-        M[6, 5] = m6 * ((cls.zf - cls.fa) ** 2 - cls.u * (cls.zf - cls.fa) * np.sin(om)) + i6
-        M[6, 6] = (
-            m6 * ((cls.zf - cls.fa) ** 2 - 2 * cls.u * (cls.zf - cls.fa) * np.sin(om) + cls.u**2)
-            + m7 * (cls.ua**2 + cls.ub**2) + i6 + i7
-        )  # fmt: skip
-        return M + np.tril(M, -1).T
-
-    @classmethod
-    def spring(cls, q: np.ndarray) -> tuple[float, float, float, float]:
-        """Return the spring's length, its elongation, and the differences of x and of y between its ends."""
-        ga = q[2]
-        xd = cls.sd * np.cos(ga) + cls.sc * np.sin(ga) + cls.xb
-        yd = cls.sd * np.sin(ga) - cls.sc * np.cos(ga) + cls.yb
-        length = float(np.hypot(xd - cls.xc, yd - cls.yc))
-        return length, length - cls.lo, xd - cls.xc, yd - cls.yc
-
-    @classmethod
-    def forces(cls, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        m2, m4, m6 = cls.m[1], cls.m[3], cls.m[5]
-        _, th, ga, ph, _, om, _ = q
-        bep, thp, _, php, dep, omp, epp = v
-        length, stretch, dx, dy = cls.spring(q)
-        fx, fy = (-cls.c0 * stretch / length * d for d in (dx, dy))
-        return np.array([
-            cls.mom - m2 * cls.da * cls.rr * thp * (thp + 2 * bep) * np.sin(th),
-            m2 * cls.da * cls.rr * bep**2 * np.sin(th),
-            fx * (cls.sc * np.cos(ga) - cls.sd * np.sin(ga)) + fy * (cls.sd * np.cos(ga) + cls.sc * np.sin(ga)),
-            m4 * cls.zt * (cls.e - cls.ea) * dep**2 * np.cos(ph),
-            -m4 * cls.zt * (cls.e - cls.ea) * php * (php + 2 * dep) * np.cos(ph),
-            -m6 * cls.u * (cls.zf - cls.fa) * epp**2 * np.cos(om),
-            m6 * cls.u * (cls.zf - cls.fa) * omp * (omp + 2 * epp) * np.cos(om),
-        ])  # fmt: skip
-
-    @classmethod
-    def terms(cls) -> list[list[tuple[float, float, tuple[float, ...]]]]:
-        """Return, for each constraint, the terms (a, p, w) of the sum of a cos(w . q + p).
-
-        Missing last entries of w are 0.
-        """
-        h = -np.pi / 2  # sin x = cos(x - pi / 2)
-        be, ga, bt, fe, oe = (1.0,), (0, 0, 1.0), (1.0, 1.0), (0, 0, 0, 1.0, 1.0), (0, 0, 0, 0, 0, 1.0, 1.0)
-        de, ep = (0, 0, 0, 0, 1.0), (0, 0, 0, 0, 0, 0, 1.0)
-        s, d, e, z, f, u = cls.ss, cls.d, cls.e, cls.zt, cls.zf, cls.u
-        none = (0.0,)
-        return [
-            [(cls.rr, 0, be), (-d, 0, bt), (-s, h, ga), (-cls.xb, 0, none)],
-            [(cls.rr, h, be), (-d, h, bt), (s, 0, ga), (-cls.yb, 0, none)],
-            [(cls.rr, 0, be), (-d, 0, bt), (-e, h, fe), (-z, 0, de), (-cls.xa, 0, none)],
-            [(cls.rr, h, be), (-d, h, bt), (e, 0, fe), (-z, h, de), (-cls.ya, 0, none)],
-            [(cls.rr, 0, be), (-d, 0, bt), (-f, 0, oe), (-u, h, ep), (-cls.xa, 0, none)],
-            [(cls.rr, h, be), (-d, h, bt), (-f, h, oe), (u, 0, ep), (-cls.ya, 0, none)],
-        ]
-
-    def __init__(self) -> None:
-        terms = [(row, *term) for row, line in enumerate(self.terms()) for term in line]
-        self.sum = np.zeros((6, len(terms)))
-        for k, term in enumerate(terms):
-            self.sum[term[0], k] = term[1]
-        self.phase = np.array([term[2] for term in terms])
-        self.weights = np.array([np.pad(term[3], (0, 7 - len(term[3]))) for term in terms])
-
-    def constraints(self, q: np.ndarray) -> np.ndarray:
-        return self.sum @ np.cos(self.weights @ q + self.phase)
-
-    def jacobian(self, q: np.ndarray) -> np.ndarray:
-        return (self.sum * -np.sin(self.weights @ q + self.phase)) @ self.weights
-
-    def rates(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return (self.sum * (-np.cos(self.weights @ q + self.phase) * (self.weights @ v))) @ self.weights
-
-    def bias(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return self.sum @ (-np.cos(self.weights @ q + self.phase) * (self.weights @ v) ** 2)
-
-    def energy(self, t: float, y: np.ndarray) -> float:
-        q, v = y[:7], y[7:]
-        return 0.5 * v @ self.mass(q) @ v + 0.5 * self.c0 * self.spring(q)[1] ** 2 - self.mom * q[0]
-
-    def energy_slope(self, t: float, y: np.ndarray) -> np.ndarray:
-        q, v = y[:7], y[7:]
-        out = np.concatenate([np.zeros(7), self.mass(q) @ v])
-        for k in (1, 3, 5):  # M depends on these, by a sine or a cosine of one angle: exact by two quarter turns
-            turn = np.zeros(7)
-            turn[k] = np.pi / 2
-            out[k] = 0.25 * v @ (self.mass(q + turn) - self.mass(q - turn)) @ v
-        length, stretch, dx, dy = self.spring(q)
-        ga = q[2]
-        out[2] = (
-            self.c0
-            * stretch
-            / length
-            * (dx * (self.sc * np.cos(ga) - self.sd * np.sin(ga)) + dy * (self.sd * np.cos(ga) + self.sc * np.sin(ga)))
-        )
-        out[0] -= self.mom
-        return out
-
-    @classmethod
-    def cases(cls) -> tuple[Case, Case]:
-        one = cls()
-        fun = constrained(one.mass, one.forces, one.jacobian, one.bias)
-        kept = levels(one.constraints, one.jacobian, one.rates, 6)
-        energy = Invariant(one.energy, grad=one.energy_slope, name="energy")
-        known = np.concatenate([cls.end, np.zeros(7)])
-        y0 = np.concatenate([cls.start, np.zeros(7)])
-        return _with_energy("Andrews", fun, kept, energy, y0, 0.03, known=known, seen=[0, 1, 2, 3, 4, 5, 6])
-
-
-DISC = 1.0, 1.0, 9.81, 0.25, 0.5  # mass, radius, gravity, moments of inertia about a diameter and about the axis
-
-
-def disc_mechanics() -> tuple[Callable[..., Any], ...]:
-    """Return the functions that define `disc`: mass matrix (q), forces (q, u), G (q), and the derivative of G u by q.
-
-    The constraints are G(q) u = 0; the derivative is a function of (q, u).
+    Its coordinates are x and y of the contact's track, heading, lean and spin. Rolling is two non-holonomic
+    constraints.
     """
-    mass, radius, gravity, flat, axial = DISC
+    gravity, flat, axial = 9.81, 0.25, 0.5  # moments of inertia about a diameter and about the axis
 
-    # q = (x, y, a, b, c) of the point of contact's track; velocity of the centre: that of (x, y, radius sin b).
-    def matrix(q: np.ndarray) -> np.ndarray:
-        b = q[3]
-        M = np.zeros((5, 5))
-        M[0, 0] = M[1, 1] = mass
-        # Spin about the axis: c' + a' cos b; about the diameters: b' and a' sin b.
-        M[2, 2] = flat * np.sin(b) ** 2 + axial * np.cos(b) ** 2
-        M[2, 4] = M[4, 2] = axial * np.cos(b)
-        M[3, 3] = flat + mass * (radius * np.cos(b)) ** 2
-        M[4, 4] = axial
+    def matrix(q: Any) -> np.ndarray:
+        # Spin about the axis: c' + a' cos b; about the diameters: b' and a' sin b. The centre is at (x, y, sin b).
+        s, c = np.sin(q[3]), np.cos(q[3])
+        M = np.diag([1, 1, flat * s**2 + axial * c**2, flat + c**2, axial])
+        M[2, 4] = M[4, 2] = axial * c
         return M
 
-    def forces(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        b, a1, b1, c1 = q[3], u[2], u[3], u[4]
-        s, c = np.sin(b), np.cos(b)
-        out = np.zeros(5)
-        # d/dt of the mass matrix' own part, and grad of T - V, by hand.
-        out[2] = -((flat - axial) * 2 * s * c * b1 * a1 - axial * s * b1 * c1)
-        out[3] = (flat - axial) * s * c * a1 * a1 - axial * s * a1 * c1 + mass * radius**2 * s * c * b1 * b1
-        out[3] += -mass * gravity * radius * c
-        out[4] = axial * s * b1 * a1
-        return out
-
-    # The centre (x, y, radius sin b) is radius e2 from the contact, e2 = (-sin a cos b, cos a cos b, sin b), and moves
-    # at w x (radius e2).
-    def jacobian(q: np.ndarray) -> np.ndarray:
-        a, b = q[2], q[3]
-        G = np.zeros((2, 5))
-        G[0, 0] = G[1, 1] = 1.0
-        G[:, 2] = radius * np.cos(b) * np.array([np.cos(a), np.sin(a)])
-        G[:, 3] = -radius * np.sin(b) * np.array([np.sin(a), -np.cos(a)])
-        G[:, 4] = radius * np.array([np.cos(a), np.sin(a)])
-        return G
-
-    def rates(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        a, b = q[2], q[3]
-        forward, side = np.array([np.cos(a), np.sin(a)]), np.array([np.sin(a), -np.cos(a)])
-        out = np.zeros((2, 5))
-        # d/da: forward -> -side, side -> forward.
-        out[:, 2] = -radius * side * (np.cos(b) * u[2] + u[4]) - radius * np.sin(b) * forward * u[3]
-        out[:, 3] = -radius * np.sin(b) * forward * u[2] - radius * np.cos(b) * side * u[3]
-        return out
-
-    return matrix, forces, jacobian, rates
-
-
-def disc() -> tuple[Case, Case]:
-    """Return a thin disc that wobbles and rolls without slipping, as two cases: without and with the energy kept.
-
-    Its coordinates are x, y, heading, lean and spin; rolling is two non-holonomic constraints.
-    """
-    mass, radius, gravity, flat, axial = DISC
-    matrix, forces, jacobian, rates = disc_mechanics()
-
-    def bias(q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return rates(q, u) @ u
-
-    def energy(t: float, y: np.ndarray) -> float:
-        return float(0.5 * y[5:] @ matrix(y[:5]) @ y[5:] + mass * gravity * radius * np.sin(y[3]))
-
-    def energy_slope(t: float, y: np.ndarray) -> np.ndarray:
-        q, u = y[:5], y[5:]
+    def forces(t: Any, q: Any, u: Any) -> np.ndarray:
         s, c = np.sin(q[3]), np.cos(q[3])
-        out = np.concatenate([np.zeros(5), matrix(q) @ u])
-        out[3] = (flat - axial) * s * c * u[2] ** 2 - axial * s * u[2] * u[4] - mass * radius**2 * s * c * u[3] ** 2
-        out[3] += mass * gravity * radius * c
-        return out
+        _, _, a1, b1, c1 = u
+        lean = (flat - axial) * s * c * a1**2 - axial * s * a1 * c1 + s * c * b1**2 - gravity * c
+        return np.array([0, 0, axial * s * b1 * c1 - (flat - axial) * 2 * s * c * b1 * a1, lean, axial * s * b1 * a1])
 
-    fun = constrained(matrix, forces, jacobian, bias)
+    def slip(t: Any, q: Any, u: Any) -> np.ndarray:
+        """Return the velocity of the point of contact: that of the centre is w x (-sin a cos b, cos a cos b, sin b)."""
+        _, _, a, b, _ = q
+        along, across = np.cos(b) * u[2] + u[4], np.sin(b) * u[3]
+        return np.array([u[0] + along * np.cos(a) - across * np.sin(a), u[1] + along * np.sin(a) + across * np.cos(a)])
 
-    def speeds(t: float, y: np.ndarray) -> np.ndarray:
-        return jacobian(y[:5]) @ y[5:]
-
-    def speed_slopes(t: float, y: np.ndarray) -> np.ndarray:
-        return np.hstack([rates(y[:5], y[5:]), jacobian(y[:5])])
-
-    kept = (Invariant(speeds, grad=speed_slopes, target=np.zeros(2), name="rolling", size=2),)
-    q0 = np.array([0.0, 0.0, 0.0, 1.2, 0.0])
-    u0 = np.array([0.0, 0.0, 1.0, 0.5, 4.0])
-    u0[:2] = -jacobian(q0)[:, 2:] @ u0[2:]
-    return _with_energy(
-        "disc, wobbling", fun, kept, Invariant(energy, grad=energy_slope, name="energy"), np.concatenate([q0, u0]), 5.0
-    )
+    q0, u0 = np.array([0.0, 0.0, 0.0, 1.2, 0.0]), np.array([0.0, 0.0, 1.0, 0.5, 4.0])
+    u0[:2] = -slip(0.0, q0, u0)
+    potential = lambda t, q: gravity * np.sin(q[3])  # noqa: E731
+    return mechanism(matrix, forces, velocity_constraints=slip, q0=q0, u0=u0, potential=potential)
 
 
 def cut_off() -> Iterator[Case]:
@@ -854,11 +545,11 @@ def cases() -> Iterator[Case]:
             yield magnetic(name, momenta)
         yield trap(name, 2)
         yield trap(name, 4)
-    yield from Andrews.cases()
-    yield from disc()
-    yield from knife_edge()
-    yield from pendulum(2)
-    yield from pendulum(3)
+    yield from constrained("Andrews", andrews(), 0.03)
+    yield from constrained("disc, wobbling", disc(), 5.0)
+    yield from constrained("knife edge", knife_edge(), 10.0)
+    yield from constrained("pendulum of 2", pendulum(2), 10.0)
+    yield from constrained("pendulum of 3", pendulum(3), 10.0)
 
 
 def mean_ratio(found: Iterable[Outcome]) -> float:

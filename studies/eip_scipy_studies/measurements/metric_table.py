@@ -22,9 +22,7 @@ from eip_scipy.problems.gravity.solar_data import load
 from ..comparators import stormer_verlet
 from ..report import table
 from ..study import Session, Study, option
-from .multistep import known_end
-
-__all__ = ["MetricTable"]
+from ..work_precision import known_end
 
 STEP = 0.002
 SAVE_EVERY = 20

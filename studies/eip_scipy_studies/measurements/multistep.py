@@ -31,10 +31,8 @@ from eip_scipy.problems.gravity.solar_data import reference_states
 from ..report import needed, table
 from ..solar.cost import by_us, timed
 from ..study import Measurement, Session, option
-from ..work_precision import cost_to_reach
+from ..work_precision import cost_to_reach, known_end
 from .orbits import Methods, Row, by_rebound, daily, orbit_table, rows, yearly
-
-__all__ = ["Multistep"]
 
 ROTATIONS = 6
 REPEATS = 200  # for runs of milliseconds
@@ -122,14 +120,6 @@ def with_projection(quick: bool) -> Table:
         return {f"{name}, rotation {turn}": run for name, run in runs.items()}
 
     return in_rotations(problem, known_end(problem), methods, 2 if quick else ROTATIONS)
-
-
-def known_end(problem: Problem) -> np.ndarray:
-    """Return the problem's reference state at the end of its interval, which must be stored."""
-    assert problem.reference is not None
-    truth = problem.reference(problem.t_span[1])
-    assert truth is not None
-    return truth
 
 
 def against_heyoka(quick: bool) -> Table:

@@ -35,8 +35,7 @@ from ..hard_cases import hard_cases
 from ..report import table
 from ..study import Measurement, Session, option
 from ..timing import clocked, least
-
-__all__ = ["NystromDefaults"]
+from ..work_precision import known_end
 
 WAYS: dict[str, dict[str, Any]] = {
     "each": {"every": 1, "compensated": False},
@@ -63,19 +62,10 @@ class System(NamedTuple):
     natively: bool = True
 
 
-def by_reference(problem: Problem, size: float = 1.0) -> System:
-    """Make a system from a problem whose last state is known.
-
-    The error is the largest one of a component of the position, divided by `size`.
-    """
-
-    def error(y: np.ndarray) -> float:
-        assert problem.reference is not None
-        truth = problem.reference(problem.t_span[1])
-        assert truth is not None
-        return float(np.max(np.abs(y - truth)[: y.size // 2])) / size
-
-    return System(problem, error)
+def by_reference(problem: Problem) -> System:
+    """Make a system from a problem whose last state is known; errors are those of a component of the position."""
+    truth = known_end(problem)
+    return System(problem, lambda y: float(np.max(np.abs(y - truth)[: y.size // 2])))
 
 
 def systems() -> Iterator[tuple[str, Callable[[], System]]]:

@@ -26,8 +26,6 @@ from ..report import table
 from ..study import Measurement, Session, option
 from .orbits import ORDERS, reordered
 
-__all__ = ["OrbitBalances"]
-
 KEPT: dict[str, tuple[str, ...] | None] = {
     "the totals": None,
     "nothing": (),

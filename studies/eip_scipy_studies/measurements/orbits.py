@@ -15,20 +15,6 @@ from ..report import needed, table
 from ..solar.cost import TimedRun, by_peer
 from ..work_precision import Runner
 
-__all__ = [
-    "ORDERS",
-    "Methods",
-    "Row",
-    "by_rebound",
-    "daily",
-    "one_each",
-    "orbit_table",
-    "rebound_states",
-    "reordered",
-    "rows",
-    "yearly",
-]
-
 ORDERS = tuple(permutations(range(3)))
 """All orders of the coordinate axes. They change the rounding of steps, but, unlike rotations, no bit of a state."""
 Methods = dict[str, tuple[Runner, Sequence[float]]]

@@ -20,8 +20,6 @@ from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, Invariant
 from ..report import table
 from ..study import Measurement, Session, option
 
-__all__ = ["Overhead"]
-
 SPAN = (0.0, 60.0)
 Y0 = np.array([0.4, 0.0, 0.0, 2.0])
 

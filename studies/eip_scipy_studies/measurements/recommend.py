@@ -19,8 +19,6 @@ from ..hard_cases import HardCase, hard_cases
 from ..report import table
 from ..study import Measurement, Session, option
 
-__all__ = ["Recommended"]
-
 FACTOR = 10.0
 
 

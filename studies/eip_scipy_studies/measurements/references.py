@@ -21,8 +21,6 @@ from eip_scipy.problems.particles.charged_particle import ORBITS
 from ..report import needed
 from ..study import Figures, Session, Study, option
 
-__all__ = ["ParticleReference", "SceneReference", "particle_equations"]
-
 FLOAT = np.longdouble
 CHECK_BITS, POINTS = 113, 100
 

@@ -23,8 +23,6 @@ from ..solar.cost import by_us, timed
 from ..study import Measurement, Session, option
 from .orbits import Methods, Row, by_rebound, daily, orbit_table, rows, yearly
 
-__all__ = ["Relativity", "potential", "reference", "speed_of_light"]
-
 REPEATS = 3
 FLOAT = np.longdouble
 speed_of_light = 299792.458 * 86400 * YEAR_D / 149597870.7  # AU/yr

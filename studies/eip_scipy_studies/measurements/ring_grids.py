@@ -27,8 +27,6 @@ from ..condensates.states import load_state
 from ..report import table
 from ..study import Measurement, Rows, Session, option
 
-__all__ = ["RingGrids"]
-
 START_POINTS, TOLERANCE = 256, 1e-8  # of the ground state
 SPLITTING_STEP = 1.25e-3
 RING = Ring()

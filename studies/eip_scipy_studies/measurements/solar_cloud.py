@@ -25,8 +25,6 @@ from ..study import Measurement, Session, option
 from ..timing import clocked, least
 from .orbits import Row
 
-__all__ = ["SolarCloud"]
-
 REPEATS = 5
 # Steps per year of each method, and its options.
 METHODS: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {

@@ -24,8 +24,6 @@ from eip_scipy.problems import Problem, solar_system
 from ..report import needed
 from ..study import Figures, Session, Study, option
 
-__all__ = ["SolarReference"]
-
 Array = np.ndarray
 FLOAT = np.longdouble
 ORDER = 14

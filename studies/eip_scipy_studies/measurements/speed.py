@@ -3,10 +3,7 @@
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
    hand for this one problem. The times per step of EIP-RK4, and of EIP-RK45 with adaptive steps, are also compared with
    that of solve_ivp with SciPy's RK45.
-2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
-3. Compiled Kepler to t = 300 with 3001 times in t_eval, compared with saving each step; a Poincaré section of 1600
-   crossings, compared with the run without it. These are times of whole calls.
-4. A process: from the start of its program to the end of its first compiled run, with user functions that are not in
+2. A process: from the start of its program to the end of its first compiled run, with user functions that are not in
    any cache.
 """
 
@@ -24,13 +21,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
-from eip_scipy.problems import kepler, solar_system
+from eip_scipy.problems import kepler
 
 from ..report import needed, table
 from ..study import Measurement, Session, option
 from ..timing import clocked, least
-
-__all__ = ["Speed"]
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
 
@@ -159,14 +154,14 @@ def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
     return a, b, c, d, worst
 
 
-def per_step(seconds: Callable[[int], float], runs: int, steps: int = STEPS) -> float:
+def per_step(seconds: Callable[[int], float], runs: int) -> float:
     """Return the seconds of one step, without the start of a run, from the least times of `runs` runs of two lengths.
 
-    ``seconds(n)`` is the time of a run of n steps; the lengths are `steps` and 0.2 of it.
+    ``seconds(n)`` is the time of a run of n steps; the lengths are `STEPS` and 0.2 of it.
     """
-    few = steps // 5
-    best = least({n: partial(seconds, n) for n in (few, steps)}, turns=runs)
-    return (best[steps] - best[few]) / (steps - few)
+    few = STEPS // 5
+    best = least({n: partial(seconds, n) for n in (few, STEPS)}, turns=runs)
+    return (best[STEPS] - best[few]) / (STEPS - few)
 
 
 def call_time(action: Callable[[], Any], calls: int) -> float:
@@ -215,41 +210,6 @@ def kepler_speed(turns: Turns) -> dict[str, float]:
     return out
 
 
-def solar_speed(turns: Turns) -> dict[str, float]:
-    problem = solar_system()
-    assert problem.h is not None
-    run: dict[str, Any] = {"fun": problem, "method": EIPRK4}
-    plain = per_step(of_integrate(problem.h, **run, invariants=()), turns.runs, 4000)
-    eip = per_step(of_integrate(problem.h, **run), turns.runs, 4000)
-    return {
-        "10 bodies, plain RK4 [us/step]": 1e6 * plain,
-        "10 bodies, EIP-RK4 [us/step]": 1e6 * eip,
-        "10 bodies, EIP-RK4 / plain RK4": eip / plain,
-    }
-
-
-@njit
-def crossing(t, y, params):
-    return y[1]
-
-
-def sampling_speed(turns: Turns) -> dict[str, float]:
-    problem = kepler(relativistic=MU)
-    short, long = (0.0, 300.0), (0.0, 5100.0)
-    times = np.linspace(*short, 3001)
-    crossings = integrate(problem, long, method=EIPRK4, h=H, events=crossing).t_events
-    assert crossings is not None
-    found = crossings[0].size
-    every = call_time(lambda: integrate(problem, short, method=EIPRK4, h=H, save_every=1), turns.calls)
-    sampled = call_time(lambda: integrate(problem, short, method=EIPRK4, h=H, t_eval=times), turns.calls)
-    plain = call_time(lambda: integrate(problem, long, method=EIPRK4, h=H), turns.calls)
-    section = call_time(lambda: integrate(problem, long, method=EIPRK4, h=H, events=crossing), turns.calls)
-    return {
-        "3001 times in t_eval / save_every=1": sampled / every,
-        f"section of {found} crossings / run without": section / plain,
-    }
-
-
 USER = """
 import time
 begin = time.perf_counter()
@@ -294,8 +254,8 @@ class Speed(Measurement[dict[str, float]]):
     def measure(self, session: Session) -> dict[str, float]:
         turns = QUICK if self.quick else Turns()
         found: dict[str, float] = {}
-        with session.bar(4, "speed", "part") as bar:
-            for part in (kepler_speed, solar_speed, sampling_speed, process_times):
+        with session.bar(2, "speed", "part") as bar:
+            for part in (kepler_speed, process_times):
                 found |= part(turns)
                 bar.update()
         return found

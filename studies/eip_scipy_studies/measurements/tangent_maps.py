@@ -2,10 +2,9 @@
 
 The state-transition matrix of Kepler's problem against its closed form; periodic orbits of the restricted three-body
 problem; Lyapunov exponents compared with heyoka's variational equations, from one start and as means over a chaotic
-sea; MEGNO compared with REBOUND's variational particles; the growth of tangent vectors under relativity, which these
-particles lack, compared with differences of orbits; the cost of columns of the state-transition matrix, for each way to
-compute products with the Jacobian, and the time that these columns save in a fit. The figure is a map of MEGNO over the
-semi-major axis and the eccentricity of the second of two planets, by this package and by REBOUND.
+sea; MEGNO compared with REBOUND's variational particles; the cost of columns of the state-transition matrix, for each
+way to compute products with the Jacobian. The figure is a map of MEGNO over the semi-major axis and the eccentricity of
+the second of two planets, by this package and by REBOUND.
 
 The study needs Numba and SymPy; heyoka and REBOUND are optional:
 ``pip install "eip_scipy[heyoka,numba,rebound,sympy]"``.
@@ -21,18 +20,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from eip_scipy import EIPDOP853, EIPRK4, ProjectionWarning, hamiltonian, integrate
-from eip_scipy.problems import kepler, nbody, solar_system
-from eip_scipy.problems.gravity.forces import ForceConstants
-from eip_scipy.tangent_maps import TrajectoryFit, megno, periodic_orbit
+from eip_scipy.problems import kepler, solar_system
+from eip_scipy.tangent_maps import megno, periodic_orbit
 
 from ..report import needed, table
 from ..study import Figures, Measurement, Rows, Session, option
-from ..timing import clocked, least
-
-__all__ = ["TangentMaps"]
+from ..timing import least
 
 PERIOD = 2 * math.pi
 E = 0.6
@@ -169,13 +164,11 @@ class Found(NamedTuple):
     exponents: dict[str, list[float | None]]
     planets: dict[str, list[float | None]]
     costs: dict[str, float]
-    fit: dict[str, float]
     axes: np.ndarray
     eccentricities: np.ndarray
     map: np.ndarray
     followed: dict[str, list[float | None]]
     sea: dict[str, Any]
-    relativity: dict[str, list[float]]
     rebound: dict[str, np.ndarray]
     rates: dict[str, np.ndarray]
 
@@ -196,9 +189,9 @@ class TangentMaps(Measurement[Found]):
 
     def measure(self, session: Session) -> Found:
         numba, _ = needed("numba", '"eip_scipy[numba]"'), needed("sympy", '"eip_scipy[sympy]"')
-        with session.bar(9, "tangent maps", "part") as bar:
+        with session.bar(7, "tangent maps", "part") as bar:
             parts: dict[str, Any] = {}
-            for part in (_kepler, _orbits, _exponents, _followed, _sea, _planets, _relativity, _costs, _fit):
+            for part in (_kepler, _orbits, _exponents, _followed, _sea, _planets, _costs):
                 parts[part.__name__[1:]] = part(self, session, numba)
                 bar.update()
             axes, eccentricities = np.linspace(1.25, 1.75, self.grid), np.linspace(0.0, 0.2, self.grid)
@@ -263,22 +256,12 @@ class TangentMaps(Measurement[Found]):
         blocks.append(f"Two planets, {self.periods} periods: mean MEGNO, and twice its slope")
         heads = [["EIPDOP853", "MEGNO"], ["REBOUND", "MEGNO"], ["EIPDOP853", "exponent"], ["REBOUND", "exponent"]]
         blocks.append(table(heads, [(name, [_number(x, 4) for x in row]) for name, row in found.planets.items()]))
-        blocks.append("Two planets with relativity (c = 100), 50 periods: log of the tangent vector's size, and MEGNO")
-        heads = [["by", "columns"], ["by differences", "of orbits"], ["without", "relativity"], ["mean MEGNO", ""]]
-        blocks.append(table(heads, [(name, [f"{x:.7f}" for x in row]) for name, row in found.relativity.items()]))
         if found.rebound:
             blocks.append(self._compared(found))
         blocks.append(
             "Time of a run with k columns, by default all, as a multiple of (k + 1) plain runs, by where J v comes from"
         )
         blocks.append(table([["multiple", ""]], [(name, [f"{x:.2f}"]) for name, x in found.costs.items()]))
-        fit = found.fit
-        blocks.append(
-            f"A fit of an orbit of 4 components: {fit['time by columns']:.3f} s and {fit['runs with columns']:.0f} "
-            f"runs with 4 columns, against {fit['time by differences']:.3f} s and {fit['runs for differences']:.0f} "
-            f"plain runs for differences: {fit['ratio']:.2f} of the time; errors {fit['error by columns']:.1e} and "
-            f"{fit['error by differences']:.1e}."
-        )
         return "\n\n".join(blocks)
 
     def _compared(self, found: Found) -> str:
@@ -448,36 +431,6 @@ def _standard_error(values: np.ndarray) -> float:
     return float(values.std(ddof=1) / math.sqrt(values.size)) if values.size > 1 else math.nan
 
 
-def _relativity(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float]]:
-    """Compare the growth of a tangent vector with that of the distance of two orbits, under relativity.
-
-    Return, for each relativistic force and start, a list: the logarithms of the growth of the tangent vector, of the
-    growth of the distance, and of the growth of the tangent vector without relativity, and last MEGNO with it.
-    REBOUND's variational particles lack these forces.
-    """
-    found, t_end, eps = {}, 50 * PERIOD, 1e-6
-    direction = np.random.default_rng(0).standard_normal(18)
-    direction /= np.linalg.norm(direction)
-    for force in ("gr-potential", "1pn"):
-        for place in (REGULAR, CHAOTIC):
-            m, y0 = two_planets(*place)
-            logs = []
-            for forces in (force, ()):
-                problem = nbody(m, y0[:9].reshape(3, 3), y0[9:].reshape(3, 3), t_span=(0, t_end), forces=forces,
-                                constants=ForceConstants(c=100.0) if forces else None)  # fmt: skip
-                run = megno(problem, deviation=direction, method=EIPDOP853, h=STEP, every=t_end)
-                logs.append(run.log_size[-1])
-                if forces:
-                    ends = [
-                        integrate(problem, y0=problem.y0 + side * eps * direction, method=EIPDOP853, h=STEP).y[:, -1]
-                        for side in (1, -1)
-                    ]
-                    logs.append(math.log(np.linalg.norm(ends[0] - ends[1]) / (2 * eps)))
-                    mean = run.megno
-            found[f"{force}: a = {place[0]:g}, e = {place[1]:g}"] = [float(x) for x in (*logs, mean)]
-    return found
-
-
 def _planets(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float | None]]:
     rebound = session.peer("rebound", "REBOUND's MEGNO")
     rates, energy = planets(numba)
@@ -562,47 +515,3 @@ def _costs_of_ready_problems() -> dict[str, float]:
 
 def _seconds(fun: Any, n: int, **options: Any) -> float:
     return float(integrate(fun, (0, n * PERIOD), PERICENTRE, **options).wall_time)
-
-
-def _fit(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
-    """Fit an orbit to observed positions, with the Jacobian from two sources.
-
-    The sources are columns of the state-transition matrix and differences of plain runs. Return the seconds, numbers of
-    runs and errors of the fitted start for both, and the ratio of the times.
-    """
-    problem = hamiltonian(KEPLER, invariants={"L": "x*py - y*px"})
-    options: dict[str, Any] = {"method": EIPDOP853, "h": PERIOD / 80}
-    t = np.linspace(0.0, 20 * PERIOD, 200)
-    truth = np.array([0.8, 0.1, -0.2, 1.15])
-    states = integrate(problem, (0, t[-1]), truth, t_eval=t, **options).y
-    guess = truth * (1 + 1e-4 * np.array([1, -1, 1, 1]))
-    fit = TrajectoryFit(problem, t, states[:2], y0=guess, observe=["x", "y"], **options)
-    count = [0]
-
-    def plain(x: np.ndarray) -> np.ndarray:
-        count[0] += 1
-        found: np.ndarray = (integrate(problem, (0, t[-1]), x, t_eval=t, **options).y[:2] - states[:2]).ravel()
-        return found
-
-    results: dict[str, Any] = {}
-
-    def by_columns() -> None:
-        fit._last, fit.evaluations = None, 0
-        results["columns"] = least_squares(fit.residuals, guess, jac=fit.jacobian, x_scale="jac", xtol=1e-12)
-
-    def by_differences() -> None:
-        count[0] = 0
-        results["differences"] = least_squares(plain, guess, x_scale="jac", xtol=1e-12)
-
-    by_columns()
-    by_differences()
-    times = least({"columns": clocked(by_columns), "differences": clocked(by_differences)}, turns=3)
-    return {
-        "time by columns": times["columns"],
-        "time by differences": times["differences"],
-        "ratio": times["columns"] / times["differences"],
-        "runs with columns": fit.evaluations,
-        "runs for differences": count[0],
-        "error by columns": float(np.abs(results["columns"].x - truth).max()),
-        "error by differences": float(np.abs(results["differences"].x - truth).max()),
-    }

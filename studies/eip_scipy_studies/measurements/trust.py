@@ -31,8 +31,6 @@ from .trust_runs.late import LATE
 from .trust_runs.record import CHANNELS, SILENT, Outcome, Run, carry_out, carry_out_plain
 from .trust_runs.sick import sick_runs
 
-__all__ = ["Trust"]
-
 LEAST_TOLD, MOST_ALARMS = 0.95, 0.01
 SPOILT, TOLERANCE = 10.0, 1e3  # times the error without projection; times rtol
 CHUNK = 8

@@ -28,8 +28,6 @@ from eip_scipy.problems import breather, korteweg_de_vries_solitons, sine_gordon
 from ..report import table
 from ..study import Figures, Measurement, Session, option
 
-__all__ = ["Waves"]
-
 OWN, RAW, EIP, SCIPY = "own method, projected", "own method alone", "EIPDOP853", "SciPy's DOP853"
 METHODS = (OWN, RAW, EIP, SCIPY)
 REPEATS, SHORT = 3, 1.0  # runs that take less than `SHORT` seconds are repeated, others run once

@@ -20,8 +20,6 @@ from eip_scipy.problems import Problem, kepler, satellite
 from ..report import table
 from ..study import Figures, Session, Study
 
-__all__ = ["WithAndWithout"]
-
 PERIOD = 2 * np.pi
 T_END = 32 * PERIOD
 TOLERANCES = {"rtol": 1e-6, "atol": 1e-9}

@@ -19,8 +19,6 @@ from ..report import needed, table
 from ..study import Measurement, Session, option
 from ..timing import clocked, least
 
-__all__ = ["Written"]
-
 njit = needed("numba", '"eip_scipy[numba]"').njit
 
 H = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"

@@ -15,19 +15,6 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy.problems import MechanicsProblem, mechanics, mechanism
 
-__all__ = [
-    "EXAMPLES",
-    "PUBLISHED",
-    "andrews",
-    "bricard",
-    "car_axis",
-    "disc",
-    "four_bar",
-    "four_bar_model",
-    "knife_edge",
-    "n_four_bar",
-]
-
 G = 9.81  # m/s^2
 FINEST = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
 

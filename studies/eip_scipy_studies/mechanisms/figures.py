@@ -12,8 +12,6 @@ from eip_scipy import EIPRK45, integrate
 
 from .examples import four_bar
 
-__all__ = ["four_bar_figures", "joints"]
-
 TOLERANCE, LAST = 1e-4, np.array([2.0, 1.5, 1.0, 0.5, 0.0])  # of the runs that are drawn; seconds before the end
 
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import time
 from typing import NamedTuple
 
-from ..beside import Beside
+from ..beside import workers
 from ..timing import least, many_calls
 from .examples import four_bar, four_bar_model
 from .ways import kept, lambdified
-
-__all__ = ["Speed", "first_result", "speed"]
 
 TURNS, TOLERANCE = 10, 1e-10
 
@@ -18,14 +16,9 @@ TURNS, TOLERANCE = 10, 1e-10
 class Speed(NamedTuple):
     """Processor time: microseconds of a right-hand side, and seconds from a model to its first result.
 
-    Attributes
-    ----------
-    compiled : float
-        Microseconds of the compiled right-hand side: the time of a run without projection, divided by its calls.
-    lambdified : float
-        Microseconds of the right-hand side as users write it, with lambdify(cse=True) and numpy.linalg.solve.
-    first : float
-        Seconds from a SymPy model whose equations are derived to the last state of a run, in a new process.
+    `compiled` is the time of a run without projection, divided by its calls; `lambdified` is that of the right-hand
+    side as users write it, with lambdify(cse=True) and numpy.linalg.solve. `first` is the time from a SymPy model whose
+    equations are derived to the last state of a run, in a new process.
     """
 
     compiled: float
@@ -45,9 +38,8 @@ def speed() -> Speed:
         return (time.process_time() - began) / calls
 
     times = least({"compiled": compiled, "lambdified": many_calls(lambda: plain(0.0, state))}, turns=TURNS)
-    with Beside() as process:
-        process.start(first_result)
-        first = process.result()
+    with workers(1) as start:
+        first = start(first_result)()
     return Speed(1e6 * times["compiled"], 1e6 * times["lambdified"], first)
 
 

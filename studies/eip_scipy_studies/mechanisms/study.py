@@ -23,8 +23,6 @@ from .figures import four_bar_figures
 from .speed import Speed, speed
 from .ways import BOTH, CONSTRAINTS, FACTORS, NEITHER, Outcome, Way, kept, ways
 
-__all__ = ["Mechanisms"]
-
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 LEVELS = (1e-2, 1e-4, 1e-6, 1e-8)  # errors whose costs are compared
 FINEST, AGREEMENT = 1e-13, 1e-8  # a run at this tolerance meets published states within this relative distance

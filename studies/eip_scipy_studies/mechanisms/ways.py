@@ -18,8 +18,6 @@ from eip_scipy.problems import MechanicsProblem
 from ..study import Session
 from .examples import four_bar_model
 
-__all__ = ["BOTH", "CONSTRAINTS", "FACTORS", "NEITHER", "Outcome", "Way", "kept", "lambdified", "ways"]
-
 BOTH, CONSTRAINTS, NEITHER = "constraints and energy", "constraints", "DOP853"
 FACTORS = (1.0, 5.0, 10.0)  # of Baumgarte
 # A run ends after this number of calls: at singular positions those without projection need millions of them.

@@ -16,8 +16,6 @@ from ..solar.solar_system import SolarSystem
 from ..study import Command, Session, Study, option, perform
 from .tables import TABLES, PaperTable
 
-__all__ = ["STUDIES", "Reproduce"]
-
 Make = Callable[[], Study[Any]]
 STUDIES: dict[str, Make] = {
     **{name: partial(PaperTable, name=name) for name in TABLES},

@@ -28,8 +28,6 @@ from ..beside import workers
 from ..report import cores
 from ..study import Check, Rows, Session, Study
 
-__all__ = ["TABLES", "Cell", "PaperTable", "Value"]
-
 TABLES = ("table1", "table2", "table3", "table4", "table5")
 LONGEST = 5  # the table that takes minutes
 OMEGA = 10.0
@@ -41,18 +39,10 @@ WIDE, NARROW, DIGITS = 12, 9, 8  # columns of the printed tables
 
 @dataclass(frozen=True)
 class Value:
-    """A number of the paper, and the same number computed by this package.
+    """A number of the paper as printed, its misprints corrected, and the same number computed by this package.
 
-    Attributes
-    ----------
-    paper : str
-        The number as printed, its misprints corrected.
-    ours, mpmath : float
-        The same number from this package in double precision, and computed in 50 digits (nan if this takes too long).
-    roundoff : float
-        Largest change of the number that round-off may cause.
-    printed : str or None
-        The misprint of the paper, if there is one.
+    `ours` is in double precision, and `mpmath` in 50 digits (nan if this takes too long). `roundoff` is the largest
+    change of the number that round-off may cause, and `printed` the misprint of the paper, if there is one.
     """
 
     paper: str
@@ -229,7 +219,7 @@ def _orders(series: Series, errors: list[float], exact: list[float], roundoff: f
 
 
 def _multiplier_errors(series: Series) -> list[float]:
-    """Return the errors in table 1: |lambda_hat - lambda_star| in the last step of the run with each step length."""
+    """Return the errors in table 1, for the run with each step length."""
     return [_multiplier_error(series, h) for h in series.steps]
 
 
@@ -273,25 +263,19 @@ def _raw_step(solver: type[EIPSolver], problem: Problem, y: np.ndarray, h: float
 def _last_defects(series: Series) -> list[float]:
     """Return the errors in tables 2 and 4: the change of the first kept invariant over a run, for each step length."""
     problem = harmonic(OMEGA) if series.table == 2 else kepler(eccentricity=0.6, relativistic=0.005)
-    return [_last_defect(problem, series, h) for h in series.steps]
-
-
-def _last_defect(problem: Problem, series: Series, h: float) -> float:
-    values = _run(problem, series, h).invariants[0]
-    return abs(float(values[-1] - values[0]))
+    runs = (_run(problem, series, h).invariants[0] for h in series.steps)
+    return [abs(float(values[-1] - values[0])) for values in runs]
 
 
 def _differences(series: Series) -> list[float]:
     """Return the errors in table 3: largest differences of a component between the ends of runs with successive h."""
     problem = kepler(eccentricity=0.6, relativistic=0.005)
-    steps = [2 * series.steps[0], *series.steps]
-    ends = [_run(problem, series, h).y[:, -1] for h in steps]
-    return [float(np.abs(a - b).max()) for a, b in pairwise(ends)]
+    return _changes([_run(problem, series, h).y[:, -1] for h in _refined(series)])
 
 
 def _field_differences(series: Series) -> list[float]:
     """Return the errors in table 5: largest moduli of the difference between the final fields for successive h."""
-    return _field_changes([_field_end(series, h) for h in _field_steps(series)])
+    return _changes([_field_end(series, h) for h in _refined(series)])
 
 
 def _shared(stored: list[Series], start: Callable[..., Callable[[], Any]]) -> Callable[[Series], list[float]]:
@@ -300,12 +284,12 @@ def _shared(stored: list[Series], start: Callable[..., Callable[[], Any]]) -> Ca
     The returned function waits for the runs of a series, and returns the errors. Runs with most steps come first.
     `start` is the function that `workers` yields.
     """
-    runs = [(series, h) for series in stored for h in _field_steps(series)]
+    runs = [(series, h) for series in stored for h in _refined(series)]
     waiting = {(series.name, h): start(_field_end, series, h) for series, h in sorted(runs, key=lambda run: run[1])}
-    return lambda series: _field_changes([waiting[series.name, h]() for h in _field_steps(series)])
+    return lambda series: _changes([waiting[series.name, h]() for h in _refined(series)])
 
 
-def _field_steps(series: Series) -> list[float]:
+def _refined(series: Series) -> list[float]:
     return [2 * series.steps[0], *series.steps]
 
 
@@ -315,7 +299,7 @@ def _field_end(series: Series, h: float) -> np.ndarray:
     return end
 
 
-def _field_changes(ends: list[np.ndarray]) -> list[float]:
+def _changes(ends: list[np.ndarray]) -> list[float]:
     return [float(np.abs(a - b).max()) for a, b in pairwise(ends)]
 
 

@@ -10,11 +10,9 @@ from typing import Any
 from eip_scipy.problems.particles.charged_particle import ORBITS
 
 from ..report import warn
-from ..study import Figures, Rows, Session, Study, option
+from ..study import Check, Figures, Rows, Session, Study, option
 from . import report
 from .runs import METHODS, PAPER_METHODS, SCENES, ParticleStudy, study
-
-__all__ = ["ChargedParticle", "Tokamak", "Uniform"]
 
 Found = dict[str, ParticleStudy]
 
@@ -47,14 +45,14 @@ class ChargedParticle(Study[Found]):
     def text(self, found: Found) -> str:
         return "\n\n".join(report.text(scene) for scene in found.values())
 
-    def checks(self, found: Found) -> list[report.RangeCheck]:
+    def checks(self, found: Found) -> list[Check]:
         return [check for scene in found.values() for check in report.checks(scene)]
 
     def numbers(self, found: Found) -> dict[str, Any]:
         checks = self.checks(found)
         return {
             "scenes": {name: scene.numbers for name, scene in found.items()},
-            "checks": [{**check._asdict(), "passed": check.passed} for check in checks],
+            "checks": [check.entry for check in checks],
             "passed": all(check.passed for check in checks),
         }
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from eip_scipy.problems.particle_orbits import ParticleOrbit
 
 from ..report import compact, table
+from ..study import Check
 from .runs import PAPER_METHODS, ParticleRun, ParticleStudy
-
-__all__ = ["RangeCheck", "checks", "figures", "rows", "text"]
 
 CURVE_POINTS = 40_000  # largest number of points, approximately, of an orbit's curve in a figure
 ROWS = 1000  # number of rows of each run in the CSV file
@@ -25,45 +24,32 @@ TITLES = {
 }
 
 
-class RangeCheck(NamedTuple):
-    """Check that a number, named `what`, lies between two bounds in the problem `scene`."""
-
-    scene: str
-    what: str
-    value: float
-    low: float
-    high: float
-
-    @property
-    def passed(self) -> bool:
-        """Return True if the number lies between the bounds; nan does not."""
-        return self.low <= self.value <= self.high
-
-    @property
-    def text(self) -> str:
-        """Return the check as a line of text."""
-        whole = float(self.value).is_integer() and self.low == self.high
-        number = f"{self.value:.0f}" if whole else compact(self.value, 5 if "tip" in self.what else 4)
-        if self.low == self.high:
-            expected = f"expected {self.low:g}"
-        elif self.low == 0:
-            expected = f"at most {compact(self.high)}"
-        elif self.high == np.inf:
-            expected = f"at least {compact(self.low)}"
-        else:
-            expected = f"between {compact(self.low, 5)} and {compact(self.high, 5)}"
-        return f"{'ok' if self.passed else 'FAILED':<6} {self.what}: {number}, {expected}"
+def range_check(scene: str, what: str, value: float, low: float, high: float) -> Check:
+    """Return the check that a number, named `what`, lies between two bounds in the problem `scene`; nan does not."""
+    passed = low <= value <= high
+    whole = float(value).is_integer() and low == high
+    number = f"{value:.0f}" if whole else compact(value, 5 if "tip" in what else 4)
+    if low == high:
+        expected = f"expected {low:g}"
+    elif low == 0:
+        expected = f"at most {compact(high)}"
+    elif high == np.inf:
+        expected = f"at least {compact(low)}"
+    else:
+        expected = f"between {compact(low, 5)} and {compact(high, 5)}"
+    record = {"scene": scene, "what": what, "value": value, "low": low, "high": high, "passed": passed}
+    return Check(f"{what}: {number}, {expected}", passed, record)
 
 
-def checks(found: ParticleStudy) -> list[RangeCheck]:
+def checks(found: ParticleStudy) -> list[Check]:
     """Compare the runs with the reference, and with the known behaviour of the methods over the paper's interval."""
     got = found.numbers
     kept = [
-        RangeCheck(found.scene, f"{name}, largest relative error of {symbol}", got[name][key], 0.0, ROUND_OFF)
+        range_check(found.scene, f"{name}, largest relative error of {symbol}", got[name][key], 0.0, ROUND_OFF)
         for name in _keepers(found)
         for symbol, key in (("H", "energy_error"), ("L", "momentum_error"))
     ]
-    reference = RangeCheck(found.scene, "reference, distance from the stored states", found.reference_error, 0.0, 2e-9)
+    reference = range_check(found.scene, "reference, distance from the stored states", found.reference_error, 0.0, 2e-9)
     special = {"uniform": _uniform_checks, "tokamak-banana": _banana_checks, "tokamak-transit": _transit_checks}
     return [reference, *kept, *special[found.scene](found.scene, got, _keepers(found))]
 
@@ -73,46 +59,48 @@ def _keepers(found: ParticleStudy) -> list[str]:
     return [name for name in found.lines if name.startswith("EIP-HL")]
 
 
-def _uniform_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
+def _uniform_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[Check]:
     true = got["reference"]["gyroradius_first"]
-    found = [RangeCheck(scene, "RK4, gyroradius in the last turn", got["RK4"]["gyroradius_last"], 0.0, 0.02)]
+    found = [range_check(scene, "RK4, gyroradius in the last turn", got["RK4"]["gyroradius_last"], 0.0, 0.02)]
     for name in keepers:
         for turn in ("first", "last"):
             value = got[name][f"gyroradius_{turn}"]
-            found.append(RangeCheck(scene, f"{name}, gyroradius in the {turn} turn", value, true - 1e-4, true + 1e-4))
+            found.append(range_check(scene, f"{name}, gyroradius in the {turn} turn", value, true - 1e-4, true + 1e-4))
         found.append(
-            RangeCheck(scene, f"{name}, error of the guiding centre's angle [rad]", got[name]["angle_error"], 0.0, 2e-3)
+            range_check(
+                scene, f"{name}, error of the guiding centre's angle [rad]", got[name]["angle_error"], 0.0, 2e-3
+            )
         )
     lost = "EIP-H, error of the guiding centre's angle [rad]: one invariant of two is not enough"
-    return [*found, RangeCheck(scene, lost, got["EIP-H"]["angle_error"], 5.0, np.inf)]
+    return [*found, range_check(scene, lost, got["EIP-H"]["angle_error"], 5.0, np.inf)]
 
 
-def _banana_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
+def _banana_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[Check]:
     found = [
-        RangeCheck(scene, "RK4, banana tips: then it circulates", got["RK4"]["tips"], 2, 2),
-        RangeCheck(scene, "EIP-H, banana tips", got["EIP-H"]["tips"], 3, 3),
+        range_check(scene, "RK4, banana tips: then it circulates", got["RK4"]["tips"], 2, 2),
+        range_check(scene, "EIP-H, banana tips", got["EIP-H"]["tips"], 3, 3),
     ]
     for name in keepers:
-        found.append(RangeCheck(scene, f"{name}, banana tips", got[name]["tips"], 8, 8))
+        found.append(range_check(scene, f"{name}, banana tips", got[name]["tips"], 8, 8))
         for end in ("nearest", "farthest"):
             value = got[name][f"tip_{end}"]
-            found.append(RangeCheck(scene, f"{name}, R of the {end} tip", value, TIP - 2e-4, TIP + 2e-4))
+            found.append(range_check(scene, f"{name}, R of the {end} tip", value, TIP - 2e-4, TIP + 2e-4))
         found.append(_moment(scene, name, got))
     return found
 
 
-def _transit_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
+def _transit_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[Check]:
     what = "error of the extrema of R and z in a turn"
-    found = [RangeCheck(scene, f"RK4, {what}", got["RK4"]["extrema_error"], 5e-3, np.inf)]
+    found = [range_check(scene, f"RK4, {what}", got["RK4"]["extrema_error"], 5e-3, np.inf)]
     for name in keepers:
-        found.append(RangeCheck(scene, f"{name}, {what}", got[name]["extrema_error"], 0.0, 5e-4))
+        found.append(range_check(scene, f"{name}, {what}", got[name]["extrema_error"], 0.0, 5e-4))
         found.append(_moment(scene, name, got))
     return found
 
 
-def _moment(scene: str, name: str, got: Mapping[str, Mapping[str, float]]) -> RangeCheck:
+def _moment(scene: str, name: str, got: Mapping[str, Mapping[str, float]]) -> Check:
     value = abs(got[name]["moment_change"])
-    return RangeCheck(scene, f"{name}, change of the magnetic moment", value, 0.0, 5e-4)
+    return range_check(scene, f"{name}, change of the magnetic moment", value, 0.0, 5e-4)
 
 
 COMMON = {
@@ -166,7 +154,7 @@ def text(found: ParticleStudy) -> str:
         *LEGEND["uniform" if found.scene == "uniform" else "tokamak"],
         "gyrophase [rad] and position: errors at the end. H, L: largest relative errors.",
         "",
-        *(check.text for check in checks(found)),
+        *(check.line for check in checks(found)),
     ]
     return "\n".join(lines)
 
@@ -194,22 +182,8 @@ def rows(found: ParticleStudy) -> Iterator[dict[str, Any]]:
 def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -> Iterator[tuple[str, Any]]:
     """Make the figures one by one: one for the uniform field, and one for both orbits in the tokamak.
 
-    Parameters
-    ----------
-    studies : mapping of str to ParticleStudy
-        Runs by problem.
-    paper_only : bool, optional
-        Draw only the rows of the paper's figures: RK4 and EIP-HL, and EIP-H in the uniform field.
-
-    Yields
-    ------
-    (str, Figure)
-        File name without its ending, and figure.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib is not installed.
+    `studies` are the runs by problem. With `paper_only` only the rows of the paper's figures are drawn: RK4 and EIP-HL,
+    and EIP-H in the uniform field. File names are without their ending.
     """
     from ..plotting import particle_figure
 

@@ -18,8 +18,6 @@ from eip_scipy.solvers import EIPSolver
 from ..comparators import boris, implicit_midpoint
 from ..long_runs import named
 
-__all__ = ["METHODS", "PAPER_METHODS", "SCENES", "ParticleRun", "ParticleStudy", "scene", "study"]
-
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False}
 REFINEMENT = 4  # number of steps of the reference in one step
 LAST_TURN = 100
@@ -30,18 +28,7 @@ Runner = Callable[[ParticleProblem], Any]
 
 @dataclass(frozen=True, eq=False)
 class ParticleRun:
-    """One method's run, saved at each step.
-
-    Attributes
-    ----------
-    orbit : ParticleOrbit
-    energy_error, momentum_error : ndarray, shape (m,)
-        Relative errors of H and L.
-    nfev : int
-        Calls of the right-hand side.
-    wall_time : float
-        Seconds.
-    """
+    """One method's run, saved at each step, with the relative errors of H and L (m,), calls of f and seconds."""
 
     orbit: ParticleOrbit
     energy_error: np.ndarray
@@ -52,19 +39,10 @@ class ParticleRun:
 
 @dataclass(frozen=True, eq=False)
 class ParticleStudy:
-    """All runs of one problem.
+    """All runs of one problem, whose name `scene` is one of `SCENES`; `lines` has the runs by the methods' names.
 
-    Attributes
-    ----------
-    scene : str
-        Name of the problem, one of `SCENES`.
-    problem : ParticleProblem
-    reference : ParticleRun
-        Run by DOP853 with 1/4 of the step and compensated sums.
-    reference_error : float
-        Largest distance of the reference from the states stored with the problem; nan if none of their times is saved.
-    lines : dict of str to ParticleRun
-        The runs by the methods' names.
+    `reference` is a run by DOP853 with 1/4 of the step and compensated sums, and `reference_error` its largest distance
+    from the states stored with the problem, nan if none of their times is saved.
     """
 
     scene: str
@@ -94,15 +72,7 @@ class ParticleStudy:
 
 
 def scene(name: str, **options: Any) -> ParticleProblem:
-    """Make a problem by its name.
-
-    Parameters
-    ----------
-    name : str
-        One of `SCENES`.
-    **options
-        Options of `uniform_field` or `tokamak`.
-    """
+    """Make a problem by its name, one of `SCENES`; the options are those of `uniform_field` or `tokamak`."""
     return uniform_field(**options) if name == "uniform" else tokamak(name.removeprefix("tokamak-"), **options)
 
 
@@ -143,24 +113,10 @@ def _boris(problem: ParticleProblem) -> Any:
 def study(
     name: str, *, paper_only: bool = False, callback: Callable[[], Any] = lambda: None, **options: Any
 ) -> ParticleStudy:
-    """Run the methods on one problem.
+    """Run the methods on one problem, one of `SCENES`, and call `callback()` after each run.
 
-    All use the canonical form of the equations, except Boris, which is a method for (x, v).
-
-    Parameters
-    ----------
-    name : str
-        One of `SCENES`.
-    paper_only : bool, optional
-        Leave out runs that the paper's figures do not need.
-    callback : callable, optional
-        ``callback()`` after each run.
-    **options
-        Options of the problem, such as ``t_end``.
-
-    Returns
-    -------
-    ParticleStudy
+    All use the canonical form of the equations, except Boris, which is a method for (x, v). With `paper_only` the runs
+    that the paper's figures do not need are left out. The options are those of the problem, such as ``t_end``.
     """
     problem, other = scene(name, **options), scene(name, form="velocity", **options)
     assert problem.h is not None

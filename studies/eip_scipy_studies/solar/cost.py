@@ -31,19 +31,6 @@ from .runs import (
     whole_number,
 )
 
-__all__ = [
-    "ENOUGH_SECONDS",
-    "MERCURY",
-    "TimedRun",
-    "by_peer",
-    "by_us",
-    "by_verlet",
-    "cost",
-    "cost_methods",
-    "panels",
-    "timed",
-]
-
 ENOUGH_SECONDS = 0.2  # disturbances of so long a run are invisible on axes of many powers of ten
 MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first number would be unstable
 MERCURY = 0  # number among the planets, which follow the Sun
@@ -51,17 +38,10 @@ MERCURY = 0  # number among the planets, which follow the Sun
 
 @dataclass(frozen=True, eq=False)
 class TimedRun:
-    """One method at one step or tolerance.
+    """One method at one step or tolerance, with its wall time in seconds.
 
-    Attributes
-    ----------
-    method : str
-    step : float
-        Step in years; for heyoka the tolerance; nan for IAS15, which chooses its steps.
-    wall_time : float
-        Seconds.
-    errors : ndarray, shape (9,)
-        Distance of each planet from the reference [AU]; nan if the run failed.
+    `step` is in years; for heyoka it is the tolerance, and for IAS15, which chooses its steps, nan. `errors` (9,) are
+    the distances of the planets from the reference [AU], nan if the run failed.
     """
 
     method: str
@@ -128,21 +108,7 @@ def timed(
     enough_seconds: float = 1.0,
     callback: Callable[[], Any] | None = None,
 ) -> list[TimedRun]:
-    """Run and time methods; see `work_precision`.
-
-    Parameters
-    ----------
-    methods : mapping
-        Functions and steps, as for `work_precision`.
-    truth : ndarray, shape (60,)
-        The state at the end of all runs.
-    repeats, enough_seconds, callback
-        As for `work_precision`.
-
-    Returns
-    -------
-    list of TimedRun
-    """
+    """Run and time methods as `work_precision` does; `truth` (60,) is the state at the end of all runs."""
     done = work_precision(
         methods, lambda y: math.nan, repeats=repeats, enough_seconds=enough_seconds, callback=callback
     )
@@ -177,24 +143,10 @@ def cost(
 ) -> list[TimedRun]:
     """Time several methods and steps, and return the times and the errors of the final positions.
 
-    The errors are relative to the stored state or, if there is none, to IAS15 or else to `tight_run`.
-
-    Parameters
-    ----------
-    scene : SolarScene
-        The problem, over the time span to be timed.
-    methods : mapping
-        From `cost_methods`.
-    peer : callable or None
-        REBOUND, if it is installed.
-    repeats : int
-        Number of runs of each method and step; a run longer than `ENOUGH_SECONDS` is not repeated.
-    callback : callable, optional
-        ``callback()`` after each run, and for each repetition that is left out.
-
-    Returns
-    -------
-    list of TimedRun
+    The errors are relative to the stored state or, if there is none, to IAS15 or else to `tight_run`. `scene` is the
+    problem over the time span to be timed, `methods` come from `cost_methods`, and `peer` is REBOUND, if it is
+    installed. A run longer than `ENOUGH_SECONDS` is not repeated. ``callback()`` is called after each run, and for each
+    repetition that is left out.
     """
     truth = stored_state(scene, scene.years)
     if truth is None:
@@ -207,23 +159,11 @@ def cost(
 def cost_methods(
     scene: SolarScene, method: type[EIPSolver], metric: str, peer: Peer | None
 ) -> dict[str, tuple[Runner, Sequence[float]]]:
-    """List the methods and steps that `cost` times.
+    """List the methods and steps that `cost` times, as for `work_precision`.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    method : type
-        The method asked for. It is timed with and without its projection; EIPRK5 (or EIPRK4 if `method` is EIPRK5),
-        Stoermer-Verlet, EIPRKN12, EIPGJ14 and, if there is a `peer`, REBOUND's methods are timed as well.
-    metric : {"error", "euclidean"}
-        Metric of the projection.
-    peer : callable or None
-        REBOUND, if it is installed.
-
-    Returns
-    -------
-    dict
-        Functions and steps by method, as for `work_precision`.
+    `method`, the method asked for, is timed with and without its projection in the given `metric`; EIPRK5 (or EIPRK4 if
+    `method` is EIPRK5), Stoermer-Verlet, EIPRKN12, EIPGJ14 and, if there is a `peer`, REBOUND's methods are timed as
+    well.
     """
     other = EIPRK4 if method is EIPRK5 else EIPRK5
     own, problem = metric_of(method, metric), scene.problem

@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 from ..report import UsageError
 from ..study import option
 
-__all__ = ["AnyEpoch", "Epoch", "kernels", "one_line", "parse_epoch"]
-
 FORMS = '"2014-02-02T20:18", "2000-01-01" (both TDB, Gregorian calendar), "JD2451545.0" or "2451545.0"'
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?)?")
 _JULIAN_DATE = re.compile(r"(?:JD ?)?(-?\d{1,8}(?:\.\d*)?)", re.IGNORECASE)
@@ -35,19 +33,8 @@ class Epoch(NamedTuple):
 def parse_epoch(text: str) -> Epoch:
     """Read an epoch without loss: both parts are the numbers nearest to the text.
 
-    Parameters
-    ----------
-    text : str
-        A date of the proleptic Gregorian calendar with or without time, or a Julian date; "TDB" may follow.
-
-    Returns
-    -------
-    Epoch
-
-    Raises
-    ------
-    ValueError
-        If the text has another form; the message lists the accepted forms.
+    The text is a date of the proleptic Gregorian calendar with or without time, or a Julian date; "TDB" may follow.
+    Other texts raise a ValueError, whose message lists the accepted forms.
 
     Examples
     --------

@@ -9,10 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..study import Check
-from .cost import MERCURY, TimedRun
+from .cost import TimedRun
 from .runs import TIGHT, MethodRun, SolarScene, report_times, stored_state
-
-__all__ = ["MERCURY", "PointErrors", "SolarRuns", "ecliptic", "errors_at", "longitude_errors"]
 
 OBLIQUITY = math.radians(84381.448 / 3600)  # IAU 1976, as the paper's data: from the axes of the ICRF to the ecliptic
 # A turn is counted right if the longitude error changes by less than half a turn between saved states. Two ellipses as
@@ -76,24 +74,11 @@ def ecliptic(scene: SolarScene, vectors: np.ndarray) -> np.ndarray:
 
 
 def longitude_errors(scene: SolarScene, run: MethodRun, truth: MethodRun) -> np.ndarray:
-    """Return the errors of the heliocentric ecliptic longitude along a run, with whole turns counted.
+    """Return the errors (9, m) in rad of the heliocentric ecliptic longitude along a run, with whole turns counted.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    run, truth : MethodRun
-        The run, and the one with which it is compared.
-
-    Returns
-    -------
-    ndarray, shape (9, m)
-        rad, at the times of `truth`. nan after the end of a run, and as soon as its longitude error changes too fast
-        between saved states for its turns to be counted.
-
-    Notes
-    -----
-    The difference of two longitudes changes slowly even if the longitudes do not: the difference is made
-    continuous in time.
+    They are those at the times of `truth`, with which the run is compared; nan after the end of a run, and as soon as
+    its longitude error changes too fast between saved states for its turns to be counted. The difference of two
+    longitudes changes slowly even if the longitudes do not: the difference is made continuous in time.
     """
     n = _common_saves(run, truth)
     error = np.full((len(scene.planets), truth.t.size), np.nan)
@@ -122,21 +107,11 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
 
 
 def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None) -> PointErrors | None:
-    """Return the errors of a run at one of the `report_times`.
+    """Return the errors of a run at one of the `report_times`, or None if they are not known.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    run : MethodRun
-    year : float
-    tight : MethodRun or None
-        The run along which whole turns are counted. It is also the reference if no reference state is stored.
-
-    Returns
-    -------
-    PointErrors or None
-        None if the errors are not known: there is no reference at that time, the run is the reference itself, or the
-        run ended before. Longitudes are nan without `tight`. Positions are relative to the centre of mass.
+    They are not known if there is no reference at that time, the run is the reference itself, or the run ended before.
+    Whole turns are counted along the run `tight`, which is also the reference if no reference state is stored; without
+    it longitudes are nan. Positions are relative to the centre of mass.
     """
     state, source = stored_state(scene, year), "stored states"
     if state is None and tight is not None and tight is not run:
@@ -172,21 +147,8 @@ def _state_at(run: MethodRun, year: float) -> np.ndarray | None:
 def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | None) -> list[Check]:
     """Return checks that hold for any sensible settings; if one fails, the results are not reliable.
 
-    They are that the runs reached the end, that `main` keeps H and L, and that `tight` agrees with stored states.
-
-    Parameters
-    ----------
-    scene : SolarScene
-    order : int
-        Order of the method asked for.
-    main : MethodRun
-        The run of this method.
-    tight : MethodRun or None
-        The most accurate run, with which the others are compared.
-
-    Returns
-    -------
-    list of Check
+    They are that the runs reached the end, that `main`, the run of the method of order `order`, keeps H and L, and that
+    `tight`, the most accurate run, agrees with stored states.
     """
     done = [Check(f"{main.name} reached the end", not main.failure)]
     # Residuals are O(h^(2p + 2)): round-off for small steps; for large ones the factor is measured, with a margin of

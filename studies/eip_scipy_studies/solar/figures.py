@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,30 +13,17 @@ from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from .. import plotting
 from ..report import describe_machine
-from .cost import ENOUGH_SECONDS, panels
-from .errors import MERCURY, SolarRuns, ecliptic, longitude_errors
+from .cost import ENOUGH_SECONDS, MERCURY, panels
+from .errors import SolarRuns, ecliptic, longitude_errors
 from .runs import MethodRun, SolarScene
 
-__all__ = ["figures", "jacobi", "osculating_orbits"]
-
-OUTER, INNER = slice(4, 9), slice(0, 4)
 ELLIPSES = 40
 
 
 def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, Any]]:
-    """Make figures one by one.
+    """Make those `FIGURES` that are in the slice `part` one by one, and yield file names and figures.
 
-    Parameters
-    ----------
-    study : SolarRuns
-        The runs, including the reference run; the last figure also needs the timings.
-    part : slice, optional
-        Slice of `FIGURES`: the figures to make.
-
-    Yields
-    ------
-    (str, Figure)
-        File name and figure.
+    The runs must include the reference run; the last figure also needs the timings.
     """
     # A method has one style in all figures; timed methods come last, so that the runs look the same without them.
     styles = method_styles(dict.fromkeys([*(run.name for run in study.runs), *(item.method for item in study.cost)]))
@@ -46,15 +34,7 @@ def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, 
 def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities of each planet relative to the centre of mass of all bodies before it.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    y : ndarray, shape (60, m)
-
-    Returns
-    -------
-    position, velocity : ndarray, shape (9, 3, m)
-        AU and AU/yr, ecliptic axes.
+    `y` are states (60, m). The results (9, 3, m) are in AU and AU/yr, in ecliptic axes.
     """
     q, v = y.reshape(2, -1, 3, y.shape[1])
     gm = scene.data.gm[:, None, None]
@@ -65,17 +45,8 @@ def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def osculating_orbits(scene: SolarScene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
     """Compute the osculating ellipses: the orbit of each planet if all bodies before it were a single one.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    y : ndarray, shape (60, m)
-    n_points : int, optional
-        Points on an ellipse.
-
-    Returns
-    -------
-    ndarray, shape (9, m, 2, n_points)
-        AU, in the plane of the ecliptic; nan for a planet that is not on an ellipse.
+    `y` are states (60, m). The result (9, m, 2, n_points) is in AU, in the plane of the ecliptic; nan for a planet that
+    is not on an ellipse.
     """
     r, v = (np.moveaxis(x, 1, -1) for x in jacobi(scene, y))
     mu = np.cumsum(scene.data.gm)[1:, None, None] * YEAR_D**2
@@ -158,15 +129,7 @@ def _sample(run: MethodRun) -> np.ndarray:
     return np.unique(np.append((golden * run.t.size).astype(int), [0, run.t.size - 1]))
 
 
-def _outer_figure(study: SolarRuns, styles: Any) -> Any:
-    return _orbits_figure(study, OUTER, "Outer planets and Pluto")
-
-
-def _inner_figure(study: SolarRuns, styles: Any) -> Any:
-    return _orbits_figure(study, INNER, "Inner planets")
-
-
-def _orbits_figure(study: SolarRuns, which: slice, title: str) -> Any:
+def _orbits_figure(which: slice, title: str, study: SolarRuns, styles: Any) -> Any:
     scene = study.scene
     panels = {}
     for name, run in _shown(study).items():
@@ -204,11 +167,11 @@ def _cost_figure(study: SolarRuns, styles: Any) -> Any:
     )
 
 
-FIGURES = {
+FIGURES: dict[str, Callable[[SolarRuns, Any], Any]] = {
     "invariant-errors.png": _errors_figure,
     "longitude-errors.png": _longitude_figure,
-    "orbits-outer.png": _outer_figure,
-    "orbits-inner.png": _inner_figure,
+    "orbits-outer.png": partial(_orbits_figure, slice(4, 9), "Outer planets and Pluto"),
+    "orbits-inner.png": partial(_orbits_figure, slice(0, 4), "Inner planets"),
     "orbit-mercury.png": _mercury_figure,
     "error-against-cost.png": _cost_figure,
 }

@@ -17,31 +17,19 @@ from eip_scipy.problems.gravity.solar_data import YEAR_D, load, reference_states
 from ..long_runs import positive
 from ..report import UsageError, compact, describe_machine, table
 from ..study import Figures, Rows, Session, Study, option
-from ..work_precision import Runner, costs_at, curves
+from ..work_precision import Runner, costs_at, curves, known_end
 from .cost import MERCURY, TimedRun, by_peer, by_us, by_verlet, panels, timed
 from .runs import KEPT, Peer, orbits_kept, whole_number
-
-__all__ = ["Found", "Frontier", "methods"]
 
 PATIENCE = 30.0  # longer runs, in seconds, are not repeated
 LEVELS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 
 def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | None) -> dict[str, Any]:
-    """Return the methods to time, with steps in years or tolerances.
+    """Return the methods to time on the ten bodies in AU and years, with steps in years or tolerances.
 
-    Parameters
-    ----------
-    problem : Problem
-        The ten bodies, in AU and years.
-    years : float
-    peer, heyoka : callable or None
-        The functions ``run`` for REBOUND and for heyoka, if these packages are installed.
-
-    Returns
-    -------
-    dict of str to (callable, sequence of float)
-        Functions and steps or tolerances by method, as for `work_precision`.
+    `peer` and `heyoka` are the functions ``run`` for REBOUND and for heyoka, if these packages are installed. The
+    result is as for `work_precision`.
     """
 
     def own(method: Any, *steps: float, **options: Any) -> tuple[Runner, Sequence[float]]:
@@ -128,13 +116,10 @@ class Frontier(Study[Found]):
         peers = session.peer("rebound", "WHFast and IAS15"), session.peer("heyoka", "heyoka")
         peer, heyoka = (None if found is None else found.run for found in peers)
         problem = solar_system(years=self.years)
-        assert problem.reference is not None
-        truth = problem.reference(self.years)
-        assert truth is not None
         chosen = methods(problem, self.years, peer, heyoka)
         total = self.repeats * sum(len(steps) for _, steps in chosen.values())
         with session.bar(total, "frontier") as bar:
-            runs = timed(chosen, truth, repeats=self.repeats, enough_seconds=PATIENCE, callback=bar.update)
+            runs = timed(chosen, known_end(problem), repeats=self.repeats, enough_seconds=PATIENCE, callback=bar.update)
         return Found(runs, describe_machine())
 
     def text(self, found: Found) -> str:

@@ -15,16 +15,14 @@ from ..report import compact, table
 from .errors import PointErrors, SolarRuns
 from .runs import BALANCED, HIGH_ORDER, MULTISTEP, TIGHT, MethodRun, report_times
 
-__all__ = ["cost_rows", "csv_rows", "json_content", "text"]
-
 
 def text(study: SolarRuns, settings: Any) -> str:
     """Lay out the head, the table, the notes and the checks, 90 characters wide with the usual names of methods.
 
     `settings` is the command, whose `h` is the step that was requested.
     """
-    parts = [_head(study, settings), _table(study), _notes(study), *_check_lines(study)]
-    return "\n".join(["", *parts])
+    checks = [check.line for check in study.checks()]
+    return "\n".join(["", _head(study, settings), _table(study), _notes(study), "", *checks])
 
 
 def _head(study: SolarRuns, settings: Any) -> str:
@@ -106,10 +104,6 @@ def _notes(study: SolarRuns) -> str:
     return "\n".join(["", fill(" ".join(filter(None, notes)), 79, break_on_hyphens=False), *failures])
 
 
-def _check_lines(study: SolarRuns) -> list[str]:
-    return ["", *(check.line for check in study.checks())]
-
-
 def cost_rows(study: SolarRuns) -> list[dict[str, Any]]:
     """Return a row for each method and step that was timed."""
     if study.cost_scene is None:
@@ -127,6 +121,16 @@ def cost_rows(study: SolarRuns) -> list[dict[str, Any]]:
     ]
 
 
+def _about(run: MethodRun) -> dict[str, Any]:
+    return {
+        "method": run.name,
+        "step_yr": run.step,
+        "wall_time_s": run.wall_time,
+        "max_relative_error_H": run.energy_error.max(),
+        "max_relative_error_L": run.momentum_error.max(),
+    }
+
+
 def csv_rows(study: SolarRuns) -> list[dict[str, Any]]:
     """Return a row for each method and each of the `report_times`, with columns for all planets."""
     rows = []
@@ -139,11 +143,7 @@ def csv_rows(study: SolarRuns) -> list[dict[str, Any]]:
             longitude, position = (errors.longitude, errors.position) if errors else (unknown, unknown)
             rows.append(
                 {
-                    "method": run.name,
-                    "step_yr": run.step,
-                    "wall_time_s": run.wall_time,
-                    "max_relative_error_H": run.energy_error.max(),
-                    "max_relative_error_L": run.momentum_error.max(),
+                    **_about(run),
                     "year": year,
                     "reference": errors.reference if errors else None,
                     **{f"longitude_{p}_rad": value for p, value in zip(planets, longitude, strict=True)},
@@ -159,11 +159,7 @@ def json_content(study: SolarRuns) -> dict[str, Any]:
     times = {year: study.errors(year) for year in report_times(scene)}
     methods = [
         {
-            "method": run.name,
-            "step_yr": run.step,
-            "wall_time_s": run.wall_time,
-            "max_relative_error_H": run.energy_error.max(),
-            "max_relative_error_L": run.momentum_error.max(),
+            **_about(run),
             "failure": run.failure or None,
             "errors": [
                 {
@@ -188,5 +184,5 @@ def json_content(study: SolarRuns) -> dict[str, Any]:
             "error_others": "largest error of another planet's position [AU]",
             "points": cost_rows(study),
         },
-        "checks": [check._asdict() for check in study.checks()],
+        "checks": [check.entry for check in study.checks()],
     }

@@ -23,28 +23,6 @@ from eip_scipy.solvers import EIPSolver
 from ..comparators import StormerVerletResult, stormer_verlet
 from ..long_runs import named
 
-__all__ = [
-    "HIGH_ORDER",
-    "KEPT",
-    "MULTISTEP",
-    "TIGHT",
-    "MethodRun",
-    "Peer",
-    "PendingRun",
-    "SolarScene",
-    "eip_name",
-    "leapfrog",
-    "make_scene",
-    "metric_of",
-    "orbits_kept",
-    "plan",
-    "rebound_run",
-    "report_times",
-    "stored_state",
-    "tight_run",
-    "whole_number",
-]
-
 Peer = Callable[..., Any]
 """`eip_scipy.integrations.rebound.run`."""
 
@@ -61,19 +39,10 @@ POWERS = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 
 @dataclass(frozen=True, eq=False)
 class SolarScene:
-    """Common input of all methods: the problem, its data, and the times at which states are saved.
+    """Common input of all methods: the problem in AU and Julian years, its data, and the times of saved states.
 
-    Attributes
-    ----------
-    problem : Problem
-        Problem in AU and Julian years; its `h` divides the time between saves.
-    data : SolarSystemData
-    years, h : float
-        Length and step of the runs in Julian years.
-    n_saves : int
-        Number of equally spaced states that are saved after the start.
-    every : int
-        Number of steps between two saved states.
+    The length `years` and the step `h` are in Julian years. `n_saves` equally spaced states are saved after the start,
+    with `every` steps between two of them; `h` divides the time between saves.
     """
 
     problem: Problem
@@ -98,23 +67,10 @@ class SolarScene:
 class MethodRun:
     """One method's run; states that are not finite are left out.
 
-    Attributes
-    ----------
-    name : str
-    head : tuple of str
-        The name, divided into the lines of a table's head.
-    step : float or None
-        Step in years; None if the method chooses its steps.
-    wall_time : float
-        Seconds of the run, without compilation and without reading states.
-    t : ndarray, shape (m,)
-        Times in Julian years.
-    y : ndarray, shape (60, m)
-        States in AU and AU/yr.
-    energy_error, momentum_error : ndarray, shape (m,)
-        ``|H - H(0)| / |H(0)|`` and ``|L - L(0)| / |L(0)|``.
-    failure : str
-        Reason why the run did not reach its end; empty if it did.
+    `head` is the name, divided into the lines of a table's head. `step` is in years, None if the method chooses its
+    steps. `wall_time` are the seconds of the run, without compilation and without reading states. The states `y` (60,
+    m), in AU and AU/yr, are those at the times `t` (m,) in Julian years. The errors (m,) are ``|H - H(0)| / |H(0)|``
+    and ``|L - L(0)| / |L(0)|``. `failure` is the reason why the run did not reach its end, empty if it did.
     """
 
     name: str
@@ -140,26 +96,12 @@ class PendingRun(NamedTuple):
 
 
 def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScene:
-    """Make the problem for a run of `years` years.
+    """Make the problem for a run of `years` Julian years, > 0.
 
-    Parameters
-    ----------
-    data : str or SolarSystemData
-        One of `eip_scipy.problems.gravity.solar_data.available()`, or data for another epoch.
-    years : float
-        Length of the run in Julian years, > 0.
-    h : float
-        Upper bound of the step in years; the step divides the time between saved states and is shortened if necessary.
-
-    Returns
-    -------
-    SolarScene
-
-    Raises
-    ------
-    ValueError
-        If the step is longer than the run or too small to change the time in floating-point arithmetic, or if the data
-        are unknown.
+    `data` is one of `eip_scipy.problems.gravity.solar_data.available()`, or data for another epoch. `h` is the upper
+    bound of the step in years; the step divides the time between saved states and is shortened if necessary. A
+    ValueError is raised if the step is longer than the run or too small to change the time in floating-point
+    arithmetic, or if the data are unknown.
     """
     FixedSteps.of((0.0, years), h, None)
     n_saves = whole_number(years / max(_save_interval(years), h))
@@ -196,46 +138,35 @@ def plan(
 ) -> list[PendingRun]:
     """Return the runs of the comparison: first that of `method`, last the most accurate one, which is the reference.
 
-    Parameters
-    ----------
-    scene : SolarScene
-    method : type
-        `EIPRK1` ... `EIPRK5` or another fixed-step class.
-    metric : {"error", "euclidean"}
-        Metric of the projection.
-    peer : callable or None
-        REBOUND's `run`, if REBOUND is installed.
-    checkpoint_of : callable, optional
-        ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
-
-    Returns
-    -------
-    list of PendingRun
+    `method` is `EIPRK1` ... `EIPRK5` or another fixed-step class, `metric` ("error" or "euclidean") that of its
+    projection, and `peer` REBOUND's `run`, if REBOUND is installed. ``checkpoint_of(name)`` returns the options of
+    `integrate` that keep checkpoints of the run of that name.
     """
-    metrics = {metric_of(method, metric), metric_of(method, "error"), "euclidean"}
-    ordered = sorted(metrics, key=lambda m: m != metric_of(method, metric))
-    names = [eip_name(method, m) for m in ordered]
-    tasks = [
-        PendingRun(name, partial(_eip, scene, method, m, **checkpoint_of(name)), True)
-        for name, m in zip(names, ordered, strict=True)
-    ]
+    tasks = []
+
+    def add(name: str, method: type[EIPSolver], head: tuple[str, str], per_save: int | None, **options: Any) -> None:
+        options |= checkpoint_of(name)
+        tasks.append(PendingRun(name, partial(_own, scene, name, method, head, per_save, **options), True))
+
+    for m in dict.fromkeys([metric_of(method, metric), metric_of(method, "error"), "euclidean"]):
+        add(eip_name(method, m), method, (method.__name__, "euclid." if m == "euclidean" else m), None, metric=m)
     name = method.TABLEAU.name
-    tasks.append(PendingRun(name, partial(_plain, scene, method, **checkpoint_of(name)), True))
+    add(name, method, (name, "alone"), None, invariants=())
     tasks.append(PendingRun("SV", lambda progress: _verlet(scene), False))
-    tasks.append(
-        PendingRun(
-            HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **checkpoint_of(HIGH_ORDER)), True
-        )
-    )
-    tasks.append(PendingRun(MULTISTEP, partial(_multistep, scene, **checkpoint_of(MULTISTEP)), True))
-    tasks.append(PendingRun(BALANCED, partial(_balanced, scene, **checkpoint_of(BALANCED)), True))
+    high_order, multistep = (whole_number(scene.interval / h) for h in (HIGH_ORDER_STEP, MULTISTEP_STEP))
+    add(HIGH_ORDER, EIPRKN12, (HIGH_ORDER, "every 10"), high_order, **KEPT)
+    add(MULTISTEP, EIPGJ14, (MULTISTEP, "auto"), multistep)
+    add(BALANCED, EIPGJ14, (MULTISTEP, "balances"), multistep, **orbits_kept(scene.data))
     if peer is None:
         tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **checkpoint_of(TIGHT)), True))
         return tasks
     per_save = max(1, round(scene.interval * YEAR_D / WHFAST_DAYS))
-    for name, integrator, steps in (("WHFast", "whfast", per_save), ("WHFast (c17)", "whfast-c17", per_save)):
+    for name, integrator, steps in (
+        ("WHFast", "whfast", per_save),
+        ("WHFast (c17)", "whfast-c17", per_save),
+        ("IAS15", "ias15", 1),
+    ):
         tasks.append(PendingRun(name, partial(rebound_run, scene, peer, name, integrator, steps), False))
-    tasks.append(PendingRun("IAS15", partial(rebound_run, scene, peer, "IAS15", "ias15", 1), False))
     return tasks
 
 
@@ -249,50 +180,27 @@ def eip_name(method: type[EIPSolver], metric: str) -> str:
     return f"{method.__name__} ({metric})"
 
 
-def _eip(scene: SolarScene, method: type[EIPSolver], metric: Any, progress: bool, **checkpoint: Any) -> MethodRun:
-    name = eip_name(method, metric)
-    head = (method.__name__, "euclid." if metric == "euclidean" else metric)
+def _own(
+    scene: SolarScene,
+    name: str,
+    method: type[EIPSolver],
+    head: tuple[str, str],
+    per_save: int | None,
+    progress: bool,
+    **options: Any,
+) -> MethodRun:
+    """Run a method of this package, with `per_save` steps between two saved states, or the step of the problem."""
+    step, every = (scene.h, scene.every) if per_save is None else (scene.interval / per_save, per_save)
     result = integrate(
-        scene.problem,
-        method=named(method, name),
-        metric=metric,
-        save_every=scene.every,
-        progress=progress,
-        **checkpoint,
+        scene.problem, method=named(method, name), h=step, save_every=every, progress=progress, **options
     )
-    return _finished(scene, name, head, scene.h, result, "" if result.success else result.message)
-
-
-def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **checkpoint: Any) -> MethodRun:
-    name = method.TABLEAU.name
-    result = integrate(
-        scene.problem,
-        method=named(method, name),
-        invariants=(),
-        save_every=scene.every,
-        progress=progress,
-        **checkpoint,
-    )
-    return _finished(scene, name, (name, "alone"), scene.h, result, "" if result.success else result.message)
+    return _finished(scene, name, head, step, result, "" if result.success else result.message)
 
 
 def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
     """Run the most accurate method that needs no REBOUND: EIPRKN12 with half of its usual step."""
-    return _high_order(scene, TIGHT, "tight", 2, progress, **checkpoint)
-
-
-def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run EIPRKN12, the method for small errors over long times, with its usual step divided by `shorter`.
-
-    `name` is the name of the run, and `word` the second line of the name in a table's head.
-    """
-    per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
-    return _long(scene, EIPRKN12, name, word, per_save, progress, **KEPT, **checkpoint)
-
-
-def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    per_save = whole_number(scene.interval / MULTISTEP_STEP)
-    return _long(scene, EIPGJ14, MULTISTEP, "auto", per_save, progress, **checkpoint)
+    per_save = 2 * whole_number(scene.interval / HIGH_ORDER_STEP)
+    return _own(scene, TIGHT, EIPRKN12, (HIGH_ORDER, "tight"), per_save, progress, **KEPT, **checkpoint)
 
 
 def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
@@ -302,23 +210,6 @@ def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
     """
     problem = solar_system(data, balances="kepler")
     return {"invariants": problem.invariants, "frame": problem.frame}
-
-
-def _balanced(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
-    """Run EIPGJ14 with the options of `orbits_kept`, which keep each planet's energy about the Sun as a `Balance`."""
-    per_save = whole_number(scene.interval / MULTISTEP_STEP)
-    return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **orbits_kept(scene.data), **checkpoint)
-
-
-def _long(
-    scene: SolarScene, method: type[EIPSolver], name: str, word: str, per_save: int, progress: bool, **options: Any
-) -> MethodRun:
-    step = scene.interval / per_save
-    result = integrate(
-        scene.problem, method=named(method, name), h=step, save_every=per_save, progress=progress, **options
-    )
-    head = (method.__name__, word)
-    return _finished(scene, name, head, step, result, "" if result.success else result.message)
 
 
 def _verlet(scene: SolarScene) -> MethodRun:

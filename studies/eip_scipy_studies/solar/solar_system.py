@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from eip_scipy.problems import SolarSystemData
 from eip_scipy.problems.gravity.solar_data import available, load
 
-from ..beside import Beside
+from ..beside import workers
 from ..listing import METRICS, fixed_step_methods
 from ..long_runs import Checkpoints, positive
 from ..report import UsageError, cores
@@ -23,29 +23,31 @@ from .epoch import AnyEpoch, kernels, one_line
 from .errors import SolarRuns
 from .runs import MethodRun, Peer, make_scene, plan
 
-__all__ = ["Found", "SolarSystem"]
-
 DATA = "de440"
 TEN_BODIES = [
     name for name in available() if len(load(name).bodies) == 10
 ]  # sets for which the tables and figures are made
 COST_YEARS = 100.0
+Start = Callable[..., Callable[[], Any]]  # from `workers`
 BESIDE_FIGURES, OWN_FIGURES = (
     slice(None, 4),
     slice(4, None),
 )  # both parts take about as long as the timings and the other figures
 
 
-class Found(NamedTuple):
+@dataclass
+class Found:
     """Results of the command.
 
-    `peer` is the function `run` of `eip_scipy.integrations.rebound`, or None if REBOUND is not installed. `beside` is
-    the second process, which does the longest run and draws figures, or None if there is none.
+    `peer` is the function `run` of `eip_scipy.integrations.rebound`, or None if REBOUND is not installed. `beside`
+    starts calls in the second process, which does the longest run and draws figures; it is None if there is none.
+    `drawn` waits for the figures that it draws.
     """
 
     runs: SolarRuns
     peer: Peer | None
-    beside: Beside | None
+    beside: Start | None
+    drawn: Callable[[], dict[str, bytes]] = dict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         rebound = session.peer("rebound", "WHFast and IAS15")
         peer = None if rebound is None else rebound.run
         alone = peer is None or self.years < self.beside_years or cores() < 2
-        beside = None if alone else session.open.enter_context(Beside())
+        beside = None if alone else session.open.enter_context(workers(1))
         try:
             self._integrate(runs, session, peer, beside)
         except KeyboardInterrupt:
@@ -103,14 +105,13 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         data: SolarSystemData = kernels().initial_data(self.epoch, self.kernel)
         return data
 
-    def _integrate(self, runs: SolarRuns, session: Session, peer: Peer | None, beside: Beside | None) -> None:
+    def _integrate(self, runs: SolarRuns, session: Session, peer: Peer | None, beside: Start | None) -> None:
         """Do the runs and add them to `runs`; the last one is done in the second process, `beside`, if there is one."""
         method = fixed_step_methods()[self.method]
         tasks = plan(runs.scene, method, self.metric, peer, self.checkpoint_options)
         starts: list[Callable[[], MethodRun]] = [partial(task.start, session.shown) for task in tasks]
         if beside is not None:
-            beside.start(partial(tasks[-1].start, False))
-            starts[-1], runs.beside = beside.result, tasks[-1].name
+            starts[-1], runs.beside = beside(tasks[-1].start, False), tasks[-1].name
         for task, start in zip(tasks, starts, strict=True):
             if task.has_bar:
                 runs.runs.append(start())
@@ -124,7 +125,7 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         """Measure the times of several methods and steps, while the second process draws."""
         runs = found.runs
         if found.beside is not None:
-            found.beside.start(partial(images, runs, BESIDE_FIGURES))
+            found.drawn = found.beside(images, runs, BESIDE_FIGURES)
         years = min(self.years, COST_YEARS)
         scene = runs.scene if years == self.years else make_scene(runs.scene.data, years, min(self.h, years))
         methods = self.timed_methods(scene, fixed_step_methods()[self.method], self.metric, found.peer)
@@ -150,11 +151,9 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
 
     def figures(self, found: Found) -> Figures:
         """Yield figures as PNG files: those that the second process has drawn, and the others."""
-        drawn = images(found.runs, slice(None) if found.beside is None else OWN_FIGURES)
-        if found.beside is not None:
-            drawn = found.beside.result() | drawn
-        for name, image in drawn.items():
-            yield name, partial(_write, image)
+        own = images(found.runs, slice(None) if found.beside is None else OWN_FIGURES)
+        for name, image in (found.drawn() | own).items():
+            yield name, partial(Path.write_bytes, data=image)
 
 
 def images(runs: SolarRuns, part: slice) -> dict[str, bytes]:
@@ -167,7 +166,3 @@ def images(runs: SolarRuns, part: slice) -> dict[str, bytes]:
         figure.savefig(stream, format="png")
         found[name] = stream.getvalue()
     return found
-
-
-def _write(image: bytes, path: Path) -> None:
-    path.write_bytes(image)

@@ -20,8 +20,6 @@ from ..study import Check, Figures, PartlyDone, Rows, Session, Study, one_of, op
 from .epoch import AnyEpoch, kernels, one_line
 from .runs import whole_number
 
-__all__ = ["Found", "Model", "ModelRun", "Truth", "errors", "models", "run_model"]
-
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 STEP = 0.001
 MOON = "moon"  # a body, not a force, but chosen together with the forces
@@ -64,12 +62,8 @@ class ModelRun(NamedTuple):
 def models(forces: Sequence[str] | None) -> list[Model]:
     """Return the models to be compared: Newton's gravitation and the model with `forces`, or those in `STANDARD`.
 
-    The name `MOON` among the forces makes the Moon a separate body. `STANDARD` is used if `forces` is None.
-
-    Raises
-    ------
-    ValueError
-        If two of the forces exclude each other.
+    The name `MOON` among the forces makes the Moon a separate body. `STANDARD` is used if `forces` is None. A
+    ValueError is raised if two of the forces exclude each other.
     """
     asked = STANDARD if forces is None else ((), tuple(forces))
     found = [Model(check_forces(name for name in names if name != MOON), MOON in names) for names in asked]
@@ -80,12 +74,8 @@ def save_times(years: float, h: float) -> tuple[np.ndarray, int, float]:
     """Return the times of saved states in years, the number of steps between two of them, and the step in years.
 
     The times have the sign of `years`; 1, 10, 100 and the end are among them if they are in the span. The step is at
-    most `h`, and the interval before the end may be shorter than the others.
-
-    Raises
-    ------
-    ValueError
-        If the step is longer than the run.
+    most `h`, and the interval before the end may be shorter than the others. A ValueError is raised if the step is
+    longer than the run.
     """
     span = abs(years)
     interval = span / 100 if span < 1 else 0.1 if span <= 200 else 1.0
@@ -109,23 +99,8 @@ def run_model(
 ) -> ModelRun:
     """Integrate a model with a step and with half of it, and compare with the ephemeris.
 
-    Parameters
-    ----------
-    model : Model
-    data : SolarSystemData
-        Initial data, with the Moon as a separate body if the model has it.
-    times : ndarray, shape (m,)
-    every : int
-    step : float
-        Results of `save_times`: times in years, number of steps between two of them, and step in years.
-    truth : dict of str to ndarray, shape (m, 3)
-        Heliocentric positions at these times, km.
-    progress : bool, optional
-        Show progress bars.
-
-    Returns
-    -------
-    ModelRun
+    `data` must have the Moon as a separate body if the model has it. `times`, `every` and `step` are the results of
+    `save_times`, and `truth` has the heliocentric positions (m, 3) at these times by body, km.
     """
     halved, own = (_positions(model, data, times, every * k, step / k, progress) for k in (2, 1))
     km, arcsec = errors(own, truth)

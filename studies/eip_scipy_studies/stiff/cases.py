@@ -14,30 +14,17 @@ from eip_scipy import Invariant
 
 from .mechanisms import chain, chain_by_angles, governor, governor_by_angles
 
-__all__ = ["CASES", "Case", "chain_case", "governor_case"]
-
 Array = np.ndarray
 TIGHT = 1e-11
 
 
 @dataclass
 class Case:
-    """A stiff problem, and its reference.
+    """A stiff problem on an interval from 0 to `end`, and its reference.
 
-    Attributes
-    ----------
-    fun : callable
-    end : float
-        The interval begins at 0.
-    y0 : ndarray, shape (n,)
-    invariants : list of Invariant
-    size : float or ndarray
-        Typical size of the components, to which the absolute tolerance and errors are relative.
-    view : callable, optional
-        Function of the last state whose values are compared with the reference; default: the state divided by `size`.
-    truth : callable, optional
-        Function without arguments that returns the true value of `view`; default: that by SciPy's Radau at small
-        tolerances.
+    `size` is the typical size of the components, to which the absolute tolerance and errors are relative. `view` is the
+    function of the last state whose values are compared with the reference; default: the state divided by `size`.
+    ``truth()`` returns the true value of `view`; default: that by SciPy's Radau at small tolerances.
     """
 
     fun: Callable[[float, Array], Array]
@@ -69,15 +56,7 @@ class Case:
         """Run the problem; return the error of the last state and the number of calls of `fun`.
 
         Calls for Jacobians are included. The error is the largest difference of a value of `view` from the reference.
-
-        Parameters
-        ----------
-        method : str or type
-        rtol : float
-        share : float
-            The absolute tolerance is ``share * rtol * size``.
-        **options
-            Options of `solve_ivp`.
+        The absolute tolerance is ``share * rtol * size``, and `options` are those of `solve_ivp`.
         """
         self.calls = 0
         run = solve_ivp(

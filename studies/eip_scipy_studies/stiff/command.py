@@ -26,8 +26,6 @@ from ..report import table
 from ..study import Check, Rows, Session, Study, option
 from .cases import CASES, Case, chain_case, governor_case
 
-__all__ = ["Stiff"]
-
 METHODS = {"Radau": EIPRadau, "BDF": EIPBDF}
 STARTS = ((1.2, 0.9, 0.5), (0.8, 0.3, 1.0), (1.5, 1.4, 1.0), (-0.7, 0.4, 0.9), (2.0, 1.6, 1.9))
 COUNTEREXAMPLE = "satellite"

@@ -10,8 +10,6 @@ import numpy as np
 
 from eip_scipy import Invariant
 
-__all__ = ["Natural", "chain", "chain_by_angles", "governor", "governor_by_angles"]
-
 Array = np.ndarray
 GRAVITY = 9.81
 # The governor of the multibody benchmark library (A05), SI units: distance of the rods' joints from the axis, length
@@ -26,18 +24,9 @@ ANGLE, SPEED = np.pi / 6, 2 * np.pi
 class Natural:
     """A mechanism with a constant mass matrix and constraints q H q / 2 = value, in coordinates q.
 
-    Attributes
-    ----------
-    mass : ndarray, shape (n, n)
-    forms : ndarray, shape (k, n, n)
-        The symmetric matrices H.
-    values : ndarray, shape (k,)
-    forces : callable
-        ``forces(q, v) -> (n,)``.
-    y0 : ndarray, shape (2 n,)
-        The state (q, v) at the start, which satisfies the constraints.
-    turn : ndarray, shape (n, n), optional
-        Generator of the rotation under which the system is invariant: (turn q) . M v is the angular momentum.
+    `mass` is (n, n), `forms` are the symmetric matrices H (k, n, n) and `values` their values (k,). ``forces(q, v)``
+    returns the forces (n,), and `y0` (2 n,) is the state (q, v) at the start, which satisfies the constraints. `turn`
+    (n, n) is the generator of the rotation under which the system is invariant: (turn q) . M v is the angular momentum.
     """
 
     mass: Array
@@ -99,12 +88,7 @@ class Natural:
 def chain(angles: Sequence[float], damping: float = 1e4) -> Natural:
     """Make a plane chain of links of 1 m with 1 kg at their ends, at rest, and rotational dampers between the links.
 
-    Parameters
-    ----------
-    angles : sequence of float
-        Angles of the links from the vertical [rad].
-    damping : float
-        Damping constant [N m s].
+    `angles` are those of the links from the vertical [rad], and `damping` is the damping constant [N m s].
     """
     n = len(angles)
     link = np.kron(np.eye(n) - np.eye(n, k=-1), np.eye(2)).reshape(n, 2, 2 * n)  # the vector along a link, by q

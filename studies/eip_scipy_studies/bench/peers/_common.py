@@ -1,17 +1,11 @@
-"""Common part of the adapters: the record of a method, and the search for its package."""
+"""Common part of the adapters: the record of a method."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
-
-from ..equations import Scene
-
-__all__ = ["ATOL", "COMPILED", "OWN", "PYTHON", "Peer", "package", "plain_fun"]
 
 PYTHON, COMPILED, OWN = "plain Python function", "function compiled by Numba", "equations in the package's own form"
 ATOL = 1e-3  # ratio of the absolute tolerance to the relative one, for all
@@ -22,27 +16,14 @@ Solve = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Peer:
-    """A method of a package with the kind of function that it takes.
+    """A method of a package with the kind of function that it takes: `PYTHON`, `COMPILED` or `OWN`.
 
-    Attributes
-    ----------
-    name : str
-        Name of the method in tables.
-    distribution : str
-        Name of the package with pip.
-    takes : str
-        `PYTHON`, `COMPILED` or `OWN`.
-    prepare : callable
-        ``prepare(scene, **extra) -> solve`` imports the package and does the work that is needed once.
-        ``solve(setting)`` returns the state at the end (n,). `extra` are further arguments of the package's own call.
-    steps : bool
-        True if the setting is a number of steps, not a tolerance.
-    scenes : tuple of str
-        Values of `Scene.equations` for which the method is run; empty: all except "members".
-    warm : bool
-        True if each setting compiles its own code, so that an uncounted run comes first.
-    projects : bool
-        True for a method of another package that is given the problem's invariants too.
+    `name` is that of the method in tables, and `distribution` that of the package with pip. ``prepare(scene, **extra)``
+    imports the package, does the work that is needed once, and returns ``solve(setting)``, which returns the state at
+    the end (n,); `extra` are further arguments of the package's own call. `steps` is True if the setting is a number of
+    steps, not a tolerance. The method is run for the values of `Scene.equations` in `scenes`; if it is empty, for all
+    except "members". `warm` is True if each setting compiles its own code, so that an uncounted run comes first.
+    `projects` is True for a method of another package that is given the problem's invariants too.
     """
 
     name: str
@@ -63,13 +44,3 @@ class Peer:
     def ours(self) -> bool:
         """Return True if the method belongs to this package."""
         return self.distribution == "eip_scipy"
-
-
-def package(name: str) -> Any:
-    """Import and return the module `name`; this function is called only in the process that runs the package."""
-    return import_module(name)
-
-
-def plain_fun(scene: Scene) -> Any:
-    """Return the right-hand side ``fun(t, y)`` of a problem as a plain Python function, as a user writes it."""
-    return scene.plain().fun

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from ..equations import Scene
-from ._common import ATOL, COMPILED, Peer, Solve, package
-
-__all__ = ["PEERS"]
+from ._common import ATOL, COMPILED, Peer, Solve
 
 
 def _cyrk(method: str, scene: Scene, **extra: Any) -> Solve:
-    cyrk, numba, filling, n = package("CyRK"), package("numba"), scene.compiled().fun, scene.y0.size
+    cyrk, numba, filling, n = import_module("CyRK"), import_module("numba"), scene.compiled().fun, scene.y0.size
 
     def fun(out, t, y, params):  # type: ignore[no-untyped-def]
         filling(t, numba.carray(y, (n,)), numba.carray(out, (n,)))
@@ -32,7 +31,7 @@ def _cyrk(method: str, scene: Scene, **extra: Any) -> Solve:
 
 
 def _numbalsoda(method: str, scene: Scene, **extra: Any) -> Solve:
-    peer, numba, filling, n = package("numbalsoda"), package("numba"), scene.compiled().fun, scene.y0.size
+    peer, numba, filling, n = import_module("numbalsoda"), import_module("numba"), scene.compiled().fun, scene.y0.size
 
     @numba.cfunc(peer.lsoda_sig)
     def fun(t, y, out, params):  # type: ignore[no-untyped-def]

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from ..equations import EQUATIONS, Scene
-from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve, package
-
-__all__ = ["PEERS"]
+from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve
 
 MEMBERS = ("members",)
 LANES = 4  # width of heyoka's batches: four doubles are a vector of AVX2
 
 
 def _ours(method: str, scene: Scene) -> Solve:
-    eip, functions = package("eip_scipy"), scene.compiled()
+    eip, functions = import_module("eip_scipy"), scene.compiled()
     second = method != "EIPDOP853"
     kept = eip.Invariant(functions.values, functions.gradients)
     right_hand_side = {"acceleration": functions.acc} if second else {"fun": functions.fun}
@@ -35,7 +34,7 @@ def _ours(method: str, scene: Scene) -> Solve:
 
 
 def _scipy(scene: Scene) -> Solve:
-    solve_ivp, kepler = package("scipy.integrate").solve_ivp, EQUATIONS["kepler"](math.sqrt).fun
+    solve_ivp, kepler = import_module("scipy.integrate").solve_ivp, EQUATIONS["kepler"](math.sqrt).fun
 
     def one(y0: np.ndarray, tolerance: float) -> np.ndarray:
         control = {"method": "DOP853", "rtol": tolerance, "atol": ATOL * tolerance}
@@ -45,7 +44,7 @@ def _scipy(scene: Scene) -> Solve:
 
 
 def _numbalsoda(scene: Scene) -> Solve:
-    peer, numba, filling = package("numbalsoda"), package("numba"), scene.compiled().fun
+    peer, numba, filling = import_module("numbalsoda"), import_module("numba"), scene.compiled().fun
     dop853, times, params, n = peer.dop853, np.array([0.0, scene.t_end]), np.zeros(1), scene.y0.shape[1]
 
     @numba.cfunc(peer.lsoda_sig)
@@ -66,7 +65,7 @@ def _numbalsoda(scene: Scene) -> Solve:
 
 
 def _heyoka(scene: Scene) -> Solve:
-    heyoka = package("heyoka")
+    heyoka = import_module("heyoka")
     names = heyoka.make_vars("x", "y", "u", "v")
     system = list(zip(names, EQUATIONS["kepler"](heyoka.sqrt).fun(0.0, names), strict=True))
     made: dict[float, Any] = {}
@@ -86,9 +85,13 @@ def _heyoka(scene: Scene) -> Solve:
 
 
 def _diffrax(scene: Scene) -> Solve:
-    jax = package("jax")
+    jax = import_module("jax")
     jax.config.update("jax_enable_x64", True)
-    jnp, diffrax, kepler = package("jax.numpy"), package("diffrax"), EQUATIONS["kepler"](package("jax.numpy").sqrt).fun
+    jnp, diffrax, kepler = (
+        import_module("jax.numpy"),
+        import_module("diffrax"),
+        EQUATIONS["kepler"](import_module("jax.numpy").sqrt).fun,
+    )
     term = diffrax.ODETerm(lambda t, y, _: jnp.stack(kepler(t, y)))
 
     def one(y0: Any, tolerance: Any) -> Any:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from ..equations import EQUATIONS, Functions, Scene
-from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve, package
-
-__all__ = ["PEERS"]
+from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve
 
 SECOND_ORDER = ("kepler", "henon_heiles", "bodies")
 
@@ -23,16 +22,16 @@ def _end(result: Any) -> np.ndarray:
 
 
 def _kept(functions: Functions) -> Any:
-    return package("eip_scipy").Invariant(functions.values, functions.gradients)
+    return import_module("eip_scipy").Invariant(functions.values, functions.gradients)
 
 
 def _problem(scene: Scene) -> Any:
     q, v = scene.y0.reshape(2, -1, 3)
-    return package("eip_scipy.problems").nbody(scene.params["gm"], q, v, t_span=(0.0, scene.t_end))
+    return import_module("eip_scipy.problems").nbody(scene.params["gm"], q, v, t_span=(0.0, scene.t_end))
 
 
 def _run(method: str, arguments: dict[str, Any], t_end: float, options: dict[str, Any], setting: float) -> np.ndarray:
-    eip = package("eip_scipy")
+    eip = import_module("eip_scipy")
     if method in ("EIPRKN12", "EIPGJ14", "EIPGJ12", "EIPRK4"):
         control: dict[str, Any] = {"h": t_end / setting}
     else:
@@ -58,7 +57,7 @@ def _python(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
 
 
 def _in_solve_ivp(scene: Scene, **extra: Any) -> Solve:
-    solve_ivp, method = package("scipy.integrate").solve_ivp, package("eip_scipy").EIPDOP853
+    solve_ivp, method = import_module("scipy.integrate").solve_ivp, import_module("eip_scipy").EIPDOP853
     functions = scene.plain()
     options = {"method": method, "invariants": _kept(functions), **extra}
 
@@ -82,7 +81,7 @@ def _compiled(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
 
 def _with_own_function(scene: Scene, functions: Functions) -> Any:
     """Return the problem that `nbody` makes, with its compiled invariants and the jitted equations of `functions`."""
-    njit, right = package("numba").njit, functions.fun
+    njit, right = import_module("numba").njit, functions.fun
     filling: Any = functions.acc
 
     @njit

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from ..equations import EQUATIONS, Scene
-from ._common import ATOL, OWN, Peer, Solve, package
-
-__all__ = ["PEERS"]
+from ._common import ATOL, OWN, Peer, Solve
 
 
 def _heyoka(scene: Scene, **extra: Any) -> Solve:
-    heyoka = package("heyoka")
+    heyoka = import_module("heyoka")
     bodies = scene.equations == "bodies"
     if bodies:
         gm = scene.params["gm"]
@@ -41,9 +40,9 @@ def _heyoka(scene: Scene, **extra: Any) -> Solve:
 
 
 def _diffrax(scene: Scene, **extra: Any) -> Solve:
-    jax = package("jax")
+    jax = import_module("jax")
     jax.config.update("jax_enable_x64", True)
-    jnp, diffrax = package("jax.numpy"), package("diffrax")
+    jnp, diffrax = import_module("jax.numpy"), import_module("diffrax")
     fun = _jax_bodies(jnp, scene) if scene.equations == "bodies" else EQUATIONS[scene.equations](jnp.sqrt).fun
     term = diffrax.ODETerm(lambda t, y, _: jnp.stack(fun(t, y)) if isinstance(value := fun(t, y), tuple) else value)
 
@@ -72,7 +71,7 @@ def _jax_bodies(jnp: Any, scene: Scene) -> Any:
 
 
 def _rebound(integrator: str, scene: Scene, **extra: Any) -> Solve:
-    run = package("eip_scipy.integrations.rebound").run
+    run = import_module("eip_scipy.integrations.rebound").run
     gm = np.array(scene.params["gm"])
     centre, drift = (gm / gm.sum()) @ scene.y0.reshape(2, -1, 3)  # REBOUND subtracts it
     moved = np.concatenate([np.tile(centre + scene.t_end * drift, gm.size), np.tile(drift, gm.size)])

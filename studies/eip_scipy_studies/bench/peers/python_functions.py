@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from ..equations import Scene
-from ._common import ATOL, COMPILED, PYTHON, Peer, Solve, package, plain_fun
-
-__all__ = ["PEERS"]
+from ._common import ATOL, COMPILED, PYTHON, Peer, Solve
 
 
 def _by_solve_ivp(solve_ivp: Any, method: Any, fun: Any, scene: Scene, extra: dict[str, Any]) -> Solve:
@@ -25,32 +24,32 @@ def _by_solve_ivp(solve_ivp: Any, method: Any, fun: Any, scene: Scene, extra: di
 
 
 def _scipy(method: str, scene: Scene, **extra: Any) -> Solve:
-    return _by_solve_ivp(package("scipy.integrate").solve_ivp, method, plain_fun(scene), scene, extra)
+    return _by_solve_ivp(import_module("scipy.integrate").solve_ivp, method, scene.plain().fun, scene, extra)
 
 
 def _scipy_jitted(method: str, scene: Scene, **extra: Any) -> Solve:
     filling = scene.compiled().fun
 
-    @package("numba").njit
+    @import_module("numba").njit
     def fun(t, y):  # type: ignore[no-untyped-def]
         out = np.empty_like(y)
         filling(t, y, out)
         return out
 
-    return _by_solve_ivp(package("scipy.integrate").solve_ivp, method, fun, scene, extra)
+    return _by_solve_ivp(import_module("scipy.integrate").solve_ivp, method, fun, scene, extra)
 
 
 def _extensisq(method: str, scene: Scene, **extra: Any) -> Solve:
-    found = getattr(package("extensisq"), method)
-    return _by_solve_ivp(package("scipy.integrate").solve_ivp, found, plain_fun(scene), scene, extra)
+    found = getattr(import_module("extensisq"), method)
+    return _by_solve_ivp(import_module("scipy.integrate").solve_ivp, found, scene.plain().fun, scene, extra)
 
 
 def _cyrk(method: str, scene: Scene, **extra: Any) -> Solve:
-    return _by_solve_ivp(package("CyRK").pysolve_ivp, method, plain_fun(scene), scene, extra)
+    return _by_solve_ivp(import_module("CyRK").pysolve_ivp, method, scene.plain().fun, scene, extra)
 
 
 def _sundae(scene: Scene, **extra: Any) -> Solve:
-    cvode, fun = package("sksundae.cvode").CVODE, plain_fun(scene)
+    cvode, fun = import_module("sksundae.cvode").CVODE, scene.plain().fun
 
     def fill(t: float, y: np.ndarray, out: np.ndarray) -> None:
         out[:] = fun(t, y)
@@ -78,11 +77,11 @@ def _homproj(scene: Scene, **extra: Any) -> Solve:
 
     pairs = [one(k) for k in range(count)]
     options = {name: [pair[name] for pair in pairs] for name in ("invariants", "gradients")}
-    return _by_solve_ivp(package("homproj").solve_ivp, "DOP853", functions.fun, scene, options | extra)
+    return _by_solve_ivp(import_module("homproj").solve_ivp, "DOP853", functions.fun, scene, options | extra)
 
 
 def _desolver(method: str, scene: Scene, **extra: Any) -> Solve:
-    desolver, fun = package("desolver"), plain_fun(scene)
+    desolver, fun = import_module("desolver"), scene.plain().fun
 
     def solve(setting: float) -> np.ndarray:
         system = desolver.OdeSystem(

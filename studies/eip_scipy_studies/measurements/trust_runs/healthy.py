@@ -65,11 +65,11 @@ def fictitious() -> Problem:
 
 
 def top(*start: float) -> Problem:
-    return s.equations("top", rigid_body(1.0, 2.0, 3.0), start, 25.0)
+    return s.equations(rigid_body(1.0, 2.0, 3.0), start, 25.0)
 
 
 def two_pendulums() -> Problem:
-    return s.equations("double pendulum", double_pendulum(9.81), [1.0, 0.5, 0.0, 0.0], 10.0)
+    return s.equations(double_pendulum(9.81), [1.0, 0.5, 0.0, 0.0], 10.0)
 
 
 def each(before: str, options: Iterable[str], after: str = "") -> str:
@@ -194,17 +194,16 @@ def spacing() -> Iterator[Run]:
 
 
 def one_coordinate(
-    name: str, slope: Callable[[float], float], potential: Callable[[float], float], q0: float, v0: float
+    slope: Callable[[float], float], potential: Callable[[float], float], q0: float, v0: float
 ) -> Problem:
     return s.mechanics(
-        name, lambda t, q, v: -slope(q[0]), lambda q: potential(q[0]), lambda q: np.array([slope(q[0])]), q0, v0, 20.0
+        lambda t, q, v: -slope(q[0]), lambda q: potential(q[0]), lambda q: np.array([slope(q[0])]), q0, v0, 20.0
     )
 
 
 def huber(width: float) -> Problem:
     """Return a body on a spring whose force is constant beyond the elongation `width`."""
     return one_coordinate(
-        "Huber's spring",
         lambda q: min(max(q, -width), width),
         lambda q: 0.5 * q * q if abs(q) < width else width * (abs(q) - width / 2),
         1.0,
@@ -215,40 +214,27 @@ def huber(width: float) -> Problem:
 def contact(stiffness: float) -> Problem:
     """Return a ball that falls onto a spring of this stiffness."""
     return one_coordinate(
-        "contact",
-        lambda q: 1 + stiffness * min(q, 0.0),
-        lambda q: q + 0.5 * stiffness * min(q, 0.0) ** 2,
-        1.0,
-        0.2,
+        lambda q: 1 + stiffness * min(q, 0.0), lambda q: q + 0.5 * stiffness * min(q, 0.0) ** 2, 1.0, 0.2
     )
 
 
 def hertz(stiffness: float) -> Problem:
     """Return a ball that falls onto a fixed ball, with Hertz's contact force."""
     return one_coordinate(
-        "Hertz's contact",
-        lambda q: 1 - stiffness * max(-q, 0.0) ** 1.5,
-        lambda q: q + 0.4 * stiffness * max(-q, 0.0) ** 2.5,
-        1.0,
-        0.0,
+        lambda q: 1 - stiffness * max(-q, 0.0) ** 1.5, lambda q: q + 0.4 * stiffness * max(-q, 0.0) ** 2.5, 1.0, 0.0
     )
 
 
 def dead_zone(width: float) -> Problem:
     """Return a body on a spring without force within the distance `width` of the origin (backlash)."""
     return one_coordinate(
-        "backlash",
-        lambda q: np.sign(q) * max(abs(q) - width, 0.0),
-        lambda q: 0.5 * max(abs(q) - width, 0.0) ** 2,
-        1.0,
-        0.3,
+        lambda q: np.sign(q) * max(abs(q) - width, 0.0), lambda q: 0.5 * max(abs(q) - width, 0.0) ** 2, 1.0, 0.3
     )
 
 
 def cubic_walls(stiffness: float) -> Problem:
     """Return a body that moves freely between soft walls."""
     return one_coordinate(
-        "cubic walls",
         lambda q: stiffness * np.sign(q) * max(abs(q) - 1, 0.0) ** 3,
         lambda q: stiffness / 4 * max(abs(q) - 1, 0.0) ** 4,
         0.0,
@@ -270,7 +256,7 @@ def kinks() -> Iterator[Run]:
 
 
 def epidemic(infection: float, recovery: float, infected: float) -> Problem:
-    return s.equations("SIR", sir(infection, recovery), [1 - infected, infected, 0.0], 60.0)
+    return s.equations(sir(infection, recovery), [1 - infected, infected, 0.0], 60.0)
 
 
 def loose() -> Iterator[Run]:

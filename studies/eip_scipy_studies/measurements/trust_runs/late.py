@@ -23,13 +23,7 @@ NYSTROM = "RKN8 h=0.05 integrate, RKN12 1e-9"
 
 def friction_from_5(strength: float) -> Problem:
     return s.mechanics(
-        "friction from t = 5 on",
-        lambda t, q, v: -np.sin(q) - strength * v * (t > 5),
-        lambda q: -np.cos(q[0]),
-        np.sin,
-        2.0,
-        0.0,
-        30.0,
+        lambda t, q, v: -np.sin(q) - strength * v * (t > 5), lambda q: -np.cos(q[0]), np.sin, 2.0, 0.0, 30.0
     )
 
 
@@ -37,13 +31,12 @@ def drag_at_pericentre(strength: float) -> Problem:
     def extra(t, y):
         return -strength * np.exp(-((np.hypot(y[0], y[1]) / 0.5) ** 8)) * y[2:]
 
-    return s.central("drag at the pericentre", extra, [1.6, 0.0, 0.0, 0.5], 40.0, s.kepler_energy())
+    return s.central(extra, [1.6, 0.0, 0.0, 0.5], 40.0, s.kepler_energy())
 
 
 def inelastic_bumper(strength: float) -> Problem:
     """Return a ball that falls onto a spring with friction."""
     return s.mechanics(
-        "inelastic bumper",
         lambda t, q, v: -1 - 400 * np.minimum(q, 0.0) - 10 * strength * v * (q < 0),
         lambda q: q[0] + 200 * min(q[0], 0.0) ** 2,
         lambda q: 1 + 400 * np.minimum(q, 0.0),
@@ -59,7 +52,7 @@ def kicks(strength: float) -> Problem:
     def push(t):
         return 10 * strength * sum(np.exp(-(((t - at) / 0.2) ** 2)) for at in (6.1, 11.7, 17.3))
 
-    return s.mechanics("kicks", lambda t, q, v: -np.sin(q) + push(t), lambda q: -np.cos(q[0]), np.sin, 2.0, 0.0, 25.0)
+    return s.mechanics(lambda t, q, v: -np.sin(q) + push(t), lambda q: -np.cos(q[0]), np.sin, 2.0, 0.0, 25.0)
 
 
 def one_bead(strength: float) -> Problem:
@@ -84,9 +77,7 @@ def two_oscillators() -> Problem:
     slow = Invariant(
         lambda t, y: 0.5 * (y[0] ** 2 + y[1] ** 2), lambda t, y: np.array([y[0], y[1], 0.0, 0.0]), name="energy"
     )
-    return s.claimed(
-        "two oscillators", lambda t, y: np.array([y[1], -y[0], y[3], -625 * y[2]]), [1.0, 0.0, 1.0, 0.0], 20.0, slow
-    )
+    return s.claimed(lambda t, y: np.array([y[1], -y[0], y[3], -625 * y[2]]), [1.0, 0.0, 1.0, 0.0], 20.0, slow)
 
 
 def late_leaks() -> Iterator[Run]:

@@ -78,40 +78,22 @@ def far_friction(t, q, v):
 
 
 def uniform_on_axis() -> Problem:
-    return s.central(
-        "Kepler in a uniform field", lambda t, y: np.array([0.02, 0.0]), [1.0, 0.0, 0.0, 1.1], 20.0, s.turning()
-    )
+    return s.central(lambda t, y: np.array([0.02, 0.0]), [1.0, 0.0, 0.0, 1.1], 20.0, s.turning())
 
 
 def precessing() -> Problem:
-    return s.central(
-        "Kepler with 1/r^4, A_x",
-        lambda t, y: -0.01 * y[:2] / np.hypot(y[0], y[1]) ** 5,
-        [0.5, 0.0, 0.0, 1.7],
-        20.0,
-        s.laplace_x(),
-    )
+    return s.central(lambda t, y: -0.01 * y[:2] / np.hypot(y[0], y[1]) ** 5, [0.5, 0.0, 0.0, 1.7], 20.0, s.laplace_x())
 
 
 def losing_mass() -> Problem:
     return s.central(
-        "Kepler, mass lost",
-        lambda t, y: np.sin(0.01 * t) * y[:2] / np.hypot(y[0], y[1]) ** 3,
-        [0.5, 0.0, 0.0, 1.7],
-        20.0,
-        s.kepler_energy(),
+        lambda t, y: np.sin(0.01 * t) * y[:2] / np.hypot(y[0], y[1]) ** 3, [0.5, 0.0, 0.0, 1.7], 20.0, s.kepler_energy()
     )
 
 
 def wrong_masses() -> Problem:
     return s.chain(
-        "unequal masses",
-        lambda d: d,
-        lambda d: d * d / 2,
-        lambda d: d,
-        [1.0, 0.0, 0.0],
-        20.0,
-        masses=np.array([1.0, 2.0, 3.0]),
+        lambda d: d, lambda d: d * d / 2, lambda d: d, [1.0, 0.0, 0.0], 20.0, masses=np.array([1.0, 2.0, 3.0])
     )
 
 
@@ -119,13 +101,17 @@ def spin_in_turning_field() -> Problem:
     def fun(t, y):
         return np.cross(y, np.array([np.sin(t), 0.0, 1.0]))
 
-    return s.claimed("spin in a turning field", fun, [0.6, 0.0, 0.8], 20.0, s.component(2, "S_z"))
+    return s.claimed(
+        fun,
+        [0.6, 0.0, 0.8],
+        20.0,
+        Invariant(lambda t, y: float(y[2]), lambda t, y: np.array([0.0, 0.0, 1.0]), name="S_z"),
+    )
 
 
 def braked_top() -> Problem:
     top = rigid_body(1.0, 2.0, 3.0)
     return s.claimed(
-        "braked top",
         lambda t, y: top.fun(t, y) - 0.1 * np.array([y[0], 0.0, 0.0]),
         [0.0, 1.0, 1.0],
         20.0,
@@ -140,7 +126,6 @@ def driven_particle() -> Problem:
         return system.fun(t, y) + np.array([0.0, 0.0, 0.1 * np.sin(t), 0.0])
 
     return s.claimed(
-        "particle, field switched on",
         fun,
         [1.0, 0.0, 0.1, 0.3],
         20.0,
@@ -149,13 +134,11 @@ def driven_particle() -> Problem:
 
 
 def particle_turning() -> Problem:
-    return s.claimed("particle, L without the field's part", boris_2d(0.01).fun, [1.0, 0.0, 0.0, 0.3], 3.0, s.turning())
+    return s.claimed(boris_2d(0.01).fun, [1.0, 0.0, 0.0, 0.3], 3.0, s.turning())
 
 
 def trap_turning() -> Problem:
-    return s.planar_field(
-        "anisotropic trap", lambda t, y: np.array([-y[0], -2.0 * y[1]]), [1.0, 0.0, 0.0, 0.5], 20.0, s.turning()
-    )
+    return s.claimed(lambda t, y: np.array([y[2], y[3], -y[0], -2.0 * y[1]]), [1.0, 0.0, 0.0, 0.5], 20.0, s.turning())
 
 
 def henon_turning() -> Problem:
@@ -174,7 +157,7 @@ def wrong_wave_relation() -> Problem:
     wrong = Invariant(
         lambda t, y: float(abs(y[0]) ** 2 - abs(y[2]) ** 2), lambda t, y: 2 * np.array([y[0], 0, -y[2]]), name="N"
     )
-    return s.claimed("three waves, wrong sign", right.fun, np.array([1.0, 0.7, 0.4]) + 0j, 10.0, wrong)
+    return s.claimed(right.fun, np.array([1.0, 0.7, 0.4]) + 0j, 10.0, wrong)
 
 
 def absorbed() -> Problem:
@@ -226,7 +209,6 @@ def falling_bodies(third: float = 5.0, softening: float = 0.0) -> Problem:
         return np.concatenate([y[6:], -np.einsum("j,ij,ijk->ik", masses, r2**-1.5, d).ravel()])
 
     return s.claimed(
-        "falling bodies",
         fun,
         np.concatenate([FALLING.ravel(), np.zeros(6)]),
         1.5,
@@ -235,7 +217,7 @@ def falling_bodies(third: float = 5.0, softening: float = 0.0) -> Problem:
 
 
 def late() -> Problem:
-    return s.mechanics("friction from t = 3", late_friction, lambda q: -np.cos(q[0]), np.sin, 2.0, 0.0, 20.0)
+    return s.mechanics(late_friction, lambda q: -np.cos(q[0]), np.sin, 2.0, 0.0, 20.0)
 
 
 def relativistic_planets() -> Problem:
@@ -251,7 +233,7 @@ def relativistic_planets() -> Problem:
 
 
 def other_ratio() -> Problem:
-    return s.equations("SIR", sir(0.5, 0.2), [0.9, 0.1, 0.0], 30.0, sir(0.5, 0.25))
+    return s.equations(sir(0.5, 0.2), [0.9, 0.1, 0.0], 30.0, sir(0.5, 0.25))
 
 
 def moving_packet(x: np.ndarray) -> np.ndarray:
@@ -260,7 +242,6 @@ def moving_packet(x: np.ndarray) -> np.ndarray:
 
 def other_norm() -> Problem:
     return s.claimed(
-        "quaternion",
         quaternion(1.0).fun,
         [1.0, 0.2, 0.3, 0.0],
         20.0,
@@ -271,7 +252,6 @@ def other_norm() -> Problem:
 def spin_sum() -> Problem:
     start = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.8, 0.6]]).ravel()
     return s.claimed(
-        "spins",
         heisenberg(0.5).fun,
         start,
         10.0,
@@ -288,7 +268,7 @@ def dragged(drag: float) -> Problem:
     def extra(t, y):
         return -drag * (y[2:] - 1.2 * np.array([-y[1], y[0]]))
 
-    return s.central("satellite", extra, [1.0, 0.0, 0.0, 1.2], 30.0, s.kepler_energy())
+    return s.central(extra, [1.0, 0.0, 0.0, 1.2], 30.0, s.kepler_energy())
 
 
 def lossy() -> Problem:
@@ -351,7 +331,7 @@ def sleeping(spoil: Callable[..., None], k: Any = 4, m: Any = 10) -> Problem:
 
     The parameters are those of `spoilt`.
     """
-    chain = s.chain("chain", np.expm1, lambda d: np.expm1(d) - d, np.expm1, [0.8, 0.0, 0.0, 0.0, 0.0, 0.0], 20.0)
+    chain = s.chain(np.expm1, lambda d: np.expm1(d) - d, np.expm1, [0.8, 0.0, 0.0, 0.0, 0.0, 0.0], 20.0)
     return spoilt(spoil, None, chain, k, m)
 
 
@@ -386,7 +366,7 @@ def from_apocentre() -> Problem:
 
 
 def stiff_chain() -> Problem:
-    return s.chain("stiff chain", lambda d: 1e4 * d, lambda d: 5e3 * d * d, lambda d: 1e4 * d, [0.1, 0.0, 0.0], 10.0)
+    return s.chain(lambda d: 1e4 * d, lambda d: 5e3 * d * d, lambda d: 1e4 * d, [0.1, 0.0, 0.0], 10.0)
 
 
 def until(make: Callable[[], Problem], end: float) -> Problem:
@@ -401,11 +381,11 @@ def meeting() -> Problem:
 
 
 def other_gravity(g: float) -> Problem:
-    return s.equations("double pendulum", double_pendulum(9.81), [2.0, 1.0, 0.0, 0.0], 5.0, double_pendulum(g))
+    return s.equations(double_pendulum(9.81), [2.0, 1.0, 0.0, 0.0], 5.0, double_pendulum(g))
 
 
 def other_inertia() -> Problem:
-    return s.equations("top", rigid_body(1.0, 2.0, 3.0), [0.0, 1.0, 1.0], 20.0, rigid_body(1.0, 2.0, 2.5))
+    return s.equations(rigid_body(1.0, 2.0, 3.0), [0.0, 1.0, 1.0], 20.0, rigid_body(1.0, 2.0, 2.5))
 
 
 def other_coefficient() -> Problem:
@@ -414,7 +394,6 @@ def other_coefficient() -> Problem:
     The invariant has the coefficient 3 in place of 2.
     """
     return s.claimed(
-        "Lotka-Volterra",
         lotka_volterra().fun,
         [1.0, 3.0],
         15.0,
@@ -439,13 +418,7 @@ def falling_probe() -> Problem:
     def gradient(t, y):
         return scale * shell.gradients(t, y * scale)[0]
 
-    return s.claimed(
-        "geodesic, wrong mass",
-        shell.fun,
-        [0.0, 10.0, 0.0, 0.97, 0.0, 4.0],
-        300.0,
-        Invariant(value, gradient, name="shell"),
-    )
+    return s.claimed(shell.fun, [0.0, 10.0, 0.0, 0.97, 0.0, 4.0], 300.0, Invariant(value, gradient, name="shell"))
 
 
 @njit

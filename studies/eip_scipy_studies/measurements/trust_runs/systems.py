@@ -19,22 +19,20 @@ njit = needed("numba", '"eip_scipy[numba]"').njit
 Array = np.ndarray
 
 
-def claimed(name: str, fun: Callable[..., Any], y0: Any, end: float, *kept: Invariant, start: float = 0.0) -> Problem:
+def claimed(fun: Callable[..., Any], y0: Any, end: float, *kept: Invariant) -> Problem:
     """Return a problem from a right-hand side and the quantities `kept` that are claimed to be invariants."""
     y0 = np.array(y0)
-    return Problem(
-        name=name, fun=fun, y0=y0 + (0j if y0.dtype.kind == "c" else 0.0), t_span=(start, end), invariants=kept
-    )
+    y0 = y0 + (0j if y0.dtype.kind == "c" else 0.0)
+    return Problem(name="claimed", fun=fun, y0=y0, t_span=(0.0, end), invariants=kept)
 
 
-def equations(name: str, system: CaseEquations, y0: Any, end: float, of: CaseEquations | None = None) -> Problem:
+def equations(system: CaseEquations, y0: Any, end: float, of: CaseEquations | None = None) -> Problem:
     """Return a system of the hard cases with the claimed invariants of the system `of`; default: its own invariants."""
     of = of or system
-    return claimed(name, system.fun, y0, end, Invariant(of.values, of.gradients, name="I"))
+    return claimed(system.fun, y0, end, Invariant(of.values, of.gradients, name="I"))
 
 
 def mechanics(
-    name: str,
     acceleration: Callable[[float, Array, Array], Any],
     potential: Callable[[Array], float],
     slope: Callable[[Array], Any],
@@ -58,13 +56,8 @@ def mechanics(
     def gradient(t, y):
         return np.concatenate([np.atleast_1d(slope(y[:n])), masses * y[n:]])
 
-    return claimed(
-        name,
-        fun,
-        np.concatenate([np.atleast_1d(q0), np.atleast_1d(v0)]),
-        end,
-        Invariant(energy, gradient, name="energy"),
-    )
+    y0 = np.concatenate([np.atleast_1d(q0), np.atleast_1d(v0)])
+    return claimed(fun, y0, end, Invariant(energy, gradient, name="energy"))
 
 
 def turning() -> Invariant:
@@ -72,16 +65,6 @@ def turning() -> Invariant:
     return Invariant(
         lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"
     )
-
-
-def norm() -> Invariant:
-    """Return the sum of the squared moduli of all components as an invariant."""
-    return Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="norm")
-
-
-def component(k: int, name: str) -> Invariant:
-    """Return the component y_k as an invariant."""
-    return Invariant(lambda t, y: float(y[k]), lambda t, y: np.arange(y.size) == k + 0.0, name=name)
 
 
 class Verlet:
@@ -105,7 +88,6 @@ class Verlet:
 def pendulum(friction: float = 0.0, sign: float = 1.0, end: float = 20.0, q0: float = 2.0, v0: float = 0.0) -> Problem:
     """Return a pendulum with friction; the potential in the claimed energy has the factor `sign`."""
     return mechanics(
-        f"pendulum, friction {friction:g}",
         lambda t, q, v: -np.sin(q) - friction * v,
         lambda q: -sign * np.cos(q[0]),
         lambda q: sign * np.sin(q),
@@ -117,13 +99,12 @@ def pendulum(friction: float = 0.0, sign: float = 1.0, end: float = 20.0, q0: fl
 
 def spring(force: Callable[[float, Array, Array], Any], q0: float = 1.0, v0: float = 0.0, end: float = 20.0) -> Problem:
     """Return q'' = force(t, q, v) with the claimed energy q'^2 / 2 + q^2 / 2."""
-    return mechanics("spring", force, lambda q: q[0] ** 2 / 2, lambda q: q, q0, v0, end)
+    return mechanics(force, lambda q: q[0] ** 2 / 2, lambda q: q, q0, v0, end)
 
 
 def duffing(cubic: float = 1.0, q0: float = 0.5, end: float = 20.0) -> Problem:
     """Return q'' = q - q^3; the quartic term in the claimed energy has the factor `cubic`."""
     return mechanics(
-        "Duffing's oscillator",
         lambda t, q, v: q - q**3,
         lambda q: -(q[0] ** 2) / 2 + cubic * q[0] ** 4 / 4,
         lambda q: -q + cubic * q**3,
@@ -135,21 +116,12 @@ def duffing(cubic: float = 1.0, q0: float = 0.5, end: float = 20.0) -> Problem:
 
 def falling(drag: float, v0: float = 0.0, end: float = 10.0) -> Problem:
     """Return a stone that falls with the air's resistance, with the claimed energy of one that falls without."""
-    return mechanics(
-        f"fall with drag {drag:g}",
-        lambda t, q, v: -1 - drag * v * np.abs(v),
-        lambda q: q[0],
-        lambda q: np.ones(1),
-        10.0,
-        v0,
-        end,
-    )
+    return mechanics(lambda t, q, v: -1 - drag * v * np.abs(v), lambda q: q[0], lambda q: np.ones(1), 10.0, v0, end)
 
 
 def henon_heiles(cubic: float = 1.0, q0: Any = (0.3, 0.2), v0: Any = (0.0, 0.0), end: float = 50.0) -> Problem:
     """Return the system of Henon and Heiles; the cubic terms in the claimed energy have the factor `cubic`."""
     return mechanics(
-        "Henon-Heiles",
         lambda t, q, v: np.array([-q[0] - 2 * q[0] * q[1], -q[1] - q[0] ** 2 + q[1] ** 2]),
         lambda q: (q @ q) / 2 + cubic * (q[0] ** 2 * q[1] - q[1] ** 3 / 3),
         lambda q: np.array([q[0] + cubic * 2 * q[0] * q[1], q[1] + cubic * (q[0] ** 2 - q[1] ** 2)]),
@@ -159,18 +131,13 @@ def henon_heiles(cubic: float = 1.0, q0: Any = (0.3, 0.2), v0: Any = (0.0, 0.0),
     )
 
 
-def central(
-    name: str, extra: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant, strength: float = 1.0
-) -> Problem:
-    """Return Kepler's attraction plus the acceleration extra(t, y) in the plane, with the claimed invariants `kept`.
-
-    `strength` is G M of the attraction.
-    """
+def central(extra: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant) -> Problem:
+    """Return Kepler's attraction plus the acceleration extra(t, y) in the plane, with the claimed invariants `kept`."""
 
     def fun(t, y):
-        return np.concatenate([y[2:], -strength * y[:2] / np.hypot(y[0], y[1]) ** 3 + extra(t, y)])
+        return np.concatenate([y[2:], -y[:2] / np.hypot(y[0], y[1]) ** 3 + extra(t, y)])
 
-    return claimed(name, fun, y0, end, *kept)
+    return claimed(fun, y0, end, *kept)
 
 
 def kepler_energy() -> Invariant:
@@ -197,18 +164,10 @@ def laplace_x() -> Invariant:
     return Invariant(value, gradient, name="A_x")
 
 
-def planar_field(
-    name: str, acceleration: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant
-) -> Problem:
-    """Return q'' = acceleration(t, y) in the plane, with the claimed invariants `kept`."""
-    return claimed(name, lambda t, y: np.concatenate([y[2:], acceleration(t, y)]), y0, end, *kept)
-
-
 # --- lattices ---
 
 
 def chain(
-    name: str,
     force: Callable[[Array], Array],
     spring_energy: Callable[[Array], Array],
     claimed_force: Callable[[Array], Array],
@@ -217,12 +176,11 @@ def chain(
     v0: Any = None,
     friction: Any = 0.0,
     masses: Any = 1.0,
-    claimed_masses: Any = 1.0,
 ) -> Problem:
     """Return masses in a row between walls, connected by springs, with a claimed energy.
 
     `force` is a function of the elongations of the springs. The claimed energy is computed with `spring_energy`, whose
-    derivative is `claimed_force`, and with `claimed_masses`.
+    derivative is `claimed_force`, and with masses of 1.
     """
     q0 = np.array(q0, dtype=float)
 
@@ -235,16 +193,8 @@ def chain(
     def potential(q):
         return float(spring_energy(stretched(q)).sum())
 
-    return mechanics(
-        name,
-        acceleration,
-        potential,
-        lambda q: -np.diff(claimed_force(stretched(q))),
-        q0,
-        np.zeros(q0.size) if v0 is None else v0,
-        end,
-        claimed_masses,
-    )
+    v0 = np.zeros(q0.size) if v0 is None else v0
+    return mechanics(acceleration, potential, lambda q: -np.diff(claimed_force(stretched(q))), q0, v0, end)
 
 
 def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bool = False) -> Problem:
@@ -255,8 +205,8 @@ def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bo
     q0 = np.where(np.arange(n) == n // 2, 0.8, 0.0)
     v0 = np.where(np.arange(n) == n // 2, 0.5, 0.0) if moving else None
     if claim_harmonic:
-        return chain("Toda lattice", np.expm1, lambda d: d * d / 2, lambda d: d, q0, end, v0)
-    return chain("Toda lattice", np.expm1, lambda d: np.expm1(d) - d, np.expm1, q0, end, v0)
+        return chain(np.expm1, lambda d: d * d / 2, lambda d: d, q0, end, v0)
+    return chain(np.expm1, lambda d: np.expm1(d) - d, np.expm1, q0, end, v0)
 
 
 def fput(
@@ -269,13 +219,7 @@ def fput(
     own = alpha if claimed_alpha is None else claimed_alpha
     q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
     return chain(
-        "FPUT chain",
-        lambda d: d + alpha * d * d,
-        lambda d: d * d / 2 + own * d**3 / 3,
-        lambda d: d + own * d * d,
-        q0,
-        end,
-        **more,
+        lambda d: d + alpha * d * d, lambda d: d * d / 2 + own * d**3 / 3, lambda d: d + own * d * d, q0, end, **more
     )
 
 
@@ -296,7 +240,6 @@ def sine_gordon(
         return np.roll(u, -1) - 2 * u + np.roll(u, 1)
 
     return mechanics(
-        "sine-Gordon by lines",
         lambda t, u, v: c * curvature(u) - np.sin(u) - friction * v,
         lambda u: own * (np.diff(u, append=u[:1]) ** 2).sum() / 2 + (1 - np.cos(u)).sum(),
         lambda u: -own * curvature(u) + np.sin(u),
@@ -347,10 +290,26 @@ def waves(
 
     mass = Invariant(lambda t, psi: float(np.vdot(psi, psi).real * dx), lambda t, psi: 2 * dx * psi, name="mass")
     known = {"mass": mass, "energy": Invariant(energy, slope, name="energy")}
-    return claimed("waves", fun, start(x) + 0j, end, *(known[item] for item in keep))
+    return claimed(fun, start(x) + 0j, end, *(known[item] for item in keep))
 
 
 # --- compiled: jitted equations and energies ---
+
+
+def jitted(rhs: Any, y0: Any, end: float, params: Array, kept: tuple[Any, Any, str], acc: Any = None) -> Problem:
+    """Return a problem of jitted functions; `kept` are value, gradient and name of the claimed invariant."""
+    value, gradient, name = kept
+
+    def fun(t, y):
+        out = np.empty(y.size)
+        rhs(t, y, out, params)
+        return out
+
+    invariants = (Invariant(value, gradient, args=(params,), in_place=True, name=name),)
+    y0 = np.array(y0, dtype=float)
+    return Problem(name=name, fun=fun, rhs=rhs, acc=acc, y0=y0, t_span=(0.0, end), params=params, invariants=invariants)
+
+
 # params: (square of the frequency, friction, strength of the driving force, its frequency)
 
 
@@ -383,24 +342,13 @@ def compiled_spring(
     frequency: float = 1.0,
     end: float = 20.0,
     y0: Any = (1.0, 0.0),
-    h: float | None = None,
 ) -> Problem:
     """Return a spring with friction and a driving force, jitted, with the claimed energy of a free spring.
 
     `square` is the square of the spring's angular frequency; the driving force is ``force * sin(frequency * t)``.
     """
-    params = np.array([square, friction, force, frequency])
-    return Problem(
-        name="spring",
-        fun=lambda t, y: np.array([y[1], -square * y[0] - friction * y[1] + force * np.sin(frequency * t)]),
-        rhs=_spring_rhs,
-        acc=None if friction else _spring_acc,
-        y0=np.array(y0, dtype=float),
-        t_span=(0.0, end),
-        h=h,
-        params=params,
-        invariants=(Invariant(_spring_energy, _spring_gradient, args=(params,), in_place=True, name="energy"),),
-    )
+    params, acc = np.array([square, friction, force, frequency]), None if friction else _spring_acc
+    return jitted(_spring_rhs, y0, end, params, (_spring_energy, _spring_gradient, "energy"), acc)
 
 
 @njit(cache=True)
@@ -420,37 +368,20 @@ def _pendulum_gradient(t, y, out, params):
     out[1] = y[1]
 
 
-def compiled_pendulum(
-    friction: float = 0.0, end: float = 20.0, y0: Any = (2.0, 0.0), h: float | None = None
-) -> Problem:
+def compiled_pendulum(friction: float = 0.0, end: float = 20.0, y0: Any = (2.0, 0.0)) -> Problem:
     """Return a pendulum with friction, jitted, with the claimed energy of one without."""
-    params = np.array([friction])
-    return Problem(
-        name="pendulum",
-        fun=lambda t, y: np.array([y[1], -np.sin(y[0]) - friction * y[1]]),
-        rhs=_pendulum_rhs,
-        y0=np.array(y0, dtype=float),
-        t_span=(0.0, end),
-        h=h,
-        params=params,
-        invariants=(Invariant(_pendulum_energy, _pendulum_gradient, args=(params,), in_place=True, name="energy"),),
-    )
+    return jitted(_pendulum_rhs, y0, end, np.array([friction]), (_pendulum_energy, _pendulum_gradient, "energy"))
 
 
 @njit(cache=True)
 def _trap_rhs(t, y, out, params):
-    out[0] = y[2]
-    out[1] = y[3]
-    out[2] = -y[0]
-    out[3] = -params[0] * y[1]
+    out[0], out[1] = y[2], y[3]
+    out[2], out[3] = -y[0], -params[0] * y[1]
 
 
 @njit(cache=True)
 def _trap_acc(t, q, params):
-    out = np.empty(2)
-    out[0] = -q[0]
-    out[1] = -params[0] * q[1]
-    return out
+    return np.array([-q[0], -params[0] * q[1]])
 
 
 @njit(cache=True)
@@ -460,29 +391,16 @@ def _trap_turning(t, y, params):
 
 @njit(cache=True)
 def _trap_gradient(t, y, out, params):
-    out[0] = y[3]
-    out[1] = -y[2]
-    out[2] = -y[1]
-    out[3] = y[0]
+    out[0], out[1], out[2], out[3] = y[3], -y[2], -y[1], y[0]
 
 
-def compiled_trap(square: float, end: float = 20.0, h: float | None = None) -> Problem:
+def compiled_trap(square: float, end: float = 20.0) -> Problem:
     """Return a body in an anisotropic trap that starts on an axis, jitted, with a claimed angular momentum.
 
     The squares of the trap's angular frequencies are 1 along that axis and `square` along the other.
     """
-    params = np.array([square])
-    return Problem(
-        name="trap",
-        fun=lambda t, y: np.array([y[2], y[3], -y[0], -square * y[1]]),
-        rhs=_trap_rhs,
-        acc=_trap_acc,
-        y0=np.array([1.0, 0.0, 0.0, 0.5]),
-        t_span=(0.0, end),
-        h=h,
-        params=params,
-        invariants=(Invariant(_trap_turning, _trap_gradient, args=(params,), in_place=True, name="L"),),
-    )
+    y0, kept = (1.0, 0.0, 0.0, 0.5), (_trap_turning, _trap_gradient, "L")
+    return jitted(_trap_rhs, y0, end, np.array([square]), kept, _trap_acc)
 
 
 @njit(cache=True)
