@@ -91,6 +91,8 @@ def jit_energy_gradient(t, y):
 
 
 jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
+JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
+JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
 
 
 def lotka_volterra(t, u):

@@ -24,12 +24,10 @@ from numba import njit
 from numpy.lib import format as npy
 from systems import (
     H_USES_F,
+    JIT_H,
+    JIT_L,
     H,
     L,
-    jit_energy,
-    jit_energy_gradient,
-    jit_momentum,
-    jit_momentum_gradient,
     jit_orbit,
     orbit,
     pericentre,
@@ -37,6 +35,8 @@ from systems import (
 
 from eip_scipy import (
     EIPDOP853,
+    EIPGJ12,
+    EIPGJ14,
     EIPRK2,
     EIPRK4,
     EIPRK5,
@@ -55,8 +55,6 @@ from eip_scipy.run import integrate as longrun
 from eip_scipy.run import resume
 
 Y0 = pericentre(0.6)
-JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
-JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
 
 
 class BrokenOffError(Exception):
@@ -72,6 +70,14 @@ def crossing(t, y):
 
 def attraction(t, q):
     return -q / np.hypot(*q) ** 3
+
+
+def attraction_gradient(t, q, dq, out):
+    r2 = q @ q
+    out[:] = (3 * q * (q @ dq) / r2 - dq) / r2**1.5
+
+
+CORRECTED = {"acceleration": attraction, "jacobian": attraction_gradient}
 
 
 def falling(t, y):
@@ -143,6 +149,8 @@ CASES = {
         Y0,
         FIXED | {"method": EIPRKN12, "h": 0.05, "every": "auto", "compensated": True, "save_every": 2},
     ),
+    "multistep": (None, Y0, FIXED | {"method": EIPGJ12, "acceleration": attraction, "h": 0.01}),
+    "multistep, corrected": (None, Y0, FIXED | {"method": EIPGJ14, "h": 0.01, **CORRECTED}),
     "complex": (
         precession,
         np.array([0.6, 0.8j]),
