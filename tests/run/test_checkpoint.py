@@ -31,6 +31,7 @@ from systems import (
     jit_orbit,
     orbit,
     pericentre,
+    same,
 )
 
 from eip_scipy import (
@@ -175,21 +176,6 @@ COMPILED = {
     "complex": (precession, np.array([0.6, 0.8j]), COMPLEX | {"compiled": True}),
 }
 AT_ONCE = ("compensated, every auto", "events", "Nystrom")
-
-
-def same(one, other):
-    """Compare every number of two results."""
-    for key in ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "method", "h"):
-        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
-    for key in ("t_events", "y_events"):
-        assert (one[key] is None) == (other[key] is None)
-        for a, b in zip(one[key] or (), other[key] or (), strict=True):
-            np.testing.assert_array_equal(a, b, err_msg=key)
-    for key in ("names", "n_projections", "n_skipped", "n_rank_reduced", "n_softened", "n_rejected_projections"):
-        assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
-    for key in ("last_defect", "max_defect", "max_correction"):
-        np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)
-    assert one.message.split(" (")[0] == other.message.split(" (")[0]
 
 
 @pytest.fixture
