@@ -101,6 +101,8 @@ WRONG_OPTIONS = [
     ("blocks", [[0, [1]]], "blocks must be an integer or a sequence of index arrays"),
     ("every", 2**70, "every must be at most 9223372036854775807, got 1180591620717411303424"),
     ("iterations", 1001, "iterations must be at most 1000, got 1001"),
+    *((key, v, f"{key} must be an integer >= 1") for key in ("iterations", "every") for v in (0, -1, 1.0, "2", True)),
+    *((key, v, f"{key} must be True or False") for key in ("reuse_f", "check", "project_initial") for v in (1, None)),
 ]
 WRONG = [
     *(({"y0": [1.0, v]}, ValueError, r"All components of the initial state `y0` must be finite\.")
