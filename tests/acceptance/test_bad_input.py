@@ -62,21 +62,111 @@ runs = pytest.mark.parametrize("driver", [by_integrate, by_ensemble], ids=["inte
 all_of_them = pytest.mark.parametrize("driver", [by_scipy, by_integrate, by_ensemble])
 
 
+def both_ways(value):
+    """Return an invariant of this value, with a gradient and without one."""
+    return Invariant(value, square_gradient, name="H"), Invariant(value, name="H")
+
+
+TOLERANCES = "rtol", "atol"
+WRONG_OPTIONS = [
+    ("metric", "errors", "metric must be 'error', 'euclidean' or an array"),
+    ("metric", [1.0, 2.0, 3.0], r"metric: weights have shape \(3,\), the state has 2"),
+    ("metric", 3.0, r"metric: weights have shape \(\)"),
+    ("metric", [1.0, -1.0], "metric: weights must be finite, >= 0"),
+    ("metric", [0.0, 0.0], "metric: weights must be finite, >= 0 and not all 0"),
+    ("metric", [1.0, math.nan], "metric: weights must be finite"),
+    ("blocks", 3, "blocks = 3 does not divide the state's 2 components"),
+    ("blocks", 0, "blocks = 0 does not divide"),
+    ("blocks", -2, "blocks = -2 does not divide"),
+    ("blocks", True, "blocks must be an integer or a sequence of index arrays"),
+    ("blocks", 1.5, "blocks must be an integer or a sequence of index arrays"),
+    ("blocks", "ab", "blocks: "),
+    ("blocks", [[0, 1], [1]], "blocks: a component is in two blocks"),
+    ("blocks", [[0, 0]], "blocks: a component is in two blocks"),
+    ("blocks", [[0, 2]], "blocks: .* not an array of indices from 0 to 1"),
+    ("blocks", [[-1]], "blocks: .* not an array of indices from 0 to 1"),
+    ("blocks", [[0.5]], "blocks: .* not an array of indices from 0 to 1"),
+    ("frame", 3, r"frame must be a pair \(C, S\)"),
+    ("frame", (np.ones((1, 3)), np.ones((3, 1))), r"frame: C has shape \(1, 3\)"),
+    ("frame", (np.ones((1, 2)), np.ones((1, 2))), r"frame: C has shape \(1, 2\) and S \(1, 2\)"),
+    ("frame", (np.array([[1.0, 0.0]]), np.array([[0.0], [1.0]])), "frame: C S is singular"),
+    ("frame", (np.array([[math.nan, 0.0]]), np.array([[1.0], [1.0]])), "frame: C S is singular"),
+    ("frame", (np.array([[1j, 0.0]]), np.array([[1.0], [1.0]])), "frame: C and S must be real"),
+    ("frame", (np.zeros((0, 2)), np.zeros((2, 0))), "frame"),
+    ("direction", "newest", "direction must be 'new', 'old' or 'midpoint', got 'newest'"),
+    ("direction", None, "direction must be 'new', 'old' or 'midpoint', got None"),
+    ("direction", ["new"], "direction must be 'new', 'old' or 'midpoint'"),
+    ("metric", ["a", "b"], r"metric must be an array of numbers, got \['a', 'b'\]"),
+    ("metric", np.array([1j, 1.0]), "metric must be an array of numbers, got .*; expected real ones"),
+    ("blocks", [[0, [1]]], "blocks must be an integer or a sequence of index arrays"),
+    ("every", 2**70, "every must be at most 9223372036854775807, got 1180591620717411303424"),
+    ("iterations", 1001, "iterations must be at most 1000, got 1001"),
+    *((key, v, f"{key} must be an integer >= 1") for key in ("iterations", "every") for v in (0, -1, 1.0, "2", True)),
+    *((key, v, f"{key} must be True or False") for key in ("reuse_f", "check", "project_initial") for v in (1, None)),
+]
+WRONG = [
+    *(({"y0": [1.0, v]}, ValueError, r"All components of the initial state `y0` must be finite\.")
+      for v in (math.nan, math.inf, -math.inf)),
+    *(({"y0": v}, ValueError, r"`y0` must be 1-dimensional\.") for v in ([[1.0, 2.0]], 1.0, np.zeros((2, 1)))),
+    *(({"y0": v}, TypeError, "`y0` must hold numbers") for v in (["a", "b"], [1.0, None])),
+    ({"fun": lambda t, y: None}, TypeError, "fun returned None, expected 2 numbers"),
+    ({"fun": lambda t, y: 1.0}, ValueError, r"fun returned shape \(\), expected \(2,\)"),
+    ({"fun": lambda t, y: [1, 2, 3]}, ValueError, r"fun returned shape \(3,\), expected \(2,\)"),
+    ({"fun": lambda t, y: y[:1]}, ValueError, r"fun returned shape \(1,\), expected \(2,\)"),
+    ({"fun": lambda t, y: np.ones((2, 1))}, ValueError, r"fun returned shape \(2, 1\), expected \(2,\)"),
+    ({"fun": lambda t, y: 1j * y}, ValueError, "y0 is real; pass y0.astype"),
+    ({"fun": lambda t, y: "ab"}, TypeError, "fun returned 'ab', expected 2 numbers"),
+    *(({"h": v}, ValueError, r"`h` must be positive\. Got " + re.escape(repr(v)))
+      for v in (0, -0.1, math.nan, math.inf, True, "0.1", [0.1], 0.1 + 0j)),
+    ({"h": None, "method": EIPRK1}, ValueError, "EIPRK1 has no error estimate and needs the step h="),
+    ({"h": 1e-20, "t_span": (5, 6)}, ValueError, "`h` is too small"),
+    *(({name: 0.1}, (ValueError, TypeError), name) for name in ("first_step", "max_step")),
+    *(({name: v}, ValueError, f"`{name}` must be positive")
+      for name in TOLERANCES for v in (-1e-3, math.nan, [1e-3, -1e-3], [math.nan, 1.0])),
+    *(({name: v}, ValueError, f"`{name}` has wrong shape")
+      for name in TOLERANCES for v in ([1e-6], [1e-6] * 3, np.full((2, 1), 1e-6))),
+    *(({name: v}, ValueError, f"`{name}` must be a number or an array of 2 numbers. Got")
+      for name in TOLERANCES for v in ("tight", None, 1j, np.array([1j, 1.0]), 10**400, [[1e-3], 1e-3])),
+    *(({name: v, "invariants": SQUARE}, ValueError, match) for name, v, match in WRONG_OPTIONS),
+    *(({"diagnostics": v}, TypeError, r"diagnostics must be a Diagnostics\(\) object")
+      for v in ({}, Diagnostics, True)),
+    *(({"invariants": item}, error, match)
+      for value, error, match in (
+          (lambda t, y: math.nan, ValueError, "invariant 'H' is not finite at y0"),
+          (lambda t, y: math.inf, ValueError, "invariant 'H' is not finite at y0"),
+          (lambda t, y: np.array([1.0, math.nan]), ValueError, r"invariant 'H\[1\]' is not finite at y0"),
+          (lambda t, y: np.ones((2, 2)), ValueError, r"invariant 'H' returned shape \(2, 2\)"),
+          (lambda t, y: 1j * (y @ y), ValueError, "invariant 'H' returned complex values"),
+          (lambda t, y: None, TypeError, "invariant 'H' returned .*None"),
+          (lambda t, y: "x", TypeError, "invariant 'H' returned"),
+      ) for item in both_ways(value)),
+    *(({"invariants": Invariant(square, grad, name="H")}, (ValueError, TypeError), f"gradient of invariant 'H'{match}")
+      for grad, match in (
+          (lambda t, y: 2 * y[:1], r" has shape \(1,\), expected \(2,\)"),
+          (lambda t, y: 2 * y[None], r" has shape \(1, 2\), expected \(2,\)"),
+          (lambda t, y: 1.0, r" has shape \(\), expected \(2,\)"),
+          (lambda t, y: None, ""),
+          (lambda t, y: 2j * y, " is complex, but y0 is real"),
+          (lambda t, y: math.nan * y, " is not finite at y0"),
+      )),
+    ({"invariants": Invariant(lambda t, y: np.full(3, y @ y), square_gradient, name="H")}, ValueError,
+     r"gradient of invariant 'H' has shape \(2,\), expected \(3, 2\)"),
+    *(({"invariants": Invariant(square, lambda t, y, factor=factor: factor * 2 * y, name="H")}, ValueError,
+       r"gradient of invariant 'H' is wrong: .* by differences and .* by grad") for factor in (-1.0, 1.001, 2.0, 0.0)),
+    *(({"invariants": Invariant(square, square_gradient, target=v, name="H")}, ValueError,
+       f"invariant 'H': target {match}")
+      for v, match in ((math.nan, "must be finite"), ([1.0, 2.0], r"has shape \(2,\)"))),
+]  # fmt: skip
+
+
+@both
+@pytest.mark.parametrize(("options", "error", "match"), WRONG, ids=lambda v: str(v)[:40])
+def test_wrong_arguments(driver, options, error, match):
+    with pytest.raises(error, match=match):
+        driver(**options)
+
+
 # The state.
-
-
-@both
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_y0_not_finite(driver, bad):
-    with pytest.raises(ValueError, match=r"All components of the initial state `y0` must be finite\."):
-        driver(y0=[1.0, bad])
-
-
-@both
-@pytest.mark.parametrize("y0", [[[1.0, 2.0]], 1.0, np.zeros((2, 1))])
-def test_y0_not_one_dimensional(driver, y0):
-    with pytest.raises(ValueError, match=r"`y0` must be 1-dimensional\."):
-        driver(y0=y0)
 
 
 @both
@@ -85,13 +175,6 @@ def test_y0_masked(driver):
         driver(y0=np.ma.array(Y0, mask=[False, True]))
     plain, unmasked = driver(), driver(y0=np.ma.array(Y0, mask=[False, False]))
     np.testing.assert_array_equal(np.asarray(unmasked.y), plain.y)
-
-
-@both
-@pytest.mark.parametrize("y0", [["a", "b"], [1.0, None]])
-def test_y0_no_numbers(driver, y0):
-    with pytest.raises(TypeError, match="`y0` must hold numbers"):
-        driver(y0=y0)
 
 
 @both
@@ -110,23 +193,6 @@ def test_y0_is_not_changed(driver):
 
 
 # The right-hand side.
-
-WRONG_VALUES = [
-    (lambda t, y: None, TypeError, "fun returned None, expected 2 numbers"),
-    (lambda t, y: 1.0, ValueError, r"fun returned shape \(\), expected \(2,\)"),
-    (lambda t, y: [1, 2, 3], ValueError, r"fun returned shape \(3,\), expected \(2,\)"),
-    (lambda t, y: y[:1], ValueError, r"fun returned shape \(1,\), expected \(2,\)"),
-    (lambda t, y: np.ones((2, 1)), ValueError, r"fun returned shape \(2, 1\), expected \(2,\)"),
-    (lambda t, y: 1j * y, ValueError, "y0 is real; pass y0.astype"),
-    (lambda t, y: "ab", TypeError, "fun returned 'ab', expected 2 numbers"),
-]
-
-
-@both
-@pytest.mark.parametrize(("wrong", "error", "match"), WRONG_VALUES)
-def test_fun_of_wrong_value(driver, wrong, error, match):
-    with pytest.raises(error, match=match):
-        driver(wrong)
 
 
 @both
@@ -309,18 +375,6 @@ class TestCompiledExceptions:
 # The interval and the step.
 
 
-@pytest.mark.parametrize("span", [(0, 1, 2), (0,), "ab", None, 1.0, (0, None)])
-def test_t_span_of_two_numbers(span):
-    with pytest.raises(ValueError, match="t_span must hold two numbers"):
-        by_integrate(t_span=span)
-
-
-@pytest.mark.parametrize("span", [(0, math.inf), (math.nan, 1), (0, math.nan), (-math.inf, 0), (math.inf, math.inf)])
-def test_t_span_finite(span):
-    with pytest.raises(ValueError, match="t_span must be finite"):
-        by_integrate(t_span=span)
-
-
 @pytest.mark.parametrize("step", [{"h": 0.1}, {"h": None, "method": EIPRK45}])
 @pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
 @pytest.mark.parametrize(
@@ -330,6 +384,19 @@ def test_start_of_t_span_finite_through_the_solver_class(span, invariants, step)
     """A run from an infinite start never arrives; the end may be infinite, because a terminal event may end the run."""
     with pytest.raises(ValueError, match=r"t_span must be finite, got .*; only its end may be infinite"):
         by_scipy(t_span=span, invariants=invariants, **step)
+
+
+@pytest.mark.parametrize(
+    ("span", "match"),
+    [
+        *((v, "must hold two numbers") for v in ((0, 1, 2), (0,), "ab", None, 1.0, (0, None))),
+        *((v, "must be finite") for v in ((0, math.inf), (math.nan, 1), (0, math.nan), (-math.inf, 0))),
+        ((math.inf, math.inf), "must be finite"),
+    ],
+)
+def test_wrong_t_span(span, match):
+    with pytest.raises(ValueError, match=f"t_span {match}"):
+        by_integrate(t_span=span)
 
 
 @pytest.mark.parametrize("span", [(0j, 1), (0, 1j), np.array([0j, 1 + 0j]), (10**400, 1), (0, 10**5000), {0: 1, 1: 2}])
@@ -365,19 +432,6 @@ def test_unbounded_interval_through_the_solver_class():
     assert sol.t_events[0][0] == pytest.approx(2.05)
 
 
-@both
-@pytest.mark.parametrize("h", [0, -0.1, math.nan, math.inf, True, "0.1", [0.1], 0.1 + 0j])
-def test_h_positive(driver, h):
-    with pytest.raises(ValueError, match=r"`h` must be positive\. Got " + re.escape(repr(h))):
-        driver(h=h)
-
-
-@both
-def test_h_missing(driver):
-    with pytest.raises(ValueError, match="EIPRK1 has no error estimate and needs the step h="):
-        driver(h=None, method=EIPRK1)
-
-
 @all_of_them
 @pytest.mark.parametrize("span", [(0, 1), (1, 0), (100, 101)])
 def test_h_longer_than_the_interval(driver, span):
@@ -398,19 +452,6 @@ def test_h_of_ten_spacings(driver, t):
     assert run.status == 0
     assert run.t[-1] == span[1]
     assert (np.diff(run.t) > 0).all()
-
-
-@both
-def test_h_far_below_the_spacing(driver):
-    with pytest.raises(ValueError, match="`h` is too small"):
-        driver(t_span=(5, 6), h=1e-20)
-
-
-@both
-@pytest.mark.parametrize("option", ["first_step", "max_step"])
-def test_h_with_options_of_adaptive_steps(driver, option):
-    with pytest.raises((ValueError, TypeError), match=option):
-        driver(**{option: 0.1})
 
 
 @both
@@ -464,30 +505,6 @@ def test_zero_length_interval(driver, h):
 
 
 @both
-@pytest.mark.parametrize("name", ["rtol", "atol"])
-@pytest.mark.parametrize("value", [-1e-3, math.nan, [1e-3, -1e-3], [math.nan, 1.0]])
-def test_tolerances_positive(driver, name, value):
-    with pytest.raises(ValueError, match=f"`{name}` must be positive"):
-        driver(**{name: value})
-
-
-@both
-@pytest.mark.parametrize("name", ["rtol", "atol"])
-@pytest.mark.parametrize("value", [[1e-6], [1e-6] * 3, np.full((2, 1), 1e-6)])
-def test_tolerances_of_wrong_shape(driver, name, value):
-    with pytest.raises(ValueError, match=f"`{name}` has wrong shape"):
-        driver(**{name: value})
-
-
-@both
-@pytest.mark.parametrize("name", ["rtol", "atol"])
-@pytest.mark.parametrize("value", ["tight", None, 1j, np.array([1j, 1.0]), 10**400, [[1e-3], 1e-3]])
-def test_tolerances_no_numbers(driver, name, value):
-    with pytest.raises(ValueError, match=f"`{name}` must be a number or an array of 2 numbers. Got"):
-        driver(**{name: value})
-
-
-@both
 @pytest.mark.parametrize("step", [{"h": 0.1}, {"h": None, "method": EIPRK45}])
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 @pytest.mark.parametrize("value", [math.inf, [1e-3, math.inf]])
@@ -530,58 +547,6 @@ def test_estimate_that_is_not_finite_is_named():
     assert run.message.startswith("fun returned a non-finite value at t=1")
 
 
-WRONG_OPTIONS = [
-    ("metric", "errors", "metric must be 'error', 'euclidean' or an array"),
-    ("metric", [1.0, 2.0, 3.0], r"metric: weights have shape \(3,\), the state has 2"),
-    ("metric", 3.0, r"metric: weights have shape \(\)"),
-    ("metric", [1.0, -1.0], "metric: weights must be finite, >= 0"),
-    ("metric", [0.0, 0.0], "metric: weights must be finite, >= 0 and not all 0"),
-    ("metric", [1.0, math.nan], "metric: weights must be finite"),
-    ("blocks", 3, "blocks = 3 does not divide the state's 2 components"),
-    ("blocks", 0, "blocks = 0 does not divide"),
-    ("blocks", -2, "blocks = -2 does not divide"),
-    ("blocks", True, "blocks must be an integer or a sequence of index arrays"),
-    ("blocks", 1.5, "blocks must be an integer or a sequence of index arrays"),
-    ("blocks", "ab", "blocks: "),
-    ("blocks", [[0, 1], [1]], "blocks: a component is in two blocks"),
-    ("blocks", [[0, 0]], "blocks: a component is in two blocks"),
-    ("blocks", [[0, 2]], "blocks: .* not an array of indices from 0 to 1"),
-    ("blocks", [[-1]], "blocks: .* not an array of indices from 0 to 1"),
-    ("blocks", [[0.5]], "blocks: .* not an array of indices from 0 to 1"),
-    ("frame", 3, r"frame must be a pair \(C, S\)"),
-    ("frame", (np.ones((1, 3)), np.ones((3, 1))), r"frame: C has shape \(1, 3\)"),
-    ("frame", (np.ones((1, 2)), np.ones((1, 2))), r"frame: C has shape \(1, 2\) and S \(1, 2\)"),
-    ("frame", (np.array([[1.0, 0.0]]), np.array([[0.0], [1.0]])), "frame: C S is singular"),
-    ("frame", (np.array([[math.nan, 0.0]]), np.array([[1.0], [1.0]])), "frame: C S is singular"),
-    ("frame", (np.array([[1j, 0.0]]), np.array([[1.0], [1.0]])), "frame: C and S must be real"),
-    ("frame", (np.zeros((0, 2)), np.zeros((2, 0))), "frame"),
-    ("direction", "newest", "direction must be 'new', 'old' or 'midpoint', got 'newest'"),
-    ("direction", None, "direction must be 'new', 'old' or 'midpoint', got None"),
-    ("direction", ["new"], "direction must be 'new', 'old' or 'midpoint'"),
-    ("metric", ["a", "b"], r"metric must be an array of numbers, got \['a', 'b'\]"),
-    ("metric", np.array([1j, 1.0]), "metric must be an array of numbers, got .*; expected real ones"),
-    ("blocks", [[0, [1]]], "blocks must be an integer or a sequence of index arrays"),
-    ("every", 2**70, "every must be at most 9223372036854775807, got 1180591620717411303424"),
-    ("iterations", 1001, "iterations must be at most 1000, got 1001"),
-    *((key, v, f"{key} must be an integer >= 1") for key in ("iterations", "every") for v in (0, -1, 1.0, "2", True)),
-    *((key, v, f"{key} must be True or False") for key in ("reuse_f", "check", "project_initial") for v in (1, None)),
-]
-
-
-@both
-@pytest.mark.parametrize(("name", "value", "match"), WRONG_OPTIONS)
-def test_wrong_values_of_options(driver, name, value, match):
-    with pytest.raises(ValueError, match=match):
-        driver(invariants=SQUARE, **{name: value})
-
-
-@both
-@pytest.mark.parametrize("value", [{}, Diagnostics, True])
-def test_wrong_diagnostics(driver, value):
-    with pytest.raises(TypeError, match=r"diagnostics must be a Diagnostics\(\) object"):
-        driver(diagnostics=value)
-
-
 @pytest.mark.parametrize(
     ("wrong", "nearest"),
     [("invarients", "invariants"), ("iteration", "iterations"), ("block", "blocks"), ("Rtol", "rtol")],
@@ -621,11 +586,9 @@ def test_options_of_other_solvers_warn_as_scipy_s(names):
 def test_wrong_method(method):
     with pytest.raises(TypeError, match="method must be an EIP class such as EIPRK4"):
         by_integrate(method=method)
-
-
-def test_method_without_a_tableau_through_solve_ivp():
-    with pytest.raises(TypeError, match="eip_method"):
-        by_scipy(method=EIPSolver)
+    if method is EIPSolver:
+        with pytest.raises(TypeError, match="eip_method"):
+            by_scipy(method=method)
 
 
 def test_missing_arguments():
@@ -650,6 +613,7 @@ WRONG_OF_RUNS = [
         ("max_bytes", v, ValueError, "max_bytes must be a number of bytes >= 0, got")
         for v in ("a", math.nan, -1, 1j, True, [1])
     ),
+    *(("save_every", v, ValueError, "save_every must be an integer >= 1") for v in (0, -1, 1.5, "1", True)),
     ("save_every", 10**30, ValueError, "save_every must be at most 9223372036854775807, got 1000"),
     ("callback", 1, TypeError, "callback must be a function callback"),
     ("events", 1, TypeError, "events must be callable, or a sequence of callables, got 1"),
@@ -659,7 +623,7 @@ WRONG_OF_RUNS = [
     *(("h", v, ValueError, "`h` must be positive. Got") for v in (10**400, 1j, "0.1", np.array([0.1]))),
     *(
         ("params", v, TypeError, "params must be an array of numbers, got")
-        for v in (10**400, [10**400], [None], 1j, np.array([1j]), ["1"])
+        for v in (10**400, [10**400], [None], 1j, np.array([1j]), ["1"], "x", [[1], [2, 3]])
     ),
     *(
         ("t_eval", v, ValueError, "t_eval must be an array of numbers, got")
@@ -856,12 +820,6 @@ def test_complex_t_eval_of_solve_ivp(t_eval, invariants):
 # Saving.
 
 
-@pytest.mark.parametrize("value", [0, -1, 1.5, "1", True])
-def test_save_every_is_a_positive_integer(value):
-    with pytest.raises(ValueError, match="save_every must be an integer >= 1"):
-        by_integrate(save_every=value)
-
-
 @pytest.mark.parametrize(
     ("t_eval", "match"),
     [
@@ -920,14 +878,6 @@ def test_invariants_of_wrong_kind(driver):
             driver(invariants=[SQUARE, wrong])
 
 
-@both
-def test_a_function_stands_for_its_invariant(driver):
-    wanted = driver(invariants=Invariant(square, name="square"))
-    for given in (square, [square]):
-        found = driver(invariants=given)
-        np.testing.assert_array_equal(found.y, wanted.y)
-
-
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "match"),
     [
@@ -956,49 +906,6 @@ def test_wrong_invariants(arguments, options, error, match):
         Invariant(*arguments, **options)
 
 
-VALUE_MISTAKES = [
-    (lambda t, y: math.nan, ValueError, "invariant 'H' is not finite at y0"),
-    (lambda t, y: math.inf, ValueError, "invariant 'H' is not finite at y0"),
-    (lambda t, y: np.array([1.0, math.nan]), ValueError, r"invariant 'H\[1\]' is not finite at y0"),
-    (lambda t, y: np.ones((2, 2)), ValueError, r"invariant 'H' returned shape \(2, 2\)"),
-    (lambda t, y: 1j * (y @ y), ValueError, "invariant 'H' returned complex values"),
-    (lambda t, y: None, TypeError, "invariant 'H' returned .*None"),
-    (lambda t, y: "x", TypeError, "invariant 'H' returned"),
-]
-
-
-@both
-@pytest.mark.parametrize(("value", "error", "match"), VALUE_MISTAKES)
-@pytest.mark.parametrize("grad", [None, square_gradient], ids=["no grad", "grad"])
-def test_wrong_values_of_invariants(driver, value, error, match, grad):
-    with pytest.raises(error, match=match):
-        driver(invariants=Invariant(value, grad, name="H"))
-
-
-GRADIENT_MISTAKES = [
-    (lambda t, y: 2 * y[:1], r"gradient of invariant 'H' has shape \(1,\), expected \(2,\)"),
-    (lambda t, y: 2 * y[None], r"gradient of invariant 'H' has shape \(1, 2\), expected \(2,\)"),
-    (lambda t, y: 1.0, r"gradient of invariant 'H' has shape \(\), expected \(2,\)"),
-    (lambda t, y: None, "gradient of invariant 'H'"),
-    (lambda t, y: 2j * y, "gradient of invariant 'H' is complex, but y0 is real"),
-    (lambda t, y: math.nan * y, "gradient of invariant 'H' is not finite at y0"),
-]
-
-
-@both
-@pytest.mark.parametrize(("grad", "match"), GRADIENT_MISTAKES)
-def test_wrong_gradients(driver, grad, match):
-    with pytest.raises((ValueError, TypeError), match=match):
-        driver(invariants=Invariant(square, grad, name="H"))
-
-
-@both
-def test_value_and_gradient_must_fit(driver):
-    """The invariant has three values, but the gradient of one."""
-    with pytest.raises(ValueError, match=r"gradient of invariant 'H' has shape \(2,\), expected \(3, 2\)"):
-        driver(invariants=Invariant(lambda t, y: np.full(3, y @ y), square_gradient, name="H"))
-
-
 LATE_MISTAKES = {
     "value, three for one": (lambda t, y: y @ y if t < 0.5 else np.ones(3), square_gradient),
     "value, one for two": (
@@ -1016,14 +923,6 @@ def test_shapes_that_change_on_the_way(driver, mistake):
     value, grad = LATE_MISTAKES[mistake]
     with pytest.raises(ValueError, match=r"'H'.*shape"):
         driver(invariants=Invariant(value, grad, name="H"), check=False)
-
-
-@both
-@pytest.mark.parametrize("factor", [-1.0, 1.001, 2.0, 0.0])
-def test_wrong_gradient_is_found_at_the_start(driver, factor):
-    wrong = Invariant(square, lambda t, y: factor * 2 * y, name="H")
-    with pytest.raises(ValueError, match=r"gradient of invariant 'H' is wrong: .* by differences and .* by grad"):
-        driver(invariants=wrong)
 
 
 @both
@@ -1130,13 +1029,6 @@ def test_start_off_the_target(driver):
     assert driver(invariants=Invariant(square, square_gradient, target=5 * (1 + 1e-9))).status == 0
     with pytest.raises(ValueError, match="violates invariant"):
         driver(invariants=Invariant(square, square_gradient, target=5 * (1 + 3e-8)))
-
-
-@both
-@pytest.mark.parametrize(("target", "match"), [(math.nan, "must be finite"), ([1.0, 2.0], r"has shape \(2,\)")])
-def test_wrong_targets(driver, target, match):
-    with pytest.raises(ValueError, match=f"invariant 'H': target {match}"):
-        driver(invariants=Invariant(square, square_gradient, target=target, name="H"))
 
 
 # project() and check_gradient().
@@ -1268,12 +1160,6 @@ def test_jit_disabled_is_a_reason(monkeypatch):
     assert "NUMBA_DISABLE_JIT" in run.message
     with pytest.raises(TypeError, match="NUMBA_DISABLE_JIT"):
         by_integrate(fun, compiled=True)
-
-
-@pytest.mark.parametrize("value", ["x", [[1], [2, 3]], {"a": 1}])
-def test_params_are_numbers(value):
-    with pytest.raises(TypeError, match="params must be an array of numbers"):
-        by_integrate(lambda t, y, p: oscillator(t, y), params=value)
 
 
 # Attributes that callers see during a run.

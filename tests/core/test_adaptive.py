@@ -596,6 +596,8 @@ def test_failures_of_compiled_runs_are_the_same(method):
         (lv, {"rtol": 0.5, "atol": 5.0, "first_step": 2.0, "invariants": Invariant(value, grad, name="V")}),
         (late_nan, {}),
         (turn, {"invariants": Invariant(ball, double, name="ball"), "check": False}),
+        *((lv, {"h": h, "invariants": Invariant(value, grad, name="V")}) for h in (1.0, 2.0)),
+        (late_nan, {"h": 0.01}),
     ]
     for fun, options in cases:
         one, other = (

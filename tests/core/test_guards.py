@@ -426,12 +426,6 @@ def test_duplicate_invariants(driver, metric, iterations):
     np.testing.assert_allclose(run.y, alone.y, rtol=0, atol=1e-13)
 
 
-def test_project_duplicates():
-    result = project([0.6, 0.81], [SQUARE, SQUARE], target=[1.0, 1.0])
-    assert result.rank == 1
-    np.testing.assert_allclose(result.y, project([0.6, 0.81], SQUARE, target=1.0).y, rtol=EPS)
-
-
 def test_duplicates_hide_no_other_invariant():
     """The independent row is found behind two equal ones."""
     tilted = Invariant(lambda t, y: y[0] + 0.5 * y[1], lambda t, y: np.array([1.0, 0.5]))
@@ -475,12 +469,6 @@ def test_values_at_a_start():
         project(rough, total)
 
 
-def test_unreachable_target():
-    below = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=-1.0, name="below")
-    with pytest.raises(ValueError, match=r"projection failed at t=0: invariant 'below', residual .*, rank 1 of 1"):
-        integrate(oscillator, (0, 1), [1.0, 2.0], method=EIPRK4, h=0.1, invariants=below, project_initial=True)
-
-
 @both
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_contradiction_on_the_way(driver, iterations):
@@ -508,14 +496,6 @@ def test_invariant_not_finite_after_a_step(driver):
     assert run.message.startswith("projection failed at t=2: invariant 'V', residual nan, rank 1 of 1")
     np.testing.assert_array_equal(run.t, [0.0])
     np.testing.assert_array_equal(run.y, [[4.0], [2.0]])
-
-
-def test_invariant_not_finite_later():
-    run = integrate(lotka_volterra, (0, 30), [4.0, 2.0], method=EIPRK1, h=0.5, invariants=VOLTERRA, save_every=1)
-    assert run.message.startswith("projection failed at t=1: invariant 'V', residual nan, rank 1 of 1")
-    np.testing.assert_array_equal(run.t, [0.0, 0.5])
-    assert np.isfinite(run.y).all()
-    assert np.isfinite(run.invariants).all()
 
 
 def test_value_not_finite_at_the_projected_state():
@@ -595,33 +575,6 @@ def test_rhs_not_finite_after_some_time(driver):
     assert run.message.startswith("fun returned a non-finite value at t=0.5")
     assert len(run.t) == 50
     assert run.t[-1] == 0.49
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.needs_jit
-def test_failures_of_compiled_runs_are_the_same():
-    from numba import njit
-
-    lv = njit(lambda t, u: np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)]))
-    value = njit(lambda t, u: u[0] - np.log(u[0]) + u[1] - np.log(u[1]))
-    grad = njit(lambda t, u: 1 - 1 / u)
-    late_nan = njit(lambda t, u: np.array([u[1], -u[0]]) * (1.0 if t < 0.5 else np.nan))
-    cases = [
-        (lv, (0, 30), [4.0, 2.0], 2.0, Invariant(value, grad, name="V")),
-        (lv, (0, 30), [4.0, 2.0], 1.0, Invariant(value, grad, name="V")),
-        (late_nan, (0, 1), [1.0, 2.0], 0.01, ()),
-    ]
-    for fun, span, y0, h, invariants in cases:
-        one, other = (
-            integrate(fun, span, y0, method=EIPRK4, h=h, invariants=invariants, save_every=1, compiled=compiled)
-            for compiled in (True, False)
-        )
-        assert one.compiled
-        assert one.status == other.status == -1
-        assert other.message.startswith(one.message)
-        np.testing.assert_array_equal(one.t, other.t)
-        np.testing.assert_array_equal(one.y, other.y)
 
 
 @both

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from c_compiler import shared_library
 from scipy.integrate import solve_ivp
-from systems import jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient
+from systems import JIT_H, JIT_L
 
 from eip_scipy import (
     EIPDOP853,
@@ -54,7 +54,7 @@ def orbit(t, y):
     return np.concatenate([y[2:], acceleration(t, y[:2])])
 
 
-INVARIANTS = (Invariant(jit_energy, jit_energy_gradient), Invariant(jit_momentum, jit_momentum_gradient))
+INVARIANTS = (JIT_H, JIT_L)
 KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 
@@ -297,44 +297,12 @@ def test_events():
     assert abs(found.t[-1] - 3 * period) < 1e-11
 
 
-@both
-def test_a_resumed_run_has_the_same_bits(method, tmp_path):
-    """The run is stopped in the start, early, and late."""
-    problem = solar_system(years=12)
-    given = {"method": method, "h": 1 / 600, "save_every": 200}
-    whole = integrate(problem, **given)
-    for stop in (1, 4, 30):
-        path, seen = tmp_path / f"{stop}.npz", []
-
-        def broken(t, y, defects, seen=seen, stop=stop):
-            seen.append(t)
-            if len(seen) > stop:
-                raise RuntimeError("power cut")
-
-        with pytest.raises(RuntimeError, match="power cut"):
-            integrate(problem, checkpoint=path, callback=broken, **given)
-        again = integrate(problem, checkpoint=path, resume=True, **given)
-        assert "resumed at step" in again.message
-        assert np.array_equal(again.y, whole.y)
-        assert np.array_equal(again.max_defect, whole.max_defect)
-        assert again.nfev == whole.nfev
-
-
 def test_evaluations_do_not_depend_on_how_fast_the_machine_is(monkeypatch):
     problem, counts = solar_system(years=0.5), []
     for seconds in (1e9, 0.0):  # that a call of the engine is to take: the second makes calls of one step
         monkeypatch.setattr(longrun, "CHUNK_SECONDS", seconds)
         counts.append(integrate(problem, method=EIPGJ14, h=1 / 600).nfev)
     assert counts[0] == counts[1]
-
-
-def test_members_have_the_bits_of_single_runs():
-    """Multistep methods run in an ensemble; tests/ensembles/test_side_by_side.py has more of these tests."""
-    problem = solar_system(years=3)
-    starts = problem.y0 * (1 + 1e-6 * np.arange(3)[:, None])
-    result = ensemble(problem, None, starts, method=EIPGJ14, h=1 / 500)
-    for member, start in zip(result.y, starts, strict=True):
-        assert np.array_equal(member, integrate(problem, y0=start, method=EIPGJ14, h=1 / 500).y[:, -1])
 
 
 @pytest.mark.parametrize("forces", ["gr-potential", "1pn", "eih", ("gr-potential", "j2")])

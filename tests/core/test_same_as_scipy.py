@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import DOP853, RK23, RK45, solve_ivp
-from systems import jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient, jit_orbit, orbit, pericentre
+from systems import (
+    JIT_H,
+    JIT_L,
+    jit_orbit,
+    orbit,
+    pericentre,
+)
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, Invariant, eip_method, integrate
 from eip_scipy.problems import kepler
@@ -315,11 +321,10 @@ def jit_lower_event(t, y):
     return y[1].real + 0.1
 
 
-ORBIT = [Invariant(jit_energy, jit_energy_gradient, name="H"), Invariant(jit_momentum, jit_momentum_gradient, name="L")]
 NORM = Invariant(jit_norm, jit_norm_gradient, name="N")
 RUNS = {
-    "orbit": (jit_orbit, (0.0, 15.0), pericentre(0.6), ORBIT),
-    "backward": (jit_orbit, (2.0, -10.0), pericentre(0.6), ORBIT),
+    "orbit": (jit_orbit, (0.0, 15.0), pericentre(0.6), [JIT_H, JIT_L]),
+    "backward": (jit_orbit, (2.0, -10.0), pericentre(0.6), [JIT_H, JIT_L]),
     "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), NORM),
     "complex backward": (jit_spin, (3.0, -9.0), np.array([1.0 + 0j, 0.2j]), NORM),
 }

@@ -10,11 +10,10 @@ import sys
 import weakref
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPRKN12, Invariant, integrate
+from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, Invariant
 from eip_scipy.core.dense import Interpolants
 from eip_scipy.engine import native
 from eip_scipy.engine.data import CUBIC, POLYNOMIAL, Work
@@ -350,52 +349,6 @@ def test_views_handed_out_outlive_the_run():
     del given, engine
     gc.collect()
     assert all(np.isfinite(view).all() for view in kept)
-
-
-@numba.njit
-def oscillators(t, y):
-    out = np.zeros_like(y)
-    for k in range(y.size // 2):
-        out[2 * k], out[2 * k + 1] = (1 + k) * y[2 * k + 1], -(1 + k) * y[2 * k]
-    return out
-
-
-@numba.njit
-def phases(t, y):
-    out = np.empty_like(y)
-    for k in range(y.size):
-        out[k] = -1j * (1 + k) * y[k]
-    return out
-
-
-@numba.njit
-def size(t, y):
-    total = 0.0
-    for k in range(y.size):
-        total += y[k].real ** 2 + y[k].imag ** 2
-    return total
-
-
-@numba.njit
-def size_gradient(t, y, out):
-    for k in range(y.size):
-        out[k] = 2 * y[k]
-
-
-@pytest.mark.needs_jit
-@pytest.mark.parametrize("fun", [oscillators, phases], ids=["real", "complex"])
-@pytest.mark.parametrize(
-    "n", [1, 4, 9, *(pytest.param(n, marks=[pytest.mark.nightly, pytest.mark.slow]) for n in (2, 3, 5))]
-)
-def test_pointers_give_the_bits_of_calls_in_python(n, fun):
-    y0 = np.linspace(1, 2, n).astype(float if fun is oscillators else complex)
-    kept = Invariant(size, size_gradient, in_place=True)
-    for options in ({"h": 0.1}, {"rtol": 1e-5, "method": EIPRK45}, {"rtol": 1e-9, "method": EIPDOP853}):
-        given = {"method": EIPRK4, "invariants": kept, "save_every": 1} | options
-        fast, slow = (integrate(fun, (0, 3), y0, compiled=compiled, **given) for compiled in (True, False))
-        np.testing.assert_array_equal(fast.y, slow.y)
-        np.testing.assert_array_equal(fast.t, slow.t)
-        assert repr(fast.diagnostics) == repr(slow.diagnostics)
 
 
 RUNS = """

@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 from numba import njit
 from systems import (
+    JIT_H,
+    JIT_L,
     SQUARE,
     H,
     L,
     jit_energy,
     jit_energy_gradient,
-    jit_momentum,
-    jit_momentum_gradient,
     jit_orbit,
     orbit,
     oscillator,
@@ -42,7 +42,7 @@ from eip_scipy.results import EnsembleResult
 from eip_scipy.run.prepare import Request
 
 needs_jit = pytest.mark.needs_jit
-HL = [Invariant(jit_energy, jit_energy_gradient, name="H"), Invariant(jit_momentum, jit_momentum_gradient, name="L")]
+HL = [JIT_H, JIT_L]
 SPAN = (0.0, 6.0)
 
 

@@ -1,4 +1,4 @@
-"""Nystrom tableaux: order conditions by trees grown here, wrong coefficients, low parts, orders on Kepler's problem."""
+"""Nystrom tableaux: order conditions by trees grown here, wrong coefficients, low parts, one step by hand."""
 
 import math
 from fractions import Fraction
@@ -306,19 +306,6 @@ def test_a_step_uses_all_weights(tableau, driver):
     np.testing.assert_allclose(run.y[:, -1], expected, rtol=1e-15)
 
 
-@pytest.mark.parametrize("tableau", METHODS[:2], ids=name)
-def test_small_methods_have_their_order(tableau):
-    """Errors of the pendulum are relative to a run with twice as many steps."""
-
-    def end(n):
-        options = {"method": eip_method(tableau), "h": 2.0 / n}
-        return integrate(acceleration=lambda t, q: -np.sin(q), t_span=(0, 2), y0=[1.0, 0.3], **options).y[:, -1]
-
-    one, two, four = (end(n) for n in (40, 80, 160))
-    order = np.log2(np.abs(one - two).max() / np.abs(two - four).max())
-    assert order == pytest.approx(tableau.order, abs=0.1)
-
-
 def test_the_first_stage_is_at_the_start():
     with pytest.raises(ValueError, match="drift: the first node is 1/2, expected 0"):
         NystromTableau("drift", A=[[]], b=["1/2"], b_prime=[1], c=["1/2"], order=2)
@@ -378,67 +365,3 @@ def test_fractions_and_fields_are_read_only():
 def test_wrong_tableaux(changes, match):
     with pytest.raises(ValueError, match=match):
         NystromTableau("bad", **{**PAIR, **changes})
-
-
-ECCENTRICITY = Fraction(1, 10)
-
-
-def kepler(t):
-    """Return position and velocity on the ellipse with unit period / 2 pi, from its pericentre."""
-    e = mpf(ECCENTRICITY.numerator) / ECCENTRICITY.denominator
-    E = mpmath.findroot(lambda x: x - e * mpmath.sin(x) - t, t)
-    root, rate = mpmath.sqrt(1 - e**2), 1 / (1 - e * mpmath.cos(E))
-    q = [mpmath.cos(E) - e, root * mpmath.sin(E)]
-    return q, [-mpmath.sin(E) * rate, root * mpmath.cos(E) * rate]
-
-
-def acceleration(q):
-    cube = mpmath.sqrt(q[0] ** 2 + q[1] ** 2) ** 3
-    return [-x / cube for x in q]
-
-
-def step(method, q, v, h):
-    """Return the new position and velocity, and the estimates."""
-    K = []
-    for row, node in zip(method.A, method.c, strict=True):
-        drift = [sum(a * k[i] for a, k in zip(row, K, strict=False)) for i in range(2)]
-        K.append(acceleration([q[i] + node * h * v[i] + h**2 * drift[i] for i in range(2)]))
-
-    def gain(key):
-        return [sum(w * k[i] for w, k in zip(method.weights[key], K, strict=True)) for i in range(2)]
-
-    ends = []
-    for position, velocity in (("b", "b_prime"), ("b_hat", "b_prime_hat")):
-        q_new = [x + h * y + h**2 * z for x, y, z in zip(q, v, gain(position), strict=True)]
-        ends.append([*q_new, *(y + h * z for y, z in zip(v, gain(velocity), strict=True))])
-    return ends
-
-
-def largest(a, b):
-    return max(abs(x - y) for x, y in zip(a, b, strict=True))
-
-
-@pytest.mark.parametrize("tableau", HIGH, ids=name)
-def test_order_on_keplers_problem(tableau):
-    """Global error of the step over a unit of time, in many digits, where the next term of the error is small."""
-
-    def error(n):
-        state = [*kepler(mpf(0))[0], *kepler(mpf(0))[1]]
-        for _ in range(n):
-            state, _ = step(digits(tableau), state[:2], state[2:], mpf(1) / n)
-        return largest(state, [*kepler(mpf(1))[0], *kepler(mpf(1))[1]])
-
-    with mpmath.workdps(DIGITS):
-        assert float(mpmath.log(error(64) / error(128), 2)) == pytest.approx(tableau.order, abs=0.1)
-
-
-@pytest.mark.parametrize("tableau", HIGH, ids=name)
-def test_estimate_is_of_its_order(tableau):
-    """The local estimate falls like h^(p_hat + 1)."""
-
-    def estimate(h):
-        return largest(*step(digits(tableau), *kepler(mpf(1)), h))
-
-    with mpmath.workdps(DIGITS):
-        ratio = estimate(mpf(1) / 64) / estimate(mpf(1) / 128)
-        assert float(mpmath.log(ratio, 2)) == pytest.approx(tableau.error_estimator_order + 1, abs=0.1)

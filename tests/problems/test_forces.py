@@ -7,7 +7,6 @@ from itertools import combinations, permutations
 import mpmath
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRKN12, check_gradient, integrate
@@ -373,15 +372,6 @@ def test_compiled_and_interpreted_runs_are_the_same(forces):
     np.testing.assert_array_equal(runs[0].y, runs[1].y)
 
 
-def test_through_solve_ivp():
-    given = mercury("1pn", years=0.1, h=0.005)
-    sol = solve_ivp(
-        given.fun, given.t_span, given.y0, method=EIPRK4, h=given.h, invariants=given.invariants, blocks=given.blocks
-    )
-    end = [item.fun(0.0, np.ascontiguousarray(sol.y[:, -1]), given.params) for item in given.invariants[:1]]
-    assert end[0] == pytest.approx(given.invariants[0].fun(0.0, given.y0, given.params), rel=1e-14)
-
-
 @pytest.mark.parametrize("forces", ["1pn", "eih"])
 def test_nystrom_methods_say_why_they_cannot(forces):
     given = mercury(forces)
@@ -527,13 +517,9 @@ def test_bad_masses(gm, message):
         nbody(gm, np.eye(2, 3), np.zeros((2, 3)), t_span=(0.0, 1.0))
 
 
-def test_bodies_at_the_same_place():
-    q = POSITION.copy()
-    q[3] = q[1]
-    with pytest.raises(ValueError, match="bodies 1 and 3 are at the same place"):
-        nbody(GM, q, VELOCITY, t_span=(0.0, 1.0))
+def test_places_that_are_not_finite():
     with pytest.raises(ValueError, match="must be finite"):
-        nbody(GM, q * np.nan, VELOCITY, t_span=(0.0, 1.0))
+        nbody(GM, POSITION * np.nan, VELOCITY, t_span=(0.0, 1.0))
 
 
 @pytest.mark.parametrize("factor", [365.25, 1 / 365.25, 86400.0, 1 / 86400.0])
@@ -582,9 +568,9 @@ def test_no_false_alarms(bodies):
         nbody(*bodies, t_span=(0.0, 1.0))
 
 
-def test_distances_of_all_pairs_are_looked_at():
+def test_bodies_at_the_same_place():
     for i, j in combinations(range(4), 2):
         q = POSITION.copy()
         q[j] = q[i]
-        with pytest.raises(ValueError, match=f"bodies {i} and {j} "):
+        with pytest.raises(ValueError, match=f"bodies {i} and {j} are at the same place"):
             nbody(GM, q, VELOCITY, t_span=(0.0, 1.0))

@@ -4,14 +4,12 @@ import csv
 import json
 import math
 import pickle
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import eip_scipy.integrations
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, check_gradient, hamiltonian, integrate
 from eip_scipy.problems import (
     centre_time,
@@ -241,13 +239,6 @@ FEW = scene_runs.Spread((1e-7, 1e-11), (30, 60), {"prs23": (1e-5, 1e-7), "global
 COARSE = scene_runs.Spread((1e-3, 1e-5), (10, 20), repeats=1)
 
 
-@pytest.fixture
-def no_rebound(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rebound", None)
-    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
-    monkeypatch.delattr(eip_scipy.integrations, "rebound", raising=False)
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
@@ -315,16 +306,6 @@ def test_unknown_scene(name, hint, capsys):
     err = capsys.readouterr().err
     assert len(err.splitlines()) == 1
     assert f"unknown scene {name!r}, expected one of {', '.join(SCENES)}{hint} (see" in err
-
-
-def test_interruption(tmp_path, capsys, monkeypatch):
-    def interrupted(*args):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(hard_scenes, "measure", interrupted)
-    assert main(["hard-scenes", "--scene", "comet", "--out", str(tmp_path), "--quiet"]) == 130
-    assert list(tmp_path.iterdir()) == []
-    assert "nothing was written" in capsys.readouterr().err
 
 
 def test_invariant_errors_and_bodies_of_a_scene():

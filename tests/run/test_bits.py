@@ -8,6 +8,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from systems import jit_momentum as momentum
 from systems import jit_momentum_gradient as momentum_gradient
+from systems import same
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate
 from eip_scipy.problems import nbody
@@ -115,19 +116,6 @@ WITH_PARAMS = [
     Invariant(momentum_of_params, momentum_gradient_in_place, in_place=True, name="L"),
 ]
 FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))
-
-
-def same(one, other):
-    """Compare every number of two results."""
-    assert other.message.startswith(one.message)
-    for key in ("t", "y", "invariants", "max_defect"):
-        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
-    for key in ("status", "nfev", "njev", "nlu"):
-        assert one[key] == other[key], key
-    for key in ("n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections"):
-        assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
-    np.testing.assert_array_equal(one.diagnostics.last_defect, other.diagnostics.last_defect)
-    np.testing.assert_array_equal(one.diagnostics.max_correction, other.diagnostics.max_correction)
 
 
 def compare(fun, span, y0, **options):

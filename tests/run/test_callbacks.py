@@ -78,34 +78,25 @@ def many(steps, how, n, tmp_path, **options):
     return plain
 
 
+@pytest.mark.parametrize("n", [MANY, pytest.param(100_000, marks=[pytest.mark.nightly, pytest.mark.slow])])
 @pytest.mark.parametrize("steps", STEPS)
 @pytest.mark.parametrize("how", [pytest.param("compiled", marks=pytest.mark.needs_jit), "interpreted"])
-def test_a_callback_at_every_step(steps, how, tmp_path):
-    many(steps, how, MANY, tmp_path)
+def test_a_callback_at_every_step(steps, how, n, tmp_path):
+    many(steps, how, n, tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.needs_jit
-def test_a_callback_at_every_step_and_events(tmp_path):
-    found = many("fixed", "compiled", MANY, tmp_path, events=passage)
-    np.testing.assert_allclose(np.diff(found.t_events[0]), math.pi, rtol=1e-7)
-    assert found.t_events[0].size == int((0.01 * MANY + math.atan2(1, 2)) / math.pi)
-
-
-@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("steps", "how", "options"),
+    ("how", "n"),
     [
-        ("fixed", "interpreted", {}),
-        ("adaptive", "interpreted", {}),
-        ("fixed", "interpreted", {"events": lambda t, y: y[0]}),
-        pytest.param("adaptive", "compiled", {}, marks=pytest.mark.needs_jit),
+        pytest.param("compiled", MANY, marks=pytest.mark.needs_jit),
+        pytest.param("interpreted", 100_000, marks=pytest.mark.nightly),
     ],
-    ids=["fixed", "adaptive", "events", "compiled"],
 )
-def test_a_hundred_thousand_callbacks(steps, how, options, tmp_path):
-    assert many(steps, how, 100_000, tmp_path, **options).t.size > 100_000
+def test_a_callback_at_every_step_and_events(how, n, tmp_path):
+    found = many("fixed", how, n, tmp_path, events=passage)
+    np.testing.assert_allclose(np.diff(found.t_events[0]), math.pi, rtol=1e-7)
+    assert found.t_events[0].size == int((0.01 * n + math.atan2(1, 2)) / math.pi)
 
 
 @pytest.mark.parametrize("steps", STEPS)

@@ -684,17 +684,11 @@ def test_time_dependent_invariants_are_no_false_alarm(h, amplitude):
 
 
 @pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
-def test_time_dependent_function_that_is_no_invariant():
-    wrong = Invariant(lambda t, y: y[0] + np.sin(t), lambda t, y: np.ones(1), name="I")
+@pytest.mark.parametrize(("rate", "added"), [(np.cos, np.sin), (lambda t: 0.0, lambda t: t)], ids=["moving", "at rest"])
+def test_time_dependent_function_that_is_no_invariant(rate, added):
+    wrong = Invariant(lambda t, y: y[0] + added(t), lambda t, y: np.ones(1), name="I")
     with pytest.warns(UserWarning, match="'I' is not an invariant"):
-        run((0.3, 1.3), [1.0], lambda t, y: np.cos(t) * np.ones(1), invariants=wrong)
-
-
-@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
-def test_time_dependent_function_at_rest_is_no_invariant():
-    wrong = Invariant(lambda t, y: y[0] + t, lambda t, y: np.ones(1), name="I")
-    with pytest.warns(UserWarning, match="'I' is not an invariant"):
-        run((0, 1), [1.0], lambda t, y: np.zeros(1), invariants=wrong)
+        run((0.3, 1.3), [1.0], lambda t, y: rate(t) * np.ones(1), invariants=wrong)
 
 
 def test_slow_drift_is_noticed():

@@ -25,7 +25,7 @@ from eip_scipy import (
     integrate,
     load,
 )
-from eip_scipy.problems import harmonic, kepler, soliton
+from eip_scipy.problems import kepler, soliton
 from eip_scipy.results import IntegrationResult, plot, save, to_dataframe, to_xarray
 
 Y0 = np.array([1.0, 2.0])
@@ -60,12 +60,6 @@ def test_component_names():
     run.component_names = ["a", "b", "c", "d"]
     assert run.component_names == ("a", "b", "c", "d")
     assert run.to_dataframe().columns[0] == "a"
-
-
-def test_names_of_another_size_are_left():
-    """A problem's function may be run from a start of another size."""
-    run = integrate(harmonic(), (0, 1), np.ones(2), method=EIPRK4, h=0.1)
-    assert run.component_names == ("q", "p")
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
+from systems import same
 
 from eip_scipy import (
     EIPDOP853,
@@ -95,16 +96,6 @@ def run(method, events=None, span=(0.0, 30.0), **options):
     return integrate(PROBLEM, span, method=method, events=events, **options)
 
 
-def assert_same(one, other):
-    """Check that all bits agree, and nfev too."""
-    np.testing.assert_array_equal(one.t, other.t)
-    np.testing.assert_array_equal(one.y, other.y)
-    for name in ("t_events", "y_events"):
-        for a, b in zip(getattr(one, name) or (), getattr(other, name) or (), strict=True):
-            np.testing.assert_array_equal(a, b)
-    assert (one.status, one.nfev, one.njev) == (other.status, other.nfev, other.njev)
-
-
 @methods
 @pytest.mark.parametrize("span", [(0.0, 30.0), (30.0, 0.0)], ids=["forward", "backward"])
 def test_roots_and_samples_of_compiled_and_interpreted_runs(method, steps, span):
@@ -115,7 +106,7 @@ def test_roots_and_samples_of_compiled_and_interpreted_runs(method, steps, span)
     assert compiled.compiled
     assert not interpreted.compiled
     assert [len(t) > 4 for t in compiled.t_events] == [True, True, True]
-    assert_same(compiled, interpreted)
+    same(compiled, interpreted)
     np.testing.assert_array_equal(compiled.sol(times), interpreted.sol(times))
 
 
@@ -126,7 +117,7 @@ def test_roots_of_a_complex_state():
     compiled = integrate(spin, (0.0, 40.0), y0, **options)
     assert compiled.compiled
     assert len(compiled.t_events[0]) > 4
-    assert_same(compiled, integrate(spin, (0.0, 40.0), y0, compiled=False, **options))
+    same(compiled, integrate(spin, (0.0, 40.0), y0, compiled=False, **options))
 
 
 @pytest.mark.parametrize(("method", "steps"), [STEPS["RK4"], STEPS["RK45"], STEPS["DOP853"]])
@@ -165,7 +156,7 @@ def test_terminal_events(terminal, span, saved):
     assert compiled.status == 1
     assert len(compiled.t_events[0]) == int(terminal)
     interpreted = run(EIPRK4, [ending, clock], compiled=False, **options)
-    assert_same(compiled, interpreted)
+    same(compiled, interpreted)
     end = compiled.t_events[0][-1]
     assert compiled.sol.ts[-1] == end
     np.testing.assert_array_equal(compiled.sol(end), compiled.y_events[0][-1])
@@ -373,7 +364,7 @@ def test_roots_and_times_of_a_resumed_run(tmp_path):
     kept = {"checkpoint": tmp_path / "run.npz", "checkpoint_every": 1e-9}
     with pytest.raises(BrokenError):
         run(EIPRK4, callback=stop, **options, **kept)
-    assert_same(run(EIPRK4, resume=True, **options, **kept), whole)
+    same(run(EIPRK4, resume=True, **options, **kept), whole)
 
 
 def test_an_unprojected_state_is_told():

@@ -50,13 +50,6 @@ LITTLE = {"timed_methods": leapfrog_only}
 
 
 @pytest.fixture
-def no_rebound(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rebound", None)
-    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
-    monkeypatch.delattr(eip_scipy.integrations, "rebound", raising=False)
-
-
-@pytest.fixture
 def no_matplotlib(monkeypatch):
     for name in list(sys.modules):
         if name.split(".")[0] == "matplotlib":

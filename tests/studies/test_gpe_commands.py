@@ -22,7 +22,6 @@ from eip_scipy.problems.gross_pitaevskii import (
 from eip_scipy.run import resume
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.condensates import lines as gpe_lines
-from eip_scipy_studies.condensates import ring as gpe_ring
 from eip_scipy_studies.condensates import runs as gpe_runs
 from eip_scipy_studies.condensates import states as gpe_states
 from eip_scipy_studies.report import UsageError
@@ -87,19 +86,6 @@ def test_a_missed_energy_fails_the_command(tmp_path, monkeypatch, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["ground-states.csv"]
 
 
-@pytest.mark.parametrize("task", ["ground-state", "ring", "vortex-lines"])
-def test_interrupted(task, tmp_path, monkeypatch, capsys):
-    def stop(*args, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(gpe_states, "ground_state", stop)
-    monkeypatch.setattr(gpe_ring, "search_ring", stop)
-    monkeypatch.setattr(gpe_lines, "search_saddle", stop)
-    assert main(["gpe", task, "--out", str(tmp_path), "--quiet"]) == 130
-    assert "nothing was written" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_cropping_keeps_the_condensate():
     grid = Grid((64, 64), -8, 8)
     x, y = grid.mesh()
@@ -129,11 +115,6 @@ SHORT = {
     "snapshots": (0.0, 0.1, 0.2, 7.0),
     "sense": -1,  # two vortices near the centre do not form a ring
 }
-
-
-@pytest.fixture
-def no_plotting(monkeypatch):
-    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
 
 
 @pytest.fixture

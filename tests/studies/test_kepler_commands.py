@@ -2,7 +2,6 @@
 
 import csv
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -16,11 +15,6 @@ from eip_scipy_studies.study import Session
 
 PNG = b"\x89PNG\r\n\x1a\n"
 T_END = 1.5
-
-
-@pytest.fixture
-def no_plotting(monkeypatch):
-    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
 
 
 def read(file):
@@ -63,23 +57,6 @@ def test_csv_of_work_and_precision_has_a_line_for_each_run(tmp_path, capsys):
         "EIPRK2", "EIPRK2", "EIPRK4", "EIPRK4", "EIPRK45", "EIPRK45",
     ]  # fmt: skip
     assert capsys.readouterr().out == ""
-
-
-@pytest.mark.usefixtures("no_plotting")
-def test_work_and_precision_without_matplotlib(tmp_path, capsys):
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 0
-    assert "eip-scipy: no figures: " in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["work-precision.csv"]
-
-
-def test_work_and_precision_interrupted(tmp_path, capsys, monkeypatch):
-    def stop(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(kepler_cost, "work_precision", stop)
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 130
-    assert "nothing was written" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_cheapest_methods_of_the_text():
@@ -171,11 +148,3 @@ def test_command_for_the_figures(lines, tmp_path, capsys, monkeypatch):
         ("EIP-H", 0.0), ("EIP-H", pytest.approx(50 * 0.03)), ("EIP-L", 0.0),
     ]  # fmt: skip
     assert float(rows[1]["q1"]) == lines["EIP-H"].y[0, 50]
-
-
-@pytest.mark.usefixtures("no_plotting")
-def test_command_for_the_figures_without_matplotlib(lines, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(kepler_figures.KeplerFigures, "measure", lambda self, session: lines)
-    assert main(["reproduce", "fig-kepler", "--out", str(tmp_path), "--quiet"]) == 1
-    assert "eip-scipy: no figures: " in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["fig-kepler.csv"]

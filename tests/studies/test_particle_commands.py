@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -27,11 +26,6 @@ def short():
 @pytest.fixture
 def short_runs(short, monkeypatch):
     monkeypatch.setattr(charged_particle, "study", lambda name, **options: short[name])
-
-
-@pytest.fixture
-def no_plotting(monkeypatch):
-    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
 
 
 def read(file):
@@ -141,24 +135,6 @@ def test_scenes_of_the_command(options, scenes, tmp_path, capsys):
 def test_wrong_usage(options, words, tmp_path, capsys):
     assert main(["charged-particle", *options, "--out", str(tmp_path)]) == 2
     assert words in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("short_runs", "no_plotting")
-def test_without_matplotlib(tmp_path, capsys):
-    assert main(["charged-particle", "uniform", "--out", str(tmp_path), "--quiet"]) == 1
-    assert "eip-scipy: no figures: " in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["charged-particle.csv"]
-
-
-def test_interrupted(tmp_path, capsys, monkeypatch):
-    def stop(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(charged_particle, "study", stop)
-    assert main(["charged-particle", "--out", str(tmp_path), "--quiet"]) == 130
-    assert "nothing was written" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.nightly
