@@ -56,29 +56,17 @@ struct OctetSystem {
 
     template <class W>
     void inv(const W &, double t, const Octet *y, Octet *values) {
-        for (const auto &[pointer, library, octets] : inv_pointers) {
-            if (library) {
-                library(t, y, nullptr, values, params.data(), n(), p());
-            } else {
-                fill(values, NOT_A_NUMBER, octets);
-                require(pointer(t, copied(floats_of(y), scratch), floats_of(values), floats_of(params.data())));
-            }
-            values += octets;
-        }
+        call_each(inv_pointers, t, y, nullptr, values, [&](auto pointer, double *out) {
+            return pointer(t, copied(floats_of(y), scratch), out, floats_of(params.data()));
+        });
     }
 
     template <class W>
     void grad(const W &, double t, const Octet *y, const Octet *f, Octet *G) {
-        for (const auto &[pointer, library, octets] : grad_pointers) {
-            if (library) {
-                library(t, y, f, G, params.data(), n(), p());
-            } else {
-                fill(G, NOT_A_NUMBER, octets);
-                const double *state = copied(floats_of(y), scratch), *slope = copied(floats_of(f), scratch_f);
-                require(pointer(t, state, slope, floats_of(G), floats_of(params.data())));
-            }
-            G += octets;
-        }
+        call_each(grad_pointers, t, y, f, G, [&](auto pointer, double *out) {
+            const double *state = copied(floats_of(y), scratch), *slope = copied(floats_of(f), scratch_f);
+            return pointer(t, state, slope, out, floats_of(params.data()));
+        });
     }
 
     static Octet *octets_of(double *a) { return reinterpret_cast<Octet *>(a); }
@@ -95,6 +83,19 @@ struct OctetSystem {
     }
     static void require(int status) {
         if (status) throw GaveUp{};
+    }
+    template <class Calls, class ByPointer>
+    void call_each(const Calls &functions, double t, const Octet *y, const Octet *f, Octet *out,
+                   const ByPointer &by_pointer) {
+        for (const auto &[pointer, library, octets] : functions) {
+            if (library) {
+                library(t, y, f, out, params.data(), n(), p());
+            } else {
+                fill(out, NOT_A_NUMBER, octets);
+                require(by_pointer(pointer, floats_of(out)));
+            }
+            out += octets;
+        }
     }
 };
 
