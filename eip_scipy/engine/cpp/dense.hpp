@@ -4,8 +4,8 @@
 
 #include <vector>
 
+#include "columns.hpp"
 #include "multistep.hpp"
-#include "state_alone.hpp"
 
 namespace eip {
 

@@ -161,9 +161,7 @@ PythonFunctions::PythonFunctions(nb::handle functions, nb::handle owner, const W
             std::optional<PythonCall> &call = calls_[kind].emplace_back();
             if (!item.is_none()) total += call.emplace(item, type, sizes.n, kept).floats();
         }
-        if (expected >= 0 && total != expected)
-            refuse(PyExc_ValueError, "engine: the values of %s are %lld floats, expected %lld", name,
-                   static_cast<long long>(total), static_cast<long long>(expected));
+        if (expected >= 0) require_floats(name, total, expected);
     };
     calls(nb::object(functions.attr("inv")), "inv", VALUES, sizes.l);
     calls(nb::object(functions.attr("grad")), "grad", GRADIENTS, sizes.l * sizes.m);
