@@ -149,7 +149,7 @@ template <class AnyRun>
     for (int64_t c = 0; in_halves && c < columns.count; ++c) put_column(columns, c, M + c * n, step.y_new);
 }
 
-// What follows looks at the state alone, without the columns behind it, and costs what it costs without columns.
+// The functions below look at the state alone, without the columns behind it, and cost what they cost without columns.
 
 // Return whether the state is at the front and its functions are called by pointer. Batches of members have none.
 template <class AnyRun>
