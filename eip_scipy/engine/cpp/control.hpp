@@ -1,8 +1,8 @@
 // A whole step: the raw one, the projection, and the control of its length, which is SciPy's.
 #pragma once
 
+#include "columns.hpp"
 #include "multistep.hpp"
-#include "state_alone.hpp"
 
 namespace eip {
 

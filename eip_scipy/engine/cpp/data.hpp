@@ -26,7 +26,7 @@ constexpr int64_t AUTO = 0;  // the option `every`
 // estimate of the step's error is available; the number of projections begun; the steps since the last projection; how
 // many figures stood out; whether the last row of K holds f at the raw result; and how many gradients of the last
 // accepted projection, and of the last one that was tried, are clearly independent. HAVE_F may also be OF_STATE, see
-// state_alone.hpp.
+// columns.hpp.
 EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED,
          HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, N_COUNTERS);
 constexpr int64_t OF_STATE = 2;

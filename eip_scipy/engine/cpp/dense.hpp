@@ -4,8 +4,8 @@
 
 #include <vector>
 
+#include "columns.hpp"
 #include "multistep.hpp"
-#include "state_alone.hpp"
 
 namespace eip {
 
@@ -243,18 +243,25 @@ struct LegendreIntegrals {
     }
 };
 
+// The state a time `passed` after the start of a step, from accelerations: h rows are what they add to velocities, and
+// h^2 rows under the weights `twice` what they add to positions.
+inline void integrate(const Piece &piece, double h, double passed, const Rows &rows, const double *twice, double *out) {
+    const int64_t half = rows.stride;
+    weighted_sum(h * h, {twice, rows.first, rows.count, half}, out, half);
+    weighted_sum(h, rows, out + half, half);
+    for (int64_t i = 0; i < half; ++i) {
+        const double v = piece.y_old[half + i];
+        out[i] = piece.y_old[i] + (passed * v + out[i]);
+        out[half + i] = v + out[half + i];
+    }
+}
+
 // The state at t_old + theta h by the accelerations' polynomial, whose Legendre coefficients are the first rows.
 inline void from_accelerations(const Dense &d, const Piece &piece, double theta, double *out, const Work &w) {
     const int64_t half = w.m / 2;
     const double h = *piece.t - *piece.t_old;
     const LegendreIntegrals integrals(theta, d.polynomials);
-    weighted_sum(h * h, {integrals.twice, piece.rows, d.polynomials, half}, out, half);
-    weighted_sum(h, {integrals.once, piece.rows, d.polynomials, half}, out + half, half);
-    for (int64_t i = 0; i < half; ++i) {
-        const double v = piece.y_old[half + i];
-        out[i] = piece.y_old[i] + (theta * h * v + out[i]);
-        out[half + i] = v + out[half + i];
-    }
+    integrate(piece, h, h * theta, {integrals.once, piece.rows, d.polynomials, half}, integrals.twice, out);
 }
 
 // For y = (q, v) of a Nystrom method: the accelerations at further stages, which the method's own ones give accurately, and
@@ -287,53 +294,36 @@ inline int64_t nodes_back(const Multistep &ms, double t_old) {
 // For the nodes of a multistep method: the accelerations of the whole history, and behind them how many nodes before the
 // newest the step begins, and its length in nodes' distances; before these, what the projections of the states that are
 // handed out change between the ends.
-inline void history(const Dense &d, const Piece &piece, const double *y_old, const double *y, double *f_old, double *f,
-                    const Work &w) {
+inline void history(const Dense &d, const Piece &piece, const double *y_old, const double *y, const Work &w) {
     const Multistep &ms = *d.multistep;
     double *missing = piece.rows + (d.rows() - 2) * w.m, *about = missing + w.m;
     for (int64_t i = 0; i < w.m; ++i) missing[i] = (piece.y[i] - y[i]) - (piece.y_old[i] - y_old[i]);
     const double h = *piece.t - *piece.t_old;
-    const int64_t back = nodes_back(ms, *piece.t_old);
-    about[0] = static_cast<double>(back);
+    about[0] = static_cast<double>(nodes_back(ms, *piece.t_old));
     about[1] = h / ms.h;
     for (int64_t j = 0; j < ms.order; ++j) copy(newest(ms) - j * ms.pitch, piece.rows + j * ms.half, ms.half);
-    slope_of(ms, back, y_old, f_old);
-    if (back > 0) slope_of(ms, back - 1, y, f);
 }
 
-// The derivative at the start of the step just made, and at its end: where the step left it, from the history of a multistep
-// method, or by an evaluation where the method leaves none.
-inline const double *slope_at_start(const Run &run, const Dense &d, double t_old, const double *y_old) {
-    double *f = d.work.row(0);
-    if (d.own_slopes) {
-        run.system.rhs(d.work, t_old, y_old, f);
-        ++run.work.counters[NFEV];
-        return f;
-    }
-    if (!d.multistep || d.multistep->brief) return run.work.row(0);
-    slope_of(*d.multistep, nodes_back(*d.multistep, t_old), y_old, f);
-    return f;
-}
-
-inline const double *slope_at_end(const Run &run, const Dense &d, double t_old, double t, const double *y) {
-    double *f = d.work.last();
+// The derivative at the start or at the end of the step just made from t_old, at the state y at t: where the step left it,
+// from the history of a multistep method, or by an evaluation where the method leaves none.
+inline const double *slope_at(bool end, const Run &run, const Dense &d, double t_old, double t, const double *y) {
+    double *f = end ? d.work.last() : d.work.row(0);
+    const double *left = end ? run.work.last() : run.work.row(0);
     if (d.own_slopes) {
         run.system.rhs(d.work, t, y, f);
         ++run.work.counters[NFEV];
         return f;
     }
-    if (!d.multistep || d.multistep->brief) return run.work.last();
-    const int64_t back = nodes_back(*d.multistep, t_old);
-    if (back == 0) return run.work.last();
-    slope_of(*d.multistep, back - 1, y, f);
+    if (!d.multistep || d.multistep->brief) return left;
+    const int64_t back = nodes_back(*d.multistep, t_old) - end;
+    if (back < 0) return left;
+    slope_of(*d.multistep, back, y, f);
     return f;
 }
 
-// Returns the state by a history: that at the start of the step, the accelerations' polynomial integrated twice, and a share
-// of what is missing at the end.
+// The state by a history: that at the start of the step, and the accelerations' polynomial integrated twice.
 inline void from_history(const Dense &d, const Piece &piece, double theta, double *out, const Work &w) {
-    const double *missing = piece.rows + (d.rows() - 2) * w.m, *about = missing + w.m;
-    const double share = theta * theta * (3.0 - 2.0 * theta);
+    const double *about = piece.rows + (d.rows() - 1) * w.m;
     const int64_t order = d.columns, half = w.m / 2;
     const double x = theta * about[1], h = (*piece.t - *piece.t_old) / about[1];
     std::vector<double> weights(2 * order);
@@ -347,14 +337,7 @@ inline void from_history(const Dense &d, const Piece &piece, double theta, doubl
         weights[j] = place * x * x;
         weights[order + j] = speed * x;
     }
-    weighted_sum(h * h, {weights.data(), piece.rows, order, half}, out, half);
-    weighted_sum(h, {weights.data() + order, piece.rows, order, half}, out + half, half);
-    for (int64_t i = 0; i < half; ++i) {
-        const double v = piece.y_old[half + i];
-        out[i] = piece.y_old[i] + (h * x * v + out[i]);
-        out[half + i] = v + out[half + i];
-    }
-    for (int64_t i = 0; i < w.m; ++i) out[i] += share * missing[i];
+    integrate(piece, h, h * x, {weights.data() + order, piece.rows, order, half}, weights.data(), out);
 }
 
 // Project w.y_hat onto w.target by Newton steps, into `out`; return false if no state nearby meets the target. One step
@@ -466,26 +449,13 @@ inline void describe(const Run &run, const DenseRun &dense, double t_old, const 
     };
     end_of_piece(d.waiting[0], t_old, y_old, step.level_old, piece.y_old);
     end_of_piece(d.waiting[1], t, y, step.level, piece.y);
-    const double *f_old = step.row(0), *f = step.last();
-    if (d.own_slopes) {
-        f_old = w.row(0);
-        f = w.last();
-        dense.run.system.rhs(w, t_old, y_old, w.row(0));
-        dense.run.system.rhs(w, t, y, w.last());
-        w.counters[NFEV] += 2;
-    }
+    const double *f_old = slope_at(false, run, d, t_old, t_old, y_old), *f = slope_at(true, run, d, t_old, t, y);
     if (d.kind == CUBIC) cubic(piece, h, f_old, f, w);
     if (d.kind == QUINTIC) quintic(piece, h, f_old, f, w);
     if (d.kind == POLYNOMIAL) polynomial(d, piece, h, step, w);
     if (d.kind == SEVENTH) seventh(dense, piece, h, y_old, step);
     if (d.kind == NYSTROM) nystrom(dense, piece, h, y_old, step);
-    if (d.kind == HISTORY) {
-        copy(step.row(0), w.row(0), w.m);
-        copy(step.last(), w.last(), w.m);
-        history(d, piece, y_old, y, w.row(0), w.last(), w);
-        f_old = w.row(0);
-        f = w.last();
-    }
+    if (d.kind == HISTORY) history(d, piece, y_old, y, w);
     if (w.balances > 0) describe_balances(d, piece, h, step, w);
     if (d.by_travel)
         travelled(piece, h, f_old, f, d.options.blocks, w);
@@ -509,9 +479,7 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
     if (d.kind == HISTORY) {
         from_history(d, piece, theta, out, w);
     } else if (d.kind == NYSTROM) {
-        const double *missing = rows + (d.rows() - 1) * m, share = theta * theta * (3.0 - 2.0 * theta);
         from_accelerations(d, piece, theta, out, w);
-        for (int64_t i = 0; i < m; ++i) out[i] += share * missing[i];
     } else if (d.kind == CUBIC) {
         from_cubic(piece, theta, out, w);
     } else if (d.kind == QUINTIC) {
@@ -524,11 +492,10 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
             out[half + i] = slope / h;
         }
     } else if (d.kind == POLYNOMIAL) {
-        const double *missing = rows + d.polynomials * m, share = theta * theta * (3.0 - 2.0 * theta);
         for (int64_t i = 0; i < m; ++i) {
             double total = 0.0;
             for (int64_t j = d.polynomials - 1; j >= 0; --j) total = (total + rows[j * m + i]) * theta;
-            out[i] = piece.y_old[i] + total + share * missing[i];
+            out[i] = piece.y_old[i] + total;
         }
     } else {
         for (int64_t i = 0; i < m; ++i) {
@@ -538,6 +505,10 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
             out[i] = total + piece.y_old[i];
         }
     }
+    if (d.kind != HISTORY && d.kind != NYSTROM && d.kind != POLYNOMIAL) return;
+    const double *missing = rows + (d.rows() - (d.kind == HISTORY ? 2 : 1)) * m;
+    const double share = theta * theta * (3.0 - 2.0 * theta);
+    for (int64_t i = 0; i < m; ++i) out[i] += share * missing[i];
 }
 
 // The state at t: an end of the step, or the interpolant's projected. Where no state near it meets the levels it is given

@@ -128,11 +128,11 @@ inline bool any_crossing(const Schedule &s) {
     run.system.event(w, t_new, y_new, s.g_new);
     if (std::isnan(s.rate[0])) {
         // If a run is continued at an event, s.g is not its value there.
-        values_near(t, part, y, slope_at_start(run, d, t, y), s.rate);
+        values_near(t, part, y, slope_at(false, run, d, t, t, y), s.rate);
         run.system.event(w, t, y, s.rate_new);
         for (int64_t i = 0; i < s.n_events; ++i) s.rate[i] = (s.rate[i] - s.rate_new[i]) / part;
     }
-    values_near(t_new, -part, y_new, slope_at_end(run, d, t, t_new, y_new), s.rate_new);
+    values_near(t_new, -part, y_new, slope_at(true, run, d, t, t_new, y_new), s.rate_new);
     for (int64_t i = 0; i < s.n_events; ++i) s.rate_new[i] = (s.g_new[i] - s.rate_new[i]) / part;
 }
 

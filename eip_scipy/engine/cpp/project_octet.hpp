@@ -15,15 +15,10 @@ namespace eip {
     eight.take(eights.before, lane, w.before, w.l);
     eight.take(eights.band, lane, w.band, w.l);
     weigh_rows(o.frame, w, w.Q);
-    const Matrix R = corner(w.R, w.l, w);
-    const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
+    const int64_t rank = factored_move(o, w, w.stage);
     eight.rank[lane] = std::max<int64_t>(rank, 0);
-    if (rank >= 0) {
-        least_norm(w.before, w.inverse_norms, R, w.pivots, rank, w.mu, w.band, EPS * o.per_band);
-        move_along(o, w, w.Q, w.stage);
-    } else {
-        for (double *out : {w.move, w.stage}) fill(out, NOT_A_NUMBER, w.m);
-    }
+    for (double *out : {w.move, w.stage})
+        if (rank < 0) fill(out, NOT_A_NUMBER, w.m);
     eight.give(w.move, lane, eights.move, w.m);
     eight.give(w.stage, lane, eight.y_new, w.m);
 }

@@ -155,24 +155,19 @@ PythonFunctions::PythonFunctions(nb::handle functions, nb::handle owner, const W
       second_order_(truth(functions.attr("second_order"))) {
     const int64_t components = second_order_ ? sizes.n / 2 : sizes.n;
     rhs_.emplace(functions.attr("rhs"), type, components, kept);
-    const auto calls = [&](const char *name, std::vector<PythonCall> &out, int64_t expected) {
+    const auto calls = [&](const nb::object &items, const char *name, Functions kind, int64_t expected) {
         int64_t total = 0;
-        for (const nb::handle item : nb::object(functions.attr(name))) {
-            out.emplace_back(item, type, sizes.n, kept);
-            total += out.back().floats();
+        for (const nb::handle item : items) {
+            std::optional<PythonCall> &call = calls_[kind].emplace_back();
+            if (!item.is_none()) total += call.emplace(item, type, sizes.n, kept).floats();
         }
-        if (expected >= 0 && total != expected)
-            refuse(PyExc_ValueError, "engine: the values of %s are %lld floats, expected %lld", name,
-                   static_cast<long long>(total), static_cast<long long>(expected));
+        if (expected >= 0) require_floats(name, total, expected);
     };
-    calls("inv", inv_, sizes.l);
-    calls("grad", grad_, sizes.l * sizes.m);
-    calls("event", event_, -1);
+    calls(nb::object(functions.attr("inv")), "inv", VALUES, sizes.l);
+    calls(nb::object(functions.attr("grad")), "grad", GRADIENTS, sizes.l * sizes.m);
+    calls(nb::object(functions.attr("event")), "event", EVENTS, -1);
+    calls(nb::object(nb::object(functions.attr("rates")).attr("functions")), "rates", RATES, -1);
     require(rhs_->floats() == (second_order_ ? m_ / 2 : m_), "engine: rhs must give as many numbers as the state has");
-    for (const nb::handle rate : nb::object(nb::object(functions.attr("rates")).attr("functions"))) {
-        rate_.emplace_back();
-        if (!rate.is_none()) rate_.back().emplace(rate, type, sizes.n, kept);
-    }
     const nb::object jacobian = functions.attr("jacobian");
     if (jacobian.is_none()) return;
     jacobian_.emplace(jacobian, type, sizes.n / 2, kept);
@@ -191,41 +186,19 @@ void PythonFunctions::rhs(double t, const double *y, double *out) {
     (*rhs_)(t, y, nullptr, out + m_ / 2, owner_);
 }
 
-void PythonFunctions::inv(double t, const double *y, double *values) {
-    for (const PythonCall &call : inv_) {
-        call(t, y, nullptr, values, {});
-        values += call.floats();
-    }
-}
-
-void PythonFunctions::grad(double t, const double *y, const double *f, double *G) {
-    for (const PythonCall &call : grad_) {
-        call(t, y, f, G, owner_);
-        G += call.floats();
-    }
-}
-
-void PythonFunctions::event(double t, const double *y, double *values) {
-    for (const PythonCall &call : event_) {
-        call(t, y, nullptr, values, {});
-        values += call.floats();
-    }
-}
-
 void PythonFunctions::jacobian(double t, const double *q, const double *dq, double *out) {
     (*jacobian_)(t, q, dq, out, owner_);
 }
 
-void PythonFunctions::inv_of(int64_t k, double t, const double *y, double *values) {
-    inv_[k](t, y, nullptr, values, {});
+void PythonFunctions::all(Functions kind, double t, const double *y, const double *f, double *out) {
+    for (const auto &call : calls_[kind]) {
+        (*call)(t, y, f, out, owner_);
+        out += call->floats();
+    }
 }
 
-void PythonFunctions::grad_of(int64_t k, double t, const double *y, const double *f, double *G) {
-    grad_[k](t, y, f, G, owner_);
-}
-
-void PythonFunctions::rate_of(int64_t k, double t, const double *y, const double *f, double *out) {
-    (*rate_[k])(t, y, f, out, {});
+void PythonFunctions::one(Functions kind, int64_t k, double t, const double *y, const double *f, double *out) {
+    (*calls_[kind][k])(t, y, f, out, owner_);
 }
 
 PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &run, nb::list &kept)
@@ -262,12 +235,6 @@ PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &ru
     kept.append(last);
     f_hat_ = last;
 }
-
-namespace {
-
-int code_of(const nb::object &returned) { return nb::cast<int>(returned); }
-
-}  // namespace
 
 // A step of a solver into w.y_hat, w.err and w.K, and its times into the clock. TOO_SMALL: it has failed.
 int PythonHooks::drive(double t, const double *y, bool again, double *clock) {
@@ -310,7 +277,9 @@ int PythonHooks::raw_step(const Step &step) {
 
 int PythonHooks::project_elsewhere(const Step &step) {
     const npy_intp n = run_.work.n;
-    return code_of(project_(time(step.t), time(step.t_new), nb::bool_(step.last), view(step.y_new, 1, &n, type_, to_)));
+    const nb::object code =
+        project_(time(step.t), time(step.t_new), nb::bool_(step.last), view(step.y_new, 1, &n, type_, to_));
+    return nb::cast<int>(code);
 }
 
 bool PythonHooks::all_agree(bool here) { return nb::bool_(agree_(nb::bool_(here))).is(nb::bool_(true)); }

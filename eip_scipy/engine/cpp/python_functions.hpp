@@ -47,30 +47,25 @@ class PythonCall {
 };
 
 // The functions of a run.
-class PythonFunctions final : public Functions {
+class PythonFunctions final : public CalledFunctions {
   public:
-    // `functions` has rhs, sequences inv, grad and event, and the rates of balances; `owner` is what all memory that functions in place fill
-    // belongs to.
+    // `functions` has rhs, sequences inv, grad and event, and the rates of balances; `owner` is what all memory that functions
+    // in place fill belongs to.
     PythonFunctions(nb::handle functions, nb::handle owner, const Work &sizes, int type, nb::list &kept);
 
     void rhs(double t, const double *y, double *out) override;
-    void inv(double t, const double *y, double *values) override;
-    void grad(double t, const double *y, const double *f, double *G) override;
-    void event(double t, const double *y, double *values) override;
     void jacobian(double t, const double *q, const double *dq, double *out) override;
-    void inv_of(int64_t k, double t, const double *y, double *values) override;
-    void grad_of(int64_t k, double t, const double *y, const double *f, double *G) override;
-    void rate_of(int64_t k, double t, const double *y, const double *f, double *out) override;
+    void all(Functions kind, double t, const double *y, const double *f, double *out) override;
+    void one(Functions kind, int64_t k, double t, const double *y, const double *f, double *out) override;
     bool has_jacobian() const { return jacobian_.has_value(); }
-    int64_t events() const { return static_cast<int64_t>(event_.size()); }
+    int64_t events() const { return std::ssize(calls_[EVENTS]); }
 
     // Adds an owner of memory that functions in place fill as well.
     void add_owner(nb::handle owner, nb::list &kept);
 
   private:
     std::optional<PythonCall> rhs_, jacobian_;
-    std::vector<PythonCall> inv_, grad_, event_;
-    std::vector<std::optional<PythonCall>> rate_;  // of each balance that has one
+    std::vector<std::optional<PythonCall>> calls_[N_FUNCTIONS];  // none for a balance without a rate of its own
     nb::handle owner_;
     int64_t m_;
     bool second_order_;

@@ -37,6 +37,12 @@ void *memory(nb::handle object, const char *name, int type, Lengths shape, nb::l
     return PyArray_DATA(array);
 }
 
+void require_floats(const char *name, int64_t total, int64_t expected) {
+    if (total != expected)
+        refuse(PyExc_ValueError, "engine: the values of %s are %lld floats, expected %lld", name,
+               static_cast<long long>(total), static_cast<long long>(expected));
+}
+
 double number(const nb::object &object) {
     const double value = PyFloat_AsDouble(object.ptr());
     if (value == -1.0 && PyErr_Occurred()) throw nb::python_error();
@@ -412,9 +418,7 @@ static std::vector<Function> pointers_of(nb::handle functions, const char *name,
             out.push_back(pointer_of<Function>(function, name, floats, n, p));
         total += floats;
     }
-    if (total != expected)
-        refuse(PyExc_ValueError, "engine: the values of %s are %lld floats, expected %lld", name,
-               static_cast<long long>(total), static_cast<long long>(expected));
+    require_floats(name, total, expected);
     return out;
 }
 

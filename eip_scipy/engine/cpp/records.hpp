@@ -73,6 +73,8 @@ void read_balances(nb::handle functions, const Work &w, System &system);
 void read_pointers(nb::handle functions, const Work &w, const Columns &columns, int64_t events, nb::list &kept,
                    System &system);
 
+// Refuses functions whose values are another number of floats.
+void require_floats(const char *name, int64_t total, int64_t expected);
 // Attributes of a record.
 double number(const nb::object &object);
 bool truth(const nb::object &object);

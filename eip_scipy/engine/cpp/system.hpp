@@ -21,19 +21,16 @@ struct Broken {};
 using ValuePointer = int (*)(double t, const double *y, double *out, const double *params);
 using GradientPointer = int (*)(double t, const double *y, const double *f, double *G, const double *params);
 
-// Functions in Python.
-class Functions {
+// Functions in Python, of these kinds; of a balance without a rate of its own there is none of the last one.
+enum Functions { VALUES, GRADIENTS, EVENTS, RATES, N_FUNCTIONS };
+class CalledFunctions {
   public:
-    virtual ~Functions() = default;
+    virtual ~CalledFunctions() = default;
     virtual void rhs(double t, const double *y, double *out) = 0;
-    virtual void inv(double t, const double *y, double *values) = 0;
-    virtual void grad(double t, const double *y, const double *f, double *G) = 0;
-    virtual void event(double t, const double *y, double *values) = 0;
     virtual void jacobian(double t, const double *q, const double *dq, double *out) = 0;
-    // Values of one item of the invariants, and the rate of one balance that has a function for it.
-    virtual void inv_of(int64_t k, double t, const double *y, double *values) = 0;
-    virtual void grad_of(int64_t k, double t, const double *y, const double *f, double *G) = 0;
-    virtual void rate_of(int64_t k, double t, const double *y, const double *f, double *out) = 0;
+    // All functions of a kind, and one of them.
+    virtual void all(Functions kind, double t, const double *y, const double *f, double *out) = 0;
+    virtual void one(Functions kind, int64_t k, double t, const double *y, const double *f, double *out) = 0;
 };
 
 struct Step;
@@ -96,7 +93,7 @@ struct System {
     std::vector<Native<ValuePointer>> inv_pointers, event_pointers;
     std::vector<Native<GradientPointer>> grad_pointers;
     Native<GradientPointer> jacobian_pointer{};
-    Functions *python = nullptr;
+    CalledFunctions *python = nullptr;
     bool by_pointer = false;
     bool second_order = false;  // rhs_pointer gives the accelerations of y = (q, v)
     std::vector<Balance> balances;
@@ -185,7 +182,7 @@ struct System {
     template <class W>
     void inv(const W &w, double t, const double *y, double *values) {
         if (together) return together->values(y, values, params);
-        if (!by_pointer) return python->inv(t, y, values);
+        if (!by_pointer) return python->all(VALUES, t, y, nullptr, values);
         if (columns) [[unlikely]]
             return call_each(Length{columns->seen}, inv_pointers, "inv", t, state_of(y, state), values);
         call_each(w, inv_pointers, "inv", t, y, values);
@@ -193,7 +190,7 @@ struct System {
 
     template <class W>
     void event(const W &w, double t, const double *y, double *values) {
-        if (python) return python->event(t, y, values);
+        if (python) return python->all(EVENTS, t, y, nullptr, values);
         if (columns) [[unlikely]]
             return call_each(Length{columns->seen}, event_pointers, "event", t, state_of(y, state), values);
         call_each(w, event_pointers, "event", t, y, values);
@@ -201,7 +198,7 @@ struct System {
 
     template <class W>
     void grad(const W &w, double t, const double *y, const double *f, double *G) {
-        if (!by_pointer) return python->grad(t, y, f, G);
+        if (!by_pointer) return python->all(GRADIENTS, t, y, f, G);
         if (columns) [[unlikely]]
             return grad_with_columns(w.m, t, y, f, G);
         each_gradient(w, t, y, f, G);
@@ -215,7 +212,7 @@ struct System {
             if (!balance.is_given)
                 rate_along_flow(w, balance, t, y, f, out);
             else if (!by_pointer)
-                python->rate_of(b, t, y, f, out);
+                python->one(RATES, b, t, y, f, out);
             else
                 call_with_f(w, balance.rate, "rate", b, t, y, f, out);
             out += balance.floats;
@@ -371,13 +368,13 @@ struct System {
         if (by_pointer)
             grad_by_pointer(w, balance.item, t, y, f, G);
         else
-            python->grad_of(balance.item, t, y, f, G);
+            python->one(GRADIENTS, balance.item, t, y, f, G);
         for (int64_t i = 0; i < balance.floats; ++i) out[i] += dot(G + i * w.m, f, w.m);
     }
 
     template <class W>
     void inv_of(const W &w, int64_t k, double t, const double *y, double *values) {
-        if (!by_pointer) return python->inv_of(k, t, y, values);
+        if (!by_pointer) return python->one(VALUES, k, t, y, nullptr, values);
         call_for_values(w, inv_pointers, "inv", k, t, y, values);
     }
 

@@ -328,29 +328,30 @@ constexpr const char *POSITIONS =
     "positions, 3 numbers per body, and as parameters G m of every body and 12 entries of the forces";
 constexpr const char *TWO = "a state of 12 numbers, and as parameters G m of both bodies and 12 entries of the forces";
 
+#define EIP_FORCES(name, function, value, numbers, fits, sizes) \
+    {name, Value::value, numbers, plain<double, function>, nullptr, fits, sizes}
 const LibraryFunction functions[] = {
-    {"forces.rhs", Value::DERIVATIVE, 0, plain<double, rhs>, nullptr, of_bodies, BODIES},
-    {"forces.acc", Value::ACCELERATION, 0, plain<double, acc>, nullptr, at_positions, POSITIONS},
-    {"forces.variational", Value::DERIVATIVE, 0, plain<double, variational>, nullptr, with_columns, COLUMNS},
-    {"forces.energy", Value::NUMBERS, 1, plain<double, energy>, nullptr, of_bodies, BODIES},
-    {"forces.energy_gradient", Value::GRADIENT_BY_F, 1, plain<double, gradient_of_energy>, nullptr, of_bodies, BODIES},
-    {"forces.momentum", Value::NUMBERS, 3, plain<double, momentum>, nullptr, of_bodies, BODIES},
-    {"forces.momentum_gradient", Value::GRADIENT, 3, plain<double, momentum_gradient>, nullptr, of_bodies, BODIES},
-    {"forces.axial_momentum", Value::NUMBERS, 1, plain<double, axial_momentum>, nullptr, of_bodies, BODIES},
-    {"forces.axial_momentum_gradient", Value::GRADIENT, 1, plain<double, axial_momentum_gradient>, nullptr, of_bodies,
-     BODIES},
-    {"eih.energy", Value::NUMBERS, 1, plain<double, eih_energy>, nullptr, of_bodies, BODIES},
-    {"eih.energy_gradient", Value::GRADIENT, 1, plain<double, eih_energy_gradient>, nullptr, of_bodies, BODIES},
-    {"eih.momentum", Value::NUMBERS, 3, plain<double, eih_momentum>, nullptr, of_bodies, BODIES},
-    {"eih.momentum_gradient", Value::GRADIENT, 3, plain<double, eih_momentum_gradient>, nullptr, of_bodies, BODIES},
-    {"eih.axial_momentum", Value::NUMBERS, 1, plain<double, eih_axial_momentum>, nullptr, of_bodies, BODIES},
-    {"eih.axial_momentum_gradient", Value::GRADIENT, 1, plain<double, eih_axial_momentum_gradient>, nullptr, of_bodies,
-     BODIES},
-    {"pair.energy", Value::NUMBERS, 1, plain<double, pair_energy>, nullptr, of_two, TWO},
-    {"pair.energy_gradient", Value::GRADIENT, 1, plain<double, pair_energy_gradient>, nullptr, of_two, TWO},
-    {"pair.momentum", Value::NUMBERS, 3, plain<double, pair_momentum>, nullptr, of_two, TWO},
-    {"pair.momentum_gradient", Value::GRADIENT, 3, plain<double, pair_momentum_gradient>, nullptr, of_two, TWO},
+    EIP_FORCES("forces.rhs", rhs, DERIVATIVE, 0, of_bodies, BODIES),
+    EIP_FORCES("forces.acc", acc, ACCELERATION, 0, at_positions, POSITIONS),
+    EIP_FORCES("forces.variational", variational, DERIVATIVE, 0, with_columns, COLUMNS),
+    EIP_FORCES("forces.energy", energy, NUMBERS, 1, of_bodies, BODIES),
+    EIP_FORCES("forces.energy_gradient", gradient_of_energy, GRADIENT_BY_F, 1, of_bodies, BODIES),
+    EIP_FORCES("forces.momentum", momentum, NUMBERS, 3, of_bodies, BODIES),
+    EIP_FORCES("forces.momentum_gradient", momentum_gradient, GRADIENT, 3, of_bodies, BODIES),
+    EIP_FORCES("forces.axial_momentum", axial_momentum, NUMBERS, 1, of_bodies, BODIES),
+    EIP_FORCES("forces.axial_momentum_gradient", axial_momentum_gradient, GRADIENT, 1, of_bodies, BODIES),
+    EIP_FORCES("eih.energy", eih_energy, NUMBERS, 1, of_bodies, BODIES),
+    EIP_FORCES("eih.energy_gradient", eih_energy_gradient, GRADIENT, 1, of_bodies, BODIES),
+    EIP_FORCES("eih.momentum", eih_momentum, NUMBERS, 3, of_bodies, BODIES),
+    EIP_FORCES("eih.momentum_gradient", eih_momentum_gradient, GRADIENT, 3, of_bodies, BODIES),
+    EIP_FORCES("eih.axial_momentum", eih_axial_momentum, NUMBERS, 1, of_bodies, BODIES),
+    EIP_FORCES("eih.axial_momentum_gradient", eih_axial_momentum_gradient, GRADIENT, 1, of_bodies, BODIES),
+    EIP_FORCES("pair.energy", pair_energy, NUMBERS, 1, of_two, TWO),
+    EIP_FORCES("pair.energy_gradient", pair_energy_gradient, GRADIENT, 1, of_two, TWO),
+    EIP_FORCES("pair.momentum", pair_momentum, NUMBERS, 3, of_two, TWO),
+    EIP_FORCES("pair.momentum_gradient", pair_momentum_gradient, GRADIENT, 3, of_two, TWO),
 };
+#undef EIP_FORCES
 
 }  // namespace
 

@@ -6,9 +6,8 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
-#include <vector>
 
-#include "newton.hpp"
+#include "einstein.hpp"
 
 namespace eip {
 namespace {
@@ -19,17 +18,8 @@ constexpr double LEAST_PERICENTRE = 1e-3;
 constexpr double LEAST_ECCENTRICITY = 0.5;
 constexpr int HALVINGS = 30;
 
-struct Point {
-    double x, y, z;
-
-    static Point at(const double *a, int64_t k) { return {a[3 * k], a[3 * k + 1], a[3 * k + 2]}; }
-    Point operator-(const Point &o) const { return {x - o.x, y - o.y, z - o.z}; }
-    double dot(const Point &o) const { return x * o.x + y * o.y + z * o.z; }
-    double square() const { return dot(*this); }
-    Point cross(const Point &o) const { return {y * o.z - z * o.y, z * o.x - x * o.z, x * o.y - y * o.x}; }
-};
-
 double cube(double x) { return x * x * x; }
+double square(const Three &a) { return dot(a, a); }
 
 // A bound pair: its mass, its distance, the elements of its orbit, and whether it comes nearer.
 struct Orbit {
@@ -64,24 +54,24 @@ struct Bodies {
     double frequency(int64_t i, int64_t j) const {
         const double mass = gm[i] + gm[j];
         if (i == j || !(mass > 0.0)) return 0.0;
-        const Point r = Point::at(q, i) - Point::at(q, j), u = Point::at(v, i) - Point::at(v, j);
-        const double distance = std::sqrt(r.square()), along = r.dot(u), own = mass / cube(distance);
-        const double inverse_axis = 2.0 / distance - u.square() / mass, momentum = r.cross(u).square() / mass;
+        const Three r = body(q, i) - body(q, j), u = body(v, i) - body(v, j);
+        const double distance = std::sqrt(square(r)), along = dot(r, u), own = mass / cube(distance);
+        const double inverse_axis = 2.0 / distance - square(u) / mass, momentum = square(cross(r, u)) / mass;
         const double eccentricity = std::sqrt(std::max(0.0, 1.0 - momentum * inverse_axis));
         const Orbit orbit{mass, distance, inverse_axis, eccentricity, along * (duration < 0.0 ? -1.0 : 1.0) < 0.0};
         const double pericentre = std::max(momentum / (1.0 + eccentricity), LEAST_PERICENTRE * distance);
         const double fastest = std::sqrt(mass / cube(std::max(pericentre, nearest(orbit, std::abs(duration)))));
         const double mean = std::sqrt(mass * cube(std::max(inverse_axis, 0.0)));
-        const Point pull = Point::at(pulls, i) - Point::at(pulls, j);
-        const Point others{pull.x + own * r.x, pull.y + own * r.y, pull.z + own * r.z};
-        const bool bound = inverse_axis > 0.0, alone = std::sqrt(others.square()) < mass / (distance * distance);
+        const Three pull = body(pulls, i) - body(pulls, j);
+        const Three others = sum(1.0, pull, own, r);
+        const bool bound = inverse_axis > 0.0, alone = std::sqrt(square(others)) < mass / (distance * distance);
         const double of_orbit = bound ? std::sqrt(mean * fastest) : fastest;
         const double found = alone && (bound || !(along > 0.0)) ? of_orbit : std::sqrt(own);
         return std::isnan(found) ? 0.0 : found;
     }
 
     double attraction(int64_t i, int64_t j) const {
-        return (gm[i] + gm[j]) / cube(std::sqrt((Point::at(q, i) - Point::at(q, j)).square()));
+        return (gm[i] + gm[j]) / cube(std::sqrt(square(body(q, i) - body(q, j))));
     }
 };
 

@@ -93,6 +93,12 @@ struct Motion : Orbit {
     }
 };
 
+// Call `function` with each orbit as a motion, by its number.
+template <class Function>
+void each_motion(const Given<double> &g, int64_t floats, const Function &function) {
+    each_orbit(g, floats, [&](int64_t k, const Orbit &orbit) { function(k, Motion(orbit, g.y, g.n / 6)); });
+}
+
 // The relative acceleration less the pull of both sides on each other, from the accelerations `a`.
 Three perturbation(const Motion &m, const double *a) { return sum(1.0, m.relative(a), m.pull, m.r); }
 
@@ -135,8 +141,7 @@ void each_perturbed(const Given<double> &g, int64_t floats, const Function &func
         gm[sun] = 0.0;
         accelerate(g.y, gm, n, a);
     }
-    each_orbit(g, floats, [&](int64_t k, const Orbit &orbit) {
-        const Motion m(orbit, g.y, n);
+    each_motion(g, floats, [&](int64_t k, const Motion &m) {
         function(k, m, NEWTON ? perturbation(m, g.y, a, g.params, sun) : perturbation(m, g.f + 3 * n));
     });
 }
@@ -174,11 +179,8 @@ void energy(const Given<double> &g) {
 }
 
 void energy_gradient(const Given<double> &g) {
-    const int64_t n = g.n / 6;
-    each_orbit(g, (n - 1) * g.n, [&](int64_t k, const Orbit &orbit) {
-        const Motion m(orbit, g.y, n);
-        m.spread(sum(m.pull, m.r, 0.0, m.r), m.v, g.out + k * g.n);
-    });
+    each_motion(g, (g.n / 6 - 1) * g.n,
+                [&](int64_t k, const Motion &m) { m.spread(sum(m.pull, m.r, 0.0, m.r), m.v, g.out + k * g.n); });
 }
 
 template <bool NEWTON>
@@ -187,17 +189,11 @@ void energy_rate(const Given<double> &g) {
 }
 
 void momentum(const Given<double> &g) {
-    const int64_t n = g.n / 6;
-    each_orbit(g, 3 * (n - 1), [&](int64_t k, const Orbit &orbit) {
-        const Motion m(orbit, g.y, n);
-        put(cross(m.r, m.v), g.out + 3 * k);
-    });
+    each_motion(g, 3 * (g.n / 6 - 1), [&](int64_t k, const Motion &m) { put(cross(m.r, m.v), g.out + 3 * k); });
 }
 
 void momentum_gradient(const Given<double> &g) {
-    const int64_t n = g.n / 6;
-    each_orbit(g, 3 * (n - 1) * g.n, [&](int64_t k, const Orbit &orbit) {
-        const Motion m(orbit, g.y, n);
+    each_motion(g, 3 * (g.n / 6 - 1) * g.n, [&](int64_t k, const Motion &m) {
         for (int c = 0; c < 3; ++c) {
             Three axis{};
             axis[c] = 1.0;
@@ -214,9 +210,7 @@ void momentum_rate(const Given<double> &g) {
 
 // v x h - mu r / |r|. Its length is mu times the eccentricity, and it points to the pericentre.
 void laplace(const Given<double> &g) {
-    const int64_t n = g.n / 6;
-    each_orbit(g, 3 * (n - 1), [&](int64_t k, const Orbit &orbit) {
-        const Motion m(orbit, g.y, n);
+    each_motion(g, 3 * (g.n / 6 - 1), [&](int64_t k, const Motion &m) {
         put(sum(dot(m.v, m.v) - m.mu.value / m.distance, m.r, -dot(m.r, m.v), m.v), g.out + 3 * k);
     });
 }
@@ -234,9 +228,7 @@ Three moved(const Motion &m, const Three &move) {
 }
 
 void laplace_gradient(const Given<double> &g) {
-    const int64_t n = g.n / 6;
-    each_orbit(g, 3 * (n - 1) * g.n, [&](int64_t number, const Orbit &orbit) {
-        const Motion m(orbit, g.y, n);
+    each_motion(g, 3 * (g.n / 6 - 1) * g.n, [&](int64_t number, const Motion &m) {
         Three by_r[3], by_v[3];
         for (int c = 0; c < 3; ++c) {
             Three axis{};

@@ -402,26 +402,16 @@ inline double energy_of_block(const double *v, const double *gm, int64_t first, 
     return carried_fold(energy_of(Octet::load(gm + first) * LANES_FROM(skip), square, potential));
 }
 
-// Their energy, with the pairs that they make with later bodies.
-[[gnu::flatten, gnu::noinline]] inline double energy_with_later(const double *q, const double *v, const double *gm,
-                                                                int64_t n, int64_t first, int64_t skip) {
+// Their energy, with the pairs that they make with the bodies j, j + STEP, ... before `end`.
+template <int STEP>
+[[gnu::flatten, gnu::noinline]] inline double energy_with(const double *q, const double *v, const double *gm,
+                                                          int64_t first, int64_t skip, int64_t j, int64_t end) {
     Octet x[3];
     Carried potential;
     load_targets<LANES>(q, first, x);
     add_own_pairs(q, gm, first, skip, x, potential);
-    for (int64_t j = first + LANES; j < n; ++j) add_potential(q, j, x, gm[j], 0.0, potential);
+    for (; j != end; j += STEP) add_potential(q, j, x, gm[j], 0.0, potential);
     return energy_of_block(v, gm, first, skip, potential);
-}
-
-// The energy of eight bodies, with the pairs that they make with earlier ones.
-[[gnu::flatten, gnu::noinline]] inline double energy_with_earlier(const double *q, const double *v, const double *gm,
-                                                                  int64_t first) {
-    Octet x[3];
-    Carried potential;
-    load_targets<LANES>(q, first, x);
-    add_own_pairs(q, gm, first, 0, x, potential);
-    for (int64_t j = first - 1; j >= 0; --j) add_potential(q, j, x, gm[j], 0.0, potential);
-    return energy_of_block(v, gm, first, 0, potential);
 }
 
 // The energy of 8 bodies or more, in blocks.
@@ -429,7 +419,7 @@ inline double energy_in_blocks(const double *q, const double *v, const double *g
     double total = 0.0;
     for (int64_t block = 0; block < n; block += LANES) {
         const int64_t first = std::min(block, n - LANES);
-        total += energy_with_later(q, v, gm, n, first, block - first);
+        total += energy_with<1>(q, v, gm, first, block - first, first + LANES, n);
     }
     return total;
 }
@@ -447,7 +437,7 @@ enum class Also { NOTHING, PULLS, ENERGY };
 // Accelerations of many bodies. The targets, in blocks of eight, form rows. A row takes its pairs with all bodies before
 // them: the pulls stay with the targets, and the reactions are stored for each row. They are added afterwards, always in
 // one order. The first bodies, 8 to 15, meet every body twice instead, so that their pulls, which may be the largest, are
-// the last terms of all sums. The energies of the blocks are those of `energy_with_earlier`, with the terms in its order.
+// the last terms of all sums. The energies of the blocks are those of `energy_sum`, with the terms in its order.
 template <Also ALSO>
 struct PairRows {
     static constexpr bool APART = ALSO == Also::PULLS, ENERGY = ALSO == Also::ENERGY;
@@ -550,18 +540,28 @@ template <bool APART>
     PairRows<APART ? Also::PULLS : Also::NOTHING>{.q = q, .gm = gm, .n = n, .out = out, .pulls = pulls}.fill();
 }
 
+// Calls visit<TARGETS>(first) for blocks of targets that cover 4 bodies or more; a block may overlap the one before it.
+template <class Visit>
+[[gnu::always_inline]] inline void in_targets(int64_t n, const Visit &visit) {
+    if (n < 8) {
+        visit.template operator()<4>(0);
+        if (n > 4) visit.template operator()<4>(n - 4);
+        return;
+    }
+    const int64_t rest = n % 8;
+    for (int64_t k = 0; k < n / 8 + (rest > 4); ++k) visit.template operator()<8>(std::min(8 * k, n - 8));
+    if (2 < rest && rest <= 4)
+        visit.template operator()<4>(n - 4);
+    else if (0 < rest && rest <= 2)
+        visit.template operator()<2>(n - 2);
+}
+
 template <bool APART>
 inline void accelerate_all(const double *q, const double *gm, int64_t n, double *out, double *pulls) {
     if (n >= MANY) return accelerate_many<APART>(q, gm, n, out, pulls);
     if (n < 4) return accelerate_few<APART>(q, gm, n, out, pulls);
-    if (n < 8) {
-        accelerate_block<APART, 4>(q, gm, n, 0, out, pulls);
-        if (n > 4) accelerate_block<APART, 4>(q, gm, n, n - 4, out, pulls);
-        return;
-    }
-    const int64_t rest = n % 8;
 #if defined(__AVX__)
-    if (rest == 2) {
+    if (n >= 8 && n % 8 == 2) {
         LastTwo last(q, gm, n - 2);
         for (int64_t first = n - 10; first >= 0; first -= 8) accelerate_block<APART>(q, gm, n, first, out, pulls, last);
         last.store<false>(n - 2, out);
@@ -569,12 +569,7 @@ inline void accelerate_all(const double *q, const double *gm, int64_t n, double 
         return;
     }
 #endif
-    for (int64_t k = 0; k < n / 8 + (rest > 4); ++k)
-        accelerate_block<APART, 8>(q, gm, n, std::min(8 * k, n - 8), out, pulls);
-    if (2 < rest && rest <= 4)
-        accelerate_block<APART, 4>(q, gm, n, n - 4, out, pulls);
-    else if (0 < rest && rest <= 2)
-        accelerate_block<APART, 2>(q, gm, n, n - 2, out, pulls);
+    in_targets(n, [&]<int TARGETS>(int64_t first) { accelerate_block<APART, TARGETS>(q, gm, n, first, out, pulls); });
 }
 
 // out (3 n) = sum over the other bodies of gm_j (q_j - q_i) / r^3.
@@ -702,7 +697,7 @@ inline double energy_sum(const double *y, const double *gm, int64_t n) {
     std::vector<double> energies(blocks);
     share(parts, [&](int64_t k) {  // the last blocks have most pairs, and the last parts begin first
         for (int64_t block = 4 * k; block < std::min(4 * k + 4, blocks); ++block)
-            energies[block] = energy_with_earlier(y, v, gm, first + LANES * block);
+            energies[block] = energy_with<-1>(y, v, gm, first + LANES * block, 0, first + LANES * block - 1, -1);
     });
     return total_energy(y, v, gm, first, energies.data(), blocks);
 }

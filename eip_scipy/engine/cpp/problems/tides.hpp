@@ -101,18 +101,7 @@ inline void tides_of_few(const double *y, const double *gm, int64_t n, int64_t c
 
 [[gnu::flatten, gnu::noinline]] inline void tides_of_many(const double *y, const double *gm, int64_t n, int64_t columns,
                                                           double *out, Tide *tides) {
-    if (n < 8) {
-        tidal_block<4>(y, gm, n, 0, columns, out, tides);
-        if (n > 4) tidal_block<4>(y, gm, n, n - 4, columns, out, tides);
-        return;
-    }
-    const int64_t rest = n % 8;
-    for (int64_t k = 0; k < n / 8 + (rest > 4); ++k)
-        tidal_block<8>(y, gm, n, std::min(8 * k, n - 8), columns, out, tides);
-    if (2 < rest && rest <= 4)
-        tidal_block<4>(y, gm, n, n - 4, columns, out, tides);
-    else if (0 < rest && rest <= 2)
-        tidal_block<2>(y, gm, n, n - 2, columns, out, tides);
+    in_targets(n, [&]<int TARGETS>(int64_t first) { tidal_block<TARGETS>(y, gm, n, first, columns, out, tides); });
 }
 
 // out = (f, Df times each column) of y = (state, columns), 6 n numbers each.
