@@ -422,8 +422,10 @@ def test_adversarial_thresholds_of_integrate(method, compiled):
         found = integrate(fun, (0.0, 8.0), Y0, params=[value], save_every=1, events=event, **options)
         np.testing.assert_array_equal(found.y, run.y)
         signs = np.sign(run.y[0] - value)
-        assert len(found.t_events[0]) == np.count_nonzero(signs[:-1] * signs[1:] <= 0), f"{value} at step {k}"
+        signs = signs[signs != 0]  # a state on the threshold is one event, not one of each of its steps
         y = found.y_events[0].reshape(-1, 4)
+        within_steps = len(y) - np.count_nonzero(signs[:-1] != signs[1:])
+        assert within_steps in (0, 2), f"{value} at step {k}"  # twice within one step, around the next pericentre
         assert np.abs(y[:, 0] - value).max(initial=0.0) <= 1e-13
         assert defects(y.T).max(initial=0.0) <= 1e-7
         crossed += len(y) > 0

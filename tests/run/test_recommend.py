@@ -84,7 +84,12 @@ def test_it_finds_the_multistep_method_for_planets():
 def test_no_equal_steps_where_the_speed_varies():
     choice = recommend(orbit, (0, 20), pericentre(0.9), invariants=[H, L], error=1e-7)
     assert not any("h" in trial.options for trial in choice.trials)
-    assert_near(error(choice.run().y[:, -1], kepler(0.9, relativistic=0).reference(20)), 1e-7)
+    # Errors scatter from one tolerance to the next, so that the cheapest run that is good enough may be far better.
+    found = error(choice.run().y[:, -1], kepler(0.9, relativistic=0).reference(20))
+    assert found <= 1e-7
+    assert_near(found, choice.error)
+    worse = [trial.nfev for trial in choice.trials if trial.options["method"] is choice.method and trial.error > 1e-7]
+    assert choice.nfev <= 1.2 * max(worse)
 
 
 def test_a_long_run_is_tried_on_a_part():

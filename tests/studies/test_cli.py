@@ -164,7 +164,7 @@ def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_reboun
         main(["solar-system", *SPAN, "--metric", "euclidean", "--data", "paper", "--out", str(tmp_path)], **LITTLE) == 0
     )
     out = capsys.readouterr().out
-    assert lines(out)[4].split() == ["euclid.", "error", "alone", "every", "10", "auto", "tight"]
+    assert lines(out)[4].split() == ["euclid.", "error", "alone", "every", "10", "auto", "balances", "tight"]
     assert "initial data 'paper'" in out
     assert "Earth" in out
     assert "ok     EIPRK4 (euclidean) keeps H" in out
