@@ -131,6 +131,7 @@ class RunSpec:
         invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
         columns = self.columns
         y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
+        invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
         options, sigma, identity = projection.settled(method, self.stepping, y, invariants)
         options = options._replace(kinds=kinds_of(options.groups, y, f))
         if columns is not None:
@@ -171,7 +172,7 @@ class RunSpec:
             )
         if run.options.watched and invariants_too and BUILD.are_finite(run.start.f.view(float)):
             known = (run.work.G, run.work.values) if run.start is run.begin else None
-            run.trust.doubts += run.invariants.check(*run.start, known)
+            run.trust.doubts += run.invariants.check(*run.start[:3], run.invariants.tau, known)
 
 
 def _scales(run: Run) -> Array:

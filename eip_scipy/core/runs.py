@@ -190,7 +190,7 @@ class Run:
     def examiner(self) -> Examiner:
         """Return the `Examiner` of the run's steps and states."""
         resolution = partial(unresolved, self.method, self.options.groups)
-        return Examiner(self.invariants, self.start.tau, self.work.trust, resolution)
+        return Examiner(self.invariants, self.invariants.tau, self.work.trust, resolution)
 
 
 class Counted:

@@ -356,6 +356,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return two mappings for a copy of this solver: values to share, such as functions, and values to copy."""
         shared = {name: getattr(self, name) for name in SHARED} | {"projection": self._spec.projection}
+        shared["tau"] = self._run.invariants.tau
         was = self._was._asdict()
         if self.fun is not self._bound_fun:  # `fun` was set since the last step
             shared["fun"] = self.fun
@@ -399,6 +400,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
                     setattr(self._scipy, name, value)
         t_bound = copied["attributes"]["t_bound"]
         invariants = InvariantSet(shared["projection"].invariants, *begin, tell=False, t_bound=t_bound)
+        invariants.tau = shared["tau"]
         self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
         if self.TABLEAU.drives:
             self._spec.attach_solver(self._run, begin)

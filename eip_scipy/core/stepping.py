@@ -27,6 +27,8 @@ __all__ = [
 AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | Driven | AtRest
 UNBOUNDED = 2**62
 LEAST_RTOL = 100 * EPS  # as in SciPy
+# Part of the time in which a state changes by its own size that is short enough for differences in time.
+PART_OF_MOTION = 2.0**-10
 
 
 class DefaultTolerance(float):
@@ -93,6 +95,18 @@ class Stepping:
         else:
             h1 = (0.01 / max(d1, d2)) ** (1 / (order + 1))
         return min(100 * h0, h1, length, span.max_step)
+
+    def scale_of_time(self, tau: float, y: np.ndarray, f: np.ndarray) -> float:
+        """Return a scale for differences in time: the step `tau`, or in adaptive runs a part of the motion if longer.
+
+        The estimated first step depends on the unit of time: in seconds it can be millions of times shorter than the
+        steps of an orbit of years, and differences over so short a time are rounding.
+        """
+        moving, size = float(np.abs(f).max(initial=0.0)), float(np.abs(y).max(initial=0.0))
+        if self.h is not None or not (0.0 < moving < math.inf and tau < math.inf):
+            return tau
+        length = abs(self.span.t_bound - self.span.t0)
+        return max(tau, min(PART_OF_MOTION * size / moving, length, self.span.max_step))
 
     def require_scale(self, y0: np.ndarray) -> None:
         """Raise an error if the error of a component has no scale at the start."""

@@ -522,8 +522,10 @@ class Sweeper:
             if not (at_ends or suspected[k]):
                 continue
             derivative = self._derivative(each.params[k])
-            run.invariants.target[:] = run.invariants.values(self.loop.driver.schedule.span.t0, each.starts[k])
-            examiner = replace(run.examiner, tau=float(each.first_steps[k]), figures=each.figures[k], largest=0.0)
+            t0, start = self.loop.driver.schedule.span.t0, each.starts[k]
+            run.invariants.target[:] = run.invariants.values(t0, start)
+            tau = run.stepping.scale_of_time(float(each.first_steps[k]), start, derivative(t0, start))
+            examiner = replace(run.examiner, tau=tau, figures=each.figures[k], largest=0.0)
             found = examiner.examine(each.suspects[k], derivative) if suspected[k] else None
             if at_ends:
                 end = derivative, float(out.t[k]), out.y[k]

@@ -165,7 +165,7 @@ class ParticleOrbit:
     @cached_property
     def _per_gyration(self) -> int:
         """Number of states in one gyration at the start; ValueError unless averages over a gyration are possible."""
-        spacing = float(np.median(np.diff(self.t[: 2 * FEWEST_PER_GYRATION])))
+        spacing = abs(float(np.median(np.diff(self.t[: 2 * FEWEST_PER_GYRATION]))))
         count = round(2 * np.pi / (self.gyrofrequency[0] * spacing))
         if count < FEWEST_PER_GYRATION or count >= self.t.size:
             raise ValueError(

@@ -160,7 +160,9 @@ WRONG = [
 
 
 @both
-@pytest.mark.parametrize(("options", "error", "match"), WRONG, ids=lambda v: str(v)[:40])
+@pytest.mark.parametrize(
+    ("options", "error", "match"), WRONG, ids=lambda v: ", ".join(v) if isinstance(v, dict) else str(v)[:40]
+)
 def test_wrong_arguments(driver, options, error, match):
     with pytest.raises(error, match=match):
         driver(**options)

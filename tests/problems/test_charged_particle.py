@@ -253,6 +253,8 @@ def test_averages_take_out_what_has_the_gyrations_period():
     orbit = ParticleOrbit(problem, t, np.tile(problem.y0[:, None], 100))
     np.testing.assert_allclose(orbit.averaged(3.0 + np.cos(t)), 3.0, rtol=1e-13)
     np.testing.assert_allclose(orbit.averaged(t), t[:81] + 9.5 * math.pi / 10, rtol=1e-13)
+    backward = ParticleOrbit(problem, -t, orbit.y)
+    np.testing.assert_allclose(backward.averaged(3.0 + np.cos(t)), 3.0, rtol=1e-13)
 
 
 # --- user-defined fields ---

@@ -17,6 +17,7 @@ from eip_scipy import (
     EIPRKN12,
     Balance,
     Invariant,
+    ProjectionWarning,
     ensemble,
     integrate,
     load,
@@ -376,3 +377,38 @@ def test_a_failed_step_leaves_the_value_alone():
     assert found.t[-1] == 3.0
     right = energy(3.0, exact(3.0), PARAMS)
     assert abs(energy(3.0, found.y[:, -1], PARAMS) - right) < 1e-11
+
+
+YEAR = 365.25 * 86400.0
+LOSS = 1e-5  # of the star's mass, a year
+
+
+@pytest.mark.parametrize("year", [YEAR, 1.0], ids=["seconds", "years"])
+def test_the_unit_of_time_does_not_matter(year):
+    """A planet of a star that loses mass, lengths in au.
+
+    SciPy's estimate of the first step is a fraction of a second in seconds: differences in time over it were rounding.
+    """
+    w, loss = 2 * np.pi / year, LOSS / year
+    t_span, y0 = (0.0, 50 * year), [0.8, 0.0, 0.0, w * 1.5**0.5]
+    scale = np.array([1.0, 1.0, w, w])
+
+    def pull(t, y):
+        return w**2 * np.exp(-loss * t) * (y[0] ** 2 + y[1] ** 2) ** -0.5
+
+    def fun(t, y):
+        return np.array([*y[2:], *(-pull(t, y) / (y[0] ** 2 + y[1] ** 2) * y[:2])])
+
+    def energy(t, y):
+        return 0.5 * (y[2] ** 2 + y[3] ** 2) - pull(t, y)
+
+    exact = scipy.integrate.solve_ivp(fun, t_span, y0, method="DOP853", rtol=1e-13, atol=scale * 1e-15).y[:2, -1]
+    options = {"method": EIPDOP853, "rtol": 1e-9, "atol": scale * 1e-11}
+
+    kept = integrate(fun, t_span, y0, invariants=Balance(energy), **options)
+    assert kept.trusted
+    assert np.linalg.norm(kept.y[:2, -1] - exact) < 3e-7  # 2.5e-5 without the balance
+
+    with pytest.warns(ProjectionWarning, match="'F' is not an invariant"):
+        wrong = integrate(fun, t_span, y0, invariants=Invariant(energy, name="F"), **options)
+    assert not wrong.trusted
