@@ -76,7 +76,7 @@ class Given(NamedTuple):
 class Energy(NamedTuple):
     """Description of a quantity that may be constant, ``value(t, y, *params)``, and ``gradient(t, y, out, *params)``.
 
-    `power` is the given rate of change, a function of (t, y, *params), or None.
+    `power` is the given rate of change, ``power(t, y, *params)``, or None.
     """
 
     description: str
