@@ -149,6 +149,12 @@ def typical_sizes(y: Array, f: Array, tau: float) -> Array:
     return floors
 
 
+def time_of_motion(y: Array, f: Array) -> float:
+    """Return the time in which a state changes by its own size; infinite if the state or its derivative is 0."""
+    moving, size = float(np.abs(f).max(initial=0.0)), float(np.abs(y).max(initial=0.0))
+    return size / moving if moving > 0 and size > 0 else np.inf
+
+
 @lru_cache
 def random_directions(n: int, is_complex: bool) -> Array:
     """Return two random directions (2, n), the same in each run; they are cached, because making them takes long."""

@@ -12,7 +12,7 @@ from ..engine import data
 from ..engine.data import EPS
 from ..engine.trust import ROUNDING_OF_DIFFERENCES, ProjectionWarning
 from .conditional import is_kept_on_a_surface, on_targets
-from .gradients import DIFFERENCE_WEIGHTS, random_directions
+from .gradients import DIFFERENCE_WEIGHTS, random_directions, time_of_motion
 
 if TYPE_CHECKING:
     from .invariants import InvariantSet
@@ -120,8 +120,7 @@ def complaints(
         return
     # The test points are at most as far away as the state moves while it changes by its own size, which is far less
     # than a step close to a singularity.
-    moving, size = np.abs(f).max(), np.abs(y).max()
-    span = np.abs(y) + (min(tau, size / moving) if size > 0 and moving > 0 else tau) * np.abs(f)
+    span = np.abs(y) + min(tau, time_of_motion(y, f)) * np.abs(f)
     directions = directions * span
     ends = _values_at_ends(known, t, y, directions, CHECK_STEPS[0])
     at = _Samples(t, y, f, tau, span, directions, G, here, ends)
@@ -324,7 +323,8 @@ def _complaints_of_rates(
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
     by_values, misled = _misled_rates(known, at, found, wrong)
-    conditional, plain = list[int](), list[int]()
+    conditional: list[int] = []
+    plain: list[int] = []
     for k in (int(k) for k in order if wrong[k]):
         if misled[k]:
             text = (
@@ -352,10 +352,10 @@ def _misled_rates(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array
     gradients of the user are considered.
     """
     given = wrong & ~known.computed
-    moving, size = np.abs(at.f).max(), np.abs(at.y).max()
-    if not given.any() or not (moving > 0 and size > 0):
+    motion = time_of_motion(at.y, at.f)
+    if not given.any() or motion == math.inf:
         return np.full(known.size, np.nan), np.zeros(known.size, bool)
-    length = FLOW_SHARE * min(at.tau, size / moving)
+    length = FLOW_SHARE * min(at.tau, motion)
 
     def along(step: float) -> Array:
         total = np.zeros(known.size)
@@ -367,7 +367,7 @@ def _misled_rates(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array
     slopes = along(length)
     terms = known.sizes_of_terms(at.y, at.G, at.here) + known.norm_products(at.G, at.span)
     errors = np.abs(slopes - along(0.5 * length)) + FLOW_ROUNDINGS * EPS * terms / length
-    by_values = found.in_time * moving + slopes
+    by_values = found.in_time * np.abs(at.f).max() + slopes
     misled = np.abs(found.rate - by_values) > 0.5 * np.abs(found.rate)
     return by_values, given & misled & (errors < 0.1 * np.abs(found.rate))
 

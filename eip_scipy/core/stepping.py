@@ -16,6 +16,7 @@ from ..methods.nystrom import NystromTableau
 from ..methods.orders import AtRest
 from ..methods.runge_kutta import Tableau
 from .driven import Driven
+from .gradients import time_of_motion
 from .inputs import is_number, reals, refuse_units, shown
 from .one_step import OneStep
 
@@ -102,11 +103,11 @@ class Stepping:
         The estimated first step depends on the unit of time: in seconds it can be millions of times shorter than the
         steps of an orbit of years, and differences over so short a time are rounding.
         """
-        moving, size = float(np.abs(f).max(initial=0.0)), float(np.abs(y).max(initial=0.0))
-        if self.h is not None or not (0.0 < moving < math.inf and tau < math.inf):
+        motion = time_of_motion(y, f)
+        if self.h is not None or motion == math.inf:
             return tau
         length = abs(self.span.t_bound - self.span.t0)
-        return max(tau, min(PART_OF_MOTION * size / moving, length, self.span.max_step))
+        return max(tau, min(PART_OF_MOTION * motion, length, self.span.max_step))
 
     def require_scale(self, y0: np.ndarray) -> None:
         """Raise an error if the error of a component has no scale at the start."""

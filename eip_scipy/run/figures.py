@@ -101,7 +101,7 @@ def planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
 
 
 def described(result: Any) -> str:
-    """Return the method, the step and a remark if the run is not reliable;  if the result does not name its method."""
+    """Return the method, the step and a remark if the run is not reliable; no text if the result names no method."""
     if "method" not in result:
         return ""
     step = "adaptive steps" if result.h is None else f"h = {result.h:g}"

@@ -14,8 +14,8 @@ constexpr double ROOT_TOLERANCE = 4.0 * EPS;  // of the step's length, and relat
 constexpr int MAX_ROOT_STEPS = 100;
 
 // A root of f between a and b, where its values fa and fb differ in sign; NaN where f is. Brent's method, each operation as in
-// scipy.optimize.brentq, and bisection where that does not converge, as at a zero of high multiplicity. `length` is that of the step, whatever the unit of time: SciPy's
-// absolute tolerance of 9e-16 would be all of a step of 1e-15.
+// scipy.optimize.brentq, and bisection where that does not converge, as at a zero of high multiplicity. `length` is that of
+// the step, whatever the unit of time: SciPy's absolute tolerance of 9e-16 would be all of a step of 1e-15.
 template <class Function>
 inline double root_between(double length, double a, double fa, double b, double fb, Function f) {
     if (fa == 0.0) return a;

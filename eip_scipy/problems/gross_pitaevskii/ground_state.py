@@ -34,6 +34,13 @@ __all__ = [
 ]
 
 REFRESH = 20  # iterations between two evaluations of what is carried along otherwise
+NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
+# The search of `lowest_ring` over numbers of vortices and windings.
+WALK_TOLERANCE, WALK_ITERATIONS = 1e-3, 150
+NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
+# Part of the vortices of a rigid rotation that a single row in the ring holds: only where the walk starts.
+ROW = 0.4
+BREAK_SYMMETRY = 1e-3
 Progress = Callable[[int, float, float], Any]
 
 
@@ -249,9 +256,6 @@ class _Preconditioner:
         return self._out
 
 
-NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
-
-
 def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     """Return the Thomas-Fermi density of mass 1, (mu - V + Omega^2 r^2 / 2) / beta where this is positive, and else 0.
 
@@ -391,13 +395,6 @@ def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generat
     a, b = side * (i + 0.5 * j), side * sqrt(0.75) * j
     points = np.column_stack([cos(angle) * a - sin(angle) * b, sin(angle) * a + cos(angle) * b])
     return points[np.hypot(*points.T) < radius]
-
-
-WALK_TOLERANCE, WALK_ITERATIONS = 1e-3, 150
-NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
-# Part of the vortices of a rigid rotation that a single row in the ring holds: only where the walk starts.
-ROW = 0.4
-BREAK_SYMMETRY = 1e-3
 
 
 def lowest_state(

@@ -87,11 +87,8 @@ def _heyoka(scene: Scene) -> Solve:
 def _diffrax(scene: Scene) -> Solve:
     jax = import_module("jax")
     jax.config.update("jax_enable_x64", True)
-    jnp, diffrax, kepler = (
-        import_module("jax.numpy"),
-        import_module("diffrax"),
-        EQUATIONS["kepler"](import_module("jax.numpy").sqrt).fun,
-    )
+    jnp, diffrax = import_module("jax.numpy"), import_module("diffrax")
+    kepler = EQUATIONS["kepler"](jnp.sqrt).fun
     term = diffrax.ODETerm(lambda t, y, _: jnp.stack(kepler(t, y)))
 
     def one(y0: Any, tolerance: Any) -> Any:
