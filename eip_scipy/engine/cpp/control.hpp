@@ -28,7 +28,7 @@ inline Code make_stages(const AnyRun &run, const Step &step) {
 }
 
 // Return whether the derivative at y_hat serves the projection only, and another one follows.
-inline bool is_for_projection(const Options &o, const Step &step) { return step.project && !o.reuse_f; }
+inline bool is_for_projection(const auto &o, const Step &step) { return step.project && !o.reuse_f; }
 
 // Computes f at y_hat in w.last(), and if the step is to be projected what else one pass finds there.
 template <class AnyRun>
@@ -49,8 +49,8 @@ inline void evaluate_raw(const AnyRun &run, const Step &step) {
 // Return whether the step's local errors are to be compared with what it changes in each block.
 template <class AnyRun>
 inline bool look_back(const AnyRun &run, const Step &step) {
-    const Method &m = run.method;
-    const Options &o = run.options;
+    const auto &m = run.method;
+    const auto &o = run.options;
     const auto &w = run.work;
     const bool estimate = o.adaptive || ((o.metric == BY_ERROR || o.every == AUTO) && w.l > 0);
     w.counters[HAVE_F] = (estimate && m.fsal) || (step.project && o.uses_f);
@@ -122,7 +122,7 @@ inline void close_derivative(const AnyRun &run, double t, const double *y, bool 
 // After the projection: the carry, the errors gathered, and f for the next step's first stage in w.last().
 template <class AnyRun>
 inline void close_step(const AnyRun &run, const Step &step, Code status) {
-    const Options &o = run.options;
+    const auto &o = run.options;
     const auto &w = run.work;
     if (o.compensated) copy(w.carry_hat, w.carry, w.m);
     if (!step.project || status == POSTPONED)
@@ -201,7 +201,7 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
     if (run.method.multistep) return next_states(OneState{of_any_length(run), y_new}, span, clock, k, k + 1, y, y_new);
     if (run.hooks && run.hooks->drives) return driven_step(run, span, clock, k, y, y_new);
     const auto &w = run.work;
-    const bool adaptive = span.h == 0.0;
+    const bool adaptive = run.options.adaptive;
     if (!adaptive) clock[TIME] = span.t0 + k * span.h;
     const double t = clock[TIME], least = adaptive ? least_step(t, span.sign) : 0.0;
     double h_abs = clock[NEXT_LENGTH];

@@ -48,7 +48,7 @@ inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
 
 // Rows along which a correction goes: w.Q, or the gradients as they are where the weights are 1.
 template <class W>
-[[gnu::always_inline]] inline auto *weighed_gradients(const Options &o, const W &w) {
+[[gnu::always_inline]] inline auto *weighed_gradients(const auto &o, const W &w) {
     if (o.metric == EUCLIDEAN && o.frame.rows == 0) return w.G;
     weigh_rows(o.frame, w, w.Q);
     return w.Q;
@@ -57,7 +57,7 @@ template <class W>
 // w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction along rows Q, neutral to the frame; out = y_hat + move. In one
 // pass, which writes in vectors what the next step reads in vectors.
 template <class Value, class W>
-[[gnu::always_inline]] inline void move_along(const Options &o, const W &w, const Value *__restrict Q,
+[[gnu::always_inline]] inline void move_along(const auto &o, const W &w, const Value *__restrict Q,
                                               Value *__restrict out) {
     const int64_t m = w.m;
     const bool framed = o.frame.rows > 0;
@@ -153,7 +153,7 @@ inline int64_t move_in_groups(const Options &o, const W &w, double *out) {
 
 // The defects that those after a projection are compared with.
 template <class W>
-inline auto *limits(const Options &o, const W &w) {
+inline auto *limits(const auto &o, const W &w) {
     return o.balance_groups.count > 0 ? w.g : w.before;
 }
 
@@ -171,7 +171,7 @@ template <class W>
 
 // The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
 template <class W>
-[[gnu::always_inline]] inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
+[[gnu::always_inline]] inline int64_t first_move(const auto &o, const W &w, double *out, bool more) {
     if (o.balance_groups.count > 0) [[unlikely]]
         return move_in_groups(o, w, out);
     double *rows = more ? nullptr : weighed_gradients(o, w);
@@ -230,7 +230,7 @@ inline void newton_matrix_solve(int64_t rank, const Work &w) {
 // The first Newton step; `largest_error` >= 0: by the weights that stand, for this one.
 template <class AnyRun>
 inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1.0) {
-    const Options &o = run.options;
+    const auto &o = run.options;
     const auto &w = run.work;
     ++w.counters[NLU];
     if (largest_error < 0.0) {
@@ -301,7 +301,7 @@ inline auto missed_targets(const Options &o, const W &w) {
 // Computations after the first Newton step: further ones, and whether the projection holds.
 template <class AnyRun>
 inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
-    const Options &o = run.options;
+    const auto &o = run.options;
     const auto &w = run.work;
     if (rank < 0) {
         copy(w.before, w.defect, w.l);
@@ -361,7 +361,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
 // the estimates vanish, all relative errors are rounding and equal.
 template <class AnyRun>
 inline Code stay(const AnyRun &run, const Step &step) {
-    const Options &o = run.options;
+    const auto &o = run.options;
     const auto &w = run.work;
     ++w.counters[SKIPPED];
     copy(w.y_hat, step.y_new, w.m);
@@ -384,7 +384,7 @@ inline Code project_evaluated(const AnyRun &run, const Step &step);
 // with every = AUTO, while the invariants know no more than round-off (y_new is then y_hat).
 template <class AnyRun>
 inline Code project_step(const AnyRun &run, const Step &step) {
-    const Options &o = run.options;
+    const auto &o = run.options;
     const auto &w = run.work;
     const Known known = std::exchange(run.system.at_raw, Known::NOTHING);
     if (known != Known::ALL) run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
@@ -408,7 +408,7 @@ inline Code project_step(const AnyRun &run, const Step &step) {
 // singular position, and steps would become very short.
 template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step) {
-    const Options &o = run.options;
+    const auto &o = run.options;
     const auto &w = run.work;
     if (!defects<double>(nullptr, w.y_hat, o, w, w.before) && o.balance_groups.count == 0) return stay(run, step);
     Moved moved = move(run, step);

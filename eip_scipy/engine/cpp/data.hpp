@@ -340,6 +340,8 @@ struct Inner {
 template <class V>
 struct WorkOf {
     using Value = V;
+    using Method = eip::Method;
+    using Options = eip::Options;
     int64_t n, m, l, stages, balances;
     Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *memory, *memory_new,
         *move, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect,

@@ -8,7 +8,9 @@ namespace {
 template <class W, typename Call>
 Code with_work(const Run &run, Call call) {
     const W work(run.work);
-    return call(RunOf<W>{run.method, run.options, work, run.system, nullptr});
+    const typename W::Method method(run.method);
+    const typename W::Options options(run.options);
+    return call(RunOf<W>{method, options, work, run.system, nullptr});
 }
 
 // Many steps by `call`, which takes a RunOf: where no function is Python's by code of its own for the short states of
@@ -16,7 +18,8 @@ Code with_work(const Run &run, Call call) {
 template <typename Call>
 Code by_length(const Run &run, Call call) {
     const bool able = !run.system.python && !run.hooks && run.work.n == run.work.m;
-    if (able && run.work.m == 4 && run.work.l == 2) return with_work<SizedWith<4, 2>>(run, call);
+    if (able && run.work.m == 4 && run.work.l == 2 && is_plain(run.method, run.options))
+        return with_work<Plain<4, 2>>(run, call);
     if (able && run.work.m == 4) return with_work<Sized<4>>(run, call);
     return able && run.work.m == 6 ? with_work<Sized<6>>(run, call) : call(run);
 }

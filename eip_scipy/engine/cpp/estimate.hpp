@@ -49,7 +49,7 @@ inline double error_norm(const double *err, const double *y, const double *y_hat
 
 // The norm of w.err.
 template <class W>
-inline double norm_of_error(const double *y, const Options &o, const W &w) {
+inline double norm_of_error(const double *y, const auto &o, const W &w) {
     if (o.columns.count > 0) [[unlikely]]
         return error_norm_of_state(w.err, y, w.y_hat, o);
     return error_norm(w.err, y, w.y_hat, o, w.n);
@@ -78,8 +78,8 @@ inline double paired_error_norm(double *err, const double *low, const double *y,
 // The estimate into w.err, and its norm for the step control.
 template <class AnyRun>
 inline void estimate_error(const AnyRun &run, const Step &step) {
-    const Method &m = run.method;
-    const Options &o = run.options;
+    const auto &m = run.method;
+    const auto &o = run.options;
     const auto &w = run.work;
     if (m.nystrom) {
         const int64_t half = w.m / 2;
@@ -119,7 +119,7 @@ inline bool is_sampled_for_resolution(const W &w) {
 // f at the raw result in w.last(), and the local error in w.err where the step makes no estimate of it.
 template <class AnyRun>
 [[gnu::cold, gnu::noinline]] inline void sample(const AnyRun &run, const Step &step) {
-    const Method &m = run.method;
+    const auto &m = run.method;
     const auto &w = run.work;
     if (!w.counters[HAVE_F]) run.system.rhs(w, step.t_new, w.y_hat, w.last());
     if (w.counters[HAVE_ERROR]) return;

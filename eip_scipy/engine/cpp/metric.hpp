@@ -94,11 +94,7 @@ template <class Value>
 inline void take_roots(Value *squares, int64_t n) {
     if constexpr (std::is_same_v<Value, double>)
         if (n < WIDTH) {
-            for (int64_t b = 0; b < n; ++b) {
-                double root = sqrt(squares[b]);
-                stay_alone(root);
-                squares[b] = root;
-            }
+            for (int64_t b = 0; b < n; ++b) store_alone(sqrt(squares[b]), squares + b);
             return;
         }
     for (int64_t b = 0; b < n; ++b) squares[b] = sqrt(squares[b]);
@@ -240,7 +236,7 @@ inline double memory_kept(const AnyRun &run) {
 // estimate and, unless it is carried along, the rounding of the state, in quadrature.
 template <class AnyRun>
 inline double relative_errors(const double *y, const AnyRun &run) {
-    const Options &o = run.options;
+    const auto &o = run.options;
     const auto &w = run.work;
     const double rounding = o.compensated ? 0.0 : EPS;
     if (block_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);

@@ -15,7 +15,7 @@ inline void nystrom_position(const double *y, double h, double c, const Rows &ro
 // The sum of the stages, y_hat.
 template <class AnyRun>
 inline void sum_stages(const AnyRun &run, const Step &step) {
-    const Method &m = run.method;
+    const auto &m = run.method;
     const auto &w = run.work;
     if (run.options.compensated)
         compensated_step(step.y, step.h, m, w);
@@ -25,7 +25,7 @@ inline void sum_stages(const AnyRun &run, const Step &step) {
 
 template <class AnyRun>
 inline void rk_stages(const AnyRun &run, const Step &step) {
-    const Method &m = run.method;
+    const auto &m = run.method;
     const auto &w = run.work;
     for (int64_t i = 1; i < m.stages; ++i) {
         combine(step.y, step.h, {m.A + i * m.columns, w.K, i, w.m}, w.stage, w.m);
@@ -41,7 +41,7 @@ inline bool made_with_rates(const AnyRun &, const Step &) {
     return false;
 }
 [[gnu::noinline]] inline void rated_stages(const Run &run, const Step &step) {
-    const Method &m = run.method;
+    const auto &m = run.method;
     const Work &w = run.work;
     const int64_t *rated = run.options.balances.rated;
     if (std::isnan(w.rate(0)[0])) run.system.rates(w, step.t, step.y, w.row(0), w.rate(0));
@@ -91,7 +91,7 @@ template <class AnyRun>
 // Stages keep v, which the accelerations must not see: BY_VELOCITY if they are found to do.
 template <class AnyRun>
 inline Code rkn_stages(const AnyRun &run, const Step &step) {
-    const Method &m = run.method;
+    const auto &m = run.method;
     const auto &w = run.work;
     const int64_t half = w.m / 2;
     const double *accelerations = w.K + half;

@@ -4,6 +4,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <utility>
 
 namespace eip {
 
@@ -35,6 +36,24 @@ inline void store_as(Value v, double *a) {
 inline Vector load(const double *a) { return load_as<Vector>(a); }
 
 inline void store(Vector v, double *a) { store_as(v, a); }
+
+// A vector, or a float that the compiler must not load, or store, together with its neighbours: the load of a vector waits until
+// all floats that have just been written there are in the cache, and to pack them takes longer than to compute with each.
+template <typename Float>
+inline Float load_alone(const double *a) {
+    if constexpr (sizeof(Float) == sizeof(double))
+        return *const_cast<const volatile double *>(a);
+    else
+        return load_as<Float>(a);
+}
+
+template <typename Float>
+inline void store_alone(Float value, double *a) {
+    if constexpr (sizeof(Float) == sizeof(double))
+        *static_cast<volatile double *>(a) = value;
+    else
+        store_as(value, a);
+}
 
 // part.template operator()<Value, COUNT>(i): COUNT vectors, or floats, from i on, until n. No entry is met twice, and
 // vectors begin at multiples of their length: what has just been written in such vectors is read at once.
@@ -80,13 +99,14 @@ template <class Term>
 
 template <class Value>
 [[gnu::always_inline]] inline Value dot(const Value *a, const Value *b, int64_t n) {
-    return sum_of(a, n, [=]<class Part>(int64_t i) { return load_as<Part>(a + i) * load_as<Part>(b + i); });
+    return sum_of(a, n, [=]<class Part>(int64_t i) { return load_alone<Part>(a + i) * load_alone<Part>(b + i); });
 }
 
 // Sum of |a_i b_i|.
 template <class Value>
 [[gnu::always_inline]] inline Value abs_dot(const Value *a, const Value *b, int64_t n) {
-    return sum_of(a, n, [=]<class Part>(int64_t i) { return absolute(load_as<Part>(a + i) * load_as<Part>(b + i)); });
+    return sum_of(a, n,
+                  [=]<class Part>(int64_t i) { return absolute(load_alone<Part>(a + i) * load_alone<Part>(b + i)); });
 }
 
 // Sum of (a_i b_i)^2.
@@ -144,48 +164,28 @@ struct Rows {
     int64_t count, stride;
 };
 
-// A vector, or a float that the compiler must not load together with its neighbours.
-template <typename Float>
-inline Float load_alone(const double *a) {
-    if constexpr (sizeof(Float) == sizeof(double))
-        return *const_cast<const volatile double *>(a);
-    else
-        return load_as<Float>(a);
-}
-
-// Keep the compiler from packing floats into a vector, which takes longer than to compute with each: the next stage waits for
-// all of them.
-template <typename Float>
-[[gnu::always_inline]] inline void stay_alone(Float &value) {
-    if constexpr (sizeof(Float) == sizeof(double)) {
-#if defined(__x86_64__)
-        asm("" : "+x"(value));
-#elif defined(__aarch64__)
-        asm("" : "+w"(value));
-#endif
-    }
-}
-
-// COUNT vectors, or floats, from i on of out = y + scale sum, or of scale sum where there is no y.
-template <typename Float, int COUNT, bool ADD>
-inline void combine_part(const double *y, double scale, const Rows &rows, double *out, int64_t i) {
+// Vectors, or floats, number K... from i on of out = y + scale sum, or of scale sum where there is no y. With constants in the
+// place of a loop the sums stay in registers.
+template <typename Float, bool ADD, int... K>
+[[gnu::always_inline]] inline void combine_those(const double *y, double scale, const Rows &rows, double *out,
+                                                 std::integer_sequence<int, K...>) {
     constexpr int LENGTH = sizeof(Float) / sizeof(double);
-    Float total[COUNT] = {};
+    Float total[sizeof...(K)] = {};
     for (int64_t j = 0; j < rows.count; ++j) {
-        const double weight = rows.weights[j];
+        const double weight = rows.weights[j], *row = rows.first + j * rows.stride;
         if (weight == 0.0) continue;
-        const double *row = rows.first + j * rows.stride + i;
-        for (int k = 0; k < COUNT; ++k) {
-            total[k] += weight * load_alone<Float>(row + k * LENGTH);
-            stay_alone(total[k]);
-        }
+        ((total[K] += weight * load_alone<Float>(row + K * LENGTH)), ...);
     }
-    for (int k = 0; k < COUNT; ++k) {
-        Float value = scale * total[k];
-        if constexpr (ADD) value = load_as<Float>(y + i + k * LENGTH) + value;
-        stay_alone(value);
-        store_as(value, out + i + k * LENGTH);
-    }
+    ((total[K] *= scale), ...);
+    if constexpr (ADD) ((total[K] += load_as<Float>(y + K * LENGTH)), ...);
+    (store_alone(total[K], out + K * LENGTH), ...);
+}
+
+template <typename Float, int COUNT, bool ADD>
+[[gnu::always_inline]] inline void combine_part(const double *y, double scale, const Rows &rows, double *out,
+                                                int64_t i) {
+    const Rows from{rows.weights, rows.first + i, rows.count, rows.stride};
+    combine_those<Float, ADD>(y + i, scale, from, out + i, std::make_integer_sequence<int, COUNT>{});
 }
 
 // Blocks of one length; the last one ends with the array and may overlap the one before it.

@@ -462,8 +462,8 @@ struct System {
 // One run: K[0] holds f(t, y) when a step begins. W is Work, or one of a length that the compiler knows.
 template <class W, class Called = System>
 struct RunOf {
-    const Method &method;
-    const Options &options;
+    const typename W::Method &method;
+    const typename W::Options &options;
     const W &work;
     Called &system;
     Hooks *hooks;
@@ -489,6 +489,39 @@ template <int64_t M, int64_t L, class Value = double>
 struct SizedWith : Sized<M, Value> {
     explicit SizedWith(const WorkOf<Value> &w) : Sized<M, Value>(w) {}
     static constexpr int64_t l = L;
+};
+
+// Options and method of a run by a one-step method without what most runs leave out, so that the compiler leaves it out, too:
+// adaptive steps, steps that are not projected, further Newton steps, balances, frames, columns and carried sums.
+struct PlainOptions : Options {
+    explicit PlainOptions(const Options &o) : Options(o) {}
+    static constexpr Frame frame{};
+    static constexpr Balances balances{};
+    static constexpr Groups balance_groups{};
+    static constexpr Columns columns{};
+    static constexpr int64_t direction = NEW, iterations = 1, every = 1;
+    static constexpr bool has_limits = false, compensated = false, adaptive = false;
+};
+struct PlainMethod : Method {
+    explicit PlainMethod(const Method &m) : Method(m) {}
+    static constexpr bool nystrom = false, paired = false;
+    static constexpr const Multistep *multistep = nullptr;
+};
+
+inline bool is_plain(const Method &m, const Options &o) {
+    const bool whole =
+        o.frame.rows == 0 && o.balances.count == 0 && o.balance_groups.count == 0 && o.columns.count == 0;
+    const bool once = o.direction == NEW && o.iterations == 1 && o.every == 1 && !o.has_limits;
+    return whole && once && !o.compensated && !o.adaptive && !m.nystrom && !m.paired && !m.multistep;
+}
+
+// A short state in such a run.
+template <int64_t M, int64_t L>
+struct Plain : SizedWith<M, L> {
+    using Method = PlainMethod;
+    using Options = PlainOptions;
+    explicit Plain(const Work &w) : SizedWith<M, L>(w) {}
+    static constexpr int64_t balances = 0;
 };
 
 // True if a run is one of a single state: batches of members have no balances.

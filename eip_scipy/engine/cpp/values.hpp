@@ -36,6 +36,10 @@ template <class Value>
 inline const Value &load_as(const Octet *a) {
     return *a;
 }
+template <class Value>
+inline const Value &load_alone(const Octet *a) {
+    return *a;
+}
 inline void store_as(const Octet &x, Octet *a) { *a = x; }
 template <class Value>
 inline const Octet &spread(const Octet &x) {
