@@ -104,11 +104,10 @@ def flow_differences(problem, directions, step=1e-4):
 
 
 FAST = ("1, free", "2, circle twice", "3, sphere")  # the others take seconds to compile, too
+LATER = [pytest.mark.nightly, pytest.mark.slow]
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SYSTEMS]
-)
+@pytest.mark.parametrize("name", [name if name in FAST else pytest.param(name, marks=LATER) for name in SYSTEMS])
 def test_columns_are_differences_of_the_flow(name):
     problem = SYSTEMS[name]()
     run, plain = integrate(problem, variations="state", **OPTIONS), integrate(problem, **OPTIONS)
