@@ -528,6 +528,10 @@ def periodic_orbit(
     of smallest norm, because the equations do not determine it along the flow and along a family of orbits. A
     correction that does not reduce the residual is halved.
 
+    The computed states are closed, which with a fixed step are those of a discrete map. `closure` therefore does not
+    contain the errors of the steps, and `y0` and `period` differ from those of the orbit by as much as the method errs.
+    The result of half the step shows by how much.
+
     References
     ----------
     K. C. Howell, Celestial Mechanics 32 (1984), 53-71, for the symmetric case.

@@ -125,15 +125,24 @@ def is_pointer(fun: Any) -> bool:
 
 
 def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
-    """Return a C function pointer as a `PointerFunction` with the keywords `form`; return anything else unchanged."""
-    return PointerFunction(fun, name, kind, **form) if is_pointer(fun) else fun
+    """Return a C function pointer as a `PointerFunction` with the keywords `form`; return anything else unchanged.
+
+    Raise TypeError for an object of ``numba.cfunc``: Python could call it, but not with the arguments it is made for.
+    """
+    return PointerFunction(fun, name, kind, **form) if is_pointer(fun) or _is_cfunc(fun) else fun
 
 
 def address_hint(fun: Any) -> str:
-    """Return the end of a message: a hint if `fun` is an integer, such as an address, otherwise ""."""
+    """Return the end of a message: a hint if `fun` is an integer, such as an address, or a Numba cfunc, else ""."""
+    if _is_cfunc(fun):
+        return f"; give the pointer that it holds, {fun.__name__}.ctypes, or compile the function with numba.njit"
     if isinstance(fun, bool) or not isinstance(fun, (int, np.integer)):
         return ""
     return "; an address does not contain the signature: give a ctypes or cffi pointer, or a scipy.LowLevelCallable"
+
+
+def _is_cfunc(fun: Any) -> bool:
+    return "numba.core.ccallback" in sys.modules and isinstance(fun, sys.modules["numba.core.ccallback"].CFunc)
 
 
 def _is_low_level(fun: Any) -> bool:

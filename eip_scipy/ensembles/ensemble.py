@@ -351,8 +351,10 @@ def ensemble(
     acceleration : callable, optional
         Instead of `fun`, as for `integrate`.
     params : array_like of float, shape (p,) or (members, p), optional
-        Parameters of all members, or of each. For a problem that names its parameters also a mapping from names to one
-        value or to one value for each member, as in ``params={"k": [1.0, 2.0]}``.
+        Parameters of all members, or of each. One number k[i] for each member is ``params=k[:, None]``, because an
+        array (p,) is common to all members; for a `Problem` with a single parameter also ``params=k``. For a problem
+        that names its parameters also a mapping from names to one value or to one value for each member, as in
+        ``params={"k": [1.0, 2.0]}``.
     method : type, optional
         As for `integrate`. Default: the method of the problem, if it has one, else `EIPRK4`.
     h : float, optional
@@ -687,6 +689,8 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
     if problem is not None:
         params = problem.plain(params=params)["params"]
     own = None if params is None else np.atleast_1d(parameter_values(params))
+    if own is not None and own.ndim == 1 and own.size > 1 and problem is not None and _takes_one_parameter(problem):
+        own = own[:, None]  # one for each member, because they cannot be common to all
     if starts.ndim == 1 and own is not None and own.ndim == 2:
         starts = np.tile(starts, (len(own), 1))
     elif starts.ndim == 1 and times:
@@ -718,6 +722,10 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
     if options.get("args") is not None:
         own = floats(extra_arguments(options["args"], params))
     return Chunk(0, starts, own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size)), times)
+
+
+def _takes_one_parameter(problem: Problem) -> bool:
+    return problem.params is not None and np.size(problem.params) == 1
 
 
 def _bare(fun: Any) -> Any:

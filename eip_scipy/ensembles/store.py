@@ -80,9 +80,8 @@ class _Store:
         checkpoint.require_same(self.path, there.get("settings"), here["settings"])
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
-            raise _other_functions(
-                self.path, "fun or an invariant", f"at the start (stored: {one[:4]}, now: {other[:4]})"
-            )
+            stored, now = (", ".join(found["start"][:4]) for found in (there, here))
+            raise _other_functions(self.path, "fun or an invariant", f"at the start (stored: {stored}; now: {now})")
         if missing:
             raise CheckpointError(
                 f"{self.path!r} is not an ensemble of eip_scipy, or was written by an earlier version of eip_scipy: "

@@ -163,19 +163,27 @@ class ParticleOrbit:
         return np.unwrap(np.arctan2((self._gyrating * second).sum(axis=0), (self._gyrating * first).sum(axis=0)))
 
     @cached_property
-    def _per_gyration(self) -> int:
-        """Number of states in one gyration at the start; ValueError unless averages over a gyration are possible."""
-        spacing = abs(float(np.median(np.diff(self.t[: 2 * FEWEST_PER_GYRATION]))))
+    def _edges(self) -> np.ndarray:
+        """Times (m + 1,) since the first state at which one state's share of time ends and the next one's begins."""
+        since = np.abs(self.t - self.t[0])
+        return np.concatenate([[-since[1] / 2], (since[1:] + since[:-1]) / 2, [1.5 * since[-1] - since[-2] / 2]])
+
+    @cached_property
+    def _gyration(self) -> tuple[float, int]:
+        """Duration of the averages, and number of them; ValueError unless averages over a gyration are possible."""
+        spacing = float(np.median(np.abs(np.diff(self.t))))
         count = round(2 * np.pi / (self.gyrofrequency[0] * spacing))
-        if count < FEWEST_PER_GYRATION or count >= self.t.size:
+        # For equal times the averages are then over whole states. A small part of the spacing allows for rounding.
+        n_means = int(np.searchsorted(self._edges, self._edges[-1] - (count - 1e-6) * spacing, side="right"))
+        if count < FEWEST_PER_GYRATION or n_means < 2:
             raise ValueError(
                 f"one gyration has {count} of the {self.t.size} states; averages need at least {FEWEST_PER_GYRATION} "
                 "states per gyration, and more than one gyration. Save more often (save_every), or integrate longer."
             )
-        return count
+        return count * spacing, n_means
 
     def averaged(self, values: Any) -> np.ndarray:
-        """Return the running means of a quantity over one gyration.
+        """Return the running means of a quantity over one gyration, weighted by the spacing of the times.
 
         Parameters
         ----------
@@ -185,19 +193,24 @@ class ParticleOrbit:
         Returns
         -------
         ndarray, shape (..., k)
-            k is m + 1 minus the number of states in a gyration; ``averaged(orbit.t)`` are the times of the means.
+            One mean for each state from which on the run lasts one gyration. ``averaged(orbit.t)`` are the times of the
+            means.
 
         Raises
         ------
         ValueError
             If one gyration has fewer than four states, or if the run is not longer than one gyration.
         """
-        n = self._per_gyration
-        values = np.asarray(values, dtype=float)
+        duration, k = self._gyration
+        edges, values = self._edges, np.asarray(values, dtype=float)
         # About the first value, so that a long sum does not lose digits of what varies.
-        sums = np.cumsum(values - values[..., :1], axis=-1)
-        means = np.concatenate([sums[..., n - 1 : n], sums[..., n:] - sums[..., :-n]], axis=-1) / n
-        return means + values[..., :1]
+        about = values - values[..., :1]
+        sums = np.cumsum(about * np.diff(edges), axis=-1)
+        sums = np.concatenate([np.zeros_like(sums[..., :1]), sums], axis=-1)
+        ends = edges[:k] + duration
+        last = np.minimum(np.searchsorted(edges, ends, side="right"), self.t.size) - 1
+        upper = sums[..., last] + (ends - edges[last]) * about[..., last]
+        return (upper - sums[..., :k]) / duration + values[..., :1]
 
     def banana_tips(self) -> Tips:
         """Return the places where the averaged velocity along B changes its sign.
@@ -237,8 +250,10 @@ class ParticleOrbit:
             As for `averaged`.
         """
         height = self.averaged(self.guiding_centre[2])
-        shift = self._per_gyration // 2
-        yield from (slice(a, b) for a, b in pairwise(shift + np.flatnonzero((height[:-1] < 0) & (height[1:] >= 0))))
+        up = np.flatnonzero((height[:-1] < 0) & (height[1:] >= 0))
+        middles = self._edges[up] + (0.5 + 1e-9) * self._gyration[0]  # at equal times, some lie on an edge
+        states = np.searchsorted(self._edges, middles, side="right") - 1
+        yield from (slice(a, b) for a, b in pairwise(states.tolist()))
 
 
 def radial_range(orbit: ParticleOrbit, turn: float) -> float:

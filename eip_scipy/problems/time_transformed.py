@@ -70,7 +70,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     Raises
     ------
     ValueError
-        If the problem has no compiled right-hand side, or one of its invariants is a `Balance`.
+        If the problem has no compiled right-hand side, or one of its invariants is a `Balance` or depends on t.
 
     Notes
     -----
@@ -100,7 +100,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         y0=np.append(problem.y0, problem.t_span[0]),
         t_span=(0.0, float(s_end)),
         params=params,
-        invariants=tuple(_transformed_invariant(item) for item in problem.invariants),
+        invariants=tuple(_transformed_invariant(item, problem) for item in problem.invariants),
         component_names=None if problem.component_names is None else (*problem.component_names, "t"),
         blocks=tuple(np.arange(n).reshape(-1, blocks)) if isinstance(blocks, int) else blocks,
         frame=frame,
@@ -136,15 +136,28 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
     return compiled_like(transformed, rhs, g)
 
 
-def _transformed_invariant(item: Invariant) -> Invariant:
+def _transformed_invariant(item: Invariant, problem: Problem) -> Invariant:
     if item.is_balance:
         raise ValueError(
             f"time_transformed: {item!r} is a Balance, whose rate is a derivative with respect to time. Pass "
             "dataclasses.replace(problem, invariants=...) without it. The new problem may get a Balance in the same "
             "way, with the rate in fictitious time."
         )
+    if _depends_on_time(item, problem):
+        raise ValueError(
+            f"time_transformed: {item!r} depends on t, but the gradient with respect to the state (y, t) is known only "
+            "for invariants of y. Pass dataclasses.replace(problem, invariants=...) without it."
+        )
     fun, grad = _transformed_functions(item.function, item.gradient, item.uses_f)
     return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
+
+
+def _depends_on_time(item: Invariant, problem: Problem) -> bool:
+    """Return True if the values of an invariant at the problem's initial state differ between three times."""
+    params = np.zeros(0) if problem.params is None else problem.params
+    t0, t1 = problem.t_span
+    values = [item.function(t, problem.y0, *(item.args or (params,))) for t in (t0, t0 + 0.37 * (t1 - t0), t1)]
+    return not all(np.array_equal(value, values[0], equal_nan=True) for value in values)
 
 
 @cache

@@ -141,6 +141,11 @@ def plain(value: Any) -> Any:
     return value
 
 
+def _number(value: Any) -> str:
+    """Return the text of a real or complex number; real values are complex numbers next to a complex derivative."""
+    return f"{value if value.imag else value.real:.12g}"
+
+
 def _digest(values: Iterable[Any]) -> str:
     """Return a hash of arrays and numbers."""
     digest = hashlib.sha256()
@@ -216,8 +221,9 @@ class _FileKeeper(Keeper):
         if not same.all():
             k = int(np.flatnonzero(~same)[0])
             raise CheckpointError(
-                f"the checkpoint {self._name!r} belongs to another run: {labels[k]} was {there[k]:.12g} {where} "
-                f"and is {here[k]:.12g} now. Resume with the functions of that run, or use another file for a new run."
+                f"the checkpoint {self._name!r} belongs to another run: {labels[k]} was {_number(there[k])} {where} "
+                f"and is {_number(here[k])} now. Resume with the functions of that run, or use another file for a new "
+                "run."
             )
 
     def _described(self, known_by: Arrays, t: float, y: np.ndarray) -> tuple[list[str], np.ndarray]:

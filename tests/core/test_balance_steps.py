@@ -324,6 +324,14 @@ def test_a_history_that_is_longer_than_the_run(solve):
         solve(swinging, (0, 0.1), START, method=EIPGJ12, h=0.01, invariants=SWING)
 
 
+@pytest.mark.parametrize("solve", [ivp, integrate])
+def test_an_interval_without_steps_needs_no_history(solve):
+    """The result is the start, as with SciPy's methods."""
+    found = solve(swinging, (0, 0), START, method=EIPGJ12, h=0.01, invariants=SWING)
+    assert found.status == 0
+    np.testing.assert_array_equal(found.y[:, -1], START)
+
+
 def test_project_needs_a_target():
     for given in ({}, {"start": [1.0, 0.0]}):
         with pytest.raises(ValueError, match=r"balance 'E' changes and has no value to keep\. Pass .* target="):

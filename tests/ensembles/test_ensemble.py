@@ -37,7 +37,7 @@ from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.ensembles.tasks import Plan, Task, run_members
 from eip_scipy.methods.nystrom import RKN1210
 from eip_scipy.methods.runge_kutta import RK5
-from eip_scipy.problems import kepler
+from eip_scipy.problems import Problem, kepler
 from eip_scipy.results import EnsembleResult
 from eip_scipy.run.prepare import Request
 
@@ -123,6 +123,19 @@ def test_problem_with_params_for_each_member():
     run = ensemble(problem, SPAN, params=params, save_every=100)
     same_members(run, lambda k: integrate(problem, SPAN, params=params[k], method=EIPRK4, save_every=100))
     assert len({tuple(y) for y in run.y}) == 6
+
+
+def test_one_number_for_each_member_of_a_problem_with_one_parameter():
+    def decay(t, y, out, params):
+        out[:] = -params[0] * y
+
+    problem = Problem("decay", lambda t, y: -y, np.ones(2), (0, 1), rhs=decay, params=np.ones(1), h=0.02)
+    k = np.array([0.5, 1.0, 2.0])
+    for y0s in (None, np.ones((3, 2))):
+        run = ensemble(problem, (0, 1), y0s, params=k)
+        np.testing.assert_allclose(run.y, np.exp(-k[:, None]) * np.ones(2), rtol=1e-7)
+    with pytest.raises(ValueError, match="params has 3 rows for 2 members"):
+        ensemble(problem, (0, 1), np.ones((2, 2)), params=k)
 
 
 @pytest.mark.slow
@@ -687,7 +700,7 @@ def test_a_store_is_not_overwritten_nor_mixed_up(where, tmp_path):
         stored(resume=True, h=0.2, **place)
     with pytest.raises(CheckpointError, match="y0 differs"):
         ensemble(oscillator, (0, 1), np.ones((11, 2)), resume=True, **place, **STORED)
-    with pytest.raises(CheckpointError, match="fun or an invariant had other values at the start"):
+    with pytest.raises(CheckpointError, match=r"at the start \(stored: [-0-9., e]*; now: [-0-9., e]*\)"):
         stored(lambda t, y: 2 * oscillator(t, y), resume=True, **place)
     with pytest.raises(CheckpointError, match="chunk is 3 in the checkpoint and 4 in this run"):
         stored(resume=True, chunk=4, **place)

@@ -257,6 +257,15 @@ def test_averages_take_out_what_has_the_gyrations_period():
     np.testing.assert_allclose(backward.averaged(3.0 + np.cos(t)), 3.0, rtol=1e-13)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_averages_weigh_states_by_the_spacing_of_their_times(seed):
+    """The mean of a cosine over its period is 0, whatever the times."""
+    problem = uniform_field(t_end=10.0)
+    t = np.sort(np.random.default_rng(seed).uniform(0, 20 * math.pi, 1600))
+    orbit = ParticleOrbit(problem, t, np.tile(problem.y0[:, None], t.size))
+    assert np.abs(orbit.averaged(np.cos(t))).max() < 4e-3
+
+
 # --- user-defined fields ---
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba import njit
 
 from eip_scipy import EIPRK4, EIPRK45, Balance, Invariant, integrate
 from eip_scipy.problems import Problem, comet, harmonic, kepler, plane_wave, rotating_packet, soliton
@@ -91,3 +92,31 @@ def test_a_balance_is_not_written_in_another_time():
     balance = Balance(lambda t, y: y @ y, lambda t, y: 0.0, lambda t, y: 2 * y, name="B")
     with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is a derivative with respect to time"):
         time_transformed(replace(kepler(), invariants=(balance,)), 1.0, centre_time)
+
+
+@pytest.mark.needs_jit
+def test_an_invariant_that_depends_on_time_is_not_written_in_another_time():
+    """x - t is constant for x' = 1; its gradient with respect to x is right, but says nothing about t."""
+
+    @njit
+    def rhs(t, y, out, params):
+        out[0], out[1] = 1.0, 0.0
+
+    @njit
+    def value(t, y, params):
+        return y[0] - t
+
+    @njit
+    def gradient(t, y, out, params):
+        out[0], out[1] = 1.0, 0.0
+
+    @njit
+    def g(y, params):
+        return 2.0
+
+    kept = Invariant(value, gradient, in_place=True, name="X")
+    problem = Problem("drift", lambda t, y: np.array([1.0, 0.0]), np.zeros(2), (0, 1), rhs=rhs, invariants=(kept,))
+    with pytest.raises(ValueError, match=r"Invariant\(X\) depends on t, but the gradient"):
+        time_transformed(problem, 1.0, g)
+    run = integrate(time_transformed(replace(problem, invariants=()), 1.0, g), method=EIPRK4, h=0.1)
+    np.testing.assert_allclose(run.y[:, -1], [2.0, 0.0, 2.0], rtol=1e-14)

@@ -630,6 +630,19 @@ def test_another_start_end_or_method_of_stepping(old_run, tmp_path):
         integrate(orbit, SPAN, Y0, t_eval=np.linspace(0, 5, 50), method=EIPRK4, h=0.03, checkpoint=path, resume=True)
 
 
+def test_real_values_of_a_complex_run_are_written_as_real_numbers(tmp_path):
+    options = {"method": EIPRK4, "h": 0.1, "checkpoint": tmp_path / "run", "resume": True}
+
+    def kept(factor):
+        return Invariant(lambda t, y: factor * np.vdot(y, y).real, lambda t, y: 2 * factor * y, name="norm")
+
+    integrate(lambda t, y: 1j * y, (0, 1), [0.6, 0.8j], invariants=kept(1), **options)
+    with pytest.raises(CheckpointError, match=r"invariant 'norm' was 1 at the start and is 2 now"):
+        integrate(lambda t, y: 1j * y, (0, 1), [0.6, 0.8j], invariants=kept(2), **options)
+    with pytest.raises(CheckpointError, match=r"fun was 0\+0\.6j at the start and is 0\+1\.2j now"):
+        integrate(lambda t, y: 2j * y, (0, 1), [0.6, 0.8j], invariants=kept(1), **options)
+
+
 def test_another_function_is_seen_by_its_value_at_the_start(old_run):
     _, path = old_run
     options = FIXED | {"checkpoint": path, "resume": True}

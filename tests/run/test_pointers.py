@@ -11,7 +11,7 @@ import cffi
 import numpy as np
 import pytest
 from c_compiler import shared_library
-from numba import njit
+from numba import cfunc, njit
 from scipy import LowLevelCallable
 from scipy.integrate import solve_ivp
 from systems import same
@@ -417,6 +417,24 @@ def test_other_signatures(c):
                 wrap(fun)
         with pytest.raises(TypeError, match="event"):
             integrate(c.kepler, (0, 1), Y0, method=EIPRK4, h=0.1, params=MU, events=[fun])
+
+
+def test_a_cfunc_of_numba_is_given_by_its_pointer():
+    @cfunc("intc(f8, CPointer(f8), CPointer(f8), CPointer(f8))")
+    def decay(t, y, out, params):
+        out[0] = -y[0]
+        return 0
+
+    options = {"t_span": (0, 1), "y0": [1.0], "method": EIPRK4, "h": 0.01}
+    message = r"must be a C function by pointer, got .*decay'>; give the pointer that it holds, decay\.ctypes, or "
+    for fun in (decay, CFunctions(decay, decay)):
+        with pytest.raises(TypeError, match=f"fun {message}"):
+            integrate(fun, **options)
+    with pytest.raises(TypeError, match=message):
+        Invariant(decay)
+    with pytest.raises(TypeError, match=f"event 0 {message}"):
+        integrate(decay.ctypes, **options, events=decay)
+    assert integrate(decay.ctypes, **options).y[0, -1] == pytest.approx(math.exp(-1), rel=1e-9)
 
 
 def test_a_gradient_s_signature_is_another_one(c):
