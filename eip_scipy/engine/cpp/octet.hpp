@@ -29,7 +29,7 @@ inline Value spread(double x) {
 
 // One instruction, and below by the compiler's own name for it: the header with the processor's takes longer to compile
 // than most of these files.
-inline Vector root(Vector v) {
+inline Vector sqrt(Vector v) {
     for (int k = 0; k < WIDTH; ++k) v[k] = std::sqrt(v[k]);
     return v;
 }
@@ -125,7 +125,7 @@ inline Mask operator!(const Mask &a) { EIP_FOR_PARTS(Mask, ~a.part[v]); }
 inline Octet where(const Mask &mask, const Octet &a, const Octet &b) {
     EIP_FOR_PARTS(Octet, mask.part[v] ? a.part[v] : b.part[v]);
 }
-inline Octet sqrt(const Octet &a) { EIP_FOR_PARTS(Octet, root(a.part[v])); }
+inline Octet sqrt(const Octet &a) { EIP_FOR_PARTS(Octet, sqrt(a.part[v])); }
 inline Octet abs(const Octet &a) { EIP_FOR_PARTS(Octet, absolute(a.part[v])); }
 inline Octet multiply_add(const Octet &a, const Octet &b, const Octet &c) {
     EIP_FOR_PARTS(Octet, fused(a.part[v], b.part[v], c.part[v]));

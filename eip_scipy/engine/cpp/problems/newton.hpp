@@ -13,18 +13,60 @@ inline void newton_rhs(const T *y, const T *gm, int64_t bodies, T *out) {
     accelerate(y, gm, bodies, out + 3 * bodies);
 }
 
+// The change of a body's pull towards a centre of this mass, at the distance r, by `moved`.
+template <class V>
+inline void tidal_change(const V &mass, const V *r, const V *moved, V *change) {
+    const V square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2];
+    const V along = r[0] * moved[0] + r[1] * moved[1] + r[2] * moved[2];
+    const V tidal = mass / (square * sqrt(square)), radial = 3.0 * along / square;
+    for (int c = 0; c < 3; ++c) change[c] = tidal * (radial * r[c] - moved[c]);
+}
+
 // The accelerations' derivative along dq, as far as the heaviest body makes it, for the bodies that dq moves; with their
-// reactions on that body. Of eight members each may have another heaviest one.
-template <class T>
-inline void central_jacobian(const T *q, const T *dq, const T *gm, int64_t bodies, T *out) {
-    T mass = gm[0], centre = 0.0, place[3], kick[3], reaction[3];
+// reactions on that body. A vector holds as many bodies as it has lanes, the last one several times.
+inline void central_jacobian(const double *q, const double *dq, const double *gm, int64_t bodies, double *out) {
+    const int64_t centre = std::max_element(gm, gm + bodies) - gm;
+    const Vector mass = spread_vector(gm[centre]);
+    double reaction[3] = {}, changes[3][WIDTH], reactions[3][WIDTH];
+    for (int64_t first = 0; first < bodies; first += WIDTH) {
+        Vector r[3], d[3], moved[3], change[3], share, index;
+        for (int lane = 0; lane < WIDTH; ++lane) {
+            const int64_t k = std::min(first + lane, bodies - 1);
+            share[lane] = gm[k];
+            index[lane] = static_cast<double>(first + lane);
+            for (int c = 0; c < 3; ++c) r[c][lane] = q[3 * k + c], d[c][lane] = dq[3 * k + c];
+        }
+        const Bits moves = ((d[0] != 0.0) | (d[1] != 0.0) | (d[2] != 0.0)) & (index != static_cast<double>(centre)) &
+                           (index < static_cast<double>(bodies));
+        for (int c = 0; c < 3; ++c) {
+            r[c] -= q[3 * centre + c];
+            moved[c] = d[c] - dq[3 * centre + c];
+        }
+        tidal_change(mass, r, moved, change);
+        for (int c = 0; c < 3; ++c) {
+            const Vector own = moves ? change[c] : Vector{};
+            store(own, changes[c]);
+            store(share / mass * own, reactions[c]);
+        }
+        for (int lane = 0; lane < WIDTH; ++lane)
+            for (int c = 0; c < 3; ++c) {
+                reaction[c] -= reactions[c][lane];
+                if (first + lane < bodies) out[3 * (first + lane) + c] = changes[c][lane];
+            }
+    }
+    std::copy(reaction, reaction + 3, out + 3 * centre);
+}
+
+// Does the same for eight members, each of which may have another heaviest body.
+inline void central_jacobian(const Octet *q, const Octet *dq, const Octet *gm, int64_t bodies, Octet *out) {
+    Octet mass = gm[0], centre = 0.0, place[3], kick[3], reaction[3];
     for (int c = 0; c < 3; ++c) {
         place[c] = q[c];
         kick[c] = dq[c];
         reaction[c] = 0.0;
     }
     for (int64_t k = 1; k < bodies; ++k) {
-        const Truth<T> heavier = gm[k] > mass;
+        const Mask heavier = gm[k] > mass;
         if (!any(heavier)) continue;
         mass = where(heavier, gm[k], mass);
         centre = where(heavier, static_cast<double>(k), centre);
@@ -34,29 +76,26 @@ inline void central_jacobian(const T *q, const T *dq, const T *gm, int64_t bodie
         }
     }
     for (int64_t k = 0; k < bodies; ++k) {
-        const T *d = dq + 3 * k;
-        T *change = out + 3 * k;
-        const Truth<T> rests = (d[0] == 0.0) & (d[1] == 0.0) & (d[2] == 0.0);
-        const Truth<T> moves = !(rests | (centre == static_cast<double>(k)));
+        const Octet *d = dq + 3 * k;
+        const Mask rests = (d[0] == 0.0) & (d[1] == 0.0) & (d[2] == 0.0);
+        const Mask moves = !(rests | (centre == static_cast<double>(k)));
         if (!any(moves)) {
-            for (int c = 0; c < 3; ++c) change[c] = 0.0;
+            std::fill(out + 3 * k, out + 3 * k + 3, 0.0);
             continue;
         }
-        T r[3], moved[3], square = 0.0, along = 0.0;
+        Octet r[3], moved[3], change[3];
         for (int c = 0; c < 3; ++c) {
             r[c] = q[3 * k + c] - place[c];
             moved[c] = d[c] - kick[c];
-            square += r[c] * r[c];
-            along += r[c] * moved[c];
         }
-        const T tidal = mass / (square * sqrt(square)), radial = 3.0 * along / square;
+        tidal_change(mass, r, moved, change);
         for (int c = 0; c < 3; ++c) {
-            change[c] = where(moves, tidal * (radial * r[c] - moved[c]), 0.0);
+            out[3 * k + c] = where(moves, change[c], 0.0);
             reaction[c] = where(moves, reaction[c] - gm[k] / mass * change[c], reaction[c]);
         }
     }
     for (int64_t k = 0; k < bodies; ++k) {
-        const Truth<T> is_centre = centre == static_cast<double>(k);
+        const Mask is_centre = centre == static_cast<double>(k);
         if (!any(is_centre)) continue;
         for (int c = 0; c < 3; ++c) out[3 * k + c] = where(is_centre, reaction[c], out[3 * k + c]);
     }
