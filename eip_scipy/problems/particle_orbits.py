@@ -154,9 +154,14 @@ class ParticleOrbit:
 
     @cached_property
     def gyrophase(self) -> np.ndarray:
-        """Angle of the gyration around B in rad, from the direction away from the z axis, without jumps (m,)."""
+        """Angle of the gyration around B in rad, without jumps (m,).
+
+        It is measured from the direction away from the z axis, on the axis from x.
+        """
         b = self._magnetic / self._strength
-        away = np.stack([self.y[0], self.y[1], np.zeros_like(self.t)]) / self.R
+        away = np.stack([self.y[0], self.y[1], np.zeros_like(self.t)])
+        away[0, self.R == 0] = 1.0
+        away /= np.where(self.R == 0, 1.0, self.R)
         first = away - (away * b).sum(axis=0) * b
         first = first / np.sqrt((first * first).sum(axis=0))
         second = np.cross(b, first, axis=0)

@@ -203,6 +203,16 @@ def test_gyration_in_a_constant_field(charge):
     np.testing.assert_allclose(angle - angle[0], -np.sign(charge) * omega * run.t, atol=1e-5)
 
 
+def test_gyrophase_of_a_particle_that_starts_on_the_axis():
+    # The directions x there, and away from the axis afterwards, are those of one motion as long as that goes along x.
+    field = ParticleField(vector_potential=constant_a, magnetic=constant_b)
+    problem = charged_particle(field, [0.0, 0.0, 0.0], [1.0, 0.0, 0.5], t_span=(0.0, 0.01), h=0.001)
+    run = integrate(problem, method=EIPRK4, save_every=1)
+    phase = ParticleOrbit(problem, run.t, run.y).gyrophase
+    turned = np.arctan2(run.y[1, 1:], run.y[0, 1:])
+    np.testing.assert_allclose(phase[1:] + turned, phase[0] - 2.0 * run.t[1:], atol=1e-9)
+
+
 def test_drifting_gyration_in_the_papers_field():
     problem = uniform_field(t_end=2700 * math.pi / 10)
     run = integrate(problem, method=EIPDOP853, save_every=1)

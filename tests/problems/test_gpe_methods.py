@@ -219,6 +219,8 @@ def test_wrong_options():
         at_rest(gpe.changed(potential=lambda x, y: x**4 + y**4).problem(np.ones((16, 16)), 1.0))
     with pytest.raises(ValueError, match="the problem has one dimension, without a z axis"):
         at_rest(soliton())
+    with pytest.raises(TypeError, match="expected a problem made by"):
+        at_rest(gpe)
     with pytest.raises(ValueError, match=r"must be at most pi / 4, got 1;"):
         Splitting(gpe, "strang").one_step(0.0, noise(grid).ravel(), 2.0)
     with pytest.raises(ValueError, match="a rotation needs two or three"):

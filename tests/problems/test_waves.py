@@ -351,6 +351,9 @@ def test_lawson_is_exact_for_linear_waves():
         (lambda: sine_gordon_breather(frequency=1.0), "0 < frequency < 1"),
         (lambda: sine_gordon_breather(velocity=-1.0), "velocity"),
         (lambda: sine_gordon_kinks(velocity=1.5), "0 < velocity < 1"),
+        (lambda: sine_gordon_kinks(velocity=0.99), "width 0.141, but 512 points .* Give points >= 1135"),
+        (lambda: sine_gordon_breather(velocity=-0.99), "Give points >= 1135"),
+        (lambda: KortewegDeVries(Grid(8, 0, 1), damping=1.0).problem(np.ones(8), 400.0), "End the run before t = 350"),
         (lambda: korteweg_de_vries_solitons((1.0, 1.0)), "all different"),
         (lambda: korteweg_de_vries_solitons((1.0, 2.0), 0.0), "a place for each"),
         (lambda: breather(beta=1.0), "beta < 0"),
@@ -359,6 +362,35 @@ def test_lawson_is_exact_for_linear_waves():
 def test_wrong_values(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("make", "of", "at", "scene"),
+    [(Lawson, "nonlinear", 3, korteweg_de_vries_solitons), (Splitting, "grid", 1, breather)],
+    ids=["Lawson", "Splitting"],
+)
+def test_a_step_may_be_interrupted_by_one_of_another_length(make, of, at, scene):
+    # Another thread that runs the same problem does so.
+    scene = scene()
+    method, known = make(scene.equation), type(scene.equation)
+    alone = method.one_step(0.0, scene.y0.copy(), 0.01)
+    uses = []
+
+    class Interrupted(known):
+        def __getattribute__(self, name):
+            uses.extend([name] * (name == of))
+            if name == of and len(uses) == at:
+                method.one_step(0.0, scene.y0.copy(), 0.004)
+            return super().__getattribute__(name)
+
+    scene.equation.__class__ = Interrupted
+    try:
+        found = method.one_step(0.0, scene.y0.copy(), 0.01)
+    finally:
+        scene.equation.__class__ = known
+    assert len(uses) > at
+    for one, other in zip(np.atleast_2d(found), np.atleast_2d(alone), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_lawson_takes_tableaux():

@@ -186,21 +186,21 @@ class Splitting:
         self.gpe, self.scheme = gpe, scheme
         self.order, self.name = scheme.order, f"splitting-{scheme.name}"
         self.evaluations = len(scheme.linear)
-        self._h: float | None = None
-        self._flows: list[LinearFlow] = []
+        self._kept: tuple[float, list[LinearFlow]] | None = None
 
     def __repr__(self) -> str:
         return f"Splitting({self.gpe!r}, {self.scheme.name!r})"
 
     def one_step(self, t: float, y: np.ndarray, h: float) -> np.ndarray:
         """Make one step of length h; `y` is overwritten and returned."""
-        if h != self._h:
-            made = {part: LinearFlow(self.gpe, part * h) for part in set(self.scheme.linear)}
-            self._flows, self._h = [made[part] for part in self.scheme.linear], h
-        gpe, scheme = self.gpe, self.scheme
+        gpe, scheme, kept = self.gpe, self.scheme, self._kept
+        if kept is None or kept[0] != h:
+            made = {part: LinearFlow(gpe, part * h) for part in set(scheme.linear)}
+            # Replaced as a whole: another thread may be in a step of another length.
+            kept = self._kept = h, [made[part] for part in scheme.linear]
         psi = y.reshape(gpe.grid.shape)
         field, work = psi, np.empty_like(psi)
-        for part, flow in zip(scheme.local, self._flows, strict=False):
+        for part, flow in zip(scheme.local, kept[1], strict=False):
             local_flow(field, gpe.V, gpe.beta, part * h)
             field, work = flow.apply(field, work)
         local_flow(field, gpe.V, gpe.beta, scheme.local[-1] * h)
@@ -234,11 +234,14 @@ def at_rest(problem: FieldProblem) -> FieldProblem:
 
     Raises
     ------
+    TypeError
+        If `problem` is anything else.
     ValueError
         If the potential is not symmetric about the z axis, or the problem has one dimension.
     """
-    gpe = problem.equation
-    assert gpe is not None
+    gpe = getattr(problem, "equation", None)
+    if gpe is None:
+        raise TypeError(f"at_rest: expected a problem made by GrossPitaevskii.problem, got {problem!r}.")
     check_radial(gpe)
     names = [item.name for item in problem.invariants if item.name is not None]
     rest = gpe.changed(Omega=0.0).problem(

@@ -19,6 +19,8 @@ __all__ = ["KortewegDeVries"]
 
 SOURCE = "Gardner, Greene, Kruskal & Miura, Phys. Rev. Lett. 19 (1967) 1095"
 
+MOST_DECAY = 700.0  # exponent of the smallest decay that is divided by
+
 
 class KortewegDeVries:
     """The equation ``u_t + 6 u u_x + u_xxx + damping u = 0`` on a ring, by Galerkin's method in Fourier modes.
@@ -239,11 +241,12 @@ class KortewegDeVries:
         Raises
         ------
         ValueError
-            If the field is not of the grid's shape.
+            If the field is not of the grid's shape, or decays below what floats can hold before `t_end`.
         """
         start = np.asarray(u0, dtype=float)
         if start.shape != self.grid.shape:
             raise ValueError(f"u0 has shape {start.shape}, expected {self.grid.shape}.")
+        _growth(2 * self.damping, t_end)
         return WaveProblem(
             name=name,
             fun=self.fun,
@@ -264,10 +267,19 @@ class KortewegDeVries:
 
 def _value(rate: float, item: Invariant, t: float, u: np.ndarray) -> float:
     """Return the invariant divided by the factor exp(-rate t) of its decay."""
-    return exp(rate * t) * item.fun(t, u)
+    return _growth(rate, t) * item.fun(t, u)
 
 
 def _gradient(rate: float, item: Invariant, t: float, u: np.ndarray, out: np.ndarray) -> None:
     assert item.gradient is not None
     item.gradient(t, u, out)
-    out *= exp(rate * t)
+    out *= _growth(rate, t)
+
+
+def _growth(rate: float, t: float) -> float:
+    if rate * t > MOST_DECAY:
+        raise ValueError(
+            f"with damping, invariants are divided by their decay exp(-{rate:g} t), which floats cannot hold at t = "
+            f"{t:g}. End the run before t = {MOST_DECAY / rate:.6g}."
+        )
+    return exp(rate * t)

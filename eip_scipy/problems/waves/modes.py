@@ -128,34 +128,38 @@ class Lawson:
         self.order, self.error_estimator_order = tableau.order, tableau.error_estimator_order
         self.evaluations = tableau.n_stages + tableau.fsal
         self.name = f"Lawson-{tableau.name}"
-        self._h: float | None = None
-        self._turns: list[np.ndarray] = []
-        self._back: list[np.ndarray] = []
+        self._kept: tuple[float, list[np.ndarray], list[np.ndarray]] | None = None
 
     def __repr__(self) -> str:
         return f"Lawson({self.equation!r}, {self.tableau!r})"
+
+    def _factors(self, h: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the factors of the modes by the linear part up to each node of a step, and their inverses."""
+        kept = self._kept
+        if kept is None or kept[0] != h:
+            phases = [1j * h * c * self.equation.frequencies for c in (*self.tableau.c, 1.0)]
+            # Replaced as a whole: another thread may be in a step of another length.
+            kept = self._kept = h, [np.exp(-x) for x in phases], [np.exp(x) for x in phases]
+        return kept[1:]
 
     def one_step(self, t: float, y: np.ndarray, h: float) -> Any:
         """Make one step of length h from the state y at t.
 
         Return the new state, or the new state and its error estimate if the tableau has one.
         """
-        if h != self._h:
-            nodes = (*self.tableau.c, 1.0)
-            phases = [1j * h * c * self.equation.frequencies for c in nodes]
-            self._turns, self._back, self._h = [np.exp(-x) for x in phases], [np.exp(x) for x in phases], h
         equation, tableau = self.equation, self.tableau
+        turns, back = self._factors(h)
         modes = equation.modes(y)
         slopes = np.empty((tableau.n_stages + tableau.fsal, modes.size), complex)
 
         def slope(stage: int, moved: np.ndarray) -> None:
-            np.multiply(equation.nonlinear(self._turns[stage] * moved), self._back[stage], out=slopes[stage])
+            np.multiply(equation.nonlinear(turns[stage] * moved), back[stage], out=slopes[stage])
 
         slope(0, modes)
         for stage in range(1, tableau.n_stages):
             slope(stage, modes + (h * tableau.A[stage, :stage]) @ slopes[:stage])
         new = modes + (h * tableau.b) @ slopes[: tableau.n_stages]
-        end = self._turns[-1]
+        end = turns[-1]
         if not tableau.has_estimate:
             return equation.field(end * new)
         if tableau.fsal:

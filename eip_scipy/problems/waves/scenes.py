@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from itertools import combinations, product
-from math import sqrt
+from math import ceil, sqrt
 from typing import Any
 
 import numpy as np
@@ -52,11 +52,13 @@ def sine_gordon_breather(
     Raises
     ------
     ValueError
-        If the frequency or the velocity is out of range.
+        If the frequency or the velocity is out of range, or the velocity so high that the breather is narrower than two
+        spacings of the grid.
     """
     refuse_units(frequency=frequency, velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < frequency < 1 or not -1 < velocity < 1:
         raise ValueError(f"a breather needs 0 < frequency < 1 and |velocity| < 1, got {frequency!r} and {velocity!r}.")
+    _require_resolved("a breather", velocity, length, points)
     return _sine_gordon("sine-gordon-breather", partial(_breather, frequency, velocity), points, length, t_end, h)
 
 
@@ -87,12 +89,23 @@ def sine_gordon_kinks(
     Raises
     ------
     ValueError
-        If the velocity is out of range.
+        If the velocity is out of range, or so high that the kinks are narrower than two spacings of the grid.
     """
     refuse_units(velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < velocity < 1:
         raise ValueError(f"kinks need 0 < velocity < 1, got {velocity!r}.")
+    _require_resolved("kinks", velocity, length, points)
     return _sine_gordon("sine-gordon-kinks", partial(_kinks, velocity, t_end / 2), points, length, t_end, h)
+
+
+def _require_resolved(what: str, velocity: float, length: float, points: int) -> None:
+    """Refuse a grid with a spacing of more than half of the width sqrt(1 - v^2) to which motion contracts a wave."""
+    width = sqrt(1 - velocity**2)
+    if length / points > width / 2:
+        raise ValueError(
+            f"{what} with velocity = {velocity:g} has the width {width:.3g}, but {points} points on a ring of length "
+            f"{length:g} are {length / points:.3g} apart. Give points >= {ceil(2 * length / width)}."
+        )
 
 
 def _sine_gordon(name: str, closed: Any, points: int, length: float, t_end: float, h: float | None) -> WaveProblem:
