@@ -23,8 +23,58 @@ inline void tidal_change(const V &mass, const V *r, const V *moved, V *change) {
 }
 
 // The accelerations' derivative along dq, as far as the heaviest body makes it, for the bodies that dq moves; with their
-// reactions on that body. A vector holds as many bodies as it has lanes, the last one several times.
+// reactions on that body. Of eight members each may have another heaviest one.
+template <class T>
+inline void central_one_by_one(const T *q, const T *dq, const T *gm, int64_t bodies, T *out) {
+    T mass = gm[0], centre = 0.0, place[3], kick[3], reaction[3];
+    for (int c = 0; c < 3; ++c) {
+        place[c] = q[c];
+        kick[c] = dq[c];
+        reaction[c] = 0.0;
+    }
+    for (int64_t k = 1; k < bodies; ++k) {
+        const Truth<T> heavier = gm[k] > mass;
+        if (!any(heavier)) continue;
+        mass = where(heavier, gm[k], mass);
+        centre = where(heavier, static_cast<double>(k), centre);
+        for (int c = 0; c < 3; ++c) {
+            place[c] = where(heavier, q[3 * k + c], place[c]);
+            kick[c] = where(heavier, dq[3 * k + c], kick[c]);
+        }
+    }
+    for (int64_t k = 0; k < bodies; ++k) {
+        const T *d = dq + 3 * k;
+        const Truth<T> rests = (d[0] == 0.0) & (d[1] == 0.0) & (d[2] == 0.0);
+        const Truth<T> moves = !(rests | (centre == static_cast<double>(k)));
+        if (!any(moves)) {
+            std::fill(out + 3 * k, out + 3 * k + 3, T(0.0));
+            continue;
+        }
+        T r[3], moved[3], change[3];
+        for (int c = 0; c < 3; ++c) {
+            r[c] = q[3 * k + c] - place[c];
+            moved[c] = d[c] - kick[c];
+        }
+        tidal_change(mass, r, moved, change);
+        for (int c = 0; c < 3; ++c) {
+            out[3 * k + c] = where(moves, change[c], 0.0);
+            reaction[c] = where(moves, reaction[c] - gm[k] / mass * change[c], reaction[c]);
+        }
+    }
+    for (int64_t k = 0; k < bodies; ++k) {
+        const Truth<T> is_centre = centre == static_cast<double>(k);
+        if (!any(is_centre)) continue;
+        for (int c = 0; c < 3; ++c) out[3 * k + c] = where(is_centre, reaction[c], out[3 * k + c]);
+    }
+}
+
+inline void central_jacobian(const Octet *q, const Octet *dq, const Octet *gm, int64_t bodies, Octet *out) {
+    central_one_by_one(q, dq, gm, bodies, out);
+}
+
+// Does the same for one state. A vector holds as many bodies as it has lanes, the last one several times.
 inline void central_jacobian(const double *q, const double *dq, const double *gm, int64_t bodies, double *out) {
+    if (bodies <= 2) return central_one_by_one(q, dq, gm, bodies, out);
     const int64_t centre = std::max_element(gm, gm + bodies) - gm;
     const Vector mass = spread_vector(gm[centre]);
     double reaction[3] = {}, changes[3][WIDTH], reactions[3][WIDTH];
@@ -55,50 +105,6 @@ inline void central_jacobian(const double *q, const double *dq, const double *gm
             }
     }
     std::copy(reaction, reaction + 3, out + 3 * centre);
-}
-
-// Does the same for eight members, each of which may have another heaviest body.
-inline void central_jacobian(const Octet *q, const Octet *dq, const Octet *gm, int64_t bodies, Octet *out) {
-    Octet mass = gm[0], centre = 0.0, place[3], kick[3], reaction[3];
-    for (int c = 0; c < 3; ++c) {
-        place[c] = q[c];
-        kick[c] = dq[c];
-        reaction[c] = 0.0;
-    }
-    for (int64_t k = 1; k < bodies; ++k) {
-        const Mask heavier = gm[k] > mass;
-        if (!any(heavier)) continue;
-        mass = where(heavier, gm[k], mass);
-        centre = where(heavier, static_cast<double>(k), centre);
-        for (int c = 0; c < 3; ++c) {
-            place[c] = where(heavier, q[3 * k + c], place[c]);
-            kick[c] = where(heavier, dq[3 * k + c], kick[c]);
-        }
-    }
-    for (int64_t k = 0; k < bodies; ++k) {
-        const Octet *d = dq + 3 * k;
-        const Mask rests = (d[0] == 0.0) & (d[1] == 0.0) & (d[2] == 0.0);
-        const Mask moves = !(rests | (centre == static_cast<double>(k)));
-        if (!any(moves)) {
-            std::fill(out + 3 * k, out + 3 * k + 3, 0.0);
-            continue;
-        }
-        Octet r[3], moved[3], change[3];
-        for (int c = 0; c < 3; ++c) {
-            r[c] = q[3 * k + c] - place[c];
-            moved[c] = d[c] - kick[c];
-        }
-        tidal_change(mass, r, moved, change);
-        for (int c = 0; c < 3; ++c) {
-            out[3 * k + c] = where(moves, change[c], 0.0);
-            reaction[c] = where(moves, reaction[c] - gm[k] / mass * change[c], reaction[c]);
-        }
-    }
-    for (int64_t k = 0; k < bodies; ++k) {
-        const Mask is_centre = centre == static_cast<double>(k);
-        if (!any(is_centre)) continue;
-        for (int c = 0; c < 3; ++c) out[3 * k + c] = where(is_centre, reaction[c], out[3 * k + c]);
-    }
 }
 
 // From the derivative f of the state.
