@@ -82,10 +82,13 @@ class Carried:
         self._labels, self._starts, self._shapes, self._extra = labels, starts, shapes, extra
         self.items = {k: item for k, item in enumerate(items) if item.is_balance}
         self._given = {k for k, item in self.items.items() if item.rate_function is not None}
-        self.mask = np.repeat(np.array([item.is_balance for item in items], bool), np.diff(starts))
+        self.mask = np.zeros(starts[-1], bool)
+        most = np.zeros(starts[-1])
+        for k, item in self.items.items():
+            own = slice(starts[k], starts[k + 1])
+            self.mask[own], most[own] = True, item.most_slowness
         self.places = np.flatnonzero(self.mask).astype(np.int64)
-        most = np.array([item.most_slowness for item in items], float)
-        self.most_slowness = np.repeat(most, np.diff(starts))[self.places]
+        self.most_slowness = most[self.places]
 
     def compile_rates(self, n: int) -> None:
         """Compile rates by dual numbers for jitted balances without a rate; the state is real and has n components."""

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -441,7 +441,8 @@ class InvariantSet:
 
     def _of_values(self, of_items: list[bool]) -> Array:
         """Return a mask (l,) in which the flag of each item is repeated as often as the item has values."""
-        return np.repeat(np.array(of_items, bool), np.diff(self.starts))
+        ends = zip(of_items, pairwise(self.starts), strict=True)
+        return np.array([flag for flag, (first, last) in ends for _ in range(last - first)], bool)
 
     def _scales(self, sizes: list[int]) -> Array:
         scales = np.zeros(self.size)

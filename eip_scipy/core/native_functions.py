@@ -172,8 +172,8 @@ def _native(fun: Any, kind: Kind, name: str, **others: Any) -> Native:
 
     `name` is its name in messages. The engine computes gradients and rates that are None.
     """
-    kind = kind._replace(**others)
-    floats = math.prod(kind.shape) * (2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1)
+    kind = kind._replace(**others) if others else kind
+    floats = math.prod(kind.shape) * (2 if kind.dtype in "FD" and not kind.real else 1)
     if fun is None or isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)
     if jit_is_off():
