@@ -340,6 +340,7 @@ struct Inner {
 template <class V>
 struct WorkOf {
     using Value = V;
+    // Types in a run with these buffers; a plain run has others (`Plain` in system.hpp).
     using Method = eip::Method;
     using Options = eip::Options;
     int64_t n, m, l, stages, balances;
