@@ -63,15 +63,15 @@ def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping,
     """
     method: Any = run.tableau
     assert stepping.h is not None
-    brief = stepping.span.n_steps - 1 < method.order
-    if brief and run.work.level.size and stepping.span.n_steps > 0:
+    brief, balanced = stepping.span.n_steps - 1 < method.order, run.work.level.size > 0
+    if brief and balanced and stepping.span.n_steps > 0:
         raise ValueError(
             f"{name} carries a Balance in its history, which needs more than {method.order} steps, but this run has "
             f"{stepping.span.n_steps}. Take a shorter step, or a Runge-Kutta method such as EIPDOP853."
         )
     check = run.options.limit < math.inf  # the option of this name bounds the shares of corrections
     corrected = slice(0, 0) if brief else _stable(method, name, system, stepping.h, check)
-    brief = brief and not run.work.level.size  # balances need room for a history, even if there is no step to take
+    brief = brief and not balanced  # the engine takes balances with the room of a history, also without steps
     run.method = run.method._replace(multistep=_record(run, method, corrected, stepping, brief=brief, level=level))
 
 

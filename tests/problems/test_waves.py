@@ -364,6 +364,12 @@ def test_wrong_values(make, message):
         make()
 
 
+def test_a_decay_counts_for_the_invariants_that_are_kept():
+    equation = KortewegDeVries(Grid(8, 0, 1), damping=1.0)
+    assert equation.problem(np.ones(8), 400.0, invariants=()).t_span == (0.0, 400.0)
+    assert equation.problem(np.ones(8), 400.0, invariants="mass").t_span == (0.0, 400.0)
+
+
 @pytest.mark.parametrize(
     ("make", "of", "at", "scene"),
     [(Lawson, "nonlinear", 3, korteweg_de_vries_solitons), (Splitting, "grid", 1, breather)],

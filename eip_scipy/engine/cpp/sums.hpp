@@ -164,8 +164,8 @@ struct Rows {
     int64_t count, stride;
 };
 
-// Vectors, or floats, number K... from i on of out = y + scale sum, or of scale sum where there is no y. With constants in the
-// place of a loop the sums stay in registers.
+// Vectors, or floats, number K... of out = y + scale sum or, without ADD, of scale sum. The sums stay in registers because the
+// compiler takes the numbers as constants from the start, which it does not in a loop.
 template <typename Float, bool ADD, int... K>
 [[gnu::always_inline]] inline void combine_those(const double *y, double scale, const Rows &rows, double *out,
                                                  std::integer_sequence<int, K...>) {

@@ -19,6 +19,7 @@ __all__ = ["KortewegDeVries"]
 
 SOURCE = "Gardner, Greene, Kruskal & Miura, Phys. Rev. Lett. 19 (1967) 1095"
 
+DECAYS = {"mass": 1, "momentum": 2}  # rates with damping, in units of it
 MOST_DECAY = 700.0  # exponent of the smallest decay that is divided by
 
 
@@ -186,7 +187,7 @@ class KortewegDeVries:
             return named_invariant(name, made, tuple(made))
         del made["energy"]
         item = named_invariant(name, made, tuple(made), where=" with damping")
-        rate = self.damping * {"mass": 1, "momentum": 2}[name]
+        rate = self.damping * DECAYS[name]
         return Invariant(partial(_value, rate, item), partial(_gradient, rate, item), name=name, in_place=True)
 
     def largest_step(self, u: Any, limit: float = 2.8) -> float:
@@ -241,12 +242,13 @@ class KortewegDeVries:
         Raises
         ------
         ValueError
-            If the field is not of the grid's shape, or decays below what floats can hold before `t_end`.
+            If the field is not of the grid's shape, or an invariant decays below what floats can hold before `t_end`.
         """
         start = np.asarray(u0, dtype=float)
         if start.shape != self.grid.shape:
             raise ValueError(f"u0 has shape {start.shape}, expected {self.grid.shape}.")
-        _growth(2 * self.damping, t_end)
+        kept = self.invariants(invariants)
+        _growth(self.damping * max((DECAYS.get(str(item.name), 0) for item in kept), default=0), t_end)
         return WaveProblem(
             name=name,
             fun=self.fun,
@@ -254,7 +256,7 @@ class KortewegDeVries:
             y0=self.field(self.modes(start)),
             t_span=(0.0, t_end),
             h=h,
-            invariants=self.invariants(invariants),
+            invariants=kept,
             metric="euclidean",
             frame=(np.ones((1, self._n)), np.ones((self._n, 1))),
             method=Lawson(self),
