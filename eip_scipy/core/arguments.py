@@ -53,7 +53,7 @@ def parameter_values(params: Any) -> np.ndarray:
             "them, params=[1.0, 2.0], or pass the mapping as args=(mapping,); fun is then called from Python. Problems "
             "made by hamiltonian or equations accept a mapping from names to values."
         )
-    return real_array("params", params, TypeError)
+    return params.copy() if _is_floats(params) else real_array("params", params, TypeError)
 
 
 def scalars(extra: tuple[Any, ...]) -> str | None:
@@ -78,7 +78,11 @@ def names(extra: tuple[Any, ...]) -> tuple[str, ...]:
 
 def _is_array(extra: tuple[Any, ...]) -> bool:
     """Return True if the further arguments are one array of floats."""
-    return len(extra) == 1 and type(extra[0]) is np.ndarray and extra[0].ndim == 1 and extra[0].dtype == float
+    return len(extra) == 1 and _is_floats(extra[0])
+
+
+def _is_floats(item: Any) -> bool:
+    return type(item) is np.ndarray and item.ndim == 1 and item.dtype == float
 
 
 def _type(item: Any) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ __all__ = ["INDEX", "blocks_of", "kinds_of"]
 
 # Unsigned integers: Numba then omits the test for negative indices, which costs more than the access itself.
 INDEX = np.uint64
+# Blocks of states with at most this many components are kept between runs: making them takes longer than a short run.
+SMALL = 2**10
 
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
@@ -50,7 +53,13 @@ def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
 
 
 def _consecutive(size: int, n: int, width: int) -> Grouping:
-    """Return blocks of `size` consecutive components, without a loop, because a field may have a million of them."""
+    """Return blocks of `size` consecutive components."""
+    return (_made if n <= SMALL else _made.__wrapped__)(size, n, width)
+
+
+@lru_cache(maxsize=64)
+def _made(size: int, n: int, width: int) -> Grouping:
+    """Make such blocks without a loop, because a field may have a million of them."""
     floats = n * width
     start = np.arange(0, floats + 1, size * width, dtype=INDEX)
     return Grouping(np.arange(floats, dtype=INDEX), start, width, size * width if n else 0)

@@ -17,6 +17,7 @@ from .jitted import NotCompilableError, is_jitted, jit_is_off
 __all__ = ["Carried", "bound", "real_value", "time_shift"]
 
 Array = np.ndarray
+NO_PLACES, NO_BOUNDS = np.zeros(0, np.int64), np.zeros(0)
 # Shifts of differences in time, in fixed steps and in first steps of adaptive ones, which are shorter than later ones.
 OF_FIXED, OF_FIRST = 1 / 32, 1 / 8
 # Parts of the run's interval, and roundings of the time, that a shift has at most and at least.
@@ -83,6 +84,9 @@ class Carried:
         self.items = {k: item for k, item in enumerate(items) if item.is_balance}
         self._given = {k for k, item in self.items.items() if item.rate_function is not None}
         self.mask = np.zeros(starts[-1], bool)
+        self.places, self.most_slowness = NO_PLACES, NO_BOUNDS
+        if not self.items:
+            return
         most = np.zeros(starts[-1])
         for k, item in self.items.items():
             own = slice(starts[k], starts[k + 1])

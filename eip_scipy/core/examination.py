@@ -19,6 +19,7 @@ from ..engine import data
 from ..engine.data import LEAST_CHANGE, Grouping, Method
 from ..engine.native import BUILD
 from ..methods.runge_kutta import DOP853, RK4
+from .gradients import random_directions
 from .invariant_checks import complaints
 from .invariants import InvariantSet, copied
 
@@ -78,7 +79,15 @@ class Examiner:
 
     def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return a sentence about an invariant or a gradient that is wrong at a state of the run, or None."""
+        if not self.invariants.balances.items and unless_refused(self._is_in_order, rhs, t, y) is not False:
+            return None
         return self._unless_refused(_complaint, rhs, t, y, True)
+
+    def _is_in_order(self, rhs: Derivative, t: float, y: Array) -> bool:
+        """Return True if a first look at a state of a run without balances finds nothing, and note rates."""
+        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
+        of_run = known.target, known.scales, self.tau, known.t_span, directions
+        return bool(_guarded(known.functions.look)(self.figures, t, y, rhs(t, y), *of_run))
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
         """Return a sentence about what is wrong in the step that the engine suspects, or None; clear its record."""
@@ -103,7 +112,7 @@ class Examiner:
         return unless_refused(partial(look, self, known), rhs, *args)
 
 
-def unless_refused(look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
+def unless_refused(look: Callable[..., Any], rhs: Derivative, *args: Any) -> Any:
     """Return ``look(rhs, *args)``; None if the right-hand side raises an exception in it, except MemoryError."""
     try:
         with np.errstate(all="ignore"):

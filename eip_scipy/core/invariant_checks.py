@@ -115,8 +115,7 @@ def complaints(
         return
     G, here = (known.gradients(t, y, f), known.values(t, y)) if evaluated is None else evaluated
     directions = random_directions(y.size, y.dtype.kind == "c")
-    interval = min(known.t_span), max(known.t_span)
-    if not known.balances.items and known.functions.is_in_order(t, y, f, G, here, tau, interval, directions):
+    if not known.balances.items and known.functions.is_in_order(t, y, f, G, here, tau, known.t_span, directions):
         return
     # The test points are at most as far away as the state moves while it changes by its own size, which is far less
     # than a step close to a singularity.

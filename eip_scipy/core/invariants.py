@@ -490,7 +490,9 @@ class InvariantSet:
     @property
     def fixed_target(self) -> Array:
         """Return the target values (l,) of the whole run; NaN for balances, whose values change."""
-        return np.where(self.balances.mask, np.nan, self.target)
+        target = self.target.copy()
+        target[self.balances.places] = np.nan
+        return target
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
         """Return the `Rates`, of compiled `functions` or from Python; `adaptive` says whether `tau` is a first step."""
@@ -565,6 +567,10 @@ class InvariantSet:
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> Array:
         """Return the gradients (l, n) at the start; raise an error for wrong shapes and numbers that are not finite."""
         G = np.empty((self.size, *y.shape), y.dtype)
+        if all(isinstance(grad, LibraryFunction) for grad in self.grads):  # whose values need no further checks
+            G = self.gradients(t, y, f)
+            if BUILD.are_finite(G.view(float)):
+                return G
         for k, (item, label) in enumerate(zip(self.items, self.labels, strict=True)):
             rows = G[self.starts[k] : self.starts[k + 1]]
             rows[:] = _first_gradient(item, self.calls[1][k], label, (t, y, f), self.extra)
@@ -633,7 +639,7 @@ class InvariantSet:
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
         """Return a message if the start misses given targets, with the worst invariant first; otherwise None."""
-        if not self.given.any():
+        if not np.count_nonzero(self.given):
             return None
         excess = np.nan_to_num(self._excess(t, y, f), nan=np.inf, posinf=np.inf)
         missed = [int(k) for k in np.argsort(-excess, kind="stable") if excess[k] > 1.0 and self.given[k]]

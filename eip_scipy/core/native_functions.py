@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events"]
 
-OF_PRODUCT = {"real": False, "takes_f": True, "in_place": True, "gradient": True}
 NO_DUALS = "a gradient is compiled only for jitted functions of real states"
 
 
@@ -42,6 +41,10 @@ class Kind(NamedTuple):
     in_place: bool = False
     gradient: bool = False
     scalars: str = ""
+
+    def like(self, shape: tuple[int, ...], size: int, **flags: bool) -> Kind:
+        """Return the signature of a function with the same parameters and type of state."""
+        return Kind(shape, size, self.p, self.dtype, scalars=self.scalars, **flags)
 
 
 class Native(NamedTuple):
@@ -72,28 +75,35 @@ def native_functions(
     invariants, y0 = run.invariants, run.y0
     second_order, number = form.startswith("acceleration"), _number(params, y0)
     size = y0.size // 2 if second_order else y0.size
-    of_rhs = {"shape": (size,), "size": size, "real": False, "in_place": form.endswith("place")}
-    rhs = _native(fun, number, "acceleration" if second_order else "fun", **of_rhs)
-    inv, grad, slopes, rate, product = (list[Native]() for _ in range(5))
+    of_rhs = number.like((size,), size, in_place=form.endswith("place"))
+    rhs = _native(fun, of_rhs, "acceleration" if second_order else "fun")
+    inv: list[Native] = []
+    grad: list[Native] = []
+    slopes: list[Native] = []
+    rate: list[Native] = []
+    product: list[Native] = []
     for k, (wide, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         item, value = _of_state(wide, number)
         name, shape = f"invariant {label!r}", _shape(invariants, k)
         if item.args:
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
-        inv.append(_native(item.function, value, name, shape=shape))
+        inv.append(_native(item.function, value.like(shape, value.size, real=True), name))
         if item.gradient is None and not isinstance(item.function, PointerFunction):
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
-        rows = {"shape": (*shape, value.size), "real": False, "takes_f": item.uses_f, "in_place": item.in_place}
-        grad.append(_native(item.gradient, value, f"gradient of {name}", **rows, gradient=True))
+        rows = (*shape, value.size)
+        of_rows = value.like(rows, value.size, takes_f=item.uses_f, in_place=item.in_place, gradient=True)
+        grad.append(_native(item.gradient, of_rows, f"gradient of {name}"))
         if wide.of_state is not None and wide.of_state.by_parameters is not None:
             p, slope = wide.of_state.parameters, wide.of_state.by_parameters
-            slopes.append(_native(slope, value, f"derivatives by parameters of {name}", shape=(*shape, p)))
+            of_slope = value.like((*shape, p), value.size, real=True)
+            slopes.append(_native(slope, of_slope, f"derivatives by parameters of {name}"))
     for k, item in invariants.balances.items.items():
-        kind = {"shape": _shape(invariants, k), "takes_f": item.rate_uses_f, "gradient": True}
-        rate.append(_native(item.rate_function, number, f"rate of balance {invariants.labels[k]!r}", **kind))
+        of_rate = number.like(_shape(invariants, k), y0.size, real=True, takes_f=item.rate_uses_f, gradient=True)
+        rate.append(_native(item.rate_function, of_rate, f"rate of balance {invariants.labels[k]!r}"))
     if jacobian is not None:
         half = y0.size // 2
-        product.append(_native(jacobian, number, "jacobian", shape=(half,), size=half, **OF_PRODUCT))
+        of_product = number.like((half,), half, takes_f=True, in_place=True, gradient=True)
+        product.append(_native(jacobian, of_product, "jacobian"))
     return NativeFunctions(
         rhs=rhs.entry,
         inv=_addresses(inv),
@@ -167,12 +177,11 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
     return Kind((), y0.size, params.values.size, y0.dtype.char, real=True, scalars=params.scalars)
 
 
-def _native(fun: Any, kind: Kind, name: str, **others: Any) -> Native:
-    """Return a function as `Native`, compiled if it is a Numba function, of the signature `kind` with `others`.
+def _native(fun: Any, kind: Kind, name: str) -> Native:
+    """Return a function as `Native`, compiled if it is a Numba function, of the signature `kind`.
 
     `name` is its name in messages. The engine computes gradients and rates that are None.
     """
-    kind = kind._replace(**others) if others else kind
     floats = math.prod(kind.shape) * (2 if kind.dtype in "FD" and not kind.real else 1)
     if fun is None or isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)

@@ -159,10 +159,12 @@ class ProjectionOptions:
         rtol, atol = stepping.rtol, stepping.atol
         groups = blocks_of(self.blocks, n, width)
         block_atol = atol[: groups.start.size - 1].copy()
-        if groups.size != 1 and atol.any():
+        if groups.size != 1 and np.count_nonzero(atol):
             squares = np.repeat(atol, width)[groups.member] ** 2 / width
             block_atol = np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
-        check, far = flag("check", self.check), FAR_IN_TOLERANCES * np.max(rtol, initial=0.0)
+        check, distant = flag("check", self.check), data.DISTANT
+        if stepping.h is None:
+            distant = float(np.clip(FAR_IN_TOLERANCES * np.max(rtol, initial=0.0), data.DISTANT, MOST_FAR))
         options = Options(
             rtol=rtol.repeat(width),
             atol=atol,
@@ -192,7 +194,7 @@ class ProjectionOptions:
             per_band=1.0 / ((data.BAND_MULTISTEP if method.has_history else band) * EPS),
             watched=check and known.size > 0,
             limit=(data.LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
-            distant=data.DISTANT if stepping.h is not None else float(np.clip(far, data.DISTANT, MOST_FAR)),
+            distant=distant,
         )
         if _can_project_jointly(options, known):
             options = options._replace(joint=known.items)

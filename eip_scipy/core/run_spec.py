@@ -47,7 +47,8 @@ class RunSpec:
     end of its history; otherwise that in the middle. ``hint()`` returns the end of a message: advice for equations that
     are not of second order. `columns` of derivatives follow the state; `stepping` and `projection` are for the state
     without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with velocities too,
-    on which it may come to depend. `called` and `left_out`: see `Run`.
+    on which it may come to depend; `is_second_order` that `rhs` is (v, a) by its construction. `called` and `left_out`:
+    see `Run`.
     """
 
     name: str
@@ -67,6 +68,7 @@ class RunSpec:
     left_out: str = ""
     columns: Columns | None = None
     sees_velocity: bool = True
+    is_second_order: bool = False
 
     def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
         """Return the run that starts at the state y0, after a check of the options, the functions and the invariants.
@@ -96,7 +98,7 @@ class RunSpec:
             guard = named_accelerations(self.name, self.fun, self.in_place, self.extra, t0, y0)
         with guard:
             f0 = self.rhs(t0, y0) if f0 is None else f0
-            if self.is_known:
+            if self.is_known or self.is_second_order:
                 return self.method, f0
             start = Start(t0, y0, f0, 0.0)
             return steppers.checked(self.method, self.rhs, start, self.name, self.hint, self.sees_velocity), f0
@@ -138,7 +140,7 @@ class RunSpec:
             options, sigma = widened(options, sigma, columns, invariants.start_gradients)
         invariants.kinds = options.kinds
         arrays = steppers.arrays(method)
-        if isinstance(arrays, Method) and arrays.nystrom:
+        if isinstance(arrays, Method) and arrays.nystrom and self.sees_velocity:
             arrays = arrays._replace(sees_velocity=self.sees_velocity)
         carried, blocks = options.balances.place, options.groups.start.size - 1
         work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, blocks, carried.size)
@@ -185,7 +187,7 @@ def _scales(run: Run) -> Array:
     """
     (t0, y0, f0, tau), frame, invariants, G = run.begin, run.options.frame, run.invariants, run.work.G
     held = spanned(frame, G.view(float))
-    if not held.any():
+    if not np.count_nonzero(held):
         return run.options.scales
     away = y0 + FRAME_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
     held &= spanned(frame, invariants.gradients(t0, away, f0).view(float))

@@ -27,6 +27,7 @@ __all__ = [
 
 AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | Driven | AtRest
 UNBOUNDED = 2**62
+LARGE_TIME = 1e300  # below it an integer can be converted to a float
 LEAST_RTOL = 100 * EPS  # as in SciPy
 # Part of the time in which a state changes by its own size that is short enough for differences in time.
 PART_OF_MOTION = 2.0**-10
@@ -103,8 +104,7 @@ class Stepping:
         The estimated first step depends on the unit of time: in seconds it can be millions of times shorter than the
         steps of an orbit of years, and differences over so short a time are rounding.
         """
-        motion = time_of_motion(y, f)
-        if self.h is not None or motion == math.inf:
+        if self.h is not None or (motion := time_of_motion(y, f)) == math.inf:
             return tau
         length = abs(self.span.t_bound - self.span.t0)
         return max(tau, min(PART_OF_MOTION * motion, length, self.span.max_step))
@@ -167,6 +167,8 @@ class StepOptions:
 
 def interval(t_span: Any) -> tuple[float, float]:
     """Return start and end of an interval, whose end may be infinite, after checks."""
+    if type(t_span) is tuple and len(t_span) == 2 and all(map(_is_plain_time, t_span)):
+        return float(t_span[0]), float(t_span[1])
     refuse_units(t_span=t_span)
     ends = reals(t_span)
     if ends is None or ends.shape != (2,):
@@ -175,6 +177,10 @@ def interval(t_span: Any) -> tuple[float, float]:
     if not math.isfinite(t0) or math.isnan(t_bound):
         raise ValueError(f"t_span must be finite, got {shown(t_span)}; only its end may be infinite.")
     return t0, t_bound
+
+
+def _is_plain_time(end: Any) -> bool:
+    return type(end) in (int, float) and abs(end) < LARGE_TIME
 
 
 def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -415,6 +415,11 @@ def are_calm(figures: numpy.typing.NDArray[numpy.float64], beyond_doubt: float, 
     Return True if no row of `figures` (..., N_FIGURES) may belong to a faulty run.
     """
 
+def note_errors(largest: numpy.typing.NDArray[numpy.float64], t: numpy.typing.NDArray[numpy.float64], values: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], t0: float) -> None:
+    """
+    Update the largest errors (l,) with those of the `values` (m, l) at the times `t` other than `t0`. An error that is NaN does not count.
+    """
+
 class InvariantFunctions:
     """The invariants of a run and their gradients, each as a `Call`."""
 
@@ -429,6 +434,11 @@ class InvariantFunctions:
     def is_in_order(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], tau: float, interval: tuple[float, float], directions: numpy.typing.NDArray[numpy.inexact]) -> bool:
         """
         Return True if the checks of precision, gradients and invariance find nothing at the state `y`, where the gradients are `G` and the values are `here`.
+        """
+
+    def look(self, figures: numpy.typing.NDArray[numpy.float64], t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], tau: float, interval: tuple[float, float], directions: numpy.typing.NDArray[numpy.inexact]) -> bool:
+        """
+        Call `note_rates` and `is_in_order` for a state of a run without balances, and return the latter's result. If `f` is not finite, return True and note nothing.
         """
 
     def rates_by_values(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray:

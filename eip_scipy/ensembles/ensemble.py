@@ -469,7 +469,8 @@ def ensemble(
             if out is None
             else ZarrStore(out, identity, resume, plan.empty(size), times, total, plan.events)
         )
-    with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
+    stopped, closed = (nullcontext(), nullcontext()) if store is None else (ended_by_sigterm(), closing(store))
+    with stopped, closed:
         gathered = _Gathered(plan, everyone, held, size, store, callback, doubts)
         result = gathered.run(partial(_pool, executor, plan, progress), progress)
     _warn(result, np.flatnonzero((result.status >= 0) & ~result.trusted))

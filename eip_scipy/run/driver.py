@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
@@ -16,7 +16,7 @@ from ..core.native_functions import raise_again
 from ..core.runs import Run
 from ..core.stepping import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
-from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
+from ..engine.native import BUILD, FailedCallError, NativeFunctions, PythonFunctions
 from .events import Events
 from .memory import most_bytes
 
@@ -68,11 +68,13 @@ class Driver:
         if interpolants is not None:
             interpolants.record.left[:] = self._events.left
         try:
-            with self.own_errors():
-                return int(self.engine.advance(k_end, self.state, self.new, self.t, self.y, self._pieces))
+            return int(self.engine.advance(k_end, self.state, self.new, self.t, self.y, self._pieces))
+        except FailedCallError as error:
+            failed = error.args
         finally:
             if interpolants is not None:
                 self._events.take(*interpolants.roots())
+        self._raise_own(*failed)
 
     def sweep(self, members: Members, steps: int) -> int:
         """Run members of an ensemble, starting at `members.where`, for `steps` steps in total, on this run's buffers.
@@ -101,6 +103,10 @@ class Driver:
             failed = error.args
         else:
             return
+        self._raise_own(*failed)
+
+    def _raise_own(self, *failed: Any) -> NoReturn:
+        """Raise the exception of the Numba or C function that failed; the arguments are those of `FailedCallError`."""
         try:
             raise_again(self.functions, *failed)
         except ChangedShapeError as changed:
@@ -241,11 +247,10 @@ class Driver:
             return None
         return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
 
-    def note(self, values: np.ndarray) -> None:
-        """Update the largest invariant errors (l,) with the `values` (l, m) at the saved states except the start."""
-        largest, target = self.run.work.max_defect, self.run.invariants.fixed_target
-        later = values[:, np.count_nonzero(self.t[: self.rows] == self.schedule.span.t0) :]
-        np.fmax(largest, np.fmax.reduce(np.abs(later - target[:, None]), axis=1, initial=0.0), out=largest)
+    def note(self, values: np.ndarray, target: np.ndarray) -> None:
+        """Update the largest errors (l,) with the `values` (l, m) at the saved states except the start."""
+        rows = np.ascontiguousarray(values.T)
+        BUILD.note_errors(self.run.work.max_defect, self.t[: self.rows], rows, target, self.schedule.span.t0)
 
     def values(self) -> np.ndarray:
         """Return the invariants of the saved states, (l, m)."""

@@ -6,8 +6,8 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
 from typing import Any, Unpack
 
 import numpy as np
@@ -213,7 +213,7 @@ def integrate(
     >>> run.y.shape, bool((run.max_defect < 1e-11).all())
     ((4, 68), True)
     """
-    asked = dict(locals())  # the fields of Request have the same names and defaults
+    asked = locals()  # the fields of Request have the same names and defaults
     known = ProjectionOptions.names()
     for name in projection:
         if name not in known:
@@ -222,8 +222,14 @@ def integrate(
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
     request = Request(*map(asked.__getitem__, Request._fields))
     keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
-    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
-        return Loop(prepared(request), keeper).run()
+    stopped = nullcontext() if checkpoint is None else ended_by_sigterm()
+    begin = time.perf_counter()
+    with kept_ctrl_c(), stopped, keeping as keeper:
+        try:
+            return Loop(prepared(request), keeper).run()
+        except BaseException as error:
+            _keep_start(error, request, time.perf_counter() - begin)
+            raise
 
 
 class Loop:
@@ -414,13 +420,13 @@ class Loop:
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
         driver, problem = self.driver, self.prepared.problem
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
-        values = self._values(broken)
-        driver.note(values)
+        values, target = self._values(broken), driver.run.invariants.fixed_target
+        driver.note(values, target)
         result = IntegrationResult(
             t=driver.t[:rows],
             y=_own(driver.y[:rows], self.prepared).T,
             invariants=values,
-            target=driver.run.invariants.fixed_target,
+            target=target,
             max_defect=driver.run.work.max_defect,
             diagnostics=self.diagnostics,
             t_events=[np.asarray(t) for t in events.t] if events.functions else None,
@@ -535,29 +541,24 @@ def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
     return tqdm(total=length, initial=abs(float(schedule.clock[TIME]) - span.t0), unit="time", **shown)
 
 
-@contextmanager
-def _start_kept(request: Request) -> Iterator[None]:
-    """Attach a result with the initial state as `partial` to an exception raised in the block that has no `partial`."""
-    begin = time.perf_counter()
-    try:
-        yield
-    except BaseException as error:
-        if not hasattr(error, "partial"):
-            with suppress(TypeError, ValueError):  # the initial state itself cannot be read
-                t0, start = started_at(request)
-                error.partial = IntegrationResult(  # type: ignore[attr-defined]
-                    {"t": np.array([t0]), "y": start[:, None], "invariants": np.zeros((0, 1)), "target": np.zeros(0)},
-                    max_defect=np.zeros(0),
-                    diagnostics=Diagnostics(),
-                    **dict.fromkeys(("t_events", "y_events", "sol")),
-                    **dict.fromkeys(("nfev", "njev", "nlu"), 0),
-                    status=-1,
-                    message=f"interrupted by {type(error).__name__} at the start",
-                    **dict.fromkeys(("success", "trusted"), False),
-                    wall_time=time.perf_counter() - begin,
-                    compiled=False,
-                    calls={},
-                    method=getattr(request.method, "__name__", str(request.method)),
-                    **{"h": None, "component_names": None, "units": "", "epoch": None},
-                )
-        raise
+def _keep_start(error: BaseException, request: Request, seconds: float) -> None:
+    """Attach a result with the initial state as `partial` to an exception that has no `partial`."""
+    if hasattr(error, "partial"):
+        return
+    with suppress(TypeError, ValueError):  # the initial state itself cannot be read
+        t0, start = started_at(request)
+        error.partial = IntegrationResult(  # type: ignore[attr-defined]
+            {"t": np.array([t0]), "y": start[:, None], "invariants": np.zeros((0, 1)), "target": np.zeros(0)},
+            max_defect=np.zeros(0),
+            diagnostics=Diagnostics(),
+            **dict.fromkeys(("t_events", "y_events", "sol")),
+            **dict.fromkeys(("nfev", "njev", "nlu"), 0),
+            status=-1,
+            message=f"interrupted by {type(error).__name__} at the start",
+            **dict.fromkeys(("success", "trusted"), False),
+            wall_time=seconds,
+            compiled=False,
+            calls={},
+            method=getattr(request.method, "__name__", str(request.method)),
+            **{"h": None, "component_names": None, "units": "", "epoch": None},
+        )

@@ -51,13 +51,13 @@ def kept_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def ended_by_sigterm(wanted: bool) -> Iterator[None]:
-    """Let SIGTERM end the block by an exception, and then the process, as its sender expects, if that is `wanted`.
+def ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end the block by an exception, and then the process, as its sender expects.
 
     The notes of this exception are printed to the standard error stream. All of this applies only in the main thread
     and without a user-defined handler, where SIGTERM would end the process at once. A second SIGTERM is ignored.
     """
-    if not (wanted and _is_ours(signal.SIGTERM, signal.SIG_DFL)):
+    if not _is_ours(signal.SIGTERM, signal.SIG_DFL):
         yield
         return
     signal.signal(signal.SIGTERM, _note_sigterm)

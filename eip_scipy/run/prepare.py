@@ -199,13 +199,13 @@ class System:
             if numbers is None:
                 raise NotCompilableError("args are neither numbers nor one array of floats")
             params = Packed(self.parameters, numbers) if self.extra else None
-            functions = native_functions(
-                *self._native_form, params, run, self.jacobian if self._corrects(run) else None
-            )
+            functions = native_functions(*self.native_form, params, run, self.jacobian if self._corrects(run) else None)
         except NotCompilableError as reason:
             if wanted:
                 raise
             return self._in_python(run), f"interpreted: {reason}"
+        if not self.events.functions:
+            return functions, None
         try:
             return with_events(functions, self.events.functions, params, run.y0), None
         except NotCompilableError as reason:
@@ -214,7 +214,7 @@ class System:
             return functions._replace(python=self._in_python(run)), f"events are called from Python: {reason}"
 
     @property
-    def _native_form(self) -> tuple[Any, str]:
+    def native_form(self) -> tuple[Any, str]:
         """Return the function to compile and its form: `acc` if it comes from the same library as `fun`, else `fun`."""
         own = isinstance(self.fun, LibraryFunction) and isinstance(self.acc, LibraryFunction)
         if own and self.fun.__name__.partition(".")[0] == self.acc.__name__.partition(".")[0]:
@@ -394,6 +394,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         called=system.name,
         left_out=system.left_out,
         sees_velocity=system.name == "fun" and (problem is None or problem.acc is None),
+        is_second_order=system.native_form[1].startswith("acceleration"),
     )
 
 

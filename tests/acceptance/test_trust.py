@@ -658,12 +658,12 @@ def test_examinations_stay_in_the_interval_and_refuse_nothing():
 
 def test_errors_of_an_examination_itself_are_not_hidden(monkeypatch):
     """Only the user's functions may refuse a state."""
-    from eip_scipy.core.invariants import InvariantSet
+    from eip_scipy.core.examination import Examiner
 
     def broken(self, *state):
         raise ArithmeticError("of the examination")
 
-    monkeypatch.setattr(InvariantSet, "note_rates", broken)
+    monkeypatch.setattr(Examiner, "_is_in_order", broken)
     with pytest.raises(ArithmeticError, match="of the examination"):
         integrate(pendulum(), (0, 3), [1.0, 0.0], method=EIPRK4, h=0.02, invariants=ENERGY)
 

@@ -221,7 +221,7 @@ def test_python_jitted_and_native_functions_give_the_same_bits():
 def test_a_problems_accelerations_are_taken_where_they_are_of_its_library():
     """They have the bits of the whole right-hand side; what belongs to another one is left alone.
 
-    Without them the run must expect that accelerations come to depend on velocities.
+    Without them the run must expect that accelerations come to depend on velocities. A call checks others at the start.
     """
     problem = nbody([1.0, 1e-3], [[0, 0, 0], [0.8, 0, 0.1]], [[0, -1e-3, 0], [0, 1.2, 0.1]], t_span=(0, 20), h=0.05)
     for method in (EIPGJ14, EIPRKN12):
@@ -229,7 +229,7 @@ def test_a_problems_accelerations_are_taken_where_they_are_of_its_library():
             integrate(replace(problem, acc=acc), method=method) for acc in (problem.acc, library["kepler.acc"], None)
         ]
         assert np.array_equal(runs[1].y, runs[0].y)
-        assert runs[1].nfev == runs[0].nfev < runs[2].nfev
+        assert runs[1].nfev == runs[0].nfev + 1 < runs[2].nfev
         np.testing.assert_allclose(runs[2].y, runs[0].y, rtol=0, atol=1e-11)
 
 

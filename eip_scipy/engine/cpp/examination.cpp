@@ -87,6 +87,19 @@ class InvariantFunctions {
                have_right_gradients(t, state, slope, gradients, values, tau, ways);
     }
 
+    // Calls `note_rates` and `is_in_order` for a state of a run. If f is empty or not finite, it only returns true.
+    bool look(ArrayOf<double, 2> figures, double t, State y, State f, Numbers target, Numbers scales, double tau,
+              std::tuple<double, double> interval, Rows directions) {
+        if (n_ == 0 || !all_finite(checked(f), m_)) return true;
+        const Array at_state = gradients(t, y, f), numbers = values(t, y);
+        Rows G;
+        Numbers here;
+        G.take(at_state.ptr());
+        here.take(numbers.ptr());
+        note_rates(figures, t, y, f, G, here, target, scales, std::nullopt);
+        return is_in_order(t, y, f, G, here, tau, interval, directions);
+    }
+
     // The rates of change along f by short differences to both sides; NaN where these differ at a kink. Rates that are
     // within the rounding of the values, which is larger than terms that nearly vanish, are 0.
     Array rates_by_values(double t, State y, State f, Rows G, Numbers here, Numbers target, Numbers scales) {
@@ -222,7 +235,7 @@ class InvariantFunctions {
     // True if the values are the same at two other times.
     bool are_fixed(double t, const double *y, const double *here, double tau,
                    const std::tuple<double, double> &interval) const {
-        const auto [low, high] = interval;
+        const auto [low, high] = std::minmax(std::get<0>(interval), std::get<1>(interval));
         const double before = t - low, after = high - t, room = std::max(before, after);
         const double side = after >= before ? 1.0 : -1.0, far = t + side * std::min(room, tau);
         if (far == t || !(0.0 < tau && tau < ENDLESS)) return false;
@@ -265,6 +278,18 @@ class InvariantFunctions {
     std::vector<PythonCall> inv_, grad_;
 };
 
+// Raises `largest` (l,) by the errors of the values (m, l) at times after t0; an error that is NaN does not count.
+void note_errors(ArrayOf<double, 1> largest, Numbers t, ArrayOf<const double, 2> values, Numbers target, double t0) {
+    const int64_t m = t.shape[0], l = largest.shape[0];
+    require(values.shape[0] == m && values.shape[1] == l && target.shape[0] == l,
+            "trust: expected values (m, l) for m times and l targets");
+    for (int64_t k = 0; k < m; ++k) {
+        if (t.data[k] == t0) continue;
+        for (int64_t i = 0; i < l; ++i)
+            largest.data[i] = std::fmax(largest.data[i], std::abs(values.data[k * l + i] - target.data[i]));
+    }
+}
+
 bool are_finite(PointsOf<const double, false> numbers) { return all_finite(numbers.data, numbers.points); }
 
 // True if no row of figures has one that may be that of a faulty run, which is the usual case.
@@ -283,6 +308,9 @@ void add_examination(nb::module_ &module) {
     module.def("are_finite", &are_finite, "numbers"_a, "Return True if no number is NaN or infinite.");
     module.def("are_calm", &are_calm, "figures"_a, "beyond_doubt"_a, "together"_a,
                "Return True if no row of `figures` (..., N_FIGURES) may belong to a faulty run.");
+    module.def("note_errors", &note_errors, "largest"_a, "t"_a, "values"_a, "target"_a, "t0"_a,
+               "Update the largest errors (l,) with those of the `values` (m, l) at the times `t` other than `t0`. An "
+               "error that is NaN does not count.");
     using Functions = InvariantFunctions;
     nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
                           "The invariants of a run and their gradients, each as a `Call`.")
@@ -294,6 +322,10 @@ void add_examination(nb::module_ &module) {
              "directions"_a,
              "Return True if the checks of precision, gradients and invariance find nothing at the state `y`, where "
              "the gradients are `G` and the values are `here`.")
+        .def("look", &Functions::look, "figures"_a, "t"_a, "y"_a, "f"_a, "target"_a, "scales"_a, "tau"_a, "interval"_a,
+             "directions"_a,
+             "Call `note_rates` and `is_in_order` for a state of a run without balances, and return the latter's "
+             "result. If `f` is not finite, return True and note nothing.")
         .def("rates_by_values", &Functions::rates_by_values, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a,
              "scales"_a,
              "Return the rates of change (l,) of the invariants along `f`, by short differences to both sides. A rate "

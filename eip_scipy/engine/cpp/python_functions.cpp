@@ -55,12 +55,29 @@ PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb:
         require(dimensions_[k] >= 0, "engine: shape contains a negative length");
         floats_ *= dimensions_[k];
     }
+    take_library();
     const nb::handle entry = kept_attribute(description, "entry", kept);
     if (entry.is_none()) return;
     require(args_.empty() && !takes_f_ && !in_place_, "engine: compiled code must be that of fun(t, y)");
     code_ = reinterpret_cast<NumbaCode *>(nb::cast<uintptr_t>(entry.attr("address")));
     release_ = reinterpret_cast<NumbaRelease *>(nb::cast<uintptr_t>(entry.attr("release")));
     require(code_ && release_, "engine: compiled code needs addresses");
+}
+
+// Numbers of the library and their gradients are computed without a detour through Python. Other arguments than they
+// take are refused where Python calls them.
+void PythonCall::take_library() {
+    const LibraryFunction *found;
+    if (type_ != NPY_DOUBLE || !nb::try_cast(fun_, found) || !(found->is_numbers() || found->is_gradient())) return;
+    params_ = found->own.data();
+    n_params_ = std::ssize(found->own);
+    if (found->own.empty()) {
+        if (args_.size() != 1 || !is_plain(args_[0].ptr(), NPY_DOUBLE, 1)) return;
+        params_ = nb::borrow<Array>(args_[0]).floats();
+        n_params_ = nb::borrow<Array>(args_[0]).size();
+    }
+    const bool same = takes_f_ == found->takes_f() && in_place_ != found->returns();
+    if (same && found->fits(components_, n_params_) && found->filled(components_) == floats_) library_ = found;
 }
 
 // Call the code that Numba compiled; false if it raised an exception, or its value has another shape.
@@ -94,6 +111,10 @@ bool PythonCall::by_numba(double t, const double *y, double *out) const {
 }
 
 void PythonCall::operator()(double t, const double *y, const double *f, double *out, nb::handle owner) const {
+    if (library_) {
+        library_->one(t, y, f, out, params_, components_, n_params_);
+        return Ending::leave_if_begun();
+    }
     if (code_ && by_numba(t, y, out)) return;
     PyObject *arguments[5 + MOST_ARGUMENTS];  // t, y, f and out before them, and the place of the callee
     const nb::object time_object = time(t), y_object = copied(y, components_, type_);

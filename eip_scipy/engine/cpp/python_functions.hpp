@@ -32,11 +32,15 @@ class PythonCall {
     int64_t floats() const { return floats_; }
 
   private:
+    void take_library();
     bool by_numba(double t, const double *y, double *out) const;
     bool take_list(PyObject *value, double *out) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
     nb::handle fun_, convert_;
+    const LibraryFunction *library_ = nullptr;
+    const double *params_ = nullptr;
+    int64_t n_params_ = 0;
     NumbaCode *code_ = nullptr;
     NumbaRelease *release_ = nullptr;
     std::vector<nb::handle> args_;
