@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,7 +76,7 @@ def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: 
     h = found.h
     n_steps = found.span.n_steps if h is None else fixed_steps(h, t, t_bound)
     span = found.span._replace(h=sign * (h or 0.0), t_bound=t_bound, sign=sign, n_steps=n_steps)
-    return replace(found, span=span, first_step=None if h is not None else float(solver.h_abs))
+    return found._replace(span=span, first_step=None if h is not None else float(solver.h_abs))
 
 
 def _check_kind_of_steps(solver: Any, was: Settings) -> None:

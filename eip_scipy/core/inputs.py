@@ -15,7 +15,7 @@ __all__ = [
     "require_arguments", "shown",
 ]  # fmt: skip
 
-PLAIN = (int, float, complex, str, bool, type(None), np.float64, np.complex128)
+PLAIN = frozenset((int, float, complex, str, bool, type(None), np.float64, np.complex128))
 DATES = (datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
 SHOWN = 120
 LARGEST_COUNT = 2**63 - 1  # largest 64-bit integer
@@ -36,7 +36,7 @@ def refuse_units(**arguments: Any) -> None:
     The keywords are the names of the user's arguments. Items of lists, tuples and object arrays are checked too.
     """
     for name, value in arguments.items():
-        if is_plain(value):
+        if type(value) in PLAIN or is_plain(value):
             continue
         for item in _leaves(value):
             if is_date(item):

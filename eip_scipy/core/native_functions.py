@@ -43,7 +43,7 @@ class Kind(NamedTuple):
     scalars: str = ""
 
     def like(self, shape: tuple[int, ...], size: int, **flags: bool) -> Kind:
-        """Return the signature of a function with the same parameters and type of state."""
+        """Return the signature of a function with the same parameters and type of state (`_replace` is slow)."""
         return Kind(shape, size, self.p, self.dtype, scalars=self.scalars, **flags)
 
 

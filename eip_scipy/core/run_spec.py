@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ FRAME_DISTANCE = 1e-4
 Array = np.ndarray
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunSpec:
+class RunSpec(NamedTuple):
     """Specification of a run in numbers and functions of (t, y), which is common to all interfaces.
 
     `name` is the solver class, for messages. If `is_known`, `method` is the `tableau` of another run of these

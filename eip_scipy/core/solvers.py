@@ -216,7 +216,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _take_stepping(self, stepping: Stepping) -> None:
         """Store options of the step control that have been checked."""
-        self._spec = replace(self._spec, stepping=stepping)
+        self._spec = self._spec._replace(stepping=stepping)
         self.h, self.max_step = stepping.h, stepping.span.max_step
         self._taken = self.fun, self.t_bound, self.direction, self.max_step, self.h
         self.rtol, self.atol = _frozen(stepping.rtol), _frozen(stepping.atol)
@@ -241,7 +241,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         """Start a run at a state and make its buffers; the arguments are those of `RunSpec.build`."""
         run = self._spec.build(y0, f0, tau, check_start=check)
         self._run, self._work = run, run.work
-        self._spec = replace(self._spec, method=run.tableau, is_known=True)
+        self._spec = self._spec._replace(method=run.tableau, is_known=True)
         run.attach(self.diagnostics)
         self.y, self.f = run.y0, run.start.f
         # The steps continue from `_raw`. If it waits for its projection, `y` is its projected copy.
@@ -351,7 +351,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             spec.attach_history(run, here)
         if method.drives:
             spec.attach_solver(run, here)
-        self._spec = replace(spec, method=method, is_known=True)
+        self._spec = spec._replace(method=method, is_known=True)
 
     def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return two mappings for a copy of this solver: values to share, such as functions, and values to copy."""
@@ -387,8 +387,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         spec = self._specified(copied["run"]["stepping"], shared["projection"])
         if self.TABLEAU.has_history:
             tableau: Any = self.TABLEAU
-            spec = replace(spec, method=replace(tableau, velocities=copied["velocities"]))
-        self._spec = replace(spec, is_known=True)
+            spec = spec._replace(method=replace(tableau, velocities=copied["velocities"]))
+        self._spec = spec._replace(is_known=True)
         if copied["scipy"] is not None and self._SCIPY is not None:
             fresh = partial(_copied, self._derivative)
             self._scipy = self._SCIPY(fresh, begin.t, begin.y, begin.t + 1.0, first_step=1.0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,8 +39,7 @@ class DefaultTolerance(float):
 ATOL = DefaultTolerance(1e-6)  # as in SciPy
 
 
-@dataclass(frozen=True)
-class Stepping:
+class Stepping(NamedTuple):
     """Step control of a run: a fixed `h`, or tolerances if `h` is None; `first_step` is None if it is estimated."""
 
     span: Span
@@ -119,8 +117,7 @@ class Stepping:
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class StepOptions:
+class StepOptions(NamedTuple):
     """The options of the step size as the user gives them.
 
     The default of `atol` applies to adaptive steps only. With fixed steps `atol` is only a scale of the error metric,
@@ -189,7 +186,9 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     out = []
     for name, value in (("rtol", rtol), ("atol", atol)):
         if isinstance(value, float) and 0.0 <= value < math.inf:
-            out.append(np.full(n, value))
+            same = np.empty(n)
+            same.fill(value)  # np.full takes much longer
+            out.append(same)
             continue
         a = reals(value)
         if a is None:

@@ -29,25 +29,25 @@ class _Came:
     put_off: object = None
 
 
-@contextmanager
-def kept_ctrl_c() -> Iterator[None]:
+class kept_ctrl_c:  # noqa: N801, faster than one made from a generator
     """Make `look_for_signals` raise KeyboardInterrupt after a Ctrl-C that Python would drop.
 
     Python prints and drops exceptions raised inside a destructor or a callback from C, including KeyboardInterrupt.
     Compilation creates and destroys LLVM objects all the time, so a Ctrl-C could do nothing. A Ctrl-C in a
     destructor or a callback is postponed until Python has left it. A user-defined handler stays in place.
     """
-    if not _is_ours(signal.SIGINT, signal.default_int_handler):
-        yield
-        return
-    _Came.ctrl_c = False
-    _signal.signal(signal.SIGINT, _note_ctrl_c)
-    try:
-        yield
-    finally:
-        _Came.put_off = None
-        _signal.signal(signal.SIGINT, signal.default_int_handler)
-        _Came.ctrl_c = False
+
+    def __enter__(self) -> None:
+        self._is_ours = _is_ours(signal.SIGINT, signal.default_int_handler)
+        if self._is_ours:
+            _Came.ctrl_c = False
+            _signal.signal(signal.SIGINT, _note_ctrl_c)
+
+    def __exit__(self, *error: object) -> None:
+        if self._is_ours:
+            _Came.put_off = None
+            _signal.signal(signal.SIGINT, signal.default_int_handler)
+            _Came.ctrl_c = False
 
 
 @contextmanager

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -103,6 +103,9 @@ class Request(NamedTuple):
 
     def with_pointers(self) -> Request:
         """Return the request with C function pointers wrapped so that Python can call them."""
+        given = self.fun, self.acceleration, self.jacobian
+        if self.events is None and all(item is None or isinstance(item, Problem) for item in given):
+            return self
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
         fun, acceleration = by_pointer(self.fun, "fun"), by_pointer(self.acceleration, "acceleration")
         return self._replace(fun=fun, acceleration=acceleration, events=as_events(self.events), jacobian=jacobian)
@@ -213,7 +216,7 @@ class System:
                 raise
             return functions._replace(python=self._in_python(run)), f"events are called from Python: {reason}"
 
-    @property
+    @cached_property
     def native_form(self) -> tuple[Any, str]:
         """Return the function to compile and its form: `acc` if it comes from the same library as `fun`, else `fun`."""
         own = isinstance(self.fun, LibraryFunction) and isinstance(self.acc, LibraryFunction)
@@ -362,7 +365,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
             f"components from {variations.columns.n} on are derivatives, which overflow in long chaotic runs: shorten "
             "the interval, or use megno or lyapunov_spectrum, which rescale them"
         )
-        spec = replace(spec, columns=variations.columns, fun=None, left_out=hint)
+        spec = spec._replace(columns=variations.columns, fun=None, left_out=hint)
     run = spec.build(y0, check_start=check_start)
     schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)
@@ -429,12 +432,12 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
 
 def _widened(request: Request, variations: Variations) -> Request:
     """Return the request for the state followed by its columns of derivatives, with functions for this longer state."""
-    extra = extra_arguments(request.args, request.params)
+    extra, events = extra_arguments(request.args, request.params), as_events(request.events)
     return request._replace(
         fun=variations.rhs,
         y0=variations.columns.wide(_state(request.y0), floats(extra)),
         jacobian=None,
-        events=replaced(request.events, variations.events(request.events)),
+        events=replaced(events, variations.events(events)),
         projection={**request.projection, "invariants": variations.invariants},
     )
 

@@ -3,7 +3,8 @@
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
    hand for this one problem. The times per step of EIP-RK4, and of EIP-RK45 with adaptive steps, are also compared with
    that of solve_ivp with SciPy's RK45.
-2. A process: from the start of its program to the end of its first compiled run, with user functions that are not in
+2. Whole calls of `integrate`, and of SciPy's solve_ivp with RK45, with one step: the time before and after the steps.
+3. A process: from the start of its program to the end of its first compiled run, with user functions that are not in
    any cache.
 """
 
@@ -20,12 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
-from eip_scipy.problems import kepler
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, Invariant, integrate
+from eip_scipy.problems import kepler, solar_system
 
 from ..report import needed, table
 from ..study import Measurement, Session, option
-from ..timing import clocked, least
+from ..timing import clocked, least, many_calls
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
 
@@ -210,6 +211,22 @@ def kepler_speed(turns: Turns) -> dict[str, float]:
     return out
 
 
+def start_times(turns: Turns) -> dict[str, float]:
+    """Return the times in ms of whole calls with one step."""
+    planets, invariants = solar_system(years=1.0), Invariant(energy, energy_gradient)
+    y0 = kepler().y0
+    calls: dict[str, Callable[[], Any]] = {
+        "kepler(), EIPRK4": partial(integrate, kepler(), (0.0, H), method=EIPRK4, h=H),
+        "solar_system(), EIPRKN12": partial(integrate, planets, (0.0, 0.01), method=EIPRKN12, h=0.01),
+        "jitted fun, H and its gradient, EIPRK4": partial(
+            integrate, kepler_array, (0.0, H), y0, method=EIPRK4, h=H, invariants=invariants
+        ),
+        "solve_ivp, RK45": partial(solve_ivp, kepler_array, (0.0, H), y0, first_step=H, rtol=1e-2),
+    }
+    best = least({name: many_calls(call) for name, call in calls.items()}, turns=10 * turns.calls)
+    return {f"a call with one step: {name} [ms]": 1e3 * seconds for name, seconds in best.items()}
+
+
 USER = """
 import time
 begin = time.perf_counter()
@@ -254,8 +271,8 @@ class Speed(Measurement[dict[str, float]]):
     def measure(self, session: Session) -> dict[str, float]:
         turns = QUICK if self.quick else Turns()
         found: dict[str, float] = {}
-        with session.bar(2, "speed", "part") as bar:
-            for part in (kepler_speed, process_times):
+        with session.bar(3, "speed", "part") as bar:
+            for part in (kepler_speed, start_times, process_times):
                 found |= part(turns)
                 bar.update()
         return found
