@@ -441,6 +441,8 @@ class InvariantSet:
 
     def _of_values(self, of_items: list[bool]) -> Array:
         """Return a mask (l,) in which the flag of each item is repeated as often as the item has values."""
+        if all(self.scalar):
+            return np.array(of_items, bool)
         ends = zip(of_items, pairwise(self.starts), strict=True)
         return np.array([flag for flag, (first, last) in ends for _ in range(last - first)], bool)
 

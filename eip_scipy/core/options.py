@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..engine.data import EPS, Options
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
 from ..methods.orders import AT_REST
 from . import steppers
-from .blocks import blocks_of
+from .blocks import blocks_of, kinds_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
 from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet, JointInvariants
@@ -134,12 +135,12 @@ class ProjectionOptions:
         return own, {name: value for name, value in keywords.items() if name not in own}
 
     def settled(
-        self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet
-    ) -> tuple[Options, np.ndarray | None, dict[str, Any]]:
+        self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, f0: np.ndarray, known: InvariantSet
+    ) -> tuple[Options, np.ndarray | None, Callable[[], dict[str, Any]]]:
         """Check the options for a run with the `known` invariants, and return them in the form that the step needs.
 
-        The second item are the weights of the metric if the user gave an array, else None. The third one, the identity
-        of the run, maps the name of each option that affects the bits of a run to its effective value.
+        The second item are the weights of the metric if the user gave an array, else None. The third one returns the
+        identity of the run: the effective value of each option that affects its bits, by name.
         """
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
@@ -179,7 +180,7 @@ class ProjectionOptions:
             computed=known.computed.astype(float),
             # Multistep methods pass the errors instead of the targets; the remaining errors are negligible.
             most_left=np.where(known.given & (not method.has_history), MOST_LEFT, np.inf),
-            kinds=groups,
+            kinds=kinds_of(groups, y0, f0),
             kappa=method.kappa,
             metric=kind,
             direction=DIRECTIONS[self.direction],
@@ -199,7 +200,7 @@ class ProjectionOptions:
         if _can_project_jointly(options, known):
             options = options._replace(joint=known.items)
         flag("project_initial", self.project_initial)
-        return options, sigma, self._identity(options, sigma, y0, known)
+        return options, sigma, partial(self._identity, options, sigma, y0, known)
 
     def _identity(self, o: Options, sigma: np.ndarray | None, y0: np.ndarray, known: InvariantSet) -> dict[str, Any]:
         carried = [known.labels[k] for k in known.balances.items]
@@ -336,9 +337,11 @@ def _starts(sizes: list[int]) -> np.ndarray:
 
 def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
     """Return True if the run can project by the functions `moments` and `shift` of `JointInvariants`."""
+    if not isinstance(known.items, JointInvariants):
+        return False
     plain = (options.metric, options.direction, options.iterations) == (data.EUCLIDEAN, data.NEW, 1)
     free = options.frame.products.size == 0 and options.every != data.AUTO and not options.compensated
-    return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items
+    return plain and free and not known.balances.items
 
 
 def takes_projection_options(documented: Documented) -> Documented:

@@ -15,7 +15,6 @@ from ..engine.trust import Trust
 from ..methods.orders import AT_REST
 from . import steppers
 from .acceleration import named_accelerations
-from .blocks import kinds_of
 from .failures import projection_failure
 from .frame import spanned
 from .invariants import TARGET_TOLERANCE, InvariantSet
@@ -133,8 +132,7 @@ class RunSpec(NamedTuple):
         columns = self.columns
         y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
-        options, sigma, identity = projection.settled(method, self.stepping, y, invariants)
-        options = options._replace(kinds=kinds_of(options.groups, y, f))
+        options, sigma, identity = projection.settled(method, self.stepping, y, f, invariants)
         if columns is not None:
             options, sigma = widened(options, sigma, columns, invariants.start_gradients)
         invariants.kinds = options.kinds
@@ -158,8 +156,8 @@ class RunSpec(NamedTuple):
 
     def _check(self, run: Run, invariants_too: bool) -> None:
         """Project the start if that is requested, and check the invariants there if `invariants_too`."""
-        if run.options.frame.products.size:
-            run.options = run.options._replace(scales=_scales(run))
+        if run.options.frame.products.size and (scales := _scales(run)) is not run.options.scales:
+            run.options = run.options._replace(scales=scales)
         if self.projection.project_initial:
             t0, y0, _, tau = run.begin
             moved = projected_start(run, self.rhs)

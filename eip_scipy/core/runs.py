@@ -26,7 +26,8 @@ from .variations import Columns, wrong_product
 
 __all__ = ["Counted", "Run", "Start", "parts_of", "run_of"]
 
-BOUND = ("tableau", "work", "invariants", "trust")  # what a copy of a run makes again, or copies by itself
+# What a copy of a run makes again, copies by itself, or does not need.
+BOUND = ("tableau", "work", "invariants", "trust", "identity")
 
 
 class Start(NamedTuple):
@@ -58,7 +59,7 @@ class Run:
     options: Options
     work: Work
     invariants: InvariantSet
-    identity: dict[str, Any]
+    identity: Callable[[], dict[str, Any]]
     trust: Trust
     called: str = "fun"
     left_out: str = ""
@@ -236,4 +237,4 @@ def run_of(parts: dict[str, Any], invariants: InvariantSet, method: Any, *, join
     invariants.target = values["options"].target  # those of balances change
     trust = Trust(invariants.names, values["work"].trust)
     trust.doubts, trust.failed = values.pop("doubts"), values.pop("failed")
-    return Run(**values, tableau=method, invariants=invariants, trust=trust)
+    return Run(**values, tableau=method, invariants=invariants, trust=trust, identity=dict)

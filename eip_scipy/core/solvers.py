@@ -344,7 +344,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run, spec = self._run, self._spec
         method, _ = spec.examined(here.y, here.f)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
-        fresh = spec.projection.settled(method, spec.stepping, run.y0, run.invariants)[0]
+        fresh = spec.projection.settled(method, spec.stepping, run.y0, run.start.f, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
         run.stepping = spec.stepping
         if method.has_history:

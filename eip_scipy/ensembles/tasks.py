@@ -171,7 +171,7 @@ class Plan:
             # The shifts of the differences depend on the start.
             "the gradient of an invariant is computed by differences": invariants.by_differences,
             "the start of each member is projected, or an invariant has a target": own_targets
-            or ready.run.identity["project_initial"],
+            or ready.run.identity()["project_initial"],
         }
         self.why_not = loop.why_not
         self.one_by_one = self.why_not or next((reason for reason, holds in reasons.items() if holds), "")
