@@ -26,7 +26,7 @@ from .variations import Columns, wrong_product
 
 __all__ = ["Counted", "Run", "Start", "parts_of", "run_of"]
 
-# What a copy of a run makes again, copies by itself, or does not need.
+# Fields that a copy of a run makes again, copies by itself, or does not need.
 BOUND = ("tableau", "work", "invariants", "trust", "identity")
 
 
