@@ -4,7 +4,21 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, Diagnostics, Invariant, eip_method, project
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK2,
+    EIPRK3,
+    EIPRK4,
+    EIPRK23,
+    EIPRK45,
+    Balance,
+    Diagnostics,
+    Invariant,
+    eip_method,
+    integrate,
+    project,
+)
+from eip_scipy.problems import kepler
 
 EPS = np.finfo(float).eps
 RTOL, STEP = 1e-3, 0.5
@@ -171,3 +185,48 @@ def test_what_is_left_may_not_exceed_the_defects_of_all(rise, good):
 def test_a_single_direction_is_not_left_out():
     with pytest.raises(ValueError, match="rank 1 of 1"):
         project(np.zeros(3), bent([1e-3, 0.0, 0.0], 1e3, 1.0, along=0))
+
+
+# All options together.
+
+COMPENSATED, TWICE = {"compensated": True}, {"iterations": 2}
+
+
+@pytest.mark.parametrize("method", [EIPRK2, EIPRK3])
+@pytest.mark.parametrize("steps", [{"rtol": 1e-5, "atol": 1e-5}, {"h": 0.03}], ids=["adaptive", "fixed"])
+@pytest.mark.parametrize("options", [COMPENSATED, TWICE, COMPENSATED | TWICE], ids=["carry", "twice", "both"])
+def test_a_circular_orbit_is_followed_with_other_options_too(method, steps, options):
+    problem = kepler(0.0, relativistic=0.0)
+    run = integrate(problem, (0, 20), method=method, blocks=1, **steps, **options)
+    assert (run.status, run.trusted) == (0, True)
+    assert np.abs(run.y[:, -1] - problem.reference(20.0)).max() < 5e-4
+    assert (run.max_defect < 1e-6).all()
+
+
+@pytest.mark.parametrize("direction", ["old", "midpoint"])
+@pytest.mark.parametrize("method", [EIPRK2, EIPRK3, EIPRK23])
+def test_a_circular_orbit_is_followed_along_other_directions(method, direction):
+    problem = kepler(0.0, relativistic=0.0)
+    run = integrate(problem, (0, 20), method=method, h=0.03, direction=direction)
+    assert (run.status, run.trusted) == (0, True)
+    assert np.abs(run.y[:, -1] - problem.reference(20.0)).max() < 5e-3
+    assert (run.max_defect < 2e-6).all()
+
+
+@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
+def test_targets_that_contradict_each_other_end_the_run(method):
+    """With drag an orbit of this angular momentum has no such energy; steps of 1e-12 would stay near the targets."""
+    drag, problem = 1e-3, kepler(0.0, relativistic=0.0)
+
+    def fun(t, y):
+        return problem.fun(t, y) - drag * np.concatenate([[0, 0], y[2:]])
+
+    def energy(t, y):
+        return 0.5 * (y[2:] @ y[2:]) - 1 / np.sqrt(y[:2] @ y[:2])
+
+    kept = [Balance(energy, lambda t, y: -drag * (y[2:] @ y[2:])), problem.invariants[1]]
+    with pytest.warns(UserWarning, match="not an invariant of this system"):
+        run = integrate(fun, (0, 100), problem.y0, method=method, rtol=1e-7, atol=1e-8, invariants=kept)
+    assert run.status == -1
+    assert "projection failed" in run.message
+    assert run.nfev < 100_000

@@ -10,6 +10,10 @@ constexpr double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 // A failed projection shrinks the step as CVODE does.
 constexpr double RETRY_FACTOR = 0.25;
 constexpr int MAX_RETRIES = 10;
+// Where no state near the trajectory meets all targets, projections succeed only after steps that change almost nothing. A run
+// ends after MOST_STUCK failures in steps whose estimated error, in tolerances, is below TINY_ERROR.
+constexpr double TINY_ERROR = 1e-6;
+constexpr int64_t MOST_STUCK = 100;
 // A step that ends next to a singular position is made again, once, with this fraction of its length.
 constexpr double SHORTENED = 0.5;
 // every = AUTO: every few steps the step asks whether a projection is worth it, and the step after one that was.
@@ -193,7 +197,7 @@ template <class AnyRun>
 
 // Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.last() = f at its end.
 //
-// A failed projection shortens the step, at most MAX_RETRIES times in a row; the first end next to a singular position
+// A failed projection shortens the step, at most MAX_RETRIES times in a row, and not where that does not help; the first end next to a singular position
 // does, too, because a step from elsewhere may cross it. Returns OK, NOT_FINITE, FAILED_PROJECTION or
 // TOO_SMALL; of a multistep method UNSTABLE and of a Nystrom method BY_VELOCITY too.
 template <class AnyRun>
@@ -228,6 +232,8 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         if (status == OK && norm < 1.0) {
             status = finish_step(run, step);
             if (status == OK) {
+                if (adaptive && w.counters[STUCK] > 0) [[unlikely]]
+                    w.counters[STUCK] -= retries == 0;
                 const double factor =
                     norm == 0.0 ? MAX_FACTOR : std::min(MAX_FACTOR, SAFETY * std::pow(norm, run.method.exponent));
                 clock[NEXT_LENGTH] = h_abs * (rejected ? std::min(1.0, factor) : factor);
@@ -238,7 +244,8 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
                 h_abs *= SHORTENED;
                 continue;
             }
-            if (retries == MAX_RETRIES) return status;
+            w.counters[STUCK] += adaptive && norm < TINY_ERROR;
+            if (retries == MAX_RETRIES || w.counters[STUCK] >= MOST_STUCK) return status;
             ++retries;
             h_abs *= RETRY_FACTOR;
         } else if (status == OK) {

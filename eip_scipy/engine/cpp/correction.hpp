@@ -298,6 +298,15 @@ inline auto missed_targets(const Options &o, const W &w) {
     return rank;
 }
 
+// (y_new, carry) = (y_hat, carry) + move, in compensated runs.
+template <class AnyRun>
+inline void add_move(const AnyRun &run, const Step &step) {
+    const auto &w = run.work;
+    if (!run.options.compensated) return;
+    copy(w.y_hat, step.y_new, w.m);
+    compensated_add(step.y_new, w.carry_hat, w.move, w.m);
+}
+
 // Computations after the first Newton step: further ones, and whether the projection holds.
 template <class AnyRun>
 inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
@@ -314,12 +323,26 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
         if (missed_targets(o, w) > 1.0) [[unlikely]]
             rank = come_nearer(of_any_length(run), step, rank);
     }
-    if (o.compensated) {
-        copy(w.y_hat, step.y_new, w.m);
-        compensated_add(step.y_new, w.carry_hat, w.move, w.m);
-    }
+    add_move(run, step);
     if (o.compensated || !o.has_limits) evaluate_invariants(run, step.t_new, step.y_new);
     return judge(limits(o, w), origin(step, w), step.y_new, o, w);
+}
+
+// Before another try: the raw state's carry, its gradients and its defects, where the last try has replaced them.
+[[gnu::cold, gnu::noinline]] inline void start_again(const Run &run, const Step &step) {
+    const Options &o = run.options;
+    const Work &w = run.work;
+    if (o.compensated) {
+        if (run.method.nystrom)
+            compensated_nystrom(step.y, step.h, run.method, w);
+        else
+            compensated_step(step.y, step.h, run.method, w);
+    }
+    if (o.iterations == 1 && o.direction == NEW) return;
+    run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    ++w.counters[NJEV];
+    evaluate_invariants(run, step.t_new, w.y_hat);
+    defects<double>(nullptr, w.y_hat, o, w, w.before);
 }
 
 // Further tries with weights ever nearer to equal relative errors; at most MAX_SOFTENED.
@@ -331,6 +354,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     Code status = FAILED_PROJECTION;
     for (int k = 0; k < MAX_SOFTENED; ++k) {
         soften(step.y, run.options, run.work);
+        start_again(run, step);
         moved = move(run, step, moved.largest_error);
         status = correct(run, step, moved.rank);
         if (status == OK && !(alone && moved.correction > HEALTHY)) break;
@@ -347,11 +371,13 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     const Matrix R = corner(w.R, w.l, w);
+    start_again(run, step);
     weigh_rows(o.frame, w, w.Q);
     const int64_t found = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     rank = std::max<int64_t>(0, std::min(rank, found));
     least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
     move_along(o, w, w.Q, step.y_new);
+    add_move(run, step);
     evaluate_invariants(run, step.t_new, step.y_new);
     shared_defects(w, w.g);
     return judge(w.g, origin(step, w), step.y_new, o, w);
@@ -415,7 +441,9 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     if (step.avoids_singular && w.counters[TRIED_INDEPENDENT] < w.counters[INDEPENDENT]) [[unlikely]]
         return NEAR_SINGULAR;
     Code status = correct(run, step, moved.rank);
-    if (o.direction == NEW && o.iterations == 1 && !o.compensated && o.balance_groups.count == 0) {
+    // Successful runs of other options are not softened.
+    const bool plain = o.direction == NEW && o.iterations == 1 && !o.compensated;
+    if (o.balance_groups.count == 0 && (plain || (status != OK && !run.method.multistep))) {
         const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.m;
         const bool alone = o.blocks.count * o.blocks.width == seen;
         const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;

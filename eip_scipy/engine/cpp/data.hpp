@@ -25,10 +25,10 @@ constexpr int64_t AUTO = 0;  // the option `every`
 // Indices of the counters, which the step updates and leaves for the next one. From HAVE_ERROR on they are: whether an
 // estimate of the step's error is available; the number of projections begun; the steps since the last projection; how
 // many figures stood out; whether the last row of K holds f at the raw result; and how many gradients of the last
-// accepted projection, and of the last one that was tried, are clearly independent. HAVE_F may also be OF_STATE, see
-// columns.hpp.
+// accepted projection, and of the last one that was tried, are clearly independent; and the failed projections of steps so
+// short that shorter ones do not help, less the steps without one. HAVE_F may also be OF_STATE, see columns.hpp.
 EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED,
-         HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, N_COUNTERS);
+         HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, STUCK, N_COUNTERS);
 constexpr int64_t OF_STATE = 2;
 // Indices of the clock of a run: the current time, the time at the end of the step tried last and its length, and the
 // length to try next.
