@@ -463,11 +463,12 @@ def ensemble(
     _check_memory(plan, total, held, max_bytes)
     store: Store | None = None
     if out is not None or checkpoint is not None:
-        identity, times = plan.identity(everyone.y0s, everyone.params, size, own), _all_times(plan, own)
+        stored = reduce if out is None else None  # statistics of the states in `out` can be computed anew
+        identity = plan.identity(everyone.y0s, everyone.params, size, own, stored)
         store = (
             CheckpointStore(checkpoint, identity, resume, checkpoint_every)
             if out is None
-            else ZarrStore(out, identity, resume, plan.empty(size), times, total, plan.events)
+            else ZarrStore(out, identity, resume, plan.empty(size), _all_times(plan, own), total, plan.events)
         )
     stopped, closed = (nullcontext(), nullcontext()) if store is None else (ended_by_sigterm(), closing(store))
     with stopped, closed:

@@ -81,7 +81,9 @@ class _Store:
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
             stored, now = (", ".join(found["start"][:4]) for found in (there, here))
-            raise _other_functions(self.path, "fun or an invariant", f"at the start (stored: {stored}; now: {now})")
+            raise _other_functions(
+                self.path, "fun, an invariant or reduce", f"at the start (stored: {stored}; now: {now})"
+            )
         if missing:
             raise CheckpointError(
                 f"{self.path!r} is not an ensemble of eip_scipy, or was written by an earlier version of eip_scipy: "

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -192,15 +192,23 @@ class Plan:
         last = np.where((members.status >= 0)[:, None], members.y, np.nan)
         return np.array([self.t_bound]), last[:, None]
 
-    def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
+    def identity(
+        self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes, reduce: Any
+    ) -> dict[str, Any]:
         """Return the data, in a form for JSON, by which a resumed ensemble is recognised as this one.
 
         They are the settings, including the number of members per chunk, `chunk`; and the first `COMPARED` of these
-        numbers at the start that `task` contains: all components of f, followed by the values of the invariants.
+        numbers at the start that `task` contains: all components of f, followed by the values of the invariants. The
+        values of `reduce` follow, if it is a function. It is None if no statistics are stored.
         """
         settings = self.ready.identity(starts, params) | {"chunk": chunk}
         settings |= {name: plain(value) for name, value in own.identity.items()}
-        return {"settings": settings, "start": self._start_values}
+        start = list(self._start_values)
+        if callable(reduce):
+            with suppress(Exception):  # it need not have a value at the start
+                value = reduce(self.t0, self.ready.run.y0.copy())
+                start += map(repr, np.atleast_1d(np.asarray(value, self.dtype)).tolist())
+        return {"settings": settings | {"reduce": "a function" if callable(reduce) else reduce}, "start": start}
 
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
         """Return values of the functions at the end of the first member that did not fail, and their sizes.

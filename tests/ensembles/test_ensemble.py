@@ -685,6 +685,22 @@ def test_resume_runs_what_is_missing(where, tmp_path, more):
         np.testing.assert_array_equal(again.trajectories[:], stored().trajectories)
 
 
+@pytest.mark.parametrize(("first", "then"), [(0, 1), (0, "state"), ("state", 0), ("state", None), (None, 1)])
+def test_statistics_of_two_quantities_are_not_mixed(first, then, tmp_path):
+    """A checkpoint keeps the statistics of the members so far; `out` keeps the states."""
+
+    def broken_off(part):
+        if part.first == 3:
+            raise KeyboardInterrupt
+
+    of = {0: lambda t, y: y[0], 1: lambda t, y: 2 * y[0], "state": "state", None: None}
+    with pytest.raises(KeyboardInterrupt):
+        stored(callback=broken_off, reduce=of[first], checkpoint=tmp_path / "kept")
+    with pytest.raises(CheckpointError, match="reduce"):
+        stored(resume=True, reduce=of[then], checkpoint=tmp_path / "kept")
+    same(stored(reduce=of[first]), stored(resume=True, reduce=of[first], checkpoint=tmp_path / "kept"))
+
+
 @both_stores
 def test_resume_starts_where_there_is_nothing(where, tmp_path):
     same(stored(), stored(resume=True, **{where: tmp_path / "kept"}))

@@ -10,8 +10,8 @@ constexpr double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 // A failed projection shrinks the step as CVODE does.
 constexpr double RETRY_FACTOR = 0.25;
 constexpr int MAX_RETRIES = 10;
-// Where no state near the trajectory meets all targets, projections succeed only after steps that change almost nothing. A run
-// ends after MOST_STUCK failures in steps whose estimated error, in tolerances, is below TINY_ERROR.
+// Steps that change almost nothing may meet targets that no state near the trajectory meets. A run ends after MOST_STUCK
+// failed projections in steps whose estimated error, in tolerances, is below TINY_ERROR.
 constexpr double TINY_ERROR = 1e-6;
 constexpr int64_t MOST_STUCK = 100;
 // A step that ends next to a singular position is made again, once, with this fraction of its length.
