@@ -68,8 +68,8 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
         both["variations"] = np.concatenate([one["variations"], two["variations"][new]])
     for name in ("nfev", "njev", "nlu", "wall_time"):
         both[name] = one[name] + two[name]
-    for name in ("t_events", "y_events"):
-        if one[name] is not None and two[name] is not None and len(one[name]) == len(two[name]):
+    if one.t_events is not None and _events(one) == _events(two):
+        for name in ("t_events", "y_events"):
             both[name] = [
                 np.concatenate([a, b]) if a.size and b.size else b if b.size else a
                 for a, b in zip(one[name], two[name], strict=True)
@@ -83,6 +83,12 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
     if "_origin" in vars(two):
         object.__setattr__(both, "_origin", vars(two)["_origin"])
     return both
+
+
+def _events(result: IntegrationResult) -> list[Any]:
+    """Return the event functions of a run, of C functions the pointers; an empty list if the run did not start."""
+    origin: Origin | None = vars(result).get("_origin")
+    return [] if origin is None else [getattr(event, "pointer", event) for event in as_events(origin.request.events)]
 
 
 def _observed(one: IntegrationResult, two: IntegrationResult, new: slice) -> dict[str, Any]:

@@ -266,6 +266,18 @@ def test_counts_go_on_in_a_continued_run(as_compiled):
     assert (other.status, other.t_events[0].size) == (1, 3 + 5)
 
 
+def test_events_of_other_functions_are_not_joined():
+    """Also not those of the same functions in another order."""
+    one, two = reaching(0.9), reaching(0.2)
+    first = integrate(oscillator, (0, SPAN / 2), START, method=EIPDOP853, h=0.1, events=[one, two])
+    for events, levels in (([two, one], (0.2, 0.9)), ([one, two], (0.9, 0.2)), (two, (0.2,))):
+        run = first.continue_to(SPAN, events=events)
+        begin = 0.0 if levels == (0.9, 0.2) else SPAN / 2
+        for level, found in zip(levels, run.t_events, strict=True):
+            times = passages(level)
+            np.testing.assert_allclose(found, times[(times > begin) & (times < SPAN)], rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize("phase", np.linspace(0.1, 0.7, 7))
 def test_an_event_that_ended_a_run_does_not_happen_again_at_once(phase):
     """The event next happens at the next passage, whatever the sign of the rounding error, and ends the run again."""
