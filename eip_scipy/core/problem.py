@@ -144,6 +144,11 @@ class Problem:
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
         refuse_units(G=self.G)
+        if not _has_params(self.fun, self.params):
+            raise ValueError(
+                f"params: the functions of the problem {self.name!r} contain other parameters, so that a copy of it "
+                "cannot have these. Make the problem with them, or pass params=... to integrate."
+            )
         if self.epoch is not None:
             object.__setattr__(self, "epoch", as_epoch("epoch", self.epoch))
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
@@ -370,6 +375,13 @@ def component_names(names: Any, n: int | None) -> tuple[str, ...]:
 def bind(rhs: Callable[..., None], params: np.ndarray | None) -> Callable[[float, np.ndarray], np.ndarray]:
     """Return ``fun(t, y)`` made from ``rhs(t, y, out[, params])``; it can be pickled if `rhs` can."""
     return partial(_derivative, rhs, () if params is None else (params,))
+
+
+def _has_params(fun: Callable[..., Any], params: Any) -> bool:
+    """Return False if `fun` was made by `bind` with other parameters than `params`."""
+    if not (isinstance(fun, partial) and fun.func is _derivative and fun.args[1]):
+        return True
+    return params is fun.args[1][0] or np.array_equal(params, fun.args[1][0])
 
 
 def _derivative(rhs: Callable[..., None], extra: tuple[np.ndarray, ...], t: float, y: np.ndarray) -> np.ndarray:

@@ -53,6 +53,13 @@ def test_repr():
     assert "invariants  one without a name" in repr(own)
 
 
+def test_a_copy_has_no_other_params():
+    """The functions of the copy would keep the old ones."""
+    assert replace(kepler(), params=kepler().params.copy()).params == kepler().params
+    with pytest.raises(ValueError, match="contain other parameters"):
+        replace(kepler(), params=[0.05])
+
+
 def test_component_names():
     assert harmonic().component_names == ("q", "p")
     body = nbody([1.0, 1e-3], np.eye(3)[:2], np.eye(3)[1:] * 0.9, t_span=(0, 1))

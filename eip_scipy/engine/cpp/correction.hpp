@@ -441,9 +441,10 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     if (step.avoids_singular && w.counters[TRIED_INDEPENDENT] < w.counters[INDEPENDENT]) [[unlikely]]
         return NEAR_SINGULAR;
     Code status = correct(run, step, moved.rank);
-    // Successful runs of other options are not softened.
+    // With other options only steps that would fail are softened, and no projections of a state by itself.
     const bool plain = o.direction == NEW && o.iterations == 1 && !o.compensated;
-    if (o.balance_groups.count == 0 && (plain || (status != OK && !run.method.multistep))) {
+    const bool in_step = !run.method.multistep && origin(step, w);
+    if (o.balance_groups.count == 0 && (plain || (status != OK && in_step))) {
         const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.m;
         const bool alone = o.blocks.count * o.blocks.width == seen;
         const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;
