@@ -167,7 +167,8 @@ class PeriodicOrbit:
     closure : float
         Largest component of ``|y(period) - y0|``, relative to the largest component of ``|y0|``.
     flow_residual : float
-        ``|M f - f| / (|M| |f|)`` with the derivative f at the start, in the 2-norm: 0 for an exact M; nan if f is 0.
+        ``|M f - f| / (|M| |f|)`` with the derivative f at the start, in the 2-norm; nan if f is 0. It is 0 for an exact
+        M if f does not depend on the time; of a forced system it says nothing.
     invariant_residual : float
         Largest value of ``|g M - g| / (|g| |M|)`` for the gradients g of the invariants at `y0`, in the 2-norm: 0 for
         an exact M; nan without invariants.

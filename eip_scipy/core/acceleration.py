@@ -49,6 +49,8 @@ def named_accelerations(
     """Run the body of a ``with`` statement, which first calls `fun`; explain its error if `fun` is an acceleration."""
     try:
         yield
+    except ArithmeticError:  # at this state, with values that do not show what fun is
+        raise
     except Exception as error:
         if is_acceleration(fun, in_place, extra, t, y):
             raise ValueError(

@@ -88,6 +88,11 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
             f"time_transformed: the problem {problem.name!r} has no compiled right-hand side that fills an "
             "array (rhs). Use a problem that has one, such as kepler() or nbody(...)."
         )
+    if problem.y0 is None or problem.t_span is None:
+        raise ValueError(
+            f"time_transformed: the problem {problem.name!r} has no y0 or no t_span, from which the new state starts. "
+            "Pass dataclasses.replace(problem, y0=..., t_span=...)."
+        )
     params = np.zeros(0) if problem.params is None else problem.params
     rhs = _transformed_rhs(problem.rhs, jitted(g))
     n, blocks, frame = problem.y0.size, problem.blocks, problem.frame

@@ -163,7 +163,7 @@ def _problem(
     problem = replace(fun, **brought)
     t0, t_end = interval(problem.t_span)
     if not math.isfinite(t_end) or t_end == t0:
-        raise ValueError(f"recommend needs an interval of finite length, got t_span={shown(problem.t_span)}.")
+        raise ValueError(f"recommend needs an interval of a finite length above 0, got t_span={shown(problem.t_span)}.")
     problem = replace(problem, t_span=(t0, t_end), y0=initial_state(problem.y0))
     if invariants is not None:
         common["invariants"] = as_invariants(invariants)

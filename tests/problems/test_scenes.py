@@ -230,6 +230,8 @@ def test_fixed_steps_in_fictitious_time_beat_fixed_steps():
 def test_a_problem_without_compiled_equations_is_refused():
     with pytest.raises(ValueError, match="has no compiled right-hand side"):
         time_transformed(replace(harmonic(), rhs=None), 1.0)
+    with pytest.raises(ValueError, match="has no y0 or no t_span"):
+        time_transformed(replace(harmonic(), y0=None), 1.0)
 
 
 # The command.

@@ -165,6 +165,21 @@ def test_what_is_neither():
         integrate(acceleration=lambda t, q, v: -v, t_span=(0, 1), y0=Y0, method=EIPGJ12, h=0.1)
 
 
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("method", SECOND_ORDER)
+def test_a_division_by_zero_in_fun_is_not_explained_away(method):
+    """Half of `out` is filled before; as Python code the function gives NaN for the other half."""
+
+    @njit
+    def attraction(t, y, out):
+        out[0], out[1] = y[2], y[3]
+        out[2] = -y[0] / (y[0] * y[0] + y[1] * y[1]) ** 1.5
+        out[3] = -y[1] / (y[0] * y[0] + y[1] * y[1]) ** 1.5
+
+    with pytest.raises(ZeroDivisionError):
+        integrate(attraction, (0, 1), np.zeros(4), method=method, h=0.01, in_place=True)
+
+
 def test_accelerations_that_depend_on_velocities():
     """Accelerations are the second half of fun: q'' = -q - v/50, whose solution decays as exp(-t/100)."""
     rate = math.sqrt(1 - 1e-4)

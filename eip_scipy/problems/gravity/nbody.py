@@ -100,7 +100,8 @@ def nbody(
     balances : str or sequence of str, optional
         Keep quantities that each orbit would conserve without the pulls of other bodies, as `Balance` objects, instead
         of the total energy and angular momentum: "kepler" or "energy", "momentum", "laplace", see `orbital_balances`.
-        They are made for planetary systems without close encounters over long times.
+        They are made for planetary systems without close encounters over long times, and hold the masses given here: a
+        run with other `params` is reported as not to be trusted.
 
     Returns
     -------
