@@ -234,6 +234,8 @@ def test_what_is_wrong_is_said():
     refused("jacobian differs from the derivatives", jacobian=lambda t, q: [[q[1], q[0]]])
     refused("gamma differs", gamma=lambda t, q, u: [-1.0])
     refused("constraints must be a function", [1, 1], [0, -G], [1.0], error=TypeError)
+    refused("t is the time", [1], [0], q0=[1], u0=[0], coordinates="t")
+    refused("t is the time", [1], [0], q0=[1], u0=[0], speeds="t")
 
     def contradicting(t, q):
         return [q[0] - 1, q[0] - 1.5]
@@ -575,6 +577,39 @@ def test_what_is_wrong_with_a_model_is_said():
     kane.kanes_equations([me.Particle("A", P, 1)], [])
     with pytest.raises(ValueError, match="auxiliary speeds"):
         mechanics(kane, {}, [0], [0])
+
+
+def test_different_quantities_have_different_names():
+    def refused(one, two, force, params, match=None):
+        expected = match or f"two different quantities are called .*{one}.* and .*{two}"
+        with pytest.raises(ValueError, match=expected):
+            mechanics(spring(force), params, [1], [0])
+        with pytest.raises(ValueError, match=expected):
+            mechanics(me.LagrangesMethod(x.diff() ** 2 / 2 + x * force, [x]), params, [1], [0])
+
+    def spring(force):
+        N, P = me.ReferenceFrame("N"), me.Point("P")
+        P.set_vel(N, x.diff() * N.x)
+        kane = me.KanesMethod(N, [x], [speed], kd_eqs=[x.diff() - speed])
+        kane.kanes_equations([me.Particle("A", P, 1)], [(P, force * N.x)])
+        return kane
+
+    x, speed, push = me.dynamicsymbols("x v_x push")
+    one, two = sympy.symbols("k"), sympy.symbols("k", positive=True)
+    named, rate = sympy.symbols("x v_x")
+    refused(r"x\(t\)", r"Symbol\('x'\)", -named * x, {named: 4})
+    refused("v_x|Derivative", r"Symbol\('v_x'\)", -rate * x, {rate: 4})
+    refused(r"Symbol\('k'\)", r"Symbol\('k', positive=True\)", -(one + two) * x, {"k": 1})
+    refused("", "", -(one + two) * x, {one: 1, two: 3}, "two keys are called 'k'")
+    refused("the time", r"Symbol\('t', real=True\)", sympy.Symbol("t", real=True) * x, {})
+    refused("", "", -x, {"x": 1}, "'x' is the name of a parameter, and of a component")
+    braces, brackets = sympy.symbols("k{1} k[1]", cls=sympy.Symbol)
+    refused(r"Symbol\('k\[1\]'\)", r"Symbol\('k\{1\}'\)", -(braces + brackets) * x, {"k{1}": 1})
+    # The amplitude of an input may have its name, and quantities of the user may contain names of the state.
+    amplitude = sympy.Symbol("push")
+    driven = mechanics(spring(push), {amplitude: 3}, [1], [2], inputs={push: amplitude * x}, outputs={"v": rate})
+    np.testing.assert_array_equal(driven.motion_at(0.0, driven.y0), [2, 3])
+    assert driven.outputs(0.0, driven.y0) == {"v": 2}
 
 
 def test_inputs_are_expressions_of_time_and_state():

@@ -201,9 +201,12 @@ def _names(coordinates: Any, speeds: Any, constraint_names: Any, sizes: Sequence
         return component_names([f"{letter}{j + 1}" for j in range(count)] if given is None else given, count)
 
     positions = named(constraint_names, "g", m + k)
+    of_coordinates, of_speeds = named(coordinates, "q", nq), named(speeds, "u", n)
+    if "t" in (*of_coordinates, *of_speeds):
+        raise ValueError("mechanism: t is the time; give the coordinate or speed of this name another one.")
     return Names(
-        named(coordinates, "q", nq),
-        named(speeds, "u", n),
+        of_coordinates,
+        of_speeds,
         positions[:m],
         (*(f"{item}'" for item in positions[:m]), *positions[m:]),
     )

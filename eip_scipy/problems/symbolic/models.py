@@ -18,7 +18,7 @@ from ...core.names import nearest
 from ..multibody.motion import plain
 from ..multibody.parts import required_outputs
 from ..multibody.problem import MechanicsProblem, mechanics_problem
-from ..multibody.start import MET, Names
+from ..multibody.start import MET, Names, by_name
 from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed, parts_of
 from .parser import as_expression, symbol
 from .system import parameter_values
@@ -207,7 +207,7 @@ def mechanics_of_model(
         parts_of(system, energies, momenta, observed),
         names,
         t,
-        (_by_name(q0, system.coordinates), _by_name(u0, system.speeds)),
+        (_by_name("q0", q0, system.coordinates), _by_name("u0", u0, system.speeds)),
         np.array([values[key] for key in system.parameters]) if system.parameters else None,
         None if held is None else [name_of(item) for item in held],
         rank_tolerance,
@@ -223,7 +223,8 @@ def mechanics_of_model(
 def _with_defaults(model: Any, params: Any, q0: Any, u0: Any, inputs: Any) -> tuple[dict[str, float], Any, Any, Any]:
     """Return the parameters by name, the start, and the inputs, by default those that a System of PyDy has."""
     # PyDy refuses constants that are in the constraints on positions alone: they are given here.
-    constants = {**(getattr(model, "constants", None) or {}), **(params or {})}
+    constants = getattr(model, "constants", None) or {}
+    values = {**by_name("constants", constants, name_of), **by_name("params", params or {}, name_of)}
     if q0 is None and u0 is None:
         q0 = u0 = getattr(model, "initial_conditions", None)
     if q0 is None or u0 is None:
@@ -231,7 +232,7 @@ def _with_defaults(model: Any, params: Any, q0: Any, u0: Any, inputs: Any) -> tu
     if inputs is None:
         given = getattr(model, "specifieds", None) or {}
         inputs = {key: _swapped(value) if callable(value) else value for key, value in given.items()}
-    return parameter_values({name_of(key): value for key, value in constants.items()}), q0, u0, inputs
+    return parameter_values(values), q0, u0, inputs
 
 
 def _require_rotations(problem: MechanicsProblem) -> None:
@@ -252,12 +253,34 @@ def _swapped(function: Any) -> Any:
     return function if isinstance(function, sympy.Basic) else lambda t, y: function(y, t)
 
 
-def _by_name(given: Any, names: tuple[str, ...]) -> Any:
+def _by_name(what: str, given: Any, names: tuple[str, ...]) -> Any:
     """Return a mapping with names as keys, those in `names` or, if there are none, all; return an array unchanged."""
     if not isinstance(given, Mapping):
         return given
-    found = {name_of(key): value for key, value in given.items()}
+    found = by_name(what, given, name_of)
     return {key: value for key, value in found.items() if key in names} or found
+
+
+def _require_different(items: Iterable[Any]) -> None:
+    """Raise ValueError if two different items, which are symbols, functions of time or their derivatives, share a name.
+
+    Converted expressions would not distinguish them.
+    """
+    known: dict[str, Any] = {}
+    for item in items:
+        first = known.setdefault(name := name_of(item), item)
+        if first != item:
+            raise ValueError(
+                f"mechanics: two different quantities are called {name!r}: {_described(first)} and {_described(item)}. "
+                "Rename one or, if they are meant to be the same, use one of them everywhere."
+            )
+
+
+def _described(item: Any) -> str:
+    """Return an item as text; that of a symbol contains its assumptions, which make symbols different."""
+    if item == TIME:
+        return "the time, dynamicsymbols._t"
+    return sympy.srepr(item) if isinstance(item, sympy.Symbol) else str(item)
 
 
 class _Conversion:
@@ -266,18 +289,12 @@ class _Conversion:
     def __init__(self, found: _Equations, inputs: Any, t: float, q0: Any, u0: Any) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
         components = list(self.names.values())
-        for k, name in enumerate(components):
-            if name in components[:k] or name == "t":
-                raise ValueError(
-                    f"mechanics: {name!r} is the name of two components of the state, or of one and of the time; "
-                    "rename one."
-                )
         self._found = found
         self._symbols = {item: symbol(name) for item, name in self.names.items()} | {TIME: symbol("t")}
         self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in found.speeds}
         count = len(found.coordinates)
         state = np.array([*_numbers(q0, components[:count]), *_numbers(u0, components[count:])])
-        parts = (*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates)
+        parts = [*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates]
         functions = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in parts))
         self.inputs = read_inputs(inputs, {name_of(item): item for item in functions}, self.names, (t, state))
         self._called = {name for name, _ in self.inputs.called}
@@ -285,6 +302,10 @@ class _Conversion:
             raise ValueError(
                 f"inputs: {taken.pop()!r} is also the name of the time or of a component of the state; rename it."
             )
+        parts += [*(item for _, item in found.energies), *found.active]
+        symbols = set().union(*(sympy.sympify(item).free_symbols for item in parts))
+        called = {item for item in functions if name_of(item) in self._called}
+        _require_different((TIME, *self.names, *sorted(called | symbols, key=sympy.srepr)))
 
     def __call__(self, expression: Any) -> Any:
         """Return the converted expression."""
@@ -334,8 +355,8 @@ class _Conversion:
 def _numbers(given: Any, names: Sequence[str]) -> list[float]:
     """Return values with which functions can be called; components that were not given are 0."""
     if isinstance(given, Mapping):
-        by_name = {name_of(key): value for key, value in given.items()}
-        return [float(by_name.get(name, 0.0)) for name in names]
+        found = {name_of(key): value for key, value in given.items()}
+        return [float(found.get(name, 0.0)) for name in names]
     return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
 
 
@@ -551,6 +572,10 @@ def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str,
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
     known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
     known |= {symbol(name) for name, _ in system.inputs}
+    if taken := sorted(values.keys() & {item.name for item in known}):
+        raise ValueError(
+            f"params: {taken[0]!r} is the name of a parameter, and of a component of the state or an input; rename one."
+        )
     free = set().union(*(item.free_symbols for item in items)) - known
     needed = {item.name for item in free}
     missing = sorted(needed - values.keys())
