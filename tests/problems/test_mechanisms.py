@@ -142,6 +142,37 @@ def test_functions_that_branch_are_called_as_they_are():
     assert np.abs(run_of_it.y[0] ** 2 + run_of_it.y[1] ** 2 - 1).max() < 1e-12
 
 
+def test_functions_may_change_their_arguments_and_return_the_same_array():
+    kept = np.empty(1)
+
+    def changing(function):
+        def call(*args):
+            value = function(*args)
+            for array in args[isinstance(args[0], float) :]:
+                array *= 0.5
+            return value
+
+        return untraceable(call)
+
+    def sideways(t, q, u):
+        kept[:] = u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])
+        return kept
+
+    def forces(t, q, u):
+        return np.array([-u[0], -q[1], q[0] * u[2]])
+
+    start = {"q0": [0.1, 0.2, 0.3], "u0": [np.cos(0.3), np.sin(0.3), 0.5]}
+    options = {"kinematics": lambda t, q, u: u.copy(), "outputs": {"x": lambda t, q, u: q[0] + 0}}
+    exact = mechanism(np.eye(3), forces, velocity_constraints=lambda t, q, u: np.array(sideways(t, q, u)), **start)
+    changed = {"kinematics": changing(options["kinematics"]), "outputs": {"x": changing(options["outputs"]["x"])}}
+    found = mechanism(changing(lambda q: np.eye(3)), changing(forces), velocity_constraints=changing(sideways),
+                      energy=changing(lambda t, q, u: u @ u), **changed, **start)  # fmt: skip
+    state = found.y0.copy()
+    np.testing.assert_allclose(found.fun(0.0, state), exact.fun(0.0, state), atol=1e-8)
+    assert found.outputs(0.0, state)["x"] == 0.1
+    np.testing.assert_array_equal(state, found.y0)
+
+
 @pytest.mark.parametrize("wrapped", [lambda f: f, untraceable])
 def test_constraints_may_depend_on_time(wrapped):
     # A bead on a rod that turns at the rate w: r'' = w^2 r.

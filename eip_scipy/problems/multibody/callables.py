@@ -11,7 +11,7 @@ import numpy as np
 from ...core.inputs import real_array, shown
 from ...core.problem import component_names
 from .motion import plain
-from .parts import Given, Parts, numerical_parts, required_outputs
+from .parts import Given, Parts, numerical_parts, on_copies, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
 
@@ -154,7 +154,10 @@ def mechanism(
 
 
 def _as_functions(given: Given) -> Given:
-    """Return `given` with functions in place of arrays; raise TypeError if another item is not a function."""
+    """Return `given` with functions in place of arrays; raise TypeError if another item is not a function.
+
+    The functions of the user get copies of arrays, see `on_copies`.
+    """
     mass, forces = given.mass, given.forces
     if not callable(mass):
         M = real_array("mass", mass)
@@ -164,7 +167,8 @@ def _as_functions(given: Given) -> Given:
     for name, value in given._asdict().items():
         if name not in ("mass", "forces") and value is not None and not callable(value):
             raise TypeError(f"mechanism: {name} must be a function, got {shown(value)}.")
-    return given._replace(mass=mass, forces=forces)
+    given = given._replace(mass=mass, forces=forces)
+    return Given(*(None if item is None else on_copies(item) for item in given))
 
 
 def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> dict[str, Callable[..., Any]]:
@@ -173,11 +177,13 @@ def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarr
     for name, item in found.items():
         if not callable(item):
             raise TypeError(f"mechanism: the output {name!r} must be a function f(t, q, u), got {shown(item)}.")
-        if np.shape(value := item(t, q, u)) != ():
+        fun = on_copies(item)
+        if np.shape(value := fun(t, q, u)) != ():
             raise ValueError(
                 f"mechanism: the output {name!r} has the shape {np.shape(value)}; expected a number. Give each "
                 "component a name of its own."
             )
+        found[name] = fun
     return found
 
 

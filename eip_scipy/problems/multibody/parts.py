@@ -19,6 +19,7 @@ __all__ = [
     "Parts",
     "columns_of",
     "numerical_parts",
+    "on_copies",
     "outputs_as_given",
     "required_outputs",
 ]
@@ -71,6 +72,20 @@ class Given(NamedTuple):
     potential: Any
     power: Any
     outputs: Any = None  # a mapping
+
+
+def on_copies(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `fun` with copies of its arguments and of its value, if these are arrays.
+
+    A function of the user may then change its arguments, which are parts of the state, and may return the same array
+    at each call.
+    """
+
+    def called(*args: Any) -> Any:
+        value = fun(*(item.copy() if isinstance(item, np.ndarray) else item for item in args))
+        return value.copy() if isinstance(value, np.ndarray) else value
+
+    return called
 
 
 class Energy(NamedTuple):

@@ -191,10 +191,12 @@ def _with_input(fill: Callable[..., None], function: Callable[..., float], n: in
     new = jitted(compilable(new_floats)) if compiles else new_like
 
     def wider(t, y, out, *params):
-        state = new(y.size + 1, y)
+        state, given = new(y.size + 1, y), new(n, y)  # the function may change its argument
         for k in range(y.size):
             state[k] = y[k]
-        state[y.size] = function(t, y[:n])
+        for k in range(n):
+            given[k] = y[k]
+        state[y.size] = function(t, given)
         fill(t, state, out, *params)
 
     return compiled_like(wider, fill, function)

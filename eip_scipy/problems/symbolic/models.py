@@ -116,7 +116,8 @@ def _traced(
     t, y = start
     values = {symbol("t"): t, **{symbol(name): x for name, x in zip(names, y, strict=True)}}
     own = [float(sympy.sympify(item).xreplace(values)) for item in found]
-    if not np.allclose(own, np.ravel(fun(t, y)), rtol=AGREES, atol=AGREES):  # `fun` depends on more than its arguments
+    wanted = np.ravel(fun(t, y.copy()))
+    if not np.allclose(own, wanted, rtol=AGREES, atol=AGREES):  # `fun` depends on more than its arguments
         return None
     back = {symbol(name): item for item, name in state.items()} | {symbol("t"): TIME}
     return {key: sympy.sympify(item).xreplace(back) for key, item in zip(keys, found, strict=True)}
