@@ -13,6 +13,7 @@ from sympy.physics import mechanics as me
 from eip_scipy import EIPDOP853, Balance, EIPRadau, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import mechanics, mechanism
+from eip_scipy.problems.symbolic.models import _solution
 from eip_scipy_studies.mechanisms import examples
 
 G = 9.81
@@ -641,6 +642,40 @@ def test_different_quantities_have_different_names():
     driven = mechanics(spring(push), {amplitude: 3}, [1], [2], inputs={push: amplitude * x}, outputs={"v": rate})
     np.testing.assert_array_equal(driven.motion_at(0.0, driven.y0), [2, 3])
     assert driven.outputs(0.0, driven.y0) == {"v": 2}
+
+
+@pytest.mark.parametrize(
+    ("order", "attitude"), [("321", (0, 0, 0)), ("321", (0, 0, np.pi / 2)), ("313", (0, 0.5, 0)), ("123", (0, 0.4, 0))]
+)
+def test_euler_angles_of_a_body_with_body_rates(order, attitude):
+    q, u = me.dynamicsymbols("q1:4"), me.dynamicsymbols("u1:4")
+    N, centre = me.ReferenceFrame("N"), me.Point("C")
+    B = N.orientnew("B", "Body", q, order)
+    rates = B.ang_vel_in(N)
+    B.set_ang_vel(N, sum((a * axis for a, axis in zip(u, B, strict=True)), 0 * N.x))
+    centre.set_vel(N, 0)
+    model = me.KanesMethod(N, q, u, kd_eqs=[a - rates.dot(axis) for a, axis in zip(u, B, strict=True)])
+    model.kanes_equations([me.RigidBody("A", centre, B, 1, (me.inertia(B, 1, 2, 3), centre))], [])
+    w = np.array([0.1, 1.0, 0.2])
+    problem = mechanics(model, {}, attitude, w)
+    state = dict(zip(q, attitude, strict=True))
+    found = problem.motion_at(0.0, problem.y0)
+    turned = [rates.dot(axis).xreplace(dict(zip([a.diff() for a in q], found[:3], strict=True))) for axis in B]
+    np.testing.assert_allclose([float(item.xreplace(state)) for item in turned], w, atol=1e-15)
+    np.testing.assert_allclose(found[3:], [-w[1] * w[2], w[2] * w[0], -w[0] * w[1] / 3], atol=1e-15)
+    if order == "313":
+        with pytest.raises(ValueError, match="divide by zero at the start"):
+            mechanics(model, {}, [0, 0, 0], w)
+
+
+def test_kinematical_equations_are_solved_by_blocks():
+    a, b, c = sympy.symbols("a b c")
+    A = sympy.Matrix([[0, 0, a, b, 0], [1, 0, 0, 0, 0], [0, 0, -b, a, c], [a, 2, b, 0, 0], [0, 0, 0, 0, c]])
+    B = sympy.Matrix([[1, a], [0, b], [c, 0], [1, 1], [a, c]])
+    X = _solution(A, B)
+    assert (A * X - B).applyfunc(sympy.simplify).is_zero_matrix
+    assert X.has(1 / (a**2 + b**2))
+    assert _solution(sympy.Matrix([[1, 0], [a, 0]]), B[:2, :]) is None
 
 
 def test_inputs_are_expressions_of_time_and_state():

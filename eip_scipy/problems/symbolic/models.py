@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import maximum_bipartite_matching
 from sympy.core.function import AppliedUndef
 from sympy.physics.mechanics import KanesMethod, Point, dynamicsymbols, msubs
 
@@ -143,6 +145,8 @@ def _called_in_python(fun: Callable[..., Any], k: int | None, t: float, y: np.nd
 # A row of constraints depends on the others if its remainder is below DEPENDENT, relative to the row, at POINTS points.
 DEPENDENT, POINTS = 1e-9, 3
 QUATERNION = 4  # components
+# Largest number of rows of a block of kinematical equations that is solved by Cramer's rule.
+LARGEST_BLOCK = 3
 
 
 class _Equations(NamedTuple):
@@ -203,20 +207,26 @@ def mechanics_of_model(
     held = independent
     if held is None and found.independent is not None:
         held = [converted.names[item] for item in found.independent]
-    problem = mechanics_problem(
-        name,
-        parts_of(system, energies, momenta, observed),
-        names,
-        t,
-        (_by_name("q0", q0, system.coordinates), _by_name("u0", u0, system.speeds)),
-        np.array([values[key] for key in system.parameters]) if system.parameters else None,
-        None if held is None else [name_of(item) for item in held],
-        rank_tolerance,
-        t_span=t_span,
-        notes=(*notes, *converted.inputs.notes),
-        parameter_names=system.parameters,
-        **others,
-    )
+    try:
+        problem = mechanics_problem(
+            name,
+            parts_of(system, energies, momenta, observed),
+            names,
+            t,
+            (_by_name("q0", q0, system.coordinates), _by_name("u0", u0, system.speeds)),
+            np.array([values[key] for key in system.parameters]) if system.parameters else None,
+            None if held is None else [name_of(item) for item in held],
+            rank_tolerance,
+            t_span=t_span,
+            notes=(*notes, *converted.inputs.notes),
+            parameter_names=system.parameters,
+            **others,
+        )
+    except ZeroDivisionError as error:
+        raise ValueError(
+            "mechanics: the equations divide by zero at the start. Start at another position, or describe it by other "
+            "coordinates: Euler angles have singular attitudes, for example, and quaternions have none."
+        ) from error
     _require_rotations(problem)
     return problem
 
@@ -432,10 +442,33 @@ def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
     by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
     if by_speeds.rows != by_speeds.cols:
         return []
-    column = -by_rates[:, k]
-    if by_speeds.is_diagonal():
-        return [converted(a / b) for a, b in zip(column, by_speeds.diagonal(), strict=True)]
-    return [converted(item) for item in by_speeds.LUsolve(column)]
+    found = _solution(by_speeds, -by_rates[:, k])
+    return [] if found is None else [converted(item) for item in found]
+
+
+def _solution(A: Any, B: Any) -> Any:
+    """Return the solution X of A X = B; None if the matrix A has too many zeros to be regular.
+
+    SymPy's `LUsolve` divides by pivots, which may be 0 although A is regular, for example with Euler angles at the
+    attitude 0. Cramer's rule divides by determinants only, but its terms are too many for large matrices. Therefore A
+    is permuted to a triangular matrix of blocks, and the rule is applied to blocks of at most `LARGEST_BLOCK` rows.
+    """
+    pattern = csr_matrix([[int(item != 0) for item in A.row(i)] for i in range(A.rows)])
+    order = maximum_bipartite_matching(pattern, perm_type="column").tolist()
+    if -1 in order:
+        return None
+    permuted, X = A[:, order], sympy.zeros(*B.shape)
+    found: list[int] = []
+    for rows in permuted.strongly_connected_components():
+        block, rest = permuted[rows, rows], B[rows, :]
+        for k in found:
+            rest -= permuted[rows, k] * X[order[k], :]
+        small = len(rows) <= LARGEST_BLOCK
+        part = block.adjugate() * rest / block.det() if small else block.LUsolve(rest)
+        for i, row in enumerate(rows):
+            X[order[row], :] = part[i, :]
+        found += rows
+    return X
 
 
 def _method(model: Any) -> Any:
@@ -464,8 +497,9 @@ def _of_kane(method: Any) -> _Equations:
     bodies, loads = method.bodylist, method.forcelist
     if not bodies:
         raise ValueError("mechanics: the model has no bodies yet; call kanes_equations(bodies, loads) first.")
-    by_speeds = method.kindiffdict()
     q, u = list(method.q), list(method.u)
+    rates = -_solution(method._k_kqdot_implicit, method._k_ku_implicit * sympy.Matrix(u) + method._f_k_implicit)
+    by_speeds = dict(zip(method.kindiffdict(), rates, strict=True))
     frame = method._inertial
     free = KanesMethod(frame, q_ind=q, u_ind=u, kd_eqs=[dq - value for dq, value in by_speeds.items()])
     active, _ = free.kanes_equations(bodies, loads)
@@ -494,7 +528,7 @@ def _of_kane(method: Any) -> _Equations:
         [] if of_loads is not None and all(_is_constant(item, frame) for item in loads or ()) else list(active),
         method,
         [item for item in (*q, *u) if item not in dependent] if dependent else None,
-        dict(by_speeds),
+        by_speeds,
     )
 
 
