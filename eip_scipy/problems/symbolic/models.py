@@ -21,6 +21,7 @@ from ..multibody.motion import plain
 from ..multibody.parts import required_outputs
 from ..multibody.problem import MechanicsProblem, mechanics_problem
 from ..multibody.start import MET, Names, by_name
+from .brackets import without_impulses
 from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed, parts_of
 from .parser import as_expression, symbol
 from .system import parameter_values
@@ -327,6 +328,8 @@ class _Conversion:
         for derivatives in (True, False):
             chosen = {k: v for k, v in self._symbols.items() if isinstance(k, sympy.Derivative) == derivatives}
             expression = expression.xreplace(chosen)
+        # The derivative of Abs(x(t)), which may be complex, contains Derivative(re(x), x), which is 1 for a real x.
+        expression = expression.xreplace({item: item.doit() for item in expression.atoms(sympy.Derivative)})
         left = sorted(
             expression.atoms(AppliedUndef, sympy.Derivative), key=lambda item: (item.args != (TIME,), str(item))
         )
@@ -335,7 +338,8 @@ class _Conversion:
             raise self._unknown(unknown[-1])
         expression = expression.xreplace({item: symbol(name_of(item)) for item in left})
         own = {*self._symbols.values(), *self._accelerations.values()}
-        return expression.xreplace({item: symbol(name_of(item)) for item in expression.free_symbols - own})
+        expression = expression.xreplace({item: symbol(name_of(item)) for item in expression.free_symbols - own})
+        return without_impulses(expression)
 
     def _unknown(self, item: Any) -> ValueError:
         inner = item.expr if isinstance(item, sympy.Derivative) else item
