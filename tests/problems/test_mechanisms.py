@@ -268,6 +268,8 @@ def test_what_is_wrong_is_said():
     refused("constraints must be a function", [1, 1], [0, -G], [1.0], error=TypeError)
     refused("t is the time", [1], [0], q0=[1], u0=[0], coordinates="t")
     refused("t is the time", [1], [0], q0=[1], u0=[0], speeds="t")
+    for wrong in (-1, 0, 1, np.nan, "1"):
+        refused("rank_tolerance must be a number between 0 and 1", rank_tolerance=wrong)
 
     def contradicting(t, q):
         return [q[0] - 1, q[0] - 1.5]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -67,7 +67,8 @@ def mechanism(
     constraints : callable, optional
         ``constraints(t, q)``, (m,), the expressions that the constraints on positions set to 0.
     q0, u0 : array_like or mapping
-        Coordinates and speeds at the start, in order or by name. They must meet the constraints, see `independent`.
+        Coordinates and speeds at the start, in order, or by name if `coordinates` and `speeds` are given. They must
+        meet the constraints, see `independent`.
     t_span : tuple of float, optional
         Start and end of the interval. If it is omitted, the start is at t = 0.
     velocity_constraints : callable, optional
@@ -193,7 +194,7 @@ def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
     """Return `given` as an array for the first calls of the functions; components missing from a mapping are 0."""
-    if isinstance(given, dict):
+    if isinstance(given, Mapping):
         if names is None:
             raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")
         return np.array([float(given.get(name, 0.0)) for name in component_names(names, None)])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import real_array
+from ...core.inputs import is_number, real_array, shown
 from ...core.invariants import Invariant
 from ...core.jitted import is_jitted
 from ...core.problem import Problem, bind
@@ -286,6 +286,8 @@ def mechanics_problem(
 
     The components in `independent`, by default all, keep the values in `start`; the others are guesses.
     """
+    if not (is_number(tolerance) and 0 < tolerance < 1):
+        raise ValueError(f"{name}: rank_tolerance must be a number between 0 and 1, got {shown(tolerance)}.")
     sizes, args = names.sizes, () if params is None else (params,)
     functions = motion(parts.fill, sizes, tolerance)
     once = motion(plain(parts.fill), sizes, tolerance)
