@@ -145,7 +145,7 @@ def mechanism(
     _require_linear(given, t, q, u)
     names = _names(coordinates, speeds, constraint_names, (q.size, u.size, m, k))
     given = given._replace(outputs=_as_outputs(outputs, names, t, q, u))
-    parts = _parts(given, names, t, q, u)
+    parts = _parts(given, names, t, q, u, np.inf if t_span is None else abs(float(t_span[1]) - t))
     problem = mechanics_problem(
         name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
     )
@@ -308,16 +308,16 @@ def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
             )
 
 
-def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
+def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray, interval: float) -> Parts:
     """Return the `Parts`, made from expressions if all functions can be converted to them, else from functions."""
     if find_spec("sympy") is None:
-        return numerical_parts(given, names, t, q, u, "SymPy is not installed")
+        return numerical_parts(given, names, t, q, u, "SymPy is not installed", interval=interval)
     from ..symbolic.traced import NotTraceableError, traced_parts
 
     try:
         return traced_parts(given, names, t, q, u)
     except NotTraceableError as error:
-        return numerical_parts(given, names, t, q, u, str(error))
+        return numerical_parts(given, names, t, q, u, str(error), interval=interval)
 
 
 def _require_derivatives(given: Given, parts: Parts, names: Names, t: float, y: np.ndarray) -> None:
