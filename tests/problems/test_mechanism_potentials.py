@@ -37,6 +37,7 @@ def test_forces_have_the_potential_that_they_come_from(potential, coordinates):
 def test_there_is_none_of_what_cannot_be_integrated():
     assert potential_of([sympy.sin(x * sympy.cos(x))], [x]) is None
     assert potential_of([sympy.Add(*(sympy.cos(n * x) * x**n for n in range(200)))], [x]) is None
+    assert potential_of([sympy.Piecewise((1 - x, x > 1), (0, True))], [x]) is None
 
 
 def test_the_energy_of_a_mechanism_needs_no_potential():
@@ -71,6 +72,29 @@ def test_springs_of_a_model_belong_to_its_energy():
     model = me.LagrangesMethod(m * (q1.diff() ** 2 + q2.diff() ** 2) / 2, [q1, q2], forcelist=forces, frame=N)
     problem = mechanics(model, {k: 5, m: 1, g: 9.81}, [0.3, 0.2], [0, 1])
     assert problem.energy_kept == "invariant, of the Lagrangian and potential of the loads"
+
+
+@pytest.mark.parametrize(
+    ("potential", "force"),
+    [
+        (lambda q: sympy.Abs(q) ** sympy.Rational(5, 2), lambda q: -2.5 * abs(q) ** 1.5 * np.sign(q)),
+        (lambda q: sympy.Heaviside(q - 1) * (q - 1) ** 2, lambda q: -2 * max(q - 1, 0)),
+        (lambda q: sympy.Piecewise(((q - 1) ** 2, q > 1), (0, True)), lambda q: -2 * max(q - 1, 0)),
+    ],
+)
+@pytest.mark.parametrize("real", [None, True])
+def test_a_lagrangian_has_branches(potential, force, real):
+    q = me.dynamicsymbols("q", real=real)
+    problem = mechanics(me.LagrangesMethod(q.diff() ** 2 / 2 - potential(q), [q]), {}, [1.5], [1])
+    assert problem.energy_kept == "invariant, of the Lagrangian"
+    for place in (-1.3, 0.4, 2.5):
+        np.testing.assert_allclose(problem.motion_at(0.0, np.array([place, 1.0])), [1.0, force(place)], rtol=1e-14)
+
+
+def test_a_jump_of_a_lagrangian_is_named_in_the_symbols_of_the_user():
+    q = me.dynamicsymbols("q")
+    with pytest.raises(ValueError, match="a function that jumps where q - 1 is 0"):
+        mechanics(me.LagrangesMethod(q.diff() ** 2 / 2 - sympy.Heaviside(q - 1) * q, [q]), {}, [0.5], [1])
 
 
 def test_an_energy_is_examined_away_from_singular_positions():

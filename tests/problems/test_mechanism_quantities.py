@@ -133,6 +133,19 @@ def test_inputs_are_expressions_or_functions(pushed, given):
         np.testing.assert_allclose(found.y[:, -1], [np.sin(2), np.cos(2)], atol=1e-5)
 
 
+def test_a_function_of_an_input_may_change_its_argument(pushed):
+    def halving(t, y):
+        y[0] *= 0.5
+        return y[0] if t < 10 else 0.0
+
+    for given in (halving, numba.njit(halving)):
+        problem = mechanics(pushed, {m: 2, k: 3}, [0], [1], inputs={push: given})
+        state = np.array([0.2, 1.0])
+        for call in (problem.motion_at, problem.fun):
+            np.testing.assert_allclose(call(0.5, state), [1.0, -0.25], rtol=1e-15)
+            np.testing.assert_array_equal(state, [0.2, 1.0])
+
+
 def test_one_function_may_give_several_inputs():
     model = me.LagrangesMethod(x.diff() ** 2 / 2 + y.diff() ** 2 / 2, [x, y], forcelist=_pushes(), frame=FRAME)
     expected = [0.1, 0.2, np.sin(0.5), 0.1]

@@ -13,6 +13,7 @@ from sympy.physics import mechanics as me
 from eip_scipy import EIPDOP853, Balance, EIPRadau, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import mechanics, mechanism
+from eip_scipy.problems.symbolic.models import _solution
 from eip_scipy_studies.mechanisms import examples
 
 G = 9.81
@@ -142,6 +143,37 @@ def test_functions_that_branch_are_called_as_they_are():
     assert np.abs(run_of_it.y[0] ** 2 + run_of_it.y[1] ** 2 - 1).max() < 1e-12
 
 
+def test_functions_may_change_their_arguments_and_return_the_same_array():
+    kept = np.empty(1)
+
+    def changing(function):
+        def call(*args):
+            value = function(*args)
+            for array in args[isinstance(args[0], float) :]:
+                array *= 0.5
+            return value
+
+        return untraceable(call)
+
+    def sideways(t, q, u):
+        kept[:] = u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])
+        return kept
+
+    def forces(t, q, u):
+        return np.array([-u[0], -q[1], q[0] * u[2]])
+
+    start = {"q0": [0.1, 0.2, 0.3], "u0": [np.cos(0.3), np.sin(0.3), 0.5]}
+    options = {"kinematics": lambda t, q, u: u.copy(), "outputs": {"x": lambda t, q, u: q[0] + 0}}
+    exact = mechanism(np.eye(3), forces, velocity_constraints=lambda t, q, u: np.array(sideways(t, q, u)), **start)
+    changed = {"kinematics": changing(options["kinematics"]), "outputs": {"x": changing(options["outputs"]["x"])}}
+    found = mechanism(changing(lambda q: np.eye(3)), changing(forces), velocity_constraints=changing(sideways),
+                      energy=changing(lambda t, q, u: u @ u), **changed, **start)  # fmt: skip
+    state = found.y0.copy()
+    np.testing.assert_allclose(found.fun(0.0, state), exact.fun(0.0, state), atol=1e-8)
+    assert found.outputs(0.0, state)["x"] == 0.1
+    np.testing.assert_array_equal(state, found.y0)
+
+
 @pytest.mark.parametrize("wrapped", [lambda f: f, untraceable])
 def test_constraints_may_depend_on_time(wrapped):
     # A bead on a rod that turns at the rate w: r'' = w^2 r.
@@ -155,6 +187,19 @@ def test_constraints_may_depend_on_time(wrapped):
     r, speed = np.cosh(w), w * np.sinh(w)
     along, across = np.array([np.cos(w), np.sin(w)]), np.array([-np.sin(w), np.cos(w)])
     np.testing.assert_allclose(last, np.append(r * along, speed * along + w * r * across), atol=1e-6)
+
+
+@pytest.mark.parametrize("t_span", [None, (0, 10)])
+def test_constraints_that_depend_on_time_are_met_nearly_at_rest(t_span):
+    # The pivot of a pendulum turns back at t = 0.
+    def swing(t, q):
+        return [(q[0] - 0.3 * np.cos(2 * t)) ** 2 + q[1] ** 2 - 1]
+
+    start = {"q0": [0.9, -0.8], "u0": [0, 0], "t_span": t_span}
+    exact, numerical = (mechanism([1, 1], [0, -G], wrapped(swing), **start) for wrapped in (lambda f: f, untraceable))
+    for slow in (0, 1e-14, 1e-8, 1e-3, 1):
+        state = np.array([0.9, -0.8, 0.8 * slow, 0.6 * slow])
+        np.testing.assert_allclose(numerical.motion_at(0.0, state), exact.motion_at(0.0, state), atol=1e-11)
 
 
 @pytest.mark.slow
@@ -234,6 +279,10 @@ def test_what_is_wrong_is_said():
     refused("jacobian differs from the derivatives", jacobian=lambda t, q: [[q[1], q[0]]])
     refused("gamma differs", gamma=lambda t, q, u: [-1.0])
     refused("constraints must be a function", [1, 1], [0, -G], [1.0], error=TypeError)
+    refused("t is the time", [1], [0], q0=[1], u0=[0], coordinates="t")
+    refused("t is the time", [1], [0], q0=[1], u0=[0], speeds="t")
+    for wrong in (-1, 0, 1, np.nan, "1"):
+        refused("rank_tolerance must be a number between 0 and 1", rank_tolerance=wrong)
 
     def contradicting(t, q):
         return [q[0] - 1, q[0] - 1.5]
@@ -575,6 +624,73 @@ def test_what_is_wrong_with_a_model_is_said():
     kane.kanes_equations([me.Particle("A", P, 1)], [])
     with pytest.raises(ValueError, match="auxiliary speeds"):
         mechanics(kane, {}, [0], [0])
+
+
+def test_different_quantities_have_different_names():
+    def refused(one, two, force, params, match=None):
+        expected = match or f"two different quantities are called .*{one}.* and .*{two}"
+        with pytest.raises(ValueError, match=expected):
+            mechanics(spring(force), params, [1], [0])
+        with pytest.raises(ValueError, match=expected):
+            mechanics(me.LagrangesMethod(x.diff() ** 2 / 2 + x * force, [x]), params, [1], [0])
+
+    def spring(force):
+        N, P = me.ReferenceFrame("N"), me.Point("P")
+        P.set_vel(N, x.diff() * N.x)
+        kane = me.KanesMethod(N, [x], [speed], kd_eqs=[x.diff() - speed])
+        kane.kanes_equations([me.Particle("A", P, 1)], [(P, force * N.x)])
+        return kane
+
+    x, speed, push = me.dynamicsymbols("x v_x push")
+    one, two = sympy.symbols("k"), sympy.symbols("k", positive=True)
+    named, rate = sympy.symbols("x v_x")
+    refused(r"x\(t\)", r"Symbol\('x'\)", -named * x, {named: 4})
+    refused("v_x|Derivative", r"Symbol\('v_x'\)", -rate * x, {rate: 4})
+    refused(r"Symbol\('k'\)", r"Symbol\('k', positive=True\)", -(one + two) * x, {"k": 1})
+    refused("", "", -(one + two) * x, {one: 1, two: 3}, "two keys are called 'k'")
+    refused("the time", r"Symbol\('t', real=True\)", sympy.Symbol("t", real=True) * x, {})
+    refused("", "", -x, {"x": 1}, "'x' is the name of a parameter, and of a component")
+    braces, brackets = sympy.symbols("k{1} k[1]", cls=sympy.Symbol)
+    refused(r"Symbol\('k\[1\]'\)", r"Symbol\('k\{1\}'\)", -(braces + brackets) * x, {"k{1}": 1})
+    # The amplitude of an input may have its name, and quantities of the user may contain names of the state.
+    amplitude = sympy.Symbol("push")
+    driven = mechanics(spring(push), {amplitude: 3}, [1], [2], inputs={push: amplitude * x}, outputs={"v": rate})
+    np.testing.assert_array_equal(driven.motion_at(0.0, driven.y0), [2, 3])
+    assert driven.outputs(0.0, driven.y0) == {"v": 2}
+
+
+@pytest.mark.parametrize(
+    ("order", "attitude"), [("321", (0, 0, 0)), ("321", (0, 0, np.pi / 2)), ("313", (0, 0.5, 0)), ("123", (0, 0.4, 0))]
+)
+def test_euler_angles_of_a_body_with_body_rates(order, attitude):
+    q, u = me.dynamicsymbols("q1:4"), me.dynamicsymbols("u1:4")
+    N, centre = me.ReferenceFrame("N"), me.Point("C")
+    B = N.orientnew("B", "Body", q, order)
+    rates = B.ang_vel_in(N)
+    B.set_ang_vel(N, sum((a * axis for a, axis in zip(u, B, strict=True)), 0 * N.x))
+    centre.set_vel(N, 0)
+    model = me.KanesMethod(N, q, u, kd_eqs=[a - rates.dot(axis) for a, axis in zip(u, B, strict=True)])
+    model.kanes_equations([me.RigidBody("A", centre, B, 1, (me.inertia(B, 1, 2, 3), centre))], [])
+    w = np.array([0.1, 1.0, 0.2])
+    problem = mechanics(model, {}, attitude, w)
+    state = dict(zip(q, attitude, strict=True))
+    found = problem.motion_at(0.0, problem.y0)
+    turned = [rates.dot(axis).xreplace(dict(zip([a.diff() for a in q], found[:3], strict=True))) for axis in B]
+    np.testing.assert_allclose([float(item.xreplace(state)) for item in turned], w, atol=1e-15)
+    np.testing.assert_allclose(found[3:], [-w[1] * w[2], w[2] * w[0], -w[0] * w[1] / 3], atol=1e-15)
+    if order == "313":
+        with pytest.raises(ValueError, match="divide by zero at the start"):
+            mechanics(model, {}, [0, 0, 0], w)
+
+
+def test_kinematical_equations_are_solved_by_blocks():
+    a, b, c = sympy.symbols("a b c")
+    A = sympy.Matrix([[0, 0, a, b, 0], [1, 0, 0, 0, 0], [0, 0, -b, a, c], [a, 2, b, 0, 0], [0, 0, 0, 0, c]])
+    B = sympy.Matrix([[1, a], [0, b], [c, 0], [1, 1], [a, c]])
+    X = _solution(A, B)
+    assert (A * X - B).applyfunc(sympy.simplify).is_zero_matrix
+    assert X.has(1 / (a**2 + b**2))
+    assert _solution(sympy.Matrix([[1, 0], [a, 0]]), B[:2, :]) is None
 
 
 def test_inputs_are_expressions_of_time_and_state():

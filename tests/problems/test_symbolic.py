@@ -335,7 +335,7 @@ def test_names_without_a_partner(H, match):
 
 def test_parameters_by_name_in_runs():
     """Parameters that are not named keep their values; an ensemble takes one for each member."""
-    problem, start = hamiltonian("p**2/(2*m) + k*q**2/2", params={"m": 2.0, "k": 1.0}), [1.0, 0.0]
+    problem, start = hamiltonian("p**2/(2*m) + k*q**2/2", params={"m": sympy.Integer(2), "k": 1.0}), [1.0, 0.0]
     options = {"method": EIPDOP853, "rtol": 1e-9, "atol": 1e-9}
     run = integrate(problem, (0, 3), start, params={"k": 4.0}, **options)
     np.testing.assert_array_equal(run.y, integrate(problem, (0, 3), start, params=[2.0, 4.0], **options).y)
@@ -621,6 +621,8 @@ def test_what_is_no_invariant_is_refused(H, invariants, says):
         (lambda: hamiltonian("p**2", params=3), TypeError, "params must be a mapping"),
         (lambda: hamiltonian("p**2", params={"k": math.inf}), ValueError, "k must be a finite number, got inf"),
         (lambda: hamiltonian("p**2", params={"k": "1"}), ValueError, "k must be a finite number, got '1'"),
+        (lambda: hamiltonian("p**2", params={"k": sympy.I}), ValueError, "k must be a finite number, got I"),
+        (lambda: hamiltonian("p**2", params={"k": sympy.Symbol("a")}), ValueError, "k must be a finite number, got a"),
         (lambda: hamiltonian("p**2", invariants=["p"]), TypeError, "invariants must be a mapping"),
         (lambda: hamiltonian("p**2", invariants={1: "p"}), TypeError, "names must be strings"),
         (lambda: hamiltonian("p**2", name=3), TypeError, "name must be a string"),

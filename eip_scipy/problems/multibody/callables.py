@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from ...core.inputs import real_array, shown
 from ...core.problem import component_names
 from .motion import plain
-from .parts import Given, Parts, numerical_parts, required_outputs
+from .parts import Given, Parts, numerical_parts, on_copies, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
 
@@ -67,7 +67,8 @@ def mechanism(
     constraints : callable, optional
         ``constraints(t, q)``, (m,), the expressions that the constraints on positions set to 0.
     q0, u0 : array_like or mapping
-        Coordinates and speeds at the start, in order or by name. They must meet the constraints, see `independent`.
+        Coordinates and speeds at the start, in order, or by name if `coordinates` and `speeds` are given. They must
+        meet the constraints, see `independent`.
     t_span : tuple of float, optional
         Start and end of the interval. If it is omitted, the start is at t = 0.
     velocity_constraints : callable, optional
@@ -144,7 +145,7 @@ def mechanism(
     _require_linear(given, t, q, u)
     names = _names(coordinates, speeds, constraint_names, (q.size, u.size, m, k))
     given = given._replace(outputs=_as_outputs(outputs, names, t, q, u))
-    parts = _parts(given, names, t, q, u)
+    parts = _parts(given, names, t, q, u, np.inf if t_span is None else abs(float(t_span[1]) - t))
     problem = mechanics_problem(
         name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
     )
@@ -154,7 +155,10 @@ def mechanism(
 
 
 def _as_functions(given: Given) -> Given:
-    """Return `given` with functions in place of arrays; raise TypeError if another item is not a function."""
+    """Return `given` with functions in place of arrays; raise TypeError if another item is not a function.
+
+    The functions of the user get copies of arrays, see `on_copies`.
+    """
     mass, forces = given.mass, given.forces
     if not callable(mass):
         M = real_array("mass", mass)
@@ -164,7 +168,8 @@ def _as_functions(given: Given) -> Given:
     for name, value in given._asdict().items():
         if name not in ("mass", "forces") and value is not None and not callable(value):
             raise TypeError(f"mechanism: {name} must be a function, got {shown(value)}.")
-    return given._replace(mass=mass, forces=forces)
+    given = given._replace(mass=mass, forces=forces)
+    return Given(*(None if item is None else on_copies(item) for item in given))
 
 
 def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> dict[str, Callable[..., Any]]:
@@ -173,11 +178,13 @@ def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarr
     for name, item in found.items():
         if not callable(item):
             raise TypeError(f"mechanism: the output {name!r} must be a function f(t, q, u), got {shown(item)}.")
-        if np.shape(value := item(t, q, u)) != ():
+        fun = on_copies(item)
+        if np.shape(value := fun(t, q, u)) != ():
             raise ValueError(
                 f"mechanism: the output {name!r} has the shape {np.shape(value)}; expected a number. Give each "
                 "component a name of its own."
             )
+        found[name] = fun
     return found
 
 
@@ -187,7 +194,7 @@ def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
     """Return `given` as an array for the first calls of the functions; components missing from a mapping are 0."""
-    if isinstance(given, dict):
+    if isinstance(given, Mapping):
         if names is None:
             raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")
         return np.array([float(given.get(name, 0.0)) for name in component_names(names, None)])
@@ -201,9 +208,12 @@ def _names(coordinates: Any, speeds: Any, constraint_names: Any, sizes: Sequence
         return component_names([f"{letter}{j + 1}" for j in range(count)] if given is None else given, count)
 
     positions = named(constraint_names, "g", m + k)
+    of_coordinates, of_speeds = named(coordinates, "q", nq), named(speeds, "u", n)
+    if "t" in (*of_coordinates, *of_speeds):
+        raise ValueError("mechanism: t is the time; give the coordinate or speed of this name another one.")
     return Names(
-        named(coordinates, "q", nq),
-        named(speeds, "u", n),
+        of_coordinates,
+        of_speeds,
         positions[:m],
         (*(f"{item}'" for item in positions[:m]), *positions[m:]),
     )
@@ -298,16 +308,16 @@ def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
             )
 
 
-def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
+def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray, interval: float) -> Parts:
     """Return the `Parts`, made from expressions if all functions can be converted to them, else from functions."""
     if find_spec("sympy") is None:
-        return numerical_parts(given, names, t, q, u, "SymPy is not installed")
+        return numerical_parts(given, names, t, q, u, "SymPy is not installed", interval=interval)
     from ..symbolic.traced import NotTraceableError, traced_parts
 
     try:
         return traced_parts(given, names, t, q, u)
     except NotTraceableError as error:
-        return numerical_parts(given, names, t, q, u, str(error))
+        return numerical_parts(given, names, t, q, u, str(error), interval=interval)
 
 
 def _require_derivatives(given: Given, parts: Parts, names: Names, t: float, y: np.ndarray) -> None:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.gradients import NumericalGradient, difference_gradient
+from ...core.gradients import NumericalGradient, difference_gradient, time_of_motion
 from ...core.inputs import shown
 from .motion import plain
 from .start import Names
@@ -19,6 +19,7 @@ __all__ = [
     "Parts",
     "columns_of",
     "numerical_parts",
+    "on_copies",
     "outputs_as_given",
     "required_outputs",
 ]
@@ -73,6 +74,20 @@ class Given(NamedTuple):
     outputs: Any = None  # a mapping
 
 
+def on_copies(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `fun` with copies of its arguments and of its value, if these are arrays.
+
+    A function of the user may then change its arguments, which are parts of the state, and may return the same array
+    at each call.
+    """
+
+    def called(*args: Any) -> Any:
+        value = fun(*(item.copy() if isinstance(item, np.ndarray) else item for item in args))
+        return value.copy() if isinstance(value, np.ndarray) else value
+
+    return called
+
+
 class Energy(NamedTuple):
     """Description of a quantity that may be constant, ``value(t, y, *params)``, and ``gradient(t, y, out, *params)``.
 
@@ -114,9 +129,14 @@ class Parts(NamedTuple):
 Array = np.ndarray
 
 
-def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
-    """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none; `why` is for the repr."""
-    found = _Numerical(given, names, t, q)
+def numerical_parts(
+    given: Given, names: Names, t: float, q: Array, u: Array, why: str, *, interval: float = np.inf
+) -> Parts:
+    """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none; `why` is for the repr.
+
+    `interval` is the length of the interval of the problem, infinite if it is not known.
+    """
+    found = _Numerical(given, names, t, q, u, interval)
     nq, energies = q.size, []
     energy, potential, power = given.energy, given.potential, given.power
     if energy is None and potential is not None:
@@ -159,7 +179,7 @@ def _sizes(y: Array) -> Array:
 class _Numerical:
     """Matrices and constraints of a mechanism, and their derivatives, from the user's functions."""
 
-    def __init__(self, given: Given, names: Names, t: float, q: Array) -> None:
+    def __init__(self, given: Given, names: Names, t: float, q: Array, u: Array, interval: float) -> None:
         self.given, self._nq = given, q.size
         self._positions, self._rows = len(names.positions), len(names.velocities)
         # The function of (q, t) gives the derivatives by q and by t together.
@@ -169,6 +189,9 @@ class _Numerical:
             self._slopes = NumericalGradient(
                 lambda _, x: np.asarray(constraints(x[-1], x[:-1])), (), True, 0.0, joint, _sizes(joint), ()
             )
+        # Constraints may depend on time. Differences over more time than this would be wrong while little moves.
+        is_known = 0 < interval < np.inf
+        self._longest = interval if is_known else max(1.0, self._duration(q, self.rates(t, q, u)))
 
     def fill(self, t: float, y: Array, out: Array) -> None:
         """Fill `out` with M, F, G, gamma and q'."""
@@ -233,8 +256,12 @@ class _Numerical:
         if self._rows == 0:
             return np.zeros(0)
         rates = self.rates(t, q, u)
-        fastest = np.abs(rates).max(initial=0.0)
-        duration = np.abs(q).max(initial=0.0) / fastest if fastest > 0 else 1.0
+        duration = min(self._duration(q, rates), self._longest)
         return difference_gradient(
-            lambda s: self.velocities(t + s[0], q + s[0] * rates, u), np.zeros(1), np.array([duration or 1.0])
+            lambda s: self.velocities(t + s[0], q + s[0] * rates, u), np.zeros(1), np.array([duration])
         )[:, 0]
+
+    def _duration(self, q: Array, rates: Array) -> float:
+        """Return the time in which coordinates change by their size; 1 if this is not finite, or if they are 0."""
+        duration = time_of_motion(q, rates)
+        return duration if np.isfinite(duration) else 1.0

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import real_array
+from ...core.inputs import is_number, real_array, shown
 from ...core.invariants import Invariant
 from ...core.jitted import is_jitted
 from ...core.problem import Problem, bind
@@ -16,7 +16,7 @@ from ...core.results import Multipliers
 from .energies import energy_of, momenta_of, norms_of, states_near, typical_speed
 from .motion import Motion, Sizes, motion, plain, vector
 from .parts import Outputs, Parts, columns_of
-from .start import Names, name_of, started
+from .start import Names, by_name, started
 
 __all__ = ["MechanicsProblem", "mechanics_problem"]
 
@@ -158,7 +158,7 @@ class MechanicsProblem(Problem):
         return () if params is None else (np.asarray(params, float),)
 
     def _named_parameters(self, given: Mapping[Any, Any]) -> np.ndarray:
-        return super()._named_parameters({name_of(name): value for name, value in given.items()})
+        return super()._named_parameters(by_name("params", given))
 
     def motion_at(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the derivative (q', u') of one state, computed by functions that are not compiled."""
@@ -286,6 +286,8 @@ def mechanics_problem(
 
     The components in `independent`, by default all, keep the values in `start`; the others are guesses.
     """
+    if not (is_number(tolerance) and 0 < tolerance < 1):
+        raise ValueError(f"{name}: rank_tolerance must be a number between 0 and 1, got {shown(tolerance)}.")
     sizes, args = names.sizes, () if params is None else (params,)
     functions = motion(parts.fill, sizes, tolerance)
     once = motion(plain(parts.fill), sizes, tolerance)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from ...core.project import project
 from ...engine.trust import ProjectionWarning
 from .motion import Sizes
 
-__all__ = ["MET", "Names", "name_of", "nearest_start", "started"]
+__all__ = ["MET", "Names", "by_name", "name_of", "nearest_start", "started"]
 
 # A constraint is met if its residual is at most this share of its terms; the same bound holds for given targets.
 MET = 1e-8
@@ -53,6 +53,17 @@ def name_of(key: Any) -> str:
     from ..symbolic.models import name_of as of_symbol
 
     return of_symbol(key)
+
+
+def by_name(what: str, given: Mapping[Any, Any], named: Callable[[Any], str] = name_of) -> dict[str, Any]:
+    """Return a mapping with names as keys; raise ValueError if two keys, such as different symbols, have one name."""
+    found: dict[str, Any] = {}
+    for key, value in given.items():
+        name = named(key)
+        if name in found:
+            raise ValueError(f"{what}: two keys are called {name!r}; expected different names. Rename one.")
+        found[name] = value
+    return found
 
 
 def started(
@@ -114,17 +125,17 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
     Names that are missing from a mapping have the value 0; a ValueError is raised if one of them is in `held`.
     """
     if isinstance(given, Mapping):
-        by_name = {name_of(name): value for name, value in given.items()}
-        for name in by_name:
+        found = by_name(what, given)
+        for name in found:
             if name not in names:
                 raise ValueError(f"{what}: unknown name {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
-        missing = [name for name in names if name in held and name not in by_name]
+        missing = [name for name in names if name in held and name not in found]
         if missing:
             raise ValueError(
                 f"{what}: {missing[0]} is missing; give its value, or list in independent= the components whose values "
                 "are kept, so that the others are computed."
             )
-        given = [by_name.get(name, 0.0) for name in names]
+        given = [found.get(name, 0.0) for name in names]
     values = np.atleast_1d(real_array(what, given)).astype(float)
     if values.shape != (len(names),):
         raise ValueError(f"{what}: got {shown(given)}; expected {len(names)} numbers, for {', '.join(names)}.")

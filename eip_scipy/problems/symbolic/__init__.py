@@ -220,8 +220,9 @@ def mechanics(
     Raises
     ------
     ValueError
-        If a parameter or an input is missing, the start does not meet the constraints, the mass matrix is singular for
-        motions that the constraints allow, or the model has auxiliary speeds.
+        If a parameter or an input is missing, two different quantities have the same name, the start does not meet the
+        constraints, the equations divide by zero there, the mass matrix is singular for motions that the constraints
+        allow, or the model has auxiliary speeds.
     ImportError
         If SymPy is not installed.
 

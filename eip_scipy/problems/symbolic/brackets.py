@@ -228,12 +228,16 @@ def shortened(expression: Any) -> str:
 
 
 def slope(expression: Any, variable: Any) -> Any:
-    """Return the derivative of an expression, without impulses at places where the expression does not jump.
+    """Return the derivative of an expression, without impulses at places where the expression does not jump."""
+    return without_impulses(sympy.diff(expression, variable))
+
+
+def without_impulses(found: Any) -> Any:
+    """Return a derivative without impulses whose factor is 0 where they occur.
 
     SymPy's derivative of q**2 sign(q) contains q**2 DiracDelta(q), which is 0. An impulse that remains belongs to a
     jump, or to a function of several branches at one place that was not understood.
     """
-    found = sympy.diff(expression, variable)
     for impulse in sorted(found.atoms(sympy.DiracDelta), key=str):
         stands_for = sympy.Dummy()
         factor = sympy.diff(found.xreplace({impulse: stands_for}), stands_for)

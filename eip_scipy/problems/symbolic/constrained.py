@@ -12,6 +12,7 @@ from sympy.integrals.manualintegrate import manualintegrate
 from ...core.jitted import compilable, compiled_like, is_compiled, jitted
 from ..multibody.motion import new_floats, new_like
 from ..multibody.parts import Energy, Outputs, Parts
+from .brackets import slope
 from .parser import symbol
 from .program import Arguments, function
 
@@ -191,10 +192,12 @@ def _with_input(fill: Callable[..., None], function: Callable[..., float], n: in
     new = jitted(compilable(new_floats)) if compiles else new_like
 
     def wider(t, y, out, *params):
-        state = new(y.size + 1, y)
+        state, given = new(y.size + 1, y), new(n, y)  # the function may change its argument
         for k in range(y.size):
             state[k] = y[k]
-        state[y.size] = function(t, y[:n])
+        for k in range(n):
+            given[k] = y[k]
+        state[y.size] = function(t, given)
         fill(t, state, out, *params)
 
     return compiled_like(wider, fill, function)
@@ -234,8 +237,8 @@ def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Call
 
 def _gradient(item: Any, system: Constrained) -> dict[int, Any]:
     """Return the nonzero derivatives of an expression with respect to the state, by the indices of the components."""
-    slopes = ((k, sympy.diff(item, x)) for k, x in enumerate(system.variables) if item.has(x))
-    return {k: slope for k, slope in slopes if slope != 0}
+    slopes = ((k, slope(item, x)) for k, x in enumerate(system.variables) if item.has(x))
+    return {k: value for k, value in slopes if value != 0}
 
 
 # Forces with more operations in all are not integrated, because that may take long.
@@ -329,7 +332,7 @@ def _is_simple(term: Any, q: Any) -> bool:
     own = [exponent for base, exponent in powers if base == q] if others else []  # such a term is integrated by parts
     if any(not (exponent.is_Integer and 0 < exponent <= MOST_FACTORS) for exponent in (*own, *(n for _, n in waves))):
         return False
-    if any(not _degree(base.args[0], q) <= 1 or not isinstance(base, KNOWN) for base in others):
+    if not all(isinstance(base, KNOWN) and _degree(base.args[0], q) <= 1 for base in others):
         return False
     return len(roots) <= 1 and all(_degree(base, q) <= 2 for base in roots) and not (roots and others)
 

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import maximum_bipartite_matching
 from sympy.core.function import AppliedUndef
 from sympy.physics.mechanics import KanesMethod, Point, dynamicsymbols, msubs
 
@@ -18,7 +20,8 @@ from ...core.names import nearest
 from ..multibody.motion import plain
 from ..multibody.parts import required_outputs
 from ..multibody.problem import MechanicsProblem, mechanics_problem
-from ..multibody.start import MET, Names
+from ..multibody.start import MET, Names, by_name
+from .brackets import without_impulses
 from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed, parts_of
 from .parser import as_expression, symbol
 from .system import parameter_values
@@ -116,7 +119,8 @@ def _traced(
     t, y = start
     values = {symbol("t"): t, **{symbol(name): x for name, x in zip(names, y, strict=True)}}
     own = [float(sympy.sympify(item).xreplace(values)) for item in found]
-    if not np.allclose(own, np.ravel(fun(t, y)), rtol=AGREES, atol=AGREES):  # `fun` depends on more than its arguments
+    wanted = np.ravel(fun(t, y.copy()))
+    if not np.allclose(own, wanted, rtol=AGREES, atol=AGREES):  # `fun` depends on more than its arguments
         return None
     back = {symbol(name): item for item, name in state.items()} | {symbol("t"): TIME}
     return {key: sympy.sympify(item).xreplace(back) for key, item in zip(keys, found, strict=True)}
@@ -142,6 +146,8 @@ def _called_in_python(fun: Callable[..., Any], k: int | None, t: float, y: np.nd
 # A row of constraints depends on the others if its remainder is below DEPENDENT, relative to the row, at POINTS points.
 DEPENDENT, POINTS = 1e-9, 3
 QUATERNION = 4  # components
+# Largest number of rows of a block of kinematical equations that is solved by Cramer's rule.
+LARGEST_BLOCK = 3
 
 
 class _Equations(NamedTuple):
@@ -202,20 +208,26 @@ def mechanics_of_model(
     held = independent
     if held is None and found.independent is not None:
         held = [converted.names[item] for item in found.independent]
-    problem = mechanics_problem(
-        name,
-        parts_of(system, energies, momenta, observed),
-        names,
-        t,
-        (_by_name(q0, system.coordinates), _by_name(u0, system.speeds)),
-        np.array([values[key] for key in system.parameters]) if system.parameters else None,
-        None if held is None else [name_of(item) for item in held],
-        rank_tolerance,
-        t_span=t_span,
-        notes=(*notes, *converted.inputs.notes),
-        parameter_names=system.parameters,
-        **others,
-    )
+    try:
+        problem = mechanics_problem(
+            name,
+            parts_of(system, energies, momenta, observed),
+            names,
+            t,
+            (_by_name("q0", q0, system.coordinates), _by_name("u0", u0, system.speeds)),
+            np.array([values[key] for key in system.parameters]) if system.parameters else None,
+            None if held is None else [name_of(item) for item in held],
+            rank_tolerance,
+            t_span=t_span,
+            notes=(*notes, *converted.inputs.notes),
+            parameter_names=system.parameters,
+            **others,
+        )
+    except ZeroDivisionError as error:
+        raise ValueError(
+            "mechanics: the equations divide by zero at the start. Start at another position, or describe it by other "
+            "coordinates: Euler angles have singular attitudes, for example, and quaternions have none."
+        ) from error
     _require_rotations(problem)
     return problem
 
@@ -223,7 +235,8 @@ def mechanics_of_model(
 def _with_defaults(model: Any, params: Any, q0: Any, u0: Any, inputs: Any) -> tuple[dict[str, float], Any, Any, Any]:
     """Return the parameters by name, the start, and the inputs, by default those that a System of PyDy has."""
     # PyDy refuses constants that are in the constraints on positions alone: they are given here.
-    constants = {**(getattr(model, "constants", None) or {}), **(params or {})}
+    constants = getattr(model, "constants", None) or {}
+    values = {**by_name("constants", constants, name_of), **by_name("params", params or {}, name_of)}
     if q0 is None and u0 is None:
         q0 = u0 = getattr(model, "initial_conditions", None)
     if q0 is None or u0 is None:
@@ -231,7 +244,7 @@ def _with_defaults(model: Any, params: Any, q0: Any, u0: Any, inputs: Any) -> tu
     if inputs is None:
         given = getattr(model, "specifieds", None) or {}
         inputs = {key: _swapped(value) if callable(value) else value for key, value in given.items()}
-    return parameter_values({name_of(key): value for key, value in constants.items()}), q0, u0, inputs
+    return parameter_values(values), q0, u0, inputs
 
 
 def _require_rotations(problem: MechanicsProblem) -> None:
@@ -252,12 +265,34 @@ def _swapped(function: Any) -> Any:
     return function if isinstance(function, sympy.Basic) else lambda t, y: function(y, t)
 
 
-def _by_name(given: Any, names: tuple[str, ...]) -> Any:
+def _by_name(what: str, given: Any, names: tuple[str, ...]) -> Any:
     """Return a mapping with names as keys, those in `names` or, if there are none, all; return an array unchanged."""
     if not isinstance(given, Mapping):
         return given
-    found = {name_of(key): value for key, value in given.items()}
+    found = by_name(what, given, name_of)
     return {key: value for key, value in found.items() if key in names} or found
+
+
+def _require_different(items: Iterable[Any]) -> None:
+    """Raise ValueError if two different items, which are symbols, functions of time or their derivatives, share a name.
+
+    Converted expressions would not distinguish them.
+    """
+    known: dict[str, Any] = {}
+    for item in items:
+        first = known.setdefault(name := name_of(item), item)
+        if first != item:
+            raise ValueError(
+                f"mechanics: two different quantities are called {name!r}: {_described(first)} and {_described(item)}. "
+                "Rename one or, if they are meant to be the same, use one of them everywhere."
+            )
+
+
+def _described(item: Any) -> str:
+    """Return an item as text; that of a symbol contains its assumptions, which make symbols different."""
+    if item == TIME:
+        return "the time, dynamicsymbols._t"
+    return sympy.srepr(item) if isinstance(item, sympy.Symbol) else str(item)
 
 
 class _Conversion:
@@ -266,18 +301,12 @@ class _Conversion:
     def __init__(self, found: _Equations, inputs: Any, t: float, q0: Any, u0: Any) -> None:
         self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
         components = list(self.names.values())
-        for k, name in enumerate(components):
-            if name in components[:k] or name == "t":
-                raise ValueError(
-                    f"mechanics: {name!r} is the name of two components of the state, or of one and of the time; "
-                    "rename one."
-                )
         self._found = found
         self._symbols = {item: symbol(name) for item, name in self.names.items()} | {TIME: symbol("t")}
         self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in found.speeds}
         count = len(found.coordinates)
         state = np.array([*_numbers(q0, components[:count]), *_numbers(u0, components[count:])])
-        parts = (*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates)
+        parts = [*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates]
         functions = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in parts))
         self.inputs = read_inputs(inputs, {name_of(item): item for item in functions}, self.names, (t, state))
         self._called = {name for name, _ in self.inputs.called}
@@ -285,6 +314,10 @@ class _Conversion:
             raise ValueError(
                 f"inputs: {taken.pop()!r} is also the name of the time or of a component of the state; rename it."
             )
+        parts += [*(item for _, item in found.energies), *found.active]
+        symbols = set().union(*(sympy.sympify(item).free_symbols for item in parts))
+        called = {item for item in functions if name_of(item) in self._called}
+        _require_different((TIME, *self.names, *sorted(called | symbols, key=sympy.srepr)))
 
     def __call__(self, expression: Any) -> Any:
         """Return the converted expression."""
@@ -295,6 +328,8 @@ class _Conversion:
         for derivatives in (True, False):
             chosen = {k: v for k, v in self._symbols.items() if isinstance(k, sympy.Derivative) == derivatives}
             expression = expression.xreplace(chosen)
+        # The derivative of Abs(x(t)), which may be complex, contains Derivative(re(x), x), which is 1 for a real x.
+        expression = expression.xreplace({item: item.doit() for item in expression.atoms(sympy.Derivative)})
         left = sorted(
             expression.atoms(AppliedUndef, sympy.Derivative), key=lambda item: (item.args != (TIME,), str(item))
         )
@@ -303,7 +338,8 @@ class _Conversion:
             raise self._unknown(unknown[-1])
         expression = expression.xreplace({item: symbol(name_of(item)) for item in left})
         own = {*self._symbols.values(), *self._accelerations.values()}
-        return expression.xreplace({item: symbol(name_of(item)) for item in expression.free_symbols - own})
+        expression = expression.xreplace({item: symbol(name_of(item)) for item in expression.free_symbols - own})
+        return without_impulses(expression)
 
     def _unknown(self, item: Any) -> ValueError:
         inner = item.expr if isinstance(item, sympy.Derivative) else item
@@ -334,8 +370,8 @@ class _Conversion:
 def _numbers(given: Any, names: Sequence[str]) -> list[float]:
     """Return values with which functions can be called; components that were not given are 0."""
     if isinstance(given, Mapping):
-        by_name = {name_of(key): value for key, value in given.items()}
-        return [float(by_name.get(name, 0.0)) for name in names]
+        found = {name_of(key): value for key, value in given.items()}
+        return [float(found.get(name, 0.0)) for name in names]
     return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
 
 
@@ -410,10 +446,33 @@ def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
     by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
     if by_speeds.rows != by_speeds.cols:
         return []
-    column = -by_rates[:, k]
-    if by_speeds.is_diagonal():
-        return [converted(a / b) for a, b in zip(column, by_speeds.diagonal(), strict=True)]
-    return [converted(item) for item in by_speeds.LUsolve(column)]
+    found = _solution(by_speeds, -by_rates[:, k])
+    return [] if found is None else [converted(item) for item in found]
+
+
+def _solution(A: Any, B: Any) -> Any:
+    """Return the solution X of A X = B; None if the matrix A has too many zeros to be regular.
+
+    SymPy's `LUsolve` divides by pivots, which may be 0 although A is regular, for example with Euler angles at the
+    attitude 0. Cramer's rule divides by determinants only, but its terms are too many for large matrices. Therefore A
+    is permuted to a triangular matrix of blocks, and the rule is applied to blocks of at most `LARGEST_BLOCK` rows.
+    """
+    pattern = csr_matrix([[int(item != 0) for item in A.row(i)] for i in range(A.rows)])
+    order = maximum_bipartite_matching(pattern, perm_type="column").tolist()
+    if -1 in order:
+        return None
+    permuted, X = A[:, order], sympy.zeros(*B.shape)
+    found: list[int] = []
+    for rows in permuted.strongly_connected_components():
+        block, rest = permuted[rows, rows], B[rows, :]
+        for k in found:
+            rest -= permuted[rows, k] * X[order[k], :]
+        small = len(rows) <= LARGEST_BLOCK
+        part = block.adjugate() * rest / block.det() if small else block.LUsolve(rest)
+        for i, row in enumerate(rows):
+            X[order[row], :] = part[i, :]
+        found += rows
+    return X
 
 
 def _method(model: Any) -> Any:
@@ -442,8 +501,9 @@ def _of_kane(method: Any) -> _Equations:
     bodies, loads = method.bodylist, method.forcelist
     if not bodies:
         raise ValueError("mechanics: the model has no bodies yet; call kanes_equations(bodies, loads) first.")
-    by_speeds = method.kindiffdict()
     q, u = list(method.q), list(method.u)
+    rates = -_solution(method._k_kqdot_implicit, method._k_ku_implicit * sympy.Matrix(u) + method._f_k_implicit)
+    by_speeds = dict(zip(method.kindiffdict(), rates, strict=True))
     frame = method._inertial
     free = KanesMethod(frame, q_ind=q, u_ind=u, kd_eqs=[dq - value for dq, value in by_speeds.items()])
     active, _ = free.kanes_equations(bodies, loads)
@@ -472,7 +532,7 @@ def _of_kane(method: Any) -> _Equations:
         [] if of_loads is not None and all(_is_constant(item, frame) for item in loads or ()) else list(active),
         method,
         [item for item in (*q, *u) if item not in dependent] if dependent else None,
-        dict(by_speeds),
+        by_speeds,
     )
 
 
@@ -551,6 +611,10 @@ def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str,
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
     known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
     known |= {symbol(name) for name, _ in system.inputs}
+    if taken := sorted(values.keys() & {item.name for item in known}):
+        raise ValueError(
+            f"params: {taken[0]!r} is the name of a parameter, and of a component of the state or an input; rename one."
+        )
     free = set().union(*(item.free_symbols for item in items)) - known
     needed = {item.name for item in free}
     missing = sorted(needed - values.keys())

@@ -211,6 +211,7 @@ class Writer:
         self.what = what
         self.body: list[ast.stmt] = []
         self.known: dict[Any, ast.expr] = {}
+        self._common: dict[Any, Any] = {}  # symbols of `cse` and their expressions
         self._written: dict[str, ast.expr] = {}
         self._places = arguments.places
 
@@ -219,6 +220,7 @@ class Writer:
         written = [with_powers_of_roots(item) for item in expressions]
         common, reduced = sympy.cse(written, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
         for name, expression in common:
+            self._common[name] = expression
             self.known[name] = self.value(expression)
         return [self.value(expression) for expression in reduced]
 
@@ -249,6 +251,8 @@ class Writer:
         raise self._unknown(expression)
 
     def _unknown(self, expression: Any) -> ValueError:
+        for name, meaning in reversed(self._common.items()):
+            expression = expression.xreplace({name: meaning})
         if isinstance(expression, sympy.DiracDelta):
             return ValueError(
                 f"{self.what}: it is the derivative of a function that jumps where {expression.args[0]} is 0. Use a "
