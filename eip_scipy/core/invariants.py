@@ -697,7 +697,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)
     if invariant.uses_f and fun is None:
         raise ValueError("check_gradient: this invariant's grad uses f, the derivative of the state; pass fun=.")
-    f = np.asarray(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)
+    f = np.array(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)
     size = np.where(y == 0, np.max(np.abs(y), initial=0.0) or 1.0, np.abs(y))
     G = InvariantSet(invariant, t, y, f, 0.0).gradients(t, y, f)
     floor = np.where(y == 0, size, 0.0)

@@ -62,7 +62,7 @@ class Surroundings:
     def _slope(self, t: float, y: Array) -> Array:
         """Return the derivative f(t, y), shape (n,); all NaN if `fun` raises an ArithmeticError or ValueError."""
         try:
-            found = np.asarray(self.fun(t, y.copy()), dtype=float)
+            found = np.array(self.fun(t, y.copy()), dtype=float)
         except (ArithmeticError, ValueError) as error:
             self.failure = self.failure or error
             return np.full_like(y, np.nan)
@@ -73,7 +73,8 @@ class Surroundings:
     def term_gradients(self, y: Array) -> Array:
         """Return the gradients (k, n) of the given functions (`terms`); all NaN if one of them cannot be computed."""
         try:
-            return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
+            found = [np.array(item.grad(y.copy()), dtype=float) for item in self.terms]
+            return np.array(found).reshape(-1, y.size)
         except (ArithmeticError, ValueError) as error:
             self.failure = self.failure or error
             return np.full((len(self.terms), y.size), np.nan)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.inputs import real_array, shown
 from ...core.problem import component_names
+from ...core.states import own_values
 from .motion import plain
 from .parts import Given, Parts, numerical_parts, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
@@ -284,9 +285,9 @@ def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
     rng = np.random.default_rng(7)
     one, two = rng.uniform(0.5, 1.5, (2, u.size))
     for what in ("kinematics", "velocity_constraints"):
-        fun = getattr(given, what)
-        if fun is None:
+        if getattr(given, what) is None:
             continue
+        fun = own_values(getattr(given, what))
         rest, first, second, both = (np.asarray(fun(t, q, v), float) for v in (0 * u, one, two, one + two))
         size = np.abs(first) + np.abs(second) + np.abs(rest)
         wrong = np.abs(both - first - second + rest)

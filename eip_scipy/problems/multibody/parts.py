@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.gradients import NumericalGradient, difference_gradient
 from ...core.inputs import shown
+from ...core.states import own_values
 from .motion import plain
 from .start import Names
 
@@ -116,6 +117,8 @@ Array = np.ndarray
 
 def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
     """Return the `Parts` of a mechanism, with numerical derivatives where the user gave none; `why` is for the repr."""
+    functions = {name: own_values(item) for name, item in given._asdict().items() if callable(item)}
+    given = given._replace(**functions)
     found = _Numerical(given, names, t, q)
     nq, energies = q.size, []
     energy, potential, power = given.energy, given.potential, given.power
