@@ -18,7 +18,7 @@ from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
-from .invariant_checks import complaints, listed, time_derivative
+from .invariant_checks import complaints, listed, reported, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
@@ -656,17 +656,7 @@ class InvariantSet:
         self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
     ) -> list[str]:
         """Check the invariants at the start, with step `tau`: raise ValueError or warn; return the warnings' texts."""
-        found = list(complaints(self, t, y, f, tau, self.rhs, evaluated))
-        for complaint in found:
-            if complaint.is_error:
-                raise ValueError(f"{complaint.text}. {complaint.advice}, or pass check=False to skip this check.")
-            advice = f" {complaint.advice}." if complaint.advice else ""
-            warnings.warn(
-                f"{complaint.text}.{advice} (check=False skips this check.)",
-                complaint.category,
-                stacklevel=users_level(),
-            )
-        return [complaint.text for complaint in found]
+        return reported(list(complaints(self, t, y, f, tau, self.rhs, evaluated)))
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:
