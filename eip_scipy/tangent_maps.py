@@ -17,6 +17,7 @@ from .core.inputs import is_number, reals, shown
 from .core.names import nearest
 from .core.options import ProjectionOptions
 from .core.results import Diagnostics
+from .core.states import own_values
 from .run.integrate import integrate
 from .run.prepare import Prepared, Request, prepared
 from .run.results import IntegrationResult
@@ -912,7 +913,7 @@ def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
 def _observed(observe: Any, names: Sequence[str]) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return the measured quantities as a function g(t, y), and the Jacobian of g."""
     if isinstance(observe, tuple | list) and len(observe) == 2 and all(callable(item) for item in observe):
-        return observe[0], observe[1]
+        return own_values(observe[0]), observe[1]
     if callable(observe):
         raise TypeError("observe: give a function together with its Jacobian, observe=(g, dg).")
     items = range(len(names)) if observe is None else [observe] if isinstance(observe, str | int) else observe

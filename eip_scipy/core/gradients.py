@@ -69,7 +69,7 @@ class NumericalGradient:
         return difference_gradient(lambda x: self._fun(t, x, extra), y, self.floors)
 
     def _fun(self, t: float, y: Array, extra: tuple) -> Array:
-        return np.asarray(self._function(t, y.copy(), *self._args, *extra))
+        return np.array(self._function(t, y.copy(), *self._args, *extra))  # the function may return the same array
 
     def _takes_complex_steps(self, t: float, y: Array, extra: tuple) -> bool:
         """Return True if the function accepts complex states and is analytic at states near the start."""
@@ -128,7 +128,7 @@ def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: comple
         ends = [y.copy(), y.copy()]
         ends[0][k] += multiple * shift
         ends[1][k] -= multiple * shift
-        above, below = (np.asarray(value(end)) for end in ends)
+        above, below = (np.array(value(end)) for end in ends)  # copies, because both may be the same array
         with np.errstate(invalid="ignore"):
             sums, lower = sums + weight * (above - below), lower + lower_weight * (above - below)
             largest = np.max([np.broadcast_to(largest, above.shape), np.abs(above), np.abs(below)], axis=0)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,13 +12,14 @@ import numpy as np
 from ..engine import data
 from ..engine.data import EPS
 from ..engine.trust import ROUNDING_OF_DIFFERENCES, ProjectionWarning
+from .callers import users_level
 from .conditional import is_kept_on_a_surface, on_targets
 from .gradients import DIFFERENCE_WEIGHTS, random_directions, time_of_motion
 
 if TYPE_CHECKING:
     from .invariants import InvariantSet
 
-__all__ = ["Complaint", "complaints", "listed", "time_derivative"]
+__all__ = ["Complaint", "complaints", "listed", "reported", "time_derivative"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -74,6 +76,22 @@ class Complaint(NamedTuple):
     advice: str = ""
     dependent: bool = False
     category: type[Warning] = UserWarning
+
+
+def reported(found: Iterable[Complaint]) -> list[str]:
+    """Raise ValueError or warn about the findings of a check at the start; return the texts of the warnings."""
+    texts = []
+    for complaint in found:
+        if complaint.is_error:
+            raise ValueError(f"{complaint.text}. {complaint.advice}, or pass check=False to skip this check.")
+        advice = f" {complaint.advice}." if complaint.advice else ""
+        warnings.warn(
+            f"{complaint.text}.{advice} (check=False skips this check.)",
+            complaint.category,
+            stacklevel=users_level(),
+        )
+        texts.append(complaint.text)
+    return texts
 
 
 class _Samples(NamedTuple):

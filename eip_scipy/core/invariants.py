@@ -18,7 +18,7 @@ from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
-from .invariant_checks import complaints, listed, time_derivative
+from .invariant_checks import complaints, listed, reported, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
@@ -656,17 +656,7 @@ class InvariantSet:
         self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
     ) -> list[str]:
         """Check the invariants at the start, with step `tau`: raise ValueError or warn; return the warnings' texts."""
-        found = list(complaints(self, t, y, f, tau, self.rhs, evaluated))
-        for complaint in found:
-            if complaint.is_error:
-                raise ValueError(f"{complaint.text}. {complaint.advice}, or pass check=False to skip this check.")
-            advice = f" {complaint.advice}." if complaint.advice else ""
-            warnings.warn(
-                f"{complaint.text}.{advice} (check=False skips this check.)",
-                complaint.category,
-                stacklevel=users_level(),
-            )
-        return [complaint.text for complaint in found]
+        return reported(list(complaints(self, t, y, f, tau, self.rhs, evaluated)))
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:
@@ -697,7 +687,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)
     if invariant.uses_f and fun is None:
         raise ValueError("check_gradient: this invariant's grad uses f, the derivative of the state; pass fun=.")
-    f = np.asarray(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)
+    f = np.array(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)
     size = np.where(y == 0, np.max(np.abs(y), initial=0.0) or 1.0, np.abs(y))
     G = InvariantSet(invariant, t, y, f, 0.0).gradients(t, y, f)
     floor = np.where(y == 0, size, 0.0)

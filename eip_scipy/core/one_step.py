@@ -7,13 +7,24 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..engine.data import NFEV, Work
+from ..engine.data import EPS, NFEV, Work
 from ..methods.orders import Ordered
+from .blocks import blocks_of, kinds_of
+from .gradients import random_directions, time_of_motion, unless_error
 from .inputs import refuse_units, shown
 
 __all__ = ["OneStep", "OneStepMethod", "as_vector"]
 
 NUMBERS = (float, np.float64, int, complex, np.complex128)
+# Length of the first step that is compared with the derivative, in times in which the state moves by its size; the
+# factor from one step to the next, because only short steps show the derivative of a stiff system; their number.
+SHORT, SHORTER, MOST_STEPS = 1e-4, 1 / 16, 5
+# Largest difference of the rate in a short step from the derivative, in units of both. A difference above it is that of
+# two equations if it is the same in the next step up to the share SAME, and larger by CLEAR than the change of the
+# derivative in the step and than its rounding, that is its change between states that differ by BLUR roundings.
+DIFFERS, SAME, CLEAR, BLUR = 1e-3, 0.01, 10.0, 4.0
+
+Array = np.ndarray
 
 
 @runtime_checkable
@@ -65,9 +76,9 @@ class OneStep(Ordered):
     and `c`, 1 and 0, are those of a tableau with a single stage at the start of the step, for code that reads the
     stages of any method. Adaptive steps change by the power `exponent` of the norm of the error estimate.
 
-    The steps do not use the right-hand side f. It is evaluated only for gradients that take f, and in a few steps to
-    judge the projections. ``nfev`` counts the evaluations for gradients and, for each step that is tried, the
-    `evaluations`.
+    The steps do not use the right-hand side f. It is evaluated only for gradients that take f, at the start to compare
+    it with a short step, and in a few steps to judge the projections. ``nfev`` counts the evaluations for gradients
+    and, for each step that is tried, the `evaluations`.
     """
 
     in_python = True
@@ -94,17 +105,76 @@ class OneStep(Ordered):
 
     def fill(self, w: Work, t: float, y: np.ndarray, h: float) -> None:
         """Make one step and write the state, and the error estimate if there is one, to the buffers `w`."""
-        result = self._one_step(float(t), y.copy(), float(h))
+        result, estimate = self._made(t, y, h)
         w.counters[NFEV] += self.evaluations
         if self.has_estimate:
-            if not isinstance(result, tuple) or len(result) != 2:
-                raise TypeError(
-                    f"{self.name}.one_step returned {type(result).__name__}, expected the pair (y_hat, err), because "
-                    "the method has error_estimator_order; return both, or remove this attribute."
-                )
-            result, estimate = result
             w.err[:] = self._vector(estimate, "an estimate", t, y).view(float)
         w.y_hat[:] = self._vector(result, "a state", t, y)
+
+    def _made(self, t: float, y: Array, h: float) -> tuple[Any, Any]:
+        """Return the state after a step and its error estimate, None without one, as `one_step` returns them."""
+        result = self._one_step(float(t), y.copy(), float(h))
+        if not self.has_estimate:
+            return result, None
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise TypeError(
+                f"{self.name}.one_step returned {type(result).__name__}, expected the pair (y_hat, err), because the "
+                "method has error_estimator_order; return both, or remove this attribute."
+            )
+        return result
+
+    def of_another_equation(
+        self, rhs: Callable[[float, Array], Array], start: Any, sign: float, called: str
+    ) -> str | None:
+        """Return a sentence if short steps from the `start` show that they do not solve the equation of `rhs`, or None.
+
+        The rate of change in a step of a method tends to the derivative as the step becomes shorter. The two are
+        compared for each half of a state (q, p), and for any other state as a whole. `sign` is the direction of the
+        steps, and `called` the argument that gave `rhs`. None is returned if the method or `rhs` raises an exception,
+        or if the method does not move the state, as an iteration whose tolerance is larger than the step.
+        """
+        with np.errstate(all="ignore"):
+            found: tuple[int, Any, Any, float] | None = unless_error(self._difference, rhs, start, sign)
+        if found is None:
+            return None
+        k, own, given, h = found
+        return (
+            f"the steps of {self.name} do not solve the equation of {called}: at the start, in a step of h={h:.2g}, "
+            f"component {k} changes at the rate {own:.6g}, and {called} gives {given:.6g}"
+        )
+
+    def _difference(
+        self, rhs: Callable[[float, Array], Array], start: Any, sign: float
+    ) -> tuple[int, Any, Any, float] | None:
+        """Return the component that differs most, its rates by a step and by `rhs`, and the step; None if none does."""
+        t, y, f, tau = start
+        motion = time_of_motion(y, f)
+        motion = tau if motion == np.inf else motion
+        h, last = sign * min(SHORT * motion, tau), np.full_like(y, np.nan)
+        is_real = y.dtype.kind == "f"
+        parts = 2 if is_real and 2 * kinds_of(blocks_of(None, y.size, 1), y, f).size == y.size else 1
+
+        def norms(x: Array) -> Array:
+            return np.linalg.norm(x.reshape(parts, -1), axis=1)
+
+        for _ in range(MOST_STEPS):
+            end = self._vector(self._made(t, y, h)[0], "a state", t, y)
+            difference = (end - y) / h - f
+            sizes = norms(difference)
+            differs = sizes > DIFFERS * (norms(f) + norms(y) / motion)
+            if not differs.any():
+                return None
+            change = norms(rhs(t + h, y + h * f) - f)
+            stays = (norms(difference - last) <= SAME * sizes) & (sizes > CLEAR * change)
+            wrong = differs & stays & (norms(end - y) > 0)
+            if wrong.any():
+                blurred = [y + BLUR * EPS * np.abs(y) * d for d in random_directions(y.size, not is_real)]
+                wrong &= sizes > CLEAR * np.max([norms(rhs(t, state) - f) for state in blurred], axis=0)
+            if wrong.any():
+                k = int(np.argmax(np.abs(difference) * np.repeat(wrong, y.size // parts)))
+                return k, difference[k] + f[k], f[k], h
+            last, h = difference, h * SHORTER
+        return None
 
     def _vector(self, value: Any, what: str, t: float, y: np.ndarray) -> np.ndarray:
         vector = as_vector(value, y.size, y.dtype, f"{self.name}.one_step returned {what}:", t)

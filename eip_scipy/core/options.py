@@ -102,8 +102,9 @@ class ProjectionOptions:
         multistep method and False for others.
     check : bool, optional
         True: check the invariants and their gradients at the start and again after some steps, monitor whether the
-        errors of the steps explain the corrections, and fail if a projection leaves an error as large as the terms of
-        the invariant. False: none of these.
+        errors of the steps explain the corrections, fail if a projection leaves an error as large as the terms of the
+        invariant, and compare a short step of a user-defined one-step method with `fun` at the start. False: none of
+        these.
     project_initial : bool, optional
         Project y0 onto given targets before the first step, by the correction with the smallest 2-norm: all components
         have equal weights, regardless of `metric` and `blocks`, and C y of a frame stays unchanged. `Diagnostics.moved`

@@ -137,7 +137,7 @@ def project(
 
 def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
     if callable(f):
-        return lambda t, state: as_derivative(f(t, state.copy()), y.size, y.dtype, t)
+        return lambda t, state: as_derivative(f(t, state.copy()), y.size, y.dtype, t).copy()
     fixed = np.zeros_like(y) if f is None else as_vector(f, y.size, y.dtype, "project: f has", t)
     return lambda t, state: fixed
 

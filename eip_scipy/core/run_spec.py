@@ -17,6 +17,7 @@ from . import steppers
 from .acceleration import named_accelerations
 from .failures import projection_failure
 from .frame import spanned
+from .invariant_checks import Complaint, reported
 from .invariants import TARGET_TOLERANCE, InvariantSet
 from .multistep import SecondOrder, attach_history
 from .options import ProjectionOptions
@@ -72,8 +73,8 @@ class RunSpec(NamedTuple):
         """Return the run that starts at the state y0, after a check of the options, the functions and the invariants.
 
         The derivative `f0` (n,) at y0 and the length `tau` of the first step are computed if they are None.
-        `check_start` is False if the invariants have been checked, and their cost reported, at the start of a similar
-        run.
+        `check_start` is False if the invariants and the steps of a user-defined method have been checked, and costs
+        reported, at the start of a similar run.
         """
         t0 = self.stepping.span.t0
         method, f0 = self.examined(y0, f0)
@@ -154,8 +155,8 @@ class RunSpec(NamedTuple):
             self.left_out, columns if columns is not None and columns.by_jvp and projection.check else None,
         )  # fmt: skip
 
-    def _check(self, run: Run, invariants_too: bool) -> None:
-        """Project the start if that is requested, and check the invariants there if `invariants_too`."""
+    def _check(self, run: Run, checks: bool) -> None:
+        """Project the start if that is requested, and check the invariants and the steps there if `checks`."""
         if run.options.frame.products.size and (scales := _scales(run)) is not run.options.scales:
             run.options = run.options._replace(scales=scales)
         if self.projection.project_initial:
@@ -169,9 +170,13 @@ class RunSpec(NamedTuple):
             raise ValueError(
                 f"{violation}; correct y0 or the target, or pass project_initial=True to project y0 first."
             )
-        if run.options.watched and invariants_too and BUILD.are_finite(run.start.f.view(float)):
+        if run.options.watched and checks and BUILD.are_finite(run.start.f.view(float)):
             known = (run.work.G, run.work.values) if run.start is run.begin else None
             run.trust.doubts += run.invariants.check(*run.start[:3], run.invariants.tau, known)
+        if self.projection.check and checks and run.tableau.in_python:
+            text = steppers.of_another_equation(run.tableau, self.rhs, run.start, self.stepping.span.sign, self.called)
+            if text is not None:
+                run.trust.doubts += reported([Complaint(False, text, "Make the method for the equation of this run")])
 
 
 def _scales(run: Run) -> Array:

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..engine.native import BUILD
 from .inputs import reals, refuse_units, shown
+from .jitted import is_jitted
 from .one_step import as_vector
 
-__all__ = ["as_derivative", "initial_state", "states"]
+__all__ = ["as_derivative", "initial_state", "own_values", "states"]
+
+
+def own_values(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a user's function with values that its later calls do not change; it may return one array again and again.
+
+    Numba functions, which cannot fill a global array, are returned unchanged.
+    """
+    if is_jitted(fun):
+        return fun
+
+    def own(*args: Any) -> Any:
+        value = fun(*args)
+        return np.array(value) if isinstance(value, np.ndarray | list) else value
+
+    return own
 
 
 def as_derivative(value: Any, n: int, dtype: np.dtype, t: float, name: str = "fun") -> np.ndarray:

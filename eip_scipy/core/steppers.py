@@ -23,7 +23,7 @@ from ..methods.runge_kutta import DOP853, Tableau
 from .driven import Driven, Stepper
 from .one_step import OneStep
 
-__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "rated"]
+__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "of_another_equation", "rated"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -107,6 +107,17 @@ def _(method: NystromTableau) -> Method:
         paired=False,
         exponent=-1.0 / ((method.error_estimator_order or 0) + 1),
     )
+
+
+@singledispatch
+def of_another_equation(method: Any, rhs: Derivative, start: Any, sign: float, called: str) -> str | None:
+    """Return a sentence if the steps of a method do not solve the equation of `rhs`, as only user-defined ones may."""
+    return None
+
+
+@of_another_equation.register
+def _(method: OneStep, rhs: Derivative, start: Any, sign: float, called: str) -> str | None:
+    return method.of_another_equation(rhs, start, sign, called)
 
 
 @singledispatch

@@ -356,8 +356,10 @@ def _of_columns_in_order(
             return rhs_by_products(fun, form, jvp, n, columns.count), "jvp"
 
         def products(t: float, y: Array, M: Array, extra: tuple) -> Array:
-            found = (jvp(t, y.copy(), row[:n].copy(), *extra) for row in M)
-            return np.array([as_derivative(value, n, y0.dtype, t, "jvp") for value in found])
+            found = np.empty((len(M), n))
+            for out, row in zip(found, M, strict=True):  # each value is copied, because jvp may return the same array
+                out[:] = as_derivative(jvp(t, y.copy(), row[:n].copy(), *extra), n, y0.dtype, t, "jvp")
+            return found
 
         return _interpreted(columns, fun, form, y0, products), "jvp"
     why: str | None = "it is not compiled by Numba"
@@ -394,7 +396,7 @@ def _require_products(
         names = ["t", "y", "dy", *["params"] * len(extra)]
         require_arguments(jvp, names, "jvp", f"Write jvp({', '.join(names)}).")
         raise
-    found = as_derivative(given, y0.size, y0.dtype, t0, "jvp")
+    found = as_derivative(given, y0.size, y0.dtype, t0, "jvp").copy()
     right = _difference(derivative, t0, y0, dy, dp, [], extra)
     if not _agree(found, right, WRONG):
         k = int(np.argmax(np.abs(found - right)))
@@ -445,7 +447,7 @@ def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
             found = np.full(n - half, np.nan, y.dtype)
             fun(t, state, found, *extra)
         else:
-            found = np.asarray(fun(t, state, *extra))
+            found = np.array(fun(t, state, *extra))  # a copy, because fun may return the same array in each call
             if found.shape == () and n - half == 1:
                 found = found.reshape(1)
         return np.concatenate([y[half:], found]) if half else found
@@ -677,9 +679,7 @@ class _WideInvariant:
 
     def _differences(self, t: float, y: Array, params: Array) -> Array:
         """Return the invariant's derivatives with respect to the parameters in Y, by differences of order 6."""
-        slopes = difference_gradient(
-            lambda p: np.asarray(self.item.function(t, y.copy(), p)), params, np.abs(params) + LEAST
-        )
+        slopes = difference_gradient(lambda p: self.item.function(t, y.copy(), p), params, np.abs(params) + LEAST)
         return np.asarray(slopes)[..., self.places]
 
 

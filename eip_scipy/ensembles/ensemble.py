@@ -56,10 +56,10 @@ LEAST_CHUNKS = 16
 LEAST_OCTETS = 4  # of members in a chunk
 TRIED = 8
 SHOWN = 5
-# Fields of a request that an ensemble handles itself or does not have.
-ALONE = {"fun", "acceleration", "t_span", "y0", "params", "projection"}
-ALONE |= {"callback", "diagnostics", "max_bytes", "progress"}
-OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
+# Fields of a request that an ensemble handles itself, those that it does not have, and its own parameters.
+HANDLED = {"fun", "acceleration", "t_span", "params", "callback", "max_bytes", "progress"}
+ALONE = HANDLED | {"y0", "diagnostics", "projection"}
+OWN = ("y0s", "executor", "reduce", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(HANDLED))
 
 
 class EnsembleKeywords(ProjectionDetails, total=False):

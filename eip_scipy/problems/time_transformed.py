@@ -17,6 +17,7 @@ from ..core.inputs import refuse_units
 from ..core.invariants import Invariant
 from ..core.jitted import compilable, compiled_like, jitted
 from ..core.problem import Problem, bind
+from ..core.states import own_values
 
 __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 
@@ -161,7 +162,8 @@ def _depends_on_time(item: Invariant, problem: Problem) -> bool:
     """Return True if the values of an invariant at the problem's initial state differ between three times."""
     params = np.zeros(0) if problem.params is None else problem.params
     t0, t1 = problem.t_span
-    values = [item.function(t, problem.y0, *(item.args or (params,))) for t in (t0, t0 + 0.37 * (t1 - t0), t1)]
+    fun = own_values(item.function)
+    values = [fun(t, problem.y0, *(item.args or (params,))) for t in (t0, t0 + 0.37 * (t1 - t0), t1)]
     return not all(np.array_equal(value, values[0], equal_nan=True) for value in values)
 
 

@@ -147,7 +147,8 @@ def integrate(
         last state are saved.
     events : callable or sequence of callable, optional
         ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`;
-        Numba functions or C functions, or Python functions, which are called from Python even if `fun` is native.
+        Numba functions or C functions, or Python functions, which are called from Python even if `fun` is native. An
+        event does not happen where its value is NaN.
     dense_output : bool, optional
         If True, store the interpolants of all steps as ``.sol``, a function of time; not available with a checkpoint.
     callback : callable, optional

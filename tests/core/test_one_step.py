@@ -140,7 +140,7 @@ def test_a_method_says_what_it_evaluates():
     method = eip_method(Counted(lambda t, y: calls.append(t) or oscillator(t, y)))
     for options in ({"h": 0.1}, {"rtol": 1e-6, "first_step": 3.0}):
         calls.clear()
-        sol = runs(method, **options)
+        sol = runs(method, check=False, **options)
         assert 2 * (sol.nfev - 1) == len(calls)  # of both drivers; the derivative at the start is theirs
     with pytest.raises(ValueError, match=r"evaluations must be an integer >= 0, got -1"):
         eip_method(type("Wrong", (Verlet,), {"evaluations": -1})())
@@ -158,6 +158,81 @@ def test_complex_states_keep_their_type():
         lambda t, y: -1j * y, (0, 1), [1 + 1j, 2.0], method=eip_method(Exact()), h=0.1, invariants=modulus, iterations=4
     )
     np.testing.assert_allclose(run.y[:, -1], np.array([1 + 1j, 2.0]) * np.exp(-1j), atol=1e-15)
+
+
+def pendulum(g):
+    return lambda t, y: np.array([y[1], -g * np.sin(y[0])])
+
+
+@pytest.mark.parametrize("lib", [integrate, solve_ivp])
+@pytest.mark.parametrize("end", [1.0, -1.0])
+@pytest.mark.parametrize("method", [RK4, RK43])
+def test_steps_of_another_equation_are_reported(lib, end, method):
+    options = {"method": eip_method(method(pendulum(1.01))), "h": 0.02, "diagnostics": Diagnostics()}
+    with pytest.warns(
+        UserWarning, match=r"do not solve the equation of fun: .* rate -0\.84988., and fun gives -0\.841471"
+    ):
+        lib(pendulum(1.0), (0, end), [1.0, 0.3], **options)
+    assert "do not solve the equation" in options["diagnostics"].message
+    assert not options["diagnostics"].trusted
+    options["diagnostics"] = Diagnostics()
+    lib(pendulum(1.0), (0, end), [1.0, 0.3], check=False, **options)
+    assert options["diagnostics"].trusted
+
+
+@pytest.mark.parametrize("rate", 10.0 ** np.arange(0, 15, 2))
+def test_steps_of_stiff_equations_are_not_reported(rate):
+    """An implicit Euler step of y' = -rate (y - z), z' = -z differs from the derivative unless it is very short."""
+
+    class Implicit:
+        order = 1
+
+        def one_step(self, t, y, h):
+            z = y[1] / (1 + h)
+            return np.array([(y[0] + h * rate * z) / (1 + h * rate), z])
+
+    for away in (0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0):
+        run = integrate(
+            lambda t, y: np.array([-rate * (y[0] - y[1]), -y[1]]), (0, 0.02), [1 + away, 1.0],
+            method=eip_method(Implicit()), h=0.01,
+        )  # fmt: skip
+        assert run.trusted
+
+
+@pytest.mark.parametrize("force", 10.0 ** np.arange(0, 13, 3))
+@pytest.mark.parametrize("q", [[1.0, 1.0], [0.1 + 0.2, 0.3], [1.2, 1.2 + 1e-9]])
+def test_steps_where_large_forces_cancel_are_not_reported(force, q):
+    class Kicks:
+        """The two forces on each mass act one after the other."""
+
+        order = 1
+
+        def one_step(self, t, y, h):
+            y[2:] -= h * force * y[:2]
+            y[2:] += h * force * y[1::-1]
+            y[:2] += h * y[2:]
+            return y
+
+    def fun(t, y):
+        return np.concatenate([y[2:], force * (y[1::-1] - y[:2])])
+
+    run = integrate(fun, (0, 1e-7), [*q, 0.0, 0.0], method=eip_method(Kicks()), h=1e-7)
+    assert run.trusted
+
+
+def test_steps_that_raise_or_do_not_move_are_not_reported():
+    class OfOneLength(RK4):
+        def one_step(self, t, y, h):
+            if h != 0.5:
+                raise ValueError("no table for this step")
+            return super().one_step(t, y, h)
+
+    class Coarse(RK4):
+        def one_step(self, t, y, h):
+            return y if h < 0.01 else super().one_step(t, y, h)
+
+    for method in (OfOneLength, Coarse):
+        assert integrate(oscillator, (0, 2), [1.0, 0.0], method=eip_method(method(oscillator)), h=0.5).trusted
 
 
 def test_an_own_step_runs_interpreted_and_says_so():

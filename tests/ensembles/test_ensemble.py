@@ -512,7 +512,8 @@ def test_progress(capsys):
     ("options", "error", "match"),
     [
         ({"metrik": "error"}, TypeError, r"ensemble\(\) has no option 'metrik'; did you mean 'metric'\?"),
-        ({"diagnostics": None}, TypeError, "no option 'diagnostics'"),
+        ({"y0": [[1.0, 0.0]]}, TypeError, r"ensemble\(\) has no option 'y0'; did you mean 'y0s'\?"),
+        ({"diagnostics": None}, TypeError, r"ensemble\(\) has no option 'diagnostics'$"),
         ({"y0s": None}, TypeError, "y0s is missing"),
         ({"y0s": [1.0, 2.0]}, ValueError, r"y0s must have the shape \(members, n\), got \(2,\)"),
         ({"y0s": np.zeros((0, 2))}, ValueError, r"got \(0, 2\)"),

@@ -369,6 +369,25 @@ def test_plain_python_functions_do_as_well():
     np.testing.assert_allclose(plain.along("B", points), np.array([mirror_b(*p) for p in POINTS]).T, rtol=1e-10)
 
 
+@pytest.mark.parametrize(("form", "varies"), [("canonical", False), ("velocity", False), ("velocity", True)])
+def test_functions_may_return_the_same_array_in_each_call(form, varies):
+    """A particle gyrates once in the uniform field B = e_z."""
+    array = np.empty(3)
+
+    def A(*where):
+        array[:] = -where[-2] / 2, where[-3] / 2, 0.0
+        return array
+
+    def E(*where):
+        array[:] = 0.0
+        return array
+
+    field = ParticleField(A, electric=E, potential=lambda *where: 0.0, varies=varies)
+    problem = charged_particle(field, [1.0, 0, 0], [0, 0.5, 0.1], t_span=(0, 2 * np.pi), form=form)
+    run = integrate(problem, method=EIPDOP853, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(run.y[:3, -1], [1.0, 0.0, 0.2 * np.pi], rtol=0, atol=1e-8)
+
+
 def test_differences_take_the_fields_length():
     """Differences of the same field on a small scale need its length, which determines their step."""
     small = 1e-6

@@ -141,6 +141,13 @@ def assert_order(found, method):
     assert found < method.order + 0.25 or method.name == "splitting-rkn6"
 
 
+def test_a_splitting_of_the_equation_before_a_quench_is_reported():
+    scene = soliton(length=60.0, t_end=0.04, h=0.02)
+    after = scene.equation.changed(beta=1.1 * scene.equation.beta).problem(scene.y0, 0.04, 0.02)
+    with pytest.warns(UserWarning, match="the steps of splitting-rkn6 do not solve the equation of fun"):
+        assert not integrate(after, method=eip_method(Splitting(scene.equation))).trusted
+
+
 @pytest.mark.parametrize("kept", [(), KEPT], ids=["raw", "EIP"])
 @pytest.mark.parametrize("method", METHODS)
 def test_soliton(method, kept):

@@ -1,5 +1,8 @@
 """`find_invariants` finds all invariants, and nothing else."""
 
+import math
+import pickle
+
 import numpy as np
 import pytest
 from numba import config, njit
@@ -375,6 +378,59 @@ def test_hard_cases(name):
         f = case.problem.fun(0.0, case.problem.y0)
         grad = item.grad(0.0, case.problem.y0)
         assert abs(grad @ f) <= 1e-12 * np.abs(grad * f).sum()
+
+
+def test_functions_may_return_the_same_array_in_each_call():
+    array = np.empty(2)
+
+    def filled(*values):
+        array[:] = values
+        return array
+
+    terms = {
+        "log(x)": (lambda y: np.log(y[0]), lambda y: filled(1 / y[0], 0.0)),
+        "log(y)": (lambda y: np.log(y[1]), lambda y: filled(0.0, 1 / y[1])),
+    }
+    assert names(lambda t, y: filled(*lotka_volterra(t, y)), [1.0, 0.5], terms=terms) == [
+        "3*y0 + 4*y1 - 3*log(x) - 2*log(y)"
+    ]
+
+
+def test_they_can_be_pickled():
+    found = find_invariants(coupled, [1.0, 0.0, 0.0, 0.5])
+    found += find_invariants(kepler, [1.0, 0.0, 0.0, 1.2], terms=[(inverse_radius, inverse_radius_gradient)])
+    assert found[-1].name == "y2**2 + y3**2 - 2*inverse_radius(y)"
+    y = np.array([0.3, -0.7, 0.2, 0.9])
+    for item in found:
+        again = pickle.loads(pickle.dumps(item))
+        assert repr(again) == repr(item)
+        np.testing.assert_array_equal(again.fun(0.0, y), item.fun(0.0, y))
+        np.testing.assert_array_equal(again.grad(0.0, y), item.grad(0.0, y))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.01, 1.0001, -1.0])
+def test_a_term_needs_its_own_gradient(factor):
+    def sir(t, y):
+        new, gone = 2.0 * y[0] * y[1], 0.5 * y[1]
+        return np.array([-new, new - gone, gone])
+
+    terms = {"log(S)": (lambda y: np.log(y[0]), lambda y: np.array([factor / y[0], 0.0, 0.0]))}
+    if factor == 1.0:
+        assert names(sir, [0.99, 0.01, 0.0], terms=terms) == ["y0 + y1 + y2", "4*y2 + log(S)"]
+        return
+    with pytest.raises(
+        ValueError, match=r"the second function of the term 'log\(S\)' is not the gradient of the first"
+    ):
+        find_invariants(sir, [0.99, 0.01, 0.0], terms=terms)
+
+
+def test_a_term_may_have_kinks_and_places_where_it_is_not_defined():
+    terms = {
+        "|x|": (lambda y: abs(y[0]), lambda y: np.array([np.sign(y[0]), 0.0])),
+        "log(x)": (lambda y: math.log(y[0]), lambda y: np.array([1 / y[0], 0.0])),
+        "big": (lambda y: 1e12 + y[1], lambda y: np.array([0.0, 1.0])),
+    }
+    assert names(lambda t, y: np.array([y[1], -y[0]]), [1e-3, 1.0], terms=terms) == ["y0**2 + y1**2"]
 
 
 def test_they_serve_a_run():

@@ -174,6 +174,19 @@ def test_functions_may_change_their_arguments_and_return_the_same_array():
     np.testing.assert_array_equal(state, found.y0)
 
 
+def test_functions_may_return_the_same_array_in_each_call():
+    array = np.empty(1)
+
+    def reusing(t, q):
+        array[:] = length(t, np.real(q))
+        return array
+
+    state = np.array([0.8, -0.6, 0.3, 0.4])
+    numerical = mechanism([1, 1], [0, -G], untraceable(reusing), **PENDULUM)
+    exact = mechanism([1, 1], [0, -G], length, **PENDULUM)
+    np.testing.assert_allclose(numerical.fun(0.0, state), exact.motion_at(0.0, state), atol=1e-11)
+
+
 @pytest.mark.parametrize("wrapped", [lambda f: f, untraceable])
 def test_constraints_may_depend_on_time(wrapped):
     # A bead on a rod that turns at the rate w: r'' = w^2 r.

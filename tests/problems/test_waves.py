@@ -72,11 +72,11 @@ def test_closed_form_solves_the_equation(scene, t):
 
 
 def test_closed_forms_are_the_well_known_ones():
-    x = np.linspace(-5, 5, 11)
-    at = breather(points=10, length=10.0).reference
+    x = np.linspace(-5, 5, 17)
+    at = breather(points=16, length=10.0).reference
     np.testing.assert_allclose(abs(at(0.0)), 2 / np.cosh(x[:-1]), rtol=1e-14)
     np.testing.assert_allclose(abs(at(np.pi / 2)), abs(at(0.0)), rtol=1e-13)
-    one = korteweg_de_vries_solitons(2.0, 1.0, points=10, length=10.0).reference(0.25)
+    one = korteweg_de_vries_solitons(2.0, 1.0, points=16, length=10.0).reference(0.25)
     distance = np.remainder(x[:-1] - 1.5 + 5, 10) - 5
     np.testing.assert_allclose(one, 1 / np.cosh(distance / np.sqrt(2)) ** 2, rtol=1e-13)
 
@@ -313,7 +313,7 @@ def test_adaptive_steps_of_lawson(tableau):
 @pytest.mark.parametrize("tableau", [RK3, RK4, DOP853], ids=lambda tableau: tableau.name)
 def test_lawson_counts_what_it_evaluates(tableau, monkeypatch):
     """And the derivative at the start; the energy's gradient takes none."""
-    scene = korteweg_de_vries_solitons(points=64, t_end=1.0)
+    scene = korteweg_de_vries_solitons(points=96, t_end=1.0)
     equation, calls = scene.equation, []
     plain = equation.nonlinear
     monkeypatch.setattr(equation, "nonlinear", lambda modes: calls.append(1) or plain(modes))
@@ -323,9 +323,26 @@ def test_lawson_counts_what_it_evaluates(tableau, monkeypatch):
 
 @pytest.mark.parametrize(("scheme", "flows"), [("strang", 1), ("s6", 6), ("rkn6", 6)])
 def test_splittings_count_their_pairs_of_transforms(scheme, flows):
-    scene = soliton(points=64, t_end=0.1)
+    scene = soliton(points=80, t_end=0.1)
     run = integrate(scene, method=eip_method(Splitting(scene.equation, scheme)), h=0.01, invariants=())
     assert run.nfev == 1 + 10 * flows
+
+
+@pytest.mark.parametrize(
+    ("scene", "h"),
+    [
+        (soliton(points=77), 0.02),
+        (soliton(points=115, velocity=4.0), 0.01),
+        (soliton(points=78, amplitude=0.5, velocity=1.0, length=70.0, t_end=20.0), 0.05),
+        (korteweg_de_vries_solitons(points=92), 0.02),
+        (korteweg_de_vries_solitons(4.0, 0.0, points=128, t_end=5.0), 0.005),
+    ],
+)
+def test_the_coarsest_grids_that_are_taken_have_small_errors(scene, h):
+    method = {"method": eip_method(Lawson(scene.equation, RK4))} if "korteweg" in scene.name else {}
+    end = scene.t_span[1]
+    run = integrate(scene, h=h, invariants=(), **method)
+    assert 1e-5 < np.abs(run.y[:, -1] - scene.reference(end)).max() / np.abs(scene.y0).max() < 4e-3
 
 
 def test_lawson_is_exact_for_linear_waves():
@@ -356,6 +373,9 @@ def test_lawson_is_exact_for_linear_waves():
         (lambda: KortewegDeVries(Grid(8, 0, 1), damping=1.0).problem(np.ones(8), 400.0), "End the run before t = 350"),
         (lambda: korteweg_de_vries_solitons((1.0, 1.0)), "all different"),
         (lambda: korteweg_de_vries_solitons((1.0, 2.0), 0.0), "a place for each"),
+        (lambda: korteweg_de_vries_solitons(points=32), "a soliton of the speed 2 has the width 1.41, .* points >= 91"),
+        (lambda: soliton(points=32), "points at most 0.524 apart, but 32 .* are 1.25 apart. Give points >= 77"),
+        (lambda: soliton(velocity=-20.0), "Give points >= 319"),
         (lambda: breather(beta=1.0), "beta < 0"),
     ],
 )

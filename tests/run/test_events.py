@@ -173,6 +173,18 @@ def test_a_search_that_finds_nothing_does_not_warn():
     assert run.t_events[0].size == 0
 
 
+@pytest.mark.parametrize("x", [1.0, -1.0])
+def test_an_event_may_be_nan_in_a_part_of_the_domain(x):
+    """log(x + 1/2) is not defined for x < -1/2, where one of the runs starts."""
+
+    def event(t, y):
+        return math.log(y[0] + 0.5) if y[0] > -0.5 else math.nan
+
+    run = integrate(oscillator, (0, 12), [x, 0.0], method=EIPDOP853, rtol=1e-9, atol=1e-9, events=event)
+    times = np.pi * np.array([1, 5, 7, 11] if x > 0 else [2, 4, 8, 10]) / 3
+    np.testing.assert_allclose(run.t_events[0], times, rtol=0, atol=1e-7)
+
+
 def test_a_passage_that_does_not_reach_zero_is_none():
     for height in (1e-3, 1e-9, 1e-14):
         run = integrate(

@@ -250,7 +250,7 @@ def assert_same(one, other):
         kepler_run,
         failed_run,
         lambda: kepler_run(events=[crossing, lambda t, y, params: y[0] - 9], dense_output=True),
-        lambda: integrate(soliton(points=16), (0, 0.01), method=EIPRK4, h=0.001),
+        lambda: integrate(soliton(points=16, length=8.0), (0, 0.01), method=EIPRK4, h=0.001),
         lambda: integrate(kepler(), (0, 3), method=EIPDOP853, rtol=1e-9),
     ],
 )
@@ -539,7 +539,7 @@ def test_plot_of_components():
     np.testing.assert_array_equal(alone.lines[1].get_ydata(), sol.y[1])
     with pytest.raises(ValueError, match="an orbit needs components named x and y"):
         plot(sol, orbit=True)
-    field = integrate(soliton(points=16), (0, 0.01), method=EIPRK4, h=0.001)
+    field = integrate(soliton(points=16, length=8.0), (0, 0.01), method=EIPRK4, h=0.001)
     first, *_ = axes_of(field.plot())
     assert first.get_title() == "the first 9 of 16"
     np.testing.assert_array_equal(first.lines[3].get_ydata(), np.abs(field.y[3]))

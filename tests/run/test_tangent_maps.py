@@ -738,6 +738,18 @@ def test_fit_of_state_and_parameter(pendulum):
     assert earlier.run(earlier.x0).t[0] == 0.0
 
 
+def test_fit_of_an_observable_that_returns_the_same_array_in_each_call(pendulum):
+    t, seen = np.linspace(0.0, 3.0, 7), np.empty(1)
+
+    def position(t, y):
+        seen[:] = y[0]
+        return seen
+
+    data = integrate(pendulum, (0, 3), [1.0, 0.2], t_eval=t, **FINE).y[0]
+    fit = TrajectoryFit(pendulum, t, data, y0=[1.0, 0.2], observe=(position, lambda t, y: np.eye(2)[:1]), **FINE)
+    np.testing.assert_array_equal(fit.residuals(fit.x0), np.zeros(7))
+
+
 # Bad input.
 
 

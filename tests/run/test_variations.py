@@ -84,6 +84,33 @@ def test_refuses_a_wrong_jvp(jvp, error, message):
         solve_ivp(pendulum, SPAN, START, method=EIPDOP853, h=0.1, variations="state", jvp=jvp)
 
 
+def reusing(fun):
+    """Return `fun` with values in an array that each call fills again, one for each type of numbers."""
+    arrays = {}
+
+    def filled(*args):
+        found = np.asarray(fun(*args))
+        array = arrays.setdefault(found.dtype, np.empty_like(found))
+        array[:] = found
+        return array
+
+    return filled
+
+
+@pytest.mark.parametrize("jvp", [None, product])
+def test_functions_may_return_the_same_array_in_each_call(jvp):
+    options = {"variations": "state", "jvp": jvp and reusing(jvp)}
+    expected = run_of(variations="state", jvp=jvp).variations
+    found = integrate(reusing(pendulum), SPAN, START, method=EIPDOP853, h=0.1, invariants=Invariant(energy), **options)
+    np.testing.assert_array_equal(found.variations, expected)
+
+
+def test_refuses_complex_steps_that_are_lost_in_the_same_array():
+    real = reusing(lambda t, y: pendulum(t, y.real))
+    with pytest.raises(ValueError, match="does not support complex steps"):
+        integrate(real, SPAN, START, method=EIPDOP853, h=0.1, variations="state")
+
+
 def test_takes_a_jvp_whose_components_have_sizes_of_their_own():
     # 7e6 m and 1e-3 m/s with a drag that is not linear: a direction of the largest size would leave the region.
     def fun(t, y):

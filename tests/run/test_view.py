@@ -82,7 +82,7 @@ def test_states_of_other_kinds():
     top = equations({"a": "b*c", "b": "-2*c*a", "c": "a*b"})
     curves = of(integrate(top, (0, 1), [1, 0.3, 0.2], method=EIPRK4, h=0.1, save_every=1))["state"]
     assert (curves["kind"], curves["names"], len(curves["rows"])) == ("curves", ["a", "b", "c"], 3)
-    scene = soliton(points=64, t_end=0.1)
+    scene = soliton(points=80, t_end=0.1)
     run = integrate(scene, h=0.02, save_every=1)
     profile = of(run)["state"]
     assert profile["kind"] == "profile"

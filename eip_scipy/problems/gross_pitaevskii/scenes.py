@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import pi, sqrt
+from math import ceil, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,9 @@ __all__ = [
 ]
 
 Potential = Callable[..., Any]
+# Wavenumbers of a soliton on both sides of v, in units of a. A grid whose largest one, pi divided by the spacing, is at
+# least |v| + 5 a has errors of about 1e-3 at t = 10 / a^2; at |v| + 3 a they are 2e-2.
+SOLITON_WAVENUMBERS = 5.0
 
 
 def harmonic_trap(*gamma: float) -> Potential:
@@ -121,10 +124,17 @@ def soliton(
     Raises
     ------
     ValueError
-        If beta is not negative or the amplitude not positive.
+        If beta is not negative, the amplitude is not positive, or the grid is too coarse for the soliton.
     """
     refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
     gpe = _focusing("bright soliton", points, length, amplitude, beta, options)
+    largest = abs(velocity) + SOLITON_WAVENUMBERS * amplitude
+    if pi * points / length < largest:
+        raise ValueError(
+            f"a bright soliton with amplitude = {amplitude:g} and velocity = {velocity:g} needs points at most "
+            f"{pi / largest:.3g} apart, but {points} points on a ring of length {length:g} are {length / points:.3g} "
+            f"apart. Give points >= {ceil(length * largest / pi)}."
+        )
     x = gpe.grid.points(0)
     exact = partial(_soliton, x, length, amplitude, velocity, beta)
     start = exact(0.0)

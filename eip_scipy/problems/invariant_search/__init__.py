@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ...core.inputs import count, is_number, refuse_units, shown
 from ...core.invariants import Invariant
-from ...core.jitted import compiled_like
+from ...core.jitted import compiled_like, is_compiled
 from ...core.problem import Problem
 from .polynomials import Term, functions, written
 from .search import Search, Surroundings
@@ -67,13 +68,15 @@ def find_invariants(
     list of Invariant
         Functionally independent invariants, the simplest first, with readable names (``"y0*y3 - y1*y2"``) and
         gradients. Coefficients are replaced by small fractions if the combination with these fractions is conserved
-        too. The functions are jitted if `fun` and the `terms` that they contain are jitted. Polynomials and other
-        functions of the returned invariants are left out. The list is empty if no invariant is found.
+        too. The functions are jitted if `fun` and the `terms` that they contain are jitted, and can otherwise be
+        pickled if these terms can. Polynomials and other functions of the returned invariants are left out. The list is
+        empty if no invariant is found.
 
     Raises
     ------
     ValueError
-        If an argument is wrong, `fun` is not finite at (t, y0), or `fun` or a term is finite at too few points.
+        If an argument is wrong, `fun` is not finite at (t, y0), `fun` or a term is finite at too few points, or the
+        gradient of a term differs from its differences.
 
     Notes
     -----
@@ -135,4 +138,4 @@ def _of_state(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of y from a function of (t, y) that does not depend on t, or from a function of y."""
     if isinstance(fun, np.ufunc) or len(inspect.signature(fun).parameters) != 2:
         return fun
-    return compiled_like(lambda y: fun(0.0, y), fun)
+    return compiled_like(lambda y: fun(0.0, y), fun) if is_compiled(fun) else partial(fun, 0.0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.jitted import compiled_like
+from ...core.jitted import compiled_like, is_compiled
 
 __all__ = ["LARGEST_DENOMINATOR", "Functions", "Monomial", "Polynomial", "Term", "functions", "product_of", "written"]
 
@@ -49,14 +49,32 @@ def functions(
 ) -> Functions:
     """Return value and gradient of a polynomial of n variables plus multiples of given functions.
 
-    Both are jitted if the given functions and `like`, the user's right-hand side, are jitted.
+    Both are jitted if the given functions and `like`, the user's right-hand side, are jitted. Otherwise they can be
+    pickled if the given functions can.
     """
+    compiled = [like, *(function for term, _ in terms for function in (term.fun, term.grad))]
+    if not all(map(is_compiled, compiled)):
+        return Functions(*(_Interpreted(polynomial, terms, n, which) for which in Functions._fields))
     found = _of_polynomial(polynomial, n)
-    compiled = [like]
     for term, coefficient in terms:
         found = _with_term(Functions(*(compiled_like(item, *compiled) for item in found)), term, coefficient)
-        compiled += [term.fun, term.grad]
     return Functions(*(compiled_like(item, *compiled) for item in found))
+
+
+class _Interpreted:
+    """One of the functions of a quantity, named in `Functions`, in Python; pickles contain its arguments."""
+
+    def __init__(self, polynomial: Polynomial, terms: Sequence[tuple[Term, float]], n: int, which: str) -> None:
+        self._arguments, found = (polynomial, terms, n, which), _of_polynomial(polynomial, n)
+        for term, coefficient in terms:
+            found = _with_term(found, term, coefficient)
+        self._function = getattr(found, which)
+
+    def __call__(self, t: float, y: np.ndarray) -> Any:
+        return self._function(t, y)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._arguments
 
 
 def _of_polynomial(polynomial: Polynomial, n: int) -> Functions:

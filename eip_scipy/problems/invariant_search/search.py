@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import DOP853
 
+from ...core.gradients import difference_gradient, unless_error
+from ...core.inputs import shown
+from ...engine.data import EPS
 from .polynomials import LARGEST_DENOMINATOR, Monomial, Polynomial, Term, product_of
 
 __all__ = ["Sample", "Search", "Surroundings"]
@@ -26,6 +29,9 @@ STEPS = 200
 LATEST = 1000.0
 # A trajectory that moves by less than this part of the components' sizes tests nothing.
 AT_REST = 1e-3
+# Number of points with each of the SPREADS at which the gradients of given functions are compared with differences, and
+# the largest error of a correct one, relative to the largest component and in roundings of the function.
+POINTS, GRADIENT_ERROR, GRADIENT_ROUNDINGS = 3, 1e-6, 1e4
 # Times after `t`, in any unit, at which a system is looked at that does not move at `t` from any state.
 LATER = 10.0 ** np.arange(-9, 19)
 
@@ -57,12 +63,14 @@ class Surroundings:
         self.rng = np.random.default_rng(seed)
         self.failure: Exception | None = None
         self._look_around()
+        for item in terms:
+            self._require_gradient(item, seed)
         self.trajectory = self._follow()
 
     def _slope(self, t: float, y: Array) -> Array:
         """Return the derivative f(t, y), shape (n,); all NaN if `fun` raises an ArithmeticError or ValueError."""
         try:
-            found = np.asarray(self.fun(t, y.copy()), dtype=float)
+            found = np.array(self.fun(t, y.copy()), dtype=float)
         except (ArithmeticError, ValueError) as error:
             self.failure = self.failure or error
             return np.full_like(y, np.nan)
@@ -73,7 +81,8 @@ class Surroundings:
     def term_gradients(self, y: Array) -> Array:
         """Return the gradients (k, n) of the given functions (`terms`); all NaN if one of them cannot be computed."""
         try:
-            return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
+            found = [np.array(item.grad(y.copy()), dtype=float) for item in self.terms]
+            return np.array(found).reshape(-1, y.size)
         except (ArithmeticError, ValueError) as error:
             self.failure = self.failure or error
             return np.full((len(self.terms), y.size), np.nan)
@@ -84,6 +93,23 @@ class Surroundings:
             return np.array([item.fun(y.copy()) for item in self.terms], dtype=float)
         except (ArithmeticError, ValueError):
             return np.full(len(self.terms), np.nan)
+
+    def _require_gradient(self, item: Term, seed: int) -> None:
+        """Raise ValueError if the gradient of a given function is wrong at most of the random points where it is known.
+
+        At single points a correct one may differ from the differences, because the function is not smooth there.
+        """
+        rng, found = np.random.default_rng(seed), []
+        for spread in np.repeat(SPREADS, POINTS):
+            y = self.y0 + spread * self.scale * rng.standard_normal(self.y0.size)
+            look = unless_error(_compared, item, y, self.scale)
+            found += [] if look is None else [look]
+        wrong = [text for text in found if text]
+        if 2 * len(wrong) > len(found):
+            raise ValueError(
+                f"find_invariants: the second function of the term {item.name!r} is not the gradient of the first: "
+                f"{wrong[0]}. Correct it."
+            )
 
     def _look_around(self) -> None:
         """Set `scale`, the sizes of the components, and `tau`, a time in which the state moves by its own size."""
@@ -185,6 +211,20 @@ class Surroundings:
             if solver.status != "failed":
                 states.append(solver.y.copy())
         return np.array(states)
+
+
+def _compared(item: Term, y: Array, scale: Array) -> str | None:
+    """Return a clause about a gradient that is wrong at y, "" if it is correct, and None if it is not finite."""
+    own = np.array(item.grad(y.copy()), dtype=float).reshape(y.shape)
+    differences = difference_gradient(lambda x: float(item.fun(x.copy())), y, 1e-3 * scale)
+    if not (np.isfinite(own).all() and np.isfinite(differences).all()):
+        return None
+    largest = np.maximum(np.abs(own), np.abs(differences)) * scale
+    wrong = np.abs(own - differences) * scale
+    k = int(np.argmax(wrong))
+    if wrong[k] <= GRADIENT_ERROR * largest.max() + GRADIENT_ROUNDINGS * EPS * abs(float(item.fun(y.copy()))):
+        return ""
+    return f"at y = {shown(y)} component {k} is {own[k]:.6g}, and {differences[k]:.6g} by differences"
 
 
 def _rates(points: Array, slopes: Array, gradients: Array, basis: Sequence[Monomial]) -> Sample:

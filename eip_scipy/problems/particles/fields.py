@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...core.jitted import compilable, jitted
+from ...core.states import own_values
 from ._equations import (
     FieldFunctions,
     at_any_time,
@@ -123,7 +124,8 @@ class ParticleField:
         """
         step = self._step
         given = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
-        A, jacobian, phi, E, B = (fun if fun is None or self.varies else at_any_time(fun) for fun in map(jitted, given))
+        own = (None if fun is None else own_values(jitted(fun)) for fun in given)
+        A, jacobian, phi, E, B = (fun if fun is None or self.varies else at_any_time(fun) for fun in own)
         if A is not None and jacobian is None:
             jacobian = difference_jacobian(A, step)
         if E is None and phi is None:
@@ -156,7 +158,7 @@ class ParticleField:
     def _plain(self, key: str) -> Callable[..., Any]:
         """Return the given function in the attribute `key` as an interpreted function of (t, x, y, z)."""
         fun = getattr(self, key)
-        return (lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where))
+        return own_values((lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where)))
 
     def check(self, position: np.ndarray, t: float = 0.0) -> None:
         """Check that the given functions agree with each other at one point and time.

@@ -58,7 +58,7 @@ def sine_gordon_breather(
     refuse_units(frequency=frequency, velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < frequency < 1 or not -1 < velocity < 1:
         raise ValueError(f"a breather needs 0 < frequency < 1 and |velocity| < 1, got {frequency!r} and {velocity!r}.")
-    _require_resolved("a breather", velocity, length, points)
+    _require_resolved(f"a breather with velocity = {velocity:g}", sqrt(1 - velocity**2), length, points)
     return _sine_gordon("sine-gordon-breather", partial(_breather, frequency, velocity), points, length, t_end, h)
 
 
@@ -94,17 +94,19 @@ def sine_gordon_kinks(
     refuse_units(velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < velocity < 1:
         raise ValueError(f"kinks need 0 < velocity < 1, got {velocity!r}.")
-    _require_resolved("kinks", velocity, length, points)
+    _require_resolved(f"kinks with velocity = {velocity:g}", sqrt(1 - velocity**2), length, points)
     return _sine_gordon("sine-gordon-kinks", partial(_kinks, velocity, t_end / 2), points, length, t_end, h)
 
 
-def _require_resolved(what: str, velocity: float, length: float, points: int) -> None:
-    """Refuse a grid with a spacing of more than half of the width sqrt(1 - v^2) to which motion contracts a wave."""
-    width = sqrt(1 - velocity**2)
+def _require_resolved(what: str, width: float, length: float, points: int) -> None:
+    """Refuse a grid with a spacing of more than half of the width of a wave, as sqrt(1 - v^2) if motion contracts it.
+
+    With two points in its width 2 / sqrt(c) a soliton of the Korteweg-de Vries equation has errors of about 1e-3.
+    """
     if length / points > width / 2:
         raise ValueError(
-            f"{what} with velocity = {velocity:g} has the width {width:.3g}, but {points} points on a ring of length "
-            f"{length:g} are {length / points:.3g} apart. Give points >= {ceil(2 * length / width)}."
+            f"{what} has the width {width:.3g}, but {points} points on a ring of length {length:g} are "
+            f"{length / points:.3g} apart. Give points >= {ceil(2 * length / width)}."
         )
 
 
@@ -171,7 +173,8 @@ def korteweg_de_vries_solitons(
     Raises
     ------
     ValueError
-        If speeds are not positive or not different, or the numbers of speeds and places differ.
+        If speeds are not positive or not different, the numbers of speeds and places differ, or the fastest soliton is
+        narrower than two spacings of the grid.
     """
     refuse_units(speeds=speeds, places=places, length=length, t_end=t_end, h=h)
     c, x0 = np.atleast_1d(np.asarray(speeds, dtype=float)), np.atleast_1d(np.asarray(places, dtype=float))
@@ -180,6 +183,7 @@ def korteweg_de_vries_solitons(
             f"solitons need positive speeds, all different, and a place for each; got {speeds!r} and {places!r}."
         )
     equation = KortewegDeVries(Grid(points, -length / 2, length / 2))
+    _require_resolved(f"a soliton of the speed {c.max():g}", 2 / sqrt(c.max()), length, points)
     exact = partial(_solitons, equation.grid.points(0), length, np.sqrt(c), x0)
     start = exact(0.0)
     step = equation.largest_step(0.5 * c.max()) / 3 if h is None else h
