@@ -65,9 +65,9 @@ class ProjectionKeywords(ProjectionDetails, total=False):
     invariants: Invariant | Callable[..., Any] | Iterable[Invariant | Callable[..., Any]]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class ProjectionOptions:
-    """The options of the projection as given by the user; `settled` checks them for a run.
+    """The options of the projection as given by the user; `settled` checks them for a run. Nothing changes them.
 
     Parameters
     ----------

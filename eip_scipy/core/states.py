@@ -47,6 +47,8 @@ def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
 
 def states(name: str, value: Any) -> np.ndarray:
     """Return a state, or several states, as a new float64 or complex128 array of any shape, after checks."""
+    if type(value) is np.ndarray and value.dtype == float:
+        return np.array(value, order="C")
     refuse_units(**{name: value})
     if np.ma.isMaskedArray(value) and np.ma.is_masked(value):
         raise ValueError(f"masked values in {name}; fill or drop them first.")

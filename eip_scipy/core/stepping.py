@@ -222,7 +222,7 @@ def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool =
     if not may_be_longer and h > span * (1 + _slack(h, t0, t_bound)):
         raise ValueError(f"`h` exceeds bounds. Got h = {h:g} for an interval of length {span:g}.")
     largest = max(abs(t0), abs(t_bound)) if math.isfinite(t_bound) else abs(t0)
-    spacing = float(np.spacing(largest))
+    spacing = math.ulp(largest)
     if h < 10 * spacing:
         raise ValueError(
             f"`h` is too small: h = {h:g} is below 10 spacings of t; the spacing of floating-point numbers at t = "
