@@ -38,14 +38,23 @@ def test_the_chain_in_angles_is_the_same():
     assert error < 1e-8
 
 
-@pytest.mark.parametrize("rtol", [1e-5, pytest.param(1e-4, marks=[pytest.mark.nightly, pytest.mark.slow])])
-def test_projection_pays_on_the_chain(rtol):
-    case = chain_case(end=2.0)
-    error, calls = case.error("Radau", rtol, 1.0)
-    kept, kept_calls = case.error(EIPRadau, rtol, 1.0, invariants=case.invariants)
-    assert kept < error / 5
-    # The study asks for 1.25 in the mean of five starts; single runs scatter with rounding errors.
-    assert kept_calls < 1.4 * calls
+ANGLES = [(1.2, 0.9, 0.5), (1.1, 0.8, 0.6), (1.25, 0.95, 0.45)]
+
+
+@pytest.mark.parametrize(
+    ("rtol", "starts"), [(1e-5, 1), pytest.param(1e-4, 3, marks=[pytest.mark.nightly, pytest.mark.slow])]
+)
+def test_projection_pays_on_the_chain(rtol, starts):
+    """Single runs scatter with rounding errors, which BLAS threads change; the study takes the mean of five starts."""
+    gains, calls = [], []
+    for angles in ANGLES[:starts]:
+        case = chain_case(angles, end=2.0)
+        error, count = case.error("Radau", rtol, 1.0)
+        kept, kept_count = case.error(EIPRadau, rtol, 1.0, invariants=case.invariants)
+        gains.append(error / kept)
+        calls.append(kept_count / count)
+    assert np.exp(np.mean(np.log(gains))) > 5
+    assert np.mean(calls) < 1.4
 
 
 @pytest.mark.nightly
