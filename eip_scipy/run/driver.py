@@ -286,9 +286,9 @@ def expected_steps(schedule: Schedule) -> int:
 def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
     """Raise MemoryError if `rows` saved states of the run would need more memory than `max_bytes` allows."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
-    if needed > most_bytes(needed, max_bytes):
-        what = f"saving {rows:.3g} states of {run.y0.size} components"
-        require_memory(needed, what, max_bytes, "increase save_every or max_bytes")
+    require_memory(
+        needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "increase save_every or max_bytes"
+    )
 
 
 def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:

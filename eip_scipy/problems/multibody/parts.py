@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.gradients import NumericalGradient, difference_gradient, time_of_motion
 from ...core.inputs import shown
+from ...core.states import own_values
 from .motion import plain
 from .start import Names
 
@@ -80,12 +81,8 @@ def on_copies(fun: Callable[..., Any]) -> Callable[..., Any]:
     A function of the user may then change its arguments, which are parts of the state, and may return the same array
     at each call.
     """
-
-    def called(*args: Any) -> Any:
-        value = fun(*(item.copy() if isinstance(item, np.ndarray) else item for item in args))
-        return value.copy() if isinstance(value, np.ndarray) else value
-
-    return called
+    own = own_values(fun)
+    return lambda *args: own(*(item.copy() if isinstance(item, np.ndarray) else item for item in args))
 
 
 class Energy(NamedTuple):
