@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
@@ -22,7 +22,7 @@ from .invariant_checks import complaints, listed, reported, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
-__all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient", "copied", "with_args"]
+__all__ = ["Invariant", "InvariantSet", "as_invariants", "check_gradient", "copied", "with_args"]
 
 Array = np.ndarray
 FLOAT = np.dtype(float)
@@ -179,46 +179,9 @@ class Invariant:
         return f"{type(self).__name__}({name})"
 
 
-class JointInvariants(tuple[Invariant, ...]):
-    """Tuple of scalar invariants whose projection needs two passes over the state and stores no gradients.
-
-    It is meant for large fields, whose gradients would fill memory. Pass it as ``invariants=``. Interpreted runs with
-    the euclidean metric, ``direction="new"`` and one Newton step, without a frame, balances, compensated summation or
-    ``every="auto"``, call `moments` and `shift` in place of the invariants' values and gradients. All other runs, and
-    steps whose gradients are nearly parallel, call the values and gradients.
-
-    Parameters
-    ----------
-    items : iterable of Invariant
-    moments : callable
-        ``moments(t, y, f, values, gram, terms)`` fills, at the state `y`, the `values` (l,), the lower half of the
-        gradients' Gram matrix `gram` (l, l), Re <G_i, G_j>, and `terms` (l,), the sums of ``|G_ik y_k|`` over the
-        floats of the state. `f` is the derivative at `y` if an item has `uses_f`, otherwise its content is undefined.
-    shift : callable
-        ``shift(t, y, f, mu, out, values)`` fills `out` with ``y + sum_i mu_i G_i(y)``, and `values` with the
-        invariants at `out`. The values must not be finite if `out` is not.
-    """
-
-    moments: Callable[..., None]
-    shift: Callable[..., None]
-
-    def __new__(
-        cls, items: Iterable[Invariant], moments: Callable[..., None], shift: Callable[..., None]
-    ) -> JointInvariants:
-        """Make the tuple of the items, with the functions `moments` and `shift` as attributes."""
-        self = super().__new__(cls, items)
-        self.moments, self.shift = moments, shift
-        return self
-
-    def __getnewargs__(self) -> tuple[Any, ...]:
-        return tuple(self), self.moments, self.shift
-
-
 def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
-    """Return invariants or functions f(t, y, *args) as a tuple of `Invariant`; `JointInvariants` stay unchanged."""
-    if isinstance(invariants, JointInvariants):
-        return invariants
-    if type(invariants) is tuple and all(isinstance(item, Invariant) for item in invariants):
+    """Return invariants or functions f(t, y, *args) as a tuple of `Invariant`; tuples of these stay unchanged."""
+    if isinstance(invariants, tuple) and all(isinstance(item, Invariant) for item in invariants):
         return invariants
     if isinstance(invariants, Invariant) or (callable(invariants) and not isinstance(invariants, type)):
         return (_as_invariant(invariants),)
@@ -510,8 +473,8 @@ class InvariantSet:
                 continue
             item.is_measured = item.is_measured or item.target is None
             item.target = self.target[self.starts[k] : self.starts[k + 1]].copy()
-        joint = self.items if isinstance(self.items, JointInvariants) else None
-        return tuple(kept) if joint is None else JointInvariants(kept, joint.moments, joint.shift)
+        # Those of a field, which are projected together, see `problems.gross_pitaevskii`.
+        return self.items.replaced(kept) if hasattr(self.items, "replaced") else tuple(kept)
 
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
         """Return an invariant with a compiled gradient if it can have one; if not, store the reason in `why_not`."""

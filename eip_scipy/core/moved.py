@@ -25,7 +25,7 @@ MOVED = {  # a module: its old names, or "*" for all of them, and the modules th
         **dict.fromkeys(RESULTS, "eip_scipy.results"),
         **dict.fromkeys(("GaussJackson", "NystromTableau", "Tableau"), "eip_scipy.methods"),
         **dict.fromkeys(("EIPSolver", "OneStepMethod"), "eip_scipy.solvers"),
-        **dict.fromkeys(("CFunctions", "JointInvariants"), "eip_scipy.problems"),
+        "CFunctions": "eip_scipy.problems",
         "CheckpointError": "eip_scipy.checkpoint",
     },
     "eip_scipy.comparators": {"*": f"{STUDIES}.comparators"},

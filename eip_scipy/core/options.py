@@ -22,7 +22,7 @@ from . import steppers
 from .blocks import blocks_of, kinds_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
-from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet, JointInvariants
+from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet
 from .stepping import AnyMethod, Stepping
 
 __all__ = [
@@ -337,8 +337,8 @@ def _starts(sizes: list[int]) -> np.ndarray:
 
 
 def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
-    """Return True if the run can project by the functions `moments` and `shift` of `JointInvariants`."""
-    if not isinstance(known.items, JointInvariants):
+    """Return True if the invariants have functions `moments` and `shift`, by which the run can project them."""
+    if not hasattr(known.items, "shift"):
         return False
     plain = (options.metric, options.direction, options.iterations) == (data.EUCLIDEAN, data.NEW, 1)
     free = options.frame.products.size == 0 and options.every != data.AUTO and not options.compensated

@@ -226,8 +226,8 @@ def parts_of(run: Run) -> dict[str, Any]:
 def run_of(parts: dict[str, Any], invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
     """Return a run made from its parts, with copies of their buffers.
 
-    `invariants` is a new set of the same invariants, made at the same start. `joint` is True if the run projects
-    `JointInvariants` with their functions `moments` and `shift`.
+    `invariants` is a new set of the same invariants, made at the same start. `joint` is True if the run projects them
+    with their functions `moments` and `shift`.
     """
     values = copy.deepcopy(parts)
     if method.in_python:

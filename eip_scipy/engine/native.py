@@ -148,9 +148,9 @@ class Hooks(NamedTuple):
     step and the length of the next one, or None if no step is short enough. If `again` is True, it repeats the last
     step with a shorter length. ``project(t_old, t, last, y_new)`` projects work.y_hat, the unprojected state at t,
     writes the result to `y_new` and returns one of the engine's codes; `last` is True for the last step of the run.
-    `joint` are the `JointInvariants`, which are tried before `project`. ``agree(here)`` returns True if the result of
-    the step before its projection is finite on all processes that hold a part of the state; `here` is True if it is
-    finite on this process.
+    `joint` are invariants with functions `moments` and `shift`, which are tried before `project`. ``agree(here)``
+    returns True if the result of the step before its projection is finite on all processes that hold a part of the
+    state; `here` is True if it is finite on this process.
     """
 
     one_step: Callable[..., Any] | None = None

@@ -1,6 +1,5 @@
 """Problems with invariants: functions that return a `Problem`."""
 
-from ..core.invariants import JointInvariants
 from ..core.moved import moved_names
 from ..core.pointers import CFunctions
 from ..core.problem import Problem
@@ -12,19 +11,7 @@ from .gravity.orbits import orbital_balances
 from .gravity.scenes import comet, figure_eight, pythagorean, satellite
 from .gravity.solar_data import SolarSystemData
 from .gravity.solar_system import solar_system
-from .gross_pitaevskii import (
-    DampedGrossPitaevskii,
-    FieldProblem,
-    Grid,
-    GrossPitaevskii,
-    Splitting,
-    breather,
-    harmonic_trap,
-    plane_wave,
-    quartic_trap,
-    rotating_packet,
-    soliton,
-)
+from .gross_pitaevskii import FieldProblem, Grid, GrossPitaevskii
 from .invariant_search import find_invariants
 from .kepler import harmonic, kepler
 from .multibody import MechanicsProblem, mechanism
@@ -32,38 +19,21 @@ from .particles.charged_particle import ParticleProblem, charged_particle, tokam
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField
 from .symbolic import equations, hamiltonian, mechanics
 from .time_transformed import centre_time, pair_time, reaches, time_transformed
-from .waves import (
-    KortewegDeVries,
-    Lawson,
-    SineGordon,
-    WaveProblem,
-    korteweg_de_vries_solitons,
-    sine_gordon_breather,
-    sine_gordon_kinks,
-)
 
 __all__ = [
     "TOKAMAK",
     "UNIFORM",
     "CFunctions",
-    "DampedGrossPitaevskii",
     "FieldProblem",
     "ForceConstants",
     "Grid",
     "GrossPitaevskii",
-    "JointInvariants",
-    "KortewegDeVries",
-    "Lawson",
     "MechanicsProblem",
     "OrbitalElements",
     "ParticleField",
     "ParticleProblem",
     "Problem",
-    "SineGordon",
     "SolarSystemData",
-    "Splitting",
-    "WaveProblem",
-    "breather",
     "centre_time",
     "charged_particle",
     "comet",
@@ -72,25 +42,17 @@ __all__ = [
     "find_invariants",
     "hamiltonian",
     "harmonic",
-    "harmonic_trap",
     "kepler",
-    "korteweg_de_vries_solitons",
     "mechanics",
     "mechanism",
     "nbody",
     "orbital_balances",
     "orbital_elements",
     "pair_time",
-    "plane_wave",
     "pythagorean",
-    "quartic_trap",
     "reaches",
-    "rotating_packet",
     "satellite",
-    "sine_gordon_breather",
-    "sine_gordon_kinks",
     "solar_system",
-    "soliton",
     "time_transformed",
     "tokamak",
     "uniform_field",

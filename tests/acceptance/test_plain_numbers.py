@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from systems import SQUARE, oscillator
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, ensemble, integrate, problems, project
-from eip_scipy.problems import ForceConstants, Grid, GrossPitaevskii, Problem, nbody
+from eip_scipy.problems import ForceConstants, Problem, nbody
 from eip_scipy_studies.comparators import stormer_verlet
 
 units = pytest.importorskip("astropy.units")
@@ -16,7 +16,6 @@ Time = pytest.importorskip("astropy.time").Time
 
 Y0 = [1.0, 2.0]
 BODIES = {"gm": [1.0, 1e-3], "position": np.eye(2, 3), "velocity": np.array([[0, 0, 0], [0, 1.0, 0]])}
-GPE = GrossPitaevskii(Grid(8, -4, 4))
 
 
 class PintLike:
@@ -129,9 +128,6 @@ ARGUMENTS = [
     *((problems.harmonic, name, 0.5) for name in ("omega", "t_end", "h")),
     *((problems.solar_system, name, 0.5) for name in ("years", "h")),
     *((problems.tokamak, name, 0.5) for name in ("t_end", "h")),
-    *((problems.soliton, name, 1.0) for name in ("amplitude", "velocity", "beta", "length", "t_end", "h")),
-    *((lambda **o: Grid(**{"shape": 8, "lower": -1, "upper": 1, **o}), name, 1.0) for name in ("lower", "upper")),
-    *((lambda **o: GrossPitaevskii(Grid(8, -4, 4), **o), name, 1.0) for name in ("Omega", "beta")),
     *((ForceConstants, name, 1.0) for name in ("c", "j2", "moon")),
     (problems.figure_eight, "periods", 1.0),
 ]

@@ -29,7 +29,7 @@ from eip_scipy import (
     project,
 )
 from eip_scipy.ensembles import tasks
-from eip_scipy.problems import JointInvariants, kepler, nbody, pythagorean
+from eip_scipy.problems import Grid, GrossPitaevskii, kepler, nbody, pythagorean
 from eip_scipy_studies.hard_cases import lotka_volterra, rigid_body, sir
 
 EVERY_CLASS = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]
@@ -293,17 +293,7 @@ def test_joint_invariants(true):
         # A decay that begins slowly: the start check does not see it.
         return -0.5j * np.fft.ifft(k**2 * np.fft.fft(y)) - 1j * np.abs(y) ** 2 * y - decay * t * y
 
-    mass = Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="mass")
-
-    def moments(t, y, f, values, gram, terms):
-        values[0] = np.vdot(y, y).real
-        gram[0, 0], terms[0] = 4 * values[0], 2 * values[0]
-
-    def shift(t, y, f, mu, out, values):
-        out[:] = y + mu[0] * 2 * y
-        values[0] = np.vdot(out, out).real
-
-    invariants = JointInvariants([mass], moments, shift)
+    invariants = GrossPitaevskii(Grid(n, 0, 2 * np.pi), beta=1.0).invariants(["mass"])
     x = 2 * np.pi * np.arange(n) / n
     y0 = 1 + 0.1 * np.exp(1j * x)
     options = {"method": EIPRK4, "h": 1e-3, "metric": "euclidean", "invariants": invariants}

@@ -1,5 +1,8 @@
 """The Gross-Pitaevskii equation: its parts against closed forms and dense matrices, its invariants, and its steps."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from orders import observed_order
@@ -7,22 +10,18 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, EIPRK45, Diagnostics, ProjectionWarning, integrate
 from eip_scipy.core.invariants import check_gradient
-from eip_scipy.problems import (
-    Grid,
-    GrossPitaevskii,
-    Problem,
-    harmonic_trap,
-    plane_wave,
-    quartic_trap,
-    rotating_packet,
-    soliton,
-)
-from eip_scipy.problems.gross_pitaevskii import Multiplier, SpectralSum, make_transforms
-from eip_scipy.problems.gross_pitaevskii.transforms import LIBRARIES
+from eip_scipy.engine.native import BUILD
+from eip_scipy.problems import Grid, GrossPitaevskii
+from eip_scipy.problems.gross_pitaevskii import Multiplier, SpectralSum, Transforms
+from eip_scipy_studies.condensates.problems import harmonic_trap, plane_wave, quartic_trap, rotating_packet, soliton
 
 
 def noise(grid):
     return np.random.default_rng(7).standard_normal(2 * grid.size).view(complex).reshape(grid.shape)
+
+
+def hamiltonian(gpe, psi):
+    return 1j * gpe.fun(0.0, psi)
 
 
 def first_derivative(n, length):
@@ -64,15 +63,15 @@ def test_two_dimensions_are_the_papers_dense_matrices(Omega, nyquist):
     linear = -0.5 * laplace + V * psi - Omega * Lz
     expected = linear + 1.5 * abs(psi) ** 2 * psi
     size = np.abs(expected).max()
-    np.testing.assert_allclose(gpe.hamiltonian(psi), expected, atol=1e-13 * size)
     np.testing.assert_allclose(gpe.fun(0, psi.ravel()), -1j * expected.ravel(), atol=1e-13 * size)
     w = 4 / 12 * 7 / 16
     assert gpe.mass(psi) == pytest.approx(w * np.sum(abs(psi) ** 2), rel=1e-14)
     energy = w * (np.vdot(psi, linear).real + 0.75 * np.sum(abs(psi) ** 4))
     assert gpe.energy(psi) == pytest.approx(energy, rel=1e-13)
     assert gpe.angular_momentum(psi) == pytest.approx(w * np.vdot(psi, Lz).real, rel=1e-12)
-    mu = np.vdot(psi, expected).real / np.vdot(psi, psi).real
-    assert gpe.chemical_potential(psi) == pytest.approx(mu, rel=1e-13)
+    out = np.empty_like(psi)
+    gpe.linear(psi, out)
+    np.testing.assert_allclose(out, linear - V * psi, atol=1e-13 * size)
 
 
 @pytest.mark.parametrize("Omega", [0.0, 0.6])
@@ -87,7 +86,7 @@ def test_vortex_of_the_harmonic_trap(shape, gamma, Omega):
     psi = (x + 1j * y) * np.exp(-0.5 * square)
     level = 2 + (gamma[2] / 2 if len(gamma) == 3 else 0) - Omega
     tolerance = 1e-6  # what the grid resolves
-    np.testing.assert_allclose(gpe.hamiltonian(psi), level * psi, atol=tolerance)
+    np.testing.assert_allclose(hamiltonian(gpe, psi), level * psi, atol=tolerance)
     assert gpe.energy(psi) / gpe.mass(psi) == pytest.approx(level, rel=tolerance)
     assert gpe.angular_momentum(psi) / gpe.mass(psi) == pytest.approx(1, rel=tolerance)
 
@@ -99,8 +98,8 @@ def test_three_dimensions_are_two_where_nothing_depends_on_z():
     two = GrossPitaevskii(flat, harmonic_trap(1, 2), **options)
     three = GrossPitaevskii(full, harmonic_trap(1, 2, 0), **options)
     lifted = np.repeat(psi[..., None], 6, axis=2)
-    expected = two.hamiltonian(psi)
-    np.testing.assert_allclose(three.hamiltonian(lifted), np.repeat(expected[..., None], 6, axis=2), atol=1e-12)
+    expected = hamiltonian(two, psi)
+    np.testing.assert_allclose(hamiltonian(three, lifted), np.repeat(expected[..., None], 6, axis=2), atol=1e-12)
     assert three.energy(lifted) == pytest.approx(two.energy(psi), rel=1e-13)
     assert three.angular_momentum(lifted) == pytest.approx(two.angular_momentum(psi), rel=1e-12)
 
@@ -111,16 +110,19 @@ def test_odd_numbers_of_points_and_one_dimension():
     gpe = GrossPitaevskii(grid)
     for k in range(-4, 5):
         psi = np.exp(1j * k * grid.points(0))
-        np.testing.assert_allclose(gpe.hamiltonian(psi), 0.5 * k * k * psi, atol=1e-13)
+        np.testing.assert_allclose(hamiltonian(gpe, psi), 0.5 * k * k * psi, atol=1e-13)
     np.testing.assert_array_equal(grid.wavenumbers(0, odd=True), grid.wavenumbers(0))
 
 
-@pytest.mark.parametrize("library", LIBRARIES)
+@pytest.mark.parametrize("library", ["ducc0", "scipy"])
 @pytest.mark.parametrize("shape", [(10,), (8, 6), (4, 6, 10)])
-def test_libraries_are_numpys_transform(library, shape):
+def test_libraries_are_numpys_transform(library, shape, monkeypatch):
     pytest.importorskip(library)
+    if library == "scipy":
+        monkeypatch.setattr("eip_scipy.problems.gross_pitaevskii.find_spec", lambda name: None)
     grid = Grid(shape, -1, 1)
-    fft, psi = make_transforms(library), noise(grid)
+    fft, psi = Transforms(1), noise(grid)
+    assert fft.gains_by_strips == (library == "scipy")
     for axes in [(0,), tuple(range(len(shape))), tuple(range(1, len(shape))) or (0,)]:
         kept, out = psi.copy(), np.empty_like(psi)
         fft.forward(psi, axes, out)
@@ -130,25 +132,16 @@ def test_libraries_are_numpys_transform(library, shape):
         np.testing.assert_array_equal(psi, kept)
 
 
-def test_library_is_chosen_among_those_installed(monkeypatch):
-    module = "eip_scipy.problems.gross_pitaevskii.transforms.find_spec"
-    monkeypatch.setattr(module, lambda name: name == "scipy" or None)
-    assert make_transforms().name == "scipy"
-    assert GrossPitaevskii(Grid((8, 8), 0, 1)).fft == "scipy"
-    with pytest.raises(ImportError, match=r'ducc0.*pip install "eip_scipy\[fft\]"'):
-        make_transforms("ducc0")
-
-
 def test_threads_do_not_change_the_result():
     grid = Grid((16, 16), -1, 1)
     psi = noise(grid)
-    one, two = (GrossPitaevskii(grid, Omega=0.3, beta=1.0, threads=n).hamiltonian(psi) for n in (1, 2))
+    one, two = (GrossPitaevskii(grid, Omega=0.3, beta=1.0, threads=n).fun(0.0, psi) for n in (1, 2))
     np.testing.assert_array_equal(one, two)
 
 
 def test_multipliers_of_one_axis_and_of_all_agree():
     grid = Grid((6, 8, 10), -1, 1)
-    fft, psi = make_transforms("scipy"), noise(grid)
+    fft, psi = Transforms(1), noise(grid)
     factors = [grid.wavenumbers(axis) ** 2 for axis in range(3)]
     single = SpectralSum(grid, fft, [Multiplier(grid, (axis,), f) for axis, f in enumerate(factors)])
     joint = SpectralSum(grid, fft, [Multiplier(grid, (0, 1, 2), sum(factors))])
@@ -157,14 +150,6 @@ def test_multipliers_of_one_axis_and_of_all_agree():
     joint.apply(psi, expected)
     np.testing.assert_allclose(out, expected, atol=1e-11)
     assert single.expectation(psi) == pytest.approx(np.vdot(psi, expected).real, rel=1e-13)
-
-
-def test_quench_changes_what_is_named():
-    gpe = GrossPitaevskii(Grid((8, 8), -1, 1), harmonic_trap(1, 1), Omega=0.5, beta=3.0, nyquist="zero", fft="scipy")
-    other = gpe.changed(potential=harmonic_trap(2, 2), Omega=0.0)
-    assert (other.Omega, other.beta, other.nyquist, other.fft) == (0.0, 3.0, "zero", "scipy")
-    np.testing.assert_allclose(other.V, 4 * gpe.V)
-    np.testing.assert_array_equal(gpe.changed(beta=1.0).V, gpe.V)
 
 
 # Invariants.
@@ -230,12 +215,109 @@ def test_angular_momentum_is_kept_where_the_trap_is_round_and_refused_where_not(
     run = integrate(p, method=EIPRK4)
     assert run.max_defect.max() < 1e-13
     assert run.diagnostics.n_rank_reduced == 0
-    oval = gpe.changed(potential=harmonic_trap(1, 2)).problem(psi, 0.2, 0.01, invariants=names)
+    oval = GrossPitaevskii(grid, harmonic_trap(1, 2), Omega=0.4, beta=1.0).problem(psi, 0.2, 0.01, invariants=names)
     with (
         pytest.warns(UserWarning, match="'angular_momentum' is not an invariant of this system"),
         pytest.warns(ProjectionWarning, match="'angular_momentum'"),
     ):
         integrate(oval, method=EIPRK4)
+
+
+# Mass and energy as one.
+
+
+@pytest.fixture(params=[(8, 16), (6, 7), (5, 9, 21)], ids=str)
+def state(request):
+    grid = Grid(request.param, -2, 3)
+    gpe = GrossPitaevskii(grid, harmonic_trap(*[1.0] * grid.dim), Omega=0.4, beta=20.0)
+    psi = noise(grid).ravel()
+    return gpe, psi, gpe.fun(0.0, psi)
+
+
+def test_sums_over_the_grid(state):
+    _, psi, f = state
+    n, image = np.abs(psi) ** 2, 1j * f
+    sizes = np.abs(psi.real * image.real) + np.abs(psi.imag * image.imag)
+    expected = (n.sum(), np.vdot(psi, image).real, np.vdot(f, f).real, (n**2).sum(), sizes.sum())
+    np.testing.assert_allclose(BUILD.condensates.moments(psi, f), expected, rtol=1e-13)
+    out = np.empty_like(psi)
+    mass, square, slope = BUILD.condensates.shifted(psi, f, 0.1, -0.02, out)
+    np.testing.assert_allclose(out, 1.1 * psi - 0.02j * f, rtol=0, atol=1e-14 * np.abs(f).max())
+    d = out - psi
+    assert mass == pytest.approx(np.vdot(out, out).real, rel=1e-13)
+    assert square == pytest.approx(np.vdot(d, d).real, rel=1e-13)
+    assert slope == pytest.approx(np.vdot(1j * f, d).real, rel=1e-12)
+    np.testing.assert_allclose(BUILD.condensates.expansion(out, psi, f), (square, slope), rtol=1e-13)
+
+
+@pytest.mark.parametrize("names", [("mass",), ("energy",), ("mass", "energy"), ("energy", "mass")], ids=str)
+def test_joint_is_the_invariants_one_by_one(state, names):
+    gpe, psi, f = state
+    count, joint = len(names), gpe.invariants(names)
+    values, gram, terms = np.empty(count), np.empty((count, count)), np.empty(count)
+    joint.moments(0.0, psi, f, values, gram, terms)
+    G = np.empty((count, psi.size), complex)
+    for item, row in zip(joint, G, strict=True):
+        item.grad(0.0, psi, f, row) if item.uses_f else item.grad(0.0, psi, row)
+    reals = G.view(float)
+    np.testing.assert_allclose(values, [item.fun(0.0, psi) for item in joint], rtol=1e-13)
+    np.testing.assert_allclose(gram, reals @ reals.T, rtol=1e-12)
+    np.testing.assert_allclose(terms, np.abs(reals * psi.view(float)).sum(axis=1), rtol=1e-12)
+    for size in (1e-15, 1e-6):  # near the state, and far from it
+        mu = size * np.arange(1.0, 1.0 + count)
+        out, moved = np.empty_like(psi), np.empty(count)
+        joint.shift(0.0, psi, f, mu, out, moved)
+        np.testing.assert_allclose(out, psi + mu @ G, rtol=0, atol=1e-14)
+        exact = [{"mass": gpe.mass, "energy": gpe.energy}[name](out) for name in names]
+        np.testing.assert_allclose(moved, exact, rtol=4e-15)
+
+
+@pytest.mark.parametrize(
+    ("options", "joint"),
+    [
+        ({}, True),
+        ({"metric": "error"}, False),
+        ({"direction": "midpoint"}, False),
+        ({"iterations": 2}, False),
+        ({"every": "auto"}, False),
+        ({"frame": (np.ones((1, 256)), np.ones((256, 1)))}, False),
+    ],
+)
+@pytest.mark.parametrize("driver", ["solve_ivp", "integrate"])
+def test_joint_steps_are_those_of_the_items(options, joint, driver, monkeypatch):
+    p = rotating_packet(0.9, points=16, t_end=0.2, h=0.004)
+    options = {"h": p.h, "method": EIPRK4, "metric": "euclidean", **options}
+    calls = []
+
+    def end(invariants):
+        if driver == "solve_ivp":
+            return solve_ivp(p.fun, p.t_span, p.y0, invariants=invariants, **options).y[:, -1]
+        return integrate(p, invariants=invariants, **options).y[:, -1]
+
+    shift = type(p.invariants).shift
+    monkeypatch.setattr(type(p.invariants), "shift", lambda *args: calls.append(1) or shift(*args))
+    found = end(p.invariants)
+    assert (len(calls) > 30) == joint
+    np.testing.assert_allclose(found, end(list(p.invariants)), rtol=0, atol=1e-13 if joint else 0)
+
+
+def test_joint_shift_that_fails_is_not_taken(monkeypatch):
+    p = rotating_packet(0.9, points=16, t_end=0.2, h=0.004)
+    shift = type(p.invariants).shift
+    wrong = lambda self, t, y, f, mu, out, values: shift(self, t, y, f, -1e3 * mu, out, values)  # noqa: E731
+    monkeypatch.setattr(type(p.invariants), "shift", wrong)
+    found = integrate(p, method=EIPRK4).y[:, -1]
+    np.testing.assert_array_equal(found, integrate(p, invariants=list(p.invariants), method=EIPRK4).y[:, -1])
+
+
+def test_joint_invariants_are_copied_and_continued():
+    p = rotating_packet(0.9, points=16, t_end=0.02, h=0.004)
+    for copied in (copy.deepcopy(p.invariants), pickle.loads(pickle.dumps(p.invariants))):
+        assert type(copied) is type(p.invariants)
+        assert [item.name for item in copied] == ["mass", "energy"]
+    joint, single = (integrate(p, invariants=kept, method=EIPRK4) for kept in (p.invariants, list(p.invariants)))
+    found, expected = (run.continue_to(0.04).y[:, -1] for run in (joint, single))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
 # Steps.
@@ -266,15 +348,6 @@ def test_soliton_travels_at_order_four_with_mass_and_energy_kept(travelling):
     gpe = travelling.equation
     assert abs(gpe.mass(bare.y[:, -1]) - gpe.mass(bare.y[:, 0])) > 1e-6
     assert np.ptp(run.invariants, axis=1).max() < 2e-14
-
-
-def test_soliton_closed_form_solves_the_equation():
-    p = soliton(points=512, length=60.0)
-    d = 1e-3
-    for t in (0.0, 17.0, 29.9):  # at 29.9 it crosses the end of the ring
-        c = [1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280]
-        rate = sum(a * p.reference(t + k * d) for a, k in zip(c, range(-4, 5), strict=True)) / d
-        np.testing.assert_allclose(rate, p.fun(t, p.reference(t)), atol=1e-9)
 
 
 def test_reuse_of_the_gradients_evaluation_is_harmless_and_saves_one_in_five(travelling):
@@ -312,13 +385,6 @@ def test_adaptive_steps():
     np.testing.assert_allclose(sol.y[:, -1], p.reference(0.5), atol=1e-6)
 
 
-def test_the_frame_of_the_records():
-    p = soliton()
-    assert isinstance(p, Problem)
-    assert (p.name, p.metric) == ("soliton", "euclidean")
-    assert [i.name for i in p.invariants] == ["mass", "energy"]
-
-
 # Stationary states: the gradients of mass and energy are parallel.
 
 
@@ -336,13 +402,6 @@ def test_plane_wave_has_rank_one():
     bare = integrate(p, method=EIPRK4, invariants=())
     exact = p.reference(1.0)
     assert np.abs(run.y[:, -1] - exact).max() <= 1.01 * np.abs(bare.y[:, -1] - exact).max()
-
-
-def test_plane_wave_needs_whole_modes():
-    with pytest.raises(ValueError, match="whole numbers"):
-        plane_wave((8, 8), (1, 0.5))
-    with pytest.raises(ValueError, match="one for each axis"):
-        plane_wave((8, 8), 1)
 
 
 # Mistakes of users.
@@ -367,14 +426,12 @@ def test_bad_grids(arguments, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"potential": lambda x, y: x * 1j}, "potential must be real"),
-        ({"potential": lambda x, y: np.where(x > 0, np.nan, 1.0) + y}, "not finite"),
+        ({"potential": lambda x, y: x * 1j}, "potential must be real and finite"),
+        ({"potential": lambda x, y: np.where(x > 0, np.nan, 1.0) + y}, "potential must be real and finite"),
         ({"potential": np.zeros((3, 3))}, r"shape \(3, 3\), which does not fit Grid\(\(8, 8\)"),
-        ({"potential": harmonic_trap(1, 1, 1)}, "3 frequencies does not fit 2"),
         ({"Omega": np.nan}, "Omega must be a finite number"),
         ({"beta": "1"}, "beta must be a finite number"),
         ({"nyquist": "half"}, "nyquist must be 'true' or 'zero', got 'half'"),
-        ({"fft": "fftw"}, "fft must be 'auto' or one of"),
         ({"threads": 0}, "threads must be an integer >= 1"),
     ],
 )
@@ -392,12 +449,10 @@ def test_bad_states_and_names():
         gpe.grid.field(np.zeros(63))
     with pytest.raises(ValueError, match="did you mean 'energy'"):
         gpe.invariants(["energie"])
-    with pytest.raises(ValueError, match="a rotation needs at least two dimensions"):
+    with pytest.raises(ValueError, match="a rotation needs two or three dimensions"):
         GrossPitaevskii(Grid(8, -1, 1), Omega=0.5)
-    with pytest.raises(ValueError, match="angular momentum needs two or three"):
+    with pytest.raises(ValueError, match="angular momentum need two or three"):
         line.angular_momentum(np.zeros(8))
-    with pytest.raises(ValueError, match="beta < 0"):
-        soliton(beta=1.0)
 
 
 def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
@@ -417,8 +472,9 @@ def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
 def test_transforms_in_strips_are_those_of_the_whole_field(monkeypatch):
     """Along x of some columns at a time, the last strip a narrower one."""
     grid = Grid((24, 150), -4, 5)
-    gpe = GrossPitaevskii(grid, harmonic_trap(1, 1), Omega=0.4, beta=2.0, fft="scipy")
+    monkeypatch.setattr("eip_scipy.problems.gross_pitaevskii.find_spec", lambda name: None)
+    gpe = GrossPitaevskii(grid, harmonic_trap(1, 1), Omega=0.4, beta=2.0)
     psi = np.random.default_rng(5).standard_normal(2 * grid.size).view(complex)
     found = gpe.fun(0.0, psi)
-    monkeypatch.setattr(type(gpe.transforms), "gains_by_strips", False)
+    gpe.transforms.gains_by_strips = False
     np.testing.assert_allclose(found, gpe.fun(0.0, psi), rtol=0, atol=1e-15 * abs(found).max())

@@ -8,10 +8,11 @@ import pytest
 from numba import njit
 
 from eip_scipy import EIPRK4, EIPRK45, Balance, Invariant, integrate
-from eip_scipy.problems import Problem, comet, harmonic, kepler, plane_wave, rotating_packet, soliton
+from eip_scipy.problems import Problem, comet, harmonic, kepler
 from eip_scipy.problems.gravity.nbody import nbody
 from eip_scipy.problems.gravity.scenes import pythagorean
 from eip_scipy.problems.time_transformed import centre_time, time_transformed
+from eip_scipy_studies.condensates.problems import plane_wave, rotating_packet, soliton
 from eip_scipy_studies.hard_cases import hard_cases
 
 MAKERS = [kepler, lambda: kepler(relativistic=0), harmonic, pythagorean, comet, soliton]

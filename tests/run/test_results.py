@@ -25,8 +25,9 @@ from eip_scipy import (
     integrate,
     load,
 )
-from eip_scipy.problems import kepler, soliton
+from eip_scipy.problems import kepler
 from eip_scipy.results import IntegrationResult, plot, save, to_dataframe, to_xarray
+from eip_scipy_studies.condensates.problems import soliton
 
 Y0 = np.array([1.0, 2.0])
 NAMES = ("x", "y", "vx", "vy")

@@ -10,20 +10,15 @@ import numpy as np
 import pytest
 
 from eip_scipy import integrate
-from eip_scipy.problems.gross_pitaevskii import (
-    Grid,
-    GrossPitaevskii,
-    GroundState,
-    Vortices,
-    ground_state,
-    imprint,
-    quartic_trap,
-)
+from eip_scipy.problems import Grid, GrossPitaevskii
 from eip_scipy.run import resume
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.condensates import lines as gpe_lines
 from eip_scipy_studies.condensates import runs as gpe_runs
 from eip_scipy_studies.condensates import states as gpe_states
+from eip_scipy_studies.condensates.ground_state import GroundState, ground_state, imprint
+from eip_scipy_studies.condensates.problems import quartic_trap
+from eip_scipy_studies.condensates.vortices import Vortices
 from eip_scipy_studies.report import UsageError
 
 PNG = b"\x89PNG\r\n\x1a\n"

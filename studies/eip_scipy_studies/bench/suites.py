@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.problems import solar_system, soliton
+from eip_scipy.problems import solar_system
 
+from ..condensates.problems import soliton
 from ..hard_cases import hard_cases, stored_cases
 from ..work_precision import known_end
 from .peers import COMPILED, OWN, PEERS, PYTHON, Peer

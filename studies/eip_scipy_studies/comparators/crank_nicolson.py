@@ -70,7 +70,7 @@ def crank_nicolson(
     Examples
     --------
     >>> from eip_scipy_studies.comparators import crank_nicolson
-    >>> from eip_scipy.problems import soliton
+    >>> from eip_scipy_studies.condensates.problems import soliton
     >>> problem = soliton(points=128)
     >>> run = crank_nicolson(problem.equation, (0.0, 1.0), problem.y0, 0.01)
     >>> bool(abs(run.y[:, -1] - problem.reference(1.0)).max() < 1e-3)

@@ -20,13 +20,14 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, eip_method, integrate
-from eip_scipy.problems import FieldProblem, Splitting, plane_wave
-from eip_scipy.problems.gross_pitaevskii import make_transforms
+from eip_scipy.problems import FieldProblem
 
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..report import describe_machine, table
 from ..study import Check, Figures, Rows, Session, Study, option
 from ..work_precision import cost_to_reach, known_end, work_precision
+from .problems import plane_wave
+from .splitting import Splitting
 
 T_END = 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
@@ -117,13 +118,12 @@ def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
 
     DOP853 runs at its tightest tolerance.
     """
-    gpe = plane_wave((points, points), fft=make_transforms().name).equation
+    gpe = plane_wave((points, points)).equation
     assert gpe is not None
     x, y = gpe.grid.mesh()
     psi0 = np.exp(1j * (x + y)) * (1 + 0.5 * np.cos(x) + 0.5 * np.sin(y))
     problem = gpe.problem(psi0, T_END, name="modulated-wave")
-    fun = gpe.changed(fft="auto").fun  # with the least round-off
-    fine = solve_ivp(fun, (0.0, T_END), problem.y0, method="DOP853", rtol=3e-14, atol=1e-15)
+    fine = solve_ivp(gpe.fun, (0.0, T_END), problem.y0, method="DOP853", rtol=3e-14, atol=1e-15)
     return problem, fine.y[:, -1]
 
 
@@ -223,7 +223,7 @@ class Efficiency(Study[Found]):
     stem: str = "fig-efficiency"
 
     def measure(self, session: Session) -> Found:
-        plane = plane_wave((self.points, self.points), t_end=T_END, fft=make_transforms().name)
+        plane = plane_wave((self.points, self.points), t_end=T_END)
         trials = dict(zip(WAVES, (Trial(plane, known_end(plane)), Trial(*modulated_wave(self.points))), strict=True))
         total = self.repeats * sum(len(steps) for trial in trials.values() for _, steps in trial.methods().values())
         with session.bar(total, "fig-efficiency") as bar:

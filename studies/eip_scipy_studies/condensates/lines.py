@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from eip_scipy.problems import GrossPitaevskii
-from eip_scipy.problems.gross_pitaevskii import density_surface, line_condensate, rotated, vortices
 
 from ..report import compact, warn
 from ..study import Check, Figures, Session
+from .problems import line_condensate
 from .runs import REFERENCE, SHOWN, Motion, QuenchRuns, QuenchStudy, field_check
+from .splitting import rotated
 from .states import (
     LINE_POINTS,
     LINES,
@@ -26,6 +27,7 @@ from .states import (
     search_saddle,
     searching,
 )
+from .vortices import density_surface, vortices
 
 OMEGA_BEFORE, OMEGA_AFTER = 0.7, 0.9
 LEVEL = 1e-3  # of the paper's surfaces
@@ -110,12 +112,17 @@ class VortexLines(QuenchStudy):
 
 
 def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[str]:
-    residual = gpe.hamiltonian(start) - gpe.chemical_potential(start) * start
+    residual = 1j * gpe.fun(0.0, start) - chemical_potential(gpe, start) * start
     return [
         f"Start: {len(vortices(gpe, start).charges)} lines, E = {gpe.energy(start):.8f}, residual "
         f"{compact(float(np.sqrt(gpe.mass(residual))))}: a saddle. A little noise, and the descent",
         f"goes on to {lower.count} lines, E = {lower.state.energy:.8f}, residual {compact(lower.state.residual)}",
     ]
+
+
+def chemical_potential(gpe: GrossPitaevskii, psi: np.ndarray) -> float:
+    """Return the mean of H, Re <H psi, psi> / <psi, psi>, of the field psi."""
+    return float(np.vdot(psi, 1j * gpe.fun(0.0, psi)).real / np.vdot(psi, psi).real)
 
 
 def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
@@ -126,7 +133,7 @@ def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
     """
     assert made.reference is not None
     start = made.problem.y0
-    mu, turn = before.chemical_potential(start), OMEGA_AFTER - OMEGA_BEFORE
+    mu, turn = chemical_potential(before, start), OMEGA_AFTER - OMEGA_BEFORE
     exact = rotated(before, start, turn * t[-1]).reshape(-1) * np.exp(-1j * mu * t[-1])
     off = np.sqrt(before.mass(made.reference[:, -1] - exact))
     return (

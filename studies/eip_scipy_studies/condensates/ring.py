@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from eip_scipy.problems import GrossPitaevskii
-from eip_scipy.problems.gross_pitaevskii import ring_condensate
 
 from ..long_runs import positive
 from ..report import UsageError
 from ..study import Figures, Session, option
+from .problems import ring_condensate
 from .runs import SHOWN, Motion, QuenchRuns, QuenchStudy
 from .states import cropped, kept_state, load_state, search_ring
 

@@ -14,12 +14,12 @@ import numpy as np
 
 from eip_scipy import EIPDOP853, EIPRK4, integrate
 from eip_scipy.problems import FieldProblem, GrossPitaevskii
-from eip_scipy.problems.gross_pitaevskii import Vortices, vortices
 from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import Checkpoints, named
 from ..report import compact, describe_machine, table
 from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
+from .vortices import Vortices, vortices
 
 METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
 SHOWN = "EIP-ME"  # fields of this method are kept, for the figures

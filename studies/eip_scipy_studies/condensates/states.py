@@ -12,23 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
-from eip_scipy.problems.gross_pitaevskii import (
-    GroundState,
-    ground_state,
-    imprint,
-    line_condensate,
-    lowest_ring,
-    polygon,
-    ring_condensate,
-    vortex_starts,
-    vortices,
-    with_noise,
-)
+from eip_scipy.problems import Grid, GrossPitaevskii
 
 from ..long_runs import Checkpoints, number
 from ..report import UsageError, compact, describe_machine, table, write_file
 from ..study import Check, Figures, Rows, Session, Study, option, some_of
+from .ground_state import GroundState, ground_state, imprint, lowest_ring, polygon, vortex_starts, with_noise
+from .problems import harmonic_trap, line_condensate, ring_condensate
+from .vortices import vortices
 
 # V = r^2 / 2, beta = 100: angular velocity and published energy.
 PUBLISHED = {0.0: 3.9459469, 0.65: 3.6506129, 0.71: 3.4997148, 0.76: 3.3475310, 0.80: 3.1904172}

@@ -21,17 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from eip_scipy import EIPDOP853, EIPRK4, Balance, integrate
+from eip_scipy import EIPDOP853, Balance, integrate
 from eip_scipy.problems import (
-    DampedGrossPitaevskii,
-    Grid,
     ParticleField,
-    SineGordon,
     charged_particle,
-    harmonic_trap,
     nbody,
     satellite,
-    sine_gordon_breather,
 )
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.gravity.orbits import orbital_balances
@@ -371,32 +366,6 @@ def held(turned: np.ndarray, turn: int) -> Case:
     return Case(of(made["energy"]), sets, {"h": 0.4}, 16, (slice(0, 3),))
 
 
-# Damped fields.
-
-
-def condensate(turned: np.ndarray, turn: int) -> Case:
-    """Return the case of a packet in a trap, with losses and Pitaevskii's damping, by RK4.
-
-    The packet starts at 1 + 0.05 `turn`.
-    """
-    grid = Grid(48, -8, 8)
-    equation = DampedGrossPitaevskii(grid, harmonic_trap(1), beta=10.0, damping=1e-4, chemical_potential=3.0, loss=1e-4)
-    packet = np.exp(-((grid.points(0) - 1 - 0.05 * turn) ** 2) / 4)
-    start = packet / math.sqrt(equation.mass(packet))
-    problem = equation.problem(start, 200.0)
-    h = 0.8 * equation.largest_step(start)
-    return Case(of(problem, EIPRK4), {"mass and energy": problem.invariants}, {"h": h}, 8, (slice(0, grid.size),))
-
-
-def wave(turned: np.ndarray, turn: int) -> Case:
-    """Return the case of the sine-Gordon breather of frequency 0.5 + 0.05 `turn`, with damping 1e-4."""
-    scene = sine_gordon_breather(frequency=0.5 + 0.05 * turn)
-    equation, n = SineGordon(Grid(512, -40, 40), damping=1e-4), scene.y0.size // 2
-    problem = equation.problem(scene.y0[:n], scene.y0[n:], 200.0)
-    h = 0.7 * equation.largest_step(6.0)
-    return Case(of(problem), {"energy": problem.invariants}, {"h": h}, 4, (slice(0, 2 * n),))
-
-
 # Oscillators x'' = -a x - b x^3 - c x' + d cos(w t + phase).
 
 
@@ -485,8 +454,6 @@ SYSTEMS = {
     "Duffing, driven by 1e-3": System(oscillator(1, 1, 0, 1e-3, 0.4, 1000), "", True),
     "charge in a varying mirror": System(particle, "", True),
     "charge in a varying field and potential": System(held, "", True),
-    "damped condensate in a trap, RK4": System(condensate, "", True),
-    "damped breather of sine-Gordon": System(wave, "", True),
     "strong driving": System(oscillator(1, 1, 0, 1.0, 0.4, 200), "", False),
     "linear resonance": System(oscillator(1, 0, 0, 1e-2, 1.0, 500), "", False),
     "attractor, damped by 0.02": System(oscillator(1, 1, 0.02, 0.05, 1.2, 2000), "", False),

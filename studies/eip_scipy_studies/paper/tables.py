@@ -21,10 +21,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, ProjectionWarning, integrate, project
-from eip_scipy.problems import Problem, harmonic, kepler, rotating_packet
+from eip_scipy.problems import Problem, harmonic, kepler
 from eip_scipy.solvers import EIPSolver
 
 from ..beside import workers
+from ..condensates.problems import rotating_packet
 from ..report import cores
 from ..study import Check, Rows, Session, Study
 

@@ -15,16 +15,14 @@ from eip_scipy.problems import (
     figure_eight,
     harmonic,
     kepler,
-    plane_wave,
     pythagorean,
-    rotating_packet,
     solar_system,
-    soliton,
     time_transformed,
     tokamak,
     uniform_field,
 )
 
+from ...condensates.problems import plane_wave, rotating_packet, soliton
 from ...hard_cases import double_pendulum, hard_cases, rigid_body, sir
 from . import systems as s
 from .record import Run, runs

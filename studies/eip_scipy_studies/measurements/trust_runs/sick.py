@@ -14,13 +14,13 @@ from eip_scipy.problems import (
     Grid,
     GrossPitaevskii,
     Problem,
-    harmonic_trap,
     kepler,
     nbody,
     pythagorean,
     solar_system,
 )
 
+from ...condensates.problems import harmonic_trap
 from ...hard_cases import (
     boris_2d,
     double_pendulum,

@@ -1,14 +1,12 @@
 """Ground states: minima of the energy among fields of mass 1, by preconditioned nonlinear conjugate gradients.
 
-Starts are Thomas-Fermi densities with vortices. The lowest state is searched from several starts, or over windings.
-
 X. Antoine, A. Levitt, Q. Tang, "Efficient spectral computation of the stationary states of rotating Bose-Einstein
 condensates by preconditioned nonlinear conjugate gradient methods", J. Comput. Phys. 343 (2017) 92-109.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import cos, hypot, pi, sin, sqrt
 from typing import Any
@@ -16,22 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from .equation import GrossPitaevskii
-from .grid import Multiplier
-from .pointwise import add_potential, divide_by_root, inner, quartic_sums, rotate
+from eip_scipy.problems import GrossPitaevskii
+from eip_scipy.problems.gross_pitaevskii import Multiplier
 
-__all__ = [
-    "GroundState",
-    "ground_state",
-    "imprint",
-    "lowest_ring",
-    "lowest_state",
-    "polygon",
-    "ring_start",
-    "thomas_fermi",
-    "vortex_starts",
-    "with_noise",
-]
+from .pointwise import add_potential, divide_by_root, inner, quartic_sums, rotate
 
 REFRESH = 20  # iterations between two evaluations of what is carried along otherwise
 NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
@@ -41,27 +27,14 @@ NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
 # Part of the vortices of a rigid rotation that a single row in the ring holds: only where the walk starts.
 ROW = 0.4
 BREAK_SYMMETRY = 1e-3
-Progress = Callable[[int, float, float], Any]
 
 
 @dataclass(frozen=True, eq=False)
 class GroundState:
     """A stationary state, a minimum of the energy unless the start had a symmetry that the minimum lacks.
 
-    Attributes
-    ----------
-    psi : ndarray, shape (J[, K[, L]])
-        The field, of mass 1.
-    energy, mu : float
-        Energy and chemical potential.
-    residual : float
-        Norm of H psi - mu psi, the root of the sum of squares times the size of a cell.
-    iterations : int
-        Number of iterations.
-    converged : bool
-        True if the residual is at most `tol` of `ground_state`.
-    message : str
-        Why the iteration ended.
+    `psi` is the field, of mass 1, `energy` and `mu` are its energy and chemical potential, and `residual` is the norm
+    of H psi - mu psi. `message` says why the search ended after its `iterations`.
     """
 
     psi: np.ndarray
@@ -72,57 +45,17 @@ class GroundState:
     converged: bool
     message: str
 
-    def __repr__(self) -> str:
-        numbers = f"energy={self.energy:.10g}, mu={self.mu:.10g}, residual={self.residual:.1e}"
-        return f"GroundState({numbers}, iterations={self.iterations}: {self.message})"
 
+def ground_state(gpe: GrossPitaevskii, start: Any, *, tol: float = 1e-8, max_iterations: int = 10_000) -> GroundState:
+    """Minimise the energy among fields of mass 1 from the field `start`, until the residual is at most `tol`.
 
-def ground_state(
-    gpe: GrossPitaevskii,
-    start: Any,
-    *,
-    tol: float = 1e-8,
-    max_iterations: int = 10_000,
-    progress: Progress | None = None,
-) -> GroundState:
-    """Minimise the energy among fields of mass 1, from a given start.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-    start : array_like
-        A field, normalised or not, see `vortex_starts` and `imprint`.
-    tol : float, optional
-        Bound for the norm of H psi - mu psi.
-    max_iterations : int, optional
-        Largest number of iterations.
-    progress : callable, optional
-        ``progress(iteration, energy, residual)``, called in each iteration; a true return value ends the search.
-
-    Returns
-    -------
-    GroundState
-        If the search ended early, `converged` is False, and `message` has the reason.
-
-    Raises
-    ------
-    ValueError
-        If the start is zero or not finite, or an option has a wrong value.
-
-    Notes
-    -----
     The method uses the combined preconditioner and the coefficient of Polak and Ribiere of the paper by Antoine, Levitt
-    and Tang (2017), with an exact line search: the energy of cos(a) psi + sin(a) p is a polynomial of degree 4 in
-    cosine and sine, whose coefficients need no further transform. One iteration costs the linear part of one field, and
-    one pair of transforms for the preconditioner.
+    and Tang, with an exact line search: the energy of cos(a) psi + sin(a) p is a polynomial of degree 4 in cosine and
+    sine, whose coefficients need no further transform. One iteration costs the linear part of one field, and one pair
+    of transforms for the preconditioner.
     """
-    if not tol > 0 or isinstance(max_iterations, bool) or not isinstance(max_iterations, int) or max_iterations < 1:
-        raise ValueError(f"tol must be > 0 and max_iterations an integer >= 1, got {tol!r} and {max_iterations!r}.")
     psi = gpe.as_field(start)
-    mass = gpe.mass(psi)
-    if not 0 < mass < np.inf:
-        raise ValueError(f"the start must be finite and not zero everywhere; its mass is {mass}.")
-    return _Descent(gpe, psi / sqrt(mass)).run(tol, max_iterations, progress)
+    return _Descent(gpe, psi / sqrt(gpe.mass(psi))).run(tol, max_iterations)
 
 
 class _Descent:
@@ -144,8 +77,8 @@ class _Descent:
         self.gpe.linear(field, out)
         add_potential(field, self.gpe.V, 0.0, out)
 
-    def run(self, tol: float, max_iterations: int, progress: Progress | None) -> GroundState:
-        """Iterate, and return the result, once it converged, `progress` says so, or no direction descends."""
+    def run(self, tol: float, max_iterations: int) -> GroundState:
+        """Iterate, and return the result once it converged or no direction descends."""
         message, iteration = "", 0
         while not message:
             if iteration % REFRESH == 0:
@@ -155,18 +88,11 @@ class _Descent:
                 message = "converged"
             elif iteration == max_iterations:
                 message = f"not converged in {max_iterations} iterations"
-            elif progress is not None and progress(iteration, self.energy(mu), norm):
-                message = "stopped by progress"
-            elif not (self.turn() and self.advance()):
+            elif not (self.conjugate_direction() and self.line_search()):
                 message = "stalled: round-off leaves no descent"
             else:
                 iteration += 1
         return GroundState(self.psi, self.gpe.energy(self.psi), mu, norm, iteration, norm <= tol, message)
-
-    def energy(self, mu: float) -> float:
-        """Return the energy, which is mu minus beta / 2 times the integral of ``|psi|^4``."""
-        density = np.abs(self.psi) ** 2
-        return mu - 0.5 * self.gpe.beta * self.gpe.grid.cell * float(np.vdot(density, density))
 
     def refresh(self) -> None:
         """Normalise psi, recompute its `image` by `apply` to remove rounding errors, and adapt the preconditioner."""
@@ -183,7 +109,7 @@ class _Descent:
         rotate(r, self.psi, 1.0, -mu)
         return mu, sqrt(self.inner(r, r))
 
-    def turn(self) -> bool:
+    def conjugate_direction(self) -> bool:
         """Choose the next direction: conjugate, or steepest if that does not descend; return False if neither does."""
         r, old = self.residual, self.old_residual
         d = self.preconditioner(r, self.psi)
@@ -197,7 +123,7 @@ class _Descent:
                 return True
         return False
 
-    def advance(self) -> bool:
+    def line_search(self) -> bool:
         """Move to the smallest energy along the great circle through psi and p; return False if psi does not move."""
         r, norm = self.old_residual, sqrt(self.inner(self.p, self.p))
         self.apply(self.p, self.p_image)
@@ -237,7 +163,7 @@ class _Preconditioner:
         self._V = gpe.V - gpe.V.min()
         self._energy = Multiplier(gpe.grid, self._axes, self._kinetic)
         self._scaled, self._out = np.empty(gpe.grid.shape, complex), np.empty(gpe.grid.shape, complex)
-        self.zero = np.zeros(gpe.grid.size)
+        self.zero = np.zeros(gpe.grid.shape)
 
     def fit(self, psi: np.ndarray) -> None:
         """Compute a from a field: its kinetic energy plus the sum of W ``|psi|^2`` times the size of a cell."""
@@ -256,27 +182,15 @@ class _Preconditioner:
         return self._out
 
 
+# Starts.
+
+
 def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     """Return the Thomas-Fermi density of mass 1, (mu - V + Omega^2 r^2 / 2) / beta where this is positive, and else 0.
 
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-        An equation with beta > 0 and a trap that confines the condensate in spite of the rotation.
-
-    Returns
-    -------
-    ndarray, shape (J[, K[, L]])
-
-    Raises
-    ------
-    ValueError
-        If beta is not positive, or the density reaches the ends of the box.
+    The equation has beta > 0 and a trap that confines the condensate in spite of the rotation. A ValueError is raised
+    if the density reaches the ends of the box.
     """
-    if not gpe.beta > 0:
-        raise ValueError(
-            f"a Thomas-Fermi density needs beta > 0, got {gpe.beta:g}; call ground_state with a start of your own."
-        )
     r2 = sum(a**2 for a in gpe.grid.mesh()[:2]) if gpe.Omega else 0.0
     well = gpe.V - 0.5 * gpe.Omega**2 * r2
     cell, low = gpe.grid.cell, float(well.min())
@@ -293,19 +207,9 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
 
 
 def imprint(gpe: GrossPitaevskii, positions: Any) -> np.ndarray:
-    """Return the Thomas-Fermi amplitude with singly charged vortices, which are lines along z in three dimensions.
+    """Return the Thomas-Fermi amplitude with singly charged vortices at the `positions` (k, 2).
 
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-        An equation in two or three dimensions.
-    positions : array_like, shape (k, 2)
-        x and y of each vortex.
-
-    Returns
-    -------
-    ndarray, shape (J, K[, L])
-        A field of mass near 1.
+    In three dimensions these are lines along z. The mass is near 1.
     """
     density = thomas_fermi(gpe)
     x, y, *_ = gpe.grid.mesh()
@@ -324,27 +228,17 @@ def polygon(count: int, radius: float) -> np.ndarray:
 
 
 def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
-    """Return the Thomas-Fermi amplitude of a ring with vortices at equal distances on its mean circle.
+    """Return the Thomas-Fermi amplitude of a ring with `count` vortices at equal distances on its mean circle.
 
-    The radius of the circle is the root of `mean_square_radius`.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-        An equation whose Thomas-Fermi density has a hole.
-    count, winding : int
-        Number of vortices on the circle, and winding number of the phase inside the circle.
-
-    Returns
-    -------
-    ndarray, shape (J, K[, L])
+    The radius of the circle is the root of the mean square radius, and `winding` the winding number of the phase inside
+    the circle.
     """
-    psi = imprint(gpe, polygon(count, sqrt(mean_square_radius(gpe))))
+    psi = imprint(gpe, polygon(count, sqrt(_mean_square_radius(gpe))))
     x, y, *_ = gpe.grid.mesh()
     return psi * np.exp(1j * winding * np.arctan2(y, x))
 
 
-def mean_square_radius(gpe: GrossPitaevskii) -> float:
+def _mean_square_radius(gpe: GrossPitaevskii) -> float:
     """Return the mean of x^2 + y^2 over the Thomas-Fermi density."""
     density = thomas_fermi(gpe)
     x, y, *_ = gpe.grid.mesh()
@@ -362,18 +256,6 @@ def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[n
 
     A condensate that turns as a rigid body has Omega / pi vortices per unit area; the lattices have 0.6 to 1.2 times
     as many, over the whole condensate and any hole in it. Without rotation (`Omega` = 0) the fields have no vortices.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-    count : int
-        Number of fields.
-    seed : int, optional
-        Seed of the random numbers.
-
-    Yields
-    ------
-    ndarray, shape (J[, K[, L]])
     """
     rng = np.random.default_rng(seed)
     amplitude = np.sqrt(thomas_fermi(gpe))
@@ -397,90 +279,27 @@ def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generat
     return points[np.hypot(*points.T) < radius]
 
 
-def lowest_state(
-    gpe: GrossPitaevskii,
-    starts: Iterable[Any],
-    *,
-    tol: float = 1e-8,
-    max_iterations: int = 10_000,
-    progress: Progress | None = None,
-) -> list[GroundState]:
-    """Search for the lowest state from several starts.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-    starts : iterable of array_like
-        See `vortex_starts` and `imprint`.
-    tol, max_iterations, progress
-        See `ground_state`.
-
-    Returns
-    -------
-    list of GroundState
-        States in the order of the starts. The lowest energy is an upper bound for that of the ground state.
-    """
-    return [ground_state(gpe, s, tol=tol, max_iterations=max_iterations, progress=progress) for s in starts]
-
-
 def lowest_ring(
-    gpe: GrossPitaevskii,
-    *,
-    tol: float = 1e-8,
-    max_iterations: int = 10_000,
-    seed: int = 0,
-    progress: Progress | None = None,
-    report: Callable[[int, int, float], Any] | None = None,
+    gpe: GrossPitaevskii, *, tol: float = 1e-8, seed: int = 0, report: Callable[[int, int, float], Any]
 ) -> GroundState:
-    """Search for the lowest state of a condensate with a hole that has one row of vortices around the hole.
+    """Search for the lowest state of a condensate in two dimensions with a hole, and one row of vortices around it.
 
-    The search is over the number of vortices and the winding number of the phase around the hole.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-        An equation whose Thomas-Fermi density has a hole.
-    tol, max_iterations, progress
-        Arguments of the last search, see `ground_state`.
-    seed : int, optional
-        Seed of the noise that breaks the symmetry of the best state before the last search.
-    report : callable, optional
-        ``report(count, winding, energy)``, called for each pair of a number of vortices and a winding number that is
-        tried.
-
-    Returns
-    -------
-    GroundState
-
-    Raises
-    ------
-    ValueError
-        If the condensate has no hole, or its hole is narrower than the grid resolves.
-
-    Notes
-    -----
-    No descent leads from a state to one with another winding. Therefore short searches are made from starts with pairs
-    (count, winding): from each pair the search goes on to its neighbour of lowest energy, until no neighbour is lower.
-    The last search starts from the best state with noise.
+    No descent leads from a state to one with another winding of the phase around the hole. Therefore short searches are
+    made from starts with pairs (count of vortices, winding), and ``report(count, winding, energy)`` is called for each:
+    from each pair the search goes on to its neighbour of lowest energy, until no neighbour is lower. The last search,
+    to the residual `tol`, starts from the best state with noise, whose seed is `seed`, to break its symmetry.
     """
-    density = thomas_fermi(gpe)
-    x, y, *_ = gpe.grid.mesh()
-    r2 = (x**2 + y**2)[density > 0] if gpe.grid.dim == 2 else (x**2 + y**2 + 0 * density)[density > 0]
-    if not r2.min() > (4 * gpe.grid.spacing[:2].max()) ** 2:
-        raise ValueError(
-            "the condensate has no hole with a radius above 4 grid spacings; use lowest_state, or a finer grid if "
-            "the hole is narrow."
-        )
+    x, y = gpe.grid.mesh()
+    r2 = (x**2 + y**2)[thomas_fermi(gpe) > 0]
     count = round(ROW * abs(gpe.Omega) * (r2.max() - r2.min()))
-    here = count, round(abs(gpe.Omega) * mean_square_radius(gpe) - count / 2)
+    here = count, round(abs(gpe.Omega) * _mean_square_radius(gpe) - count / 2)
     found: dict[tuple[int, int], GroundState] = {}
 
     def energy(pair: tuple[int, int]) -> float:
         if pair not in found:
             start = ring_start(gpe, *pair)
             found[pair] = ground_state(gpe, start, tol=WALK_TOLERANCE, max_iterations=WALK_ITERATIONS)
-            if report is not None:
-                report(*pair, found[pair].energy)
+            report(*pair, found[pair].energy)
         return found[pair].energy
 
     while True:
@@ -489,4 +308,4 @@ def lowest_ring(
             break
         here = best
     start = with_noise(found[here].psi, np.random.default_rng(seed), BREAK_SYMMETRY)
-    return ground_state(gpe, start, tol=tol, max_iterations=max_iterations, progress=progress)
+    return ground_state(gpe, start, tol=tol)
