@@ -9,7 +9,6 @@ from systems import SQUARE, oscillator
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, ensemble, integrate, problems, project
 from eip_scipy.problems import ForceConstants, Grid, GrossPitaevskii, Problem, nbody
-from eip_scipy_studies.comparators import stormer_verlet
 
 units = pytest.importorskip("astropy.units")
 Time = pytest.importorskip("astropy.time").Time
@@ -101,11 +100,6 @@ def problem(**options):
     return Problem(**{"name": "mine", "fun": oscillator, "y0": np.array(Y0), "t_span": (0, 1), **options})
 
 
-def verlet(**options):
-    arguments = {"t_span": (0, 1), "y0": Y0, "h": 0.1, **options}
-    return stormer_verlet(lambda t, q, *p: -q, **arguments)
-
-
 ARGUMENTS = [
     (by_integrate, "t_span", (0.0, 1.0)),
     *((by_integrate, name, value) for name, value in (("y0", Y0), ("h", 0.1), ("params", [1.0]), ("t_eval", [0.5]))),
@@ -124,7 +118,6 @@ ARGUMENTS = [
     *((by_nbody, name, value) for name, value in (*BODIES.items(), ("t_span", (0.0, 1.0)), ("h", 0.1))),
     *((problem, name, value) for name, value in (("y0", Y0), ("t_span", (0.0, 1.0)), ("h", 0.1), ("params", Y0))),
     *((lambda **o: check_gradient(SQUARE, **{"t": 0.0, "y": Y0, **o}), n, v) for n, v in (("t", 0.0), ("y", Y0))),
-    *((verlet, name, value) for name, value in (("t_span", (0.0, 1.0)), ("y0", Y0), ("h", 0.1), ("params", [1.0]))),
     *((problems.kepler, name, 0.5) for name in ("eccentricity", "relativistic", "t_end", "h")),
     *((problems.harmonic, name, 0.5) for name in ("omega", "t_end", "h")),
     *((problems.solar_system, name, 0.5) for name in ("years", "h")),
