@@ -82,19 +82,12 @@ COMMANDS = {
     "study multistep": Entry(
         "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
     ),
-    "study particle-reference": Entry(
-        "measurements.references:ParticleReference", "reference states of the charged particles"
-    ),
     "study recommend": Entry("measurements.recommend:Recommended", "true errors of recommended runs on the hard cases"),
     "study relativity": Entry(
         "measurements.relativity:Relativity", "ten bodies with relativity compared with WHFast and IAS15"
     ),
-    "study scene-reference": Entry("measurements.references:SceneReference", "reference states of the hard problems"),
     "study solar-cloud": Entry(
         "measurements.solar_cloud:SolarCloud", "an ensemble of solar systems compared with REBOUND"
-    ),
-    "study solar-reference": Entry(
-        "measurements.solar_reference:SolarReference", "reference states of the solar system, computed in 80 bits"
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
     "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
