@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .numba_pointers import Compiled
     from .runs import Run
 
-__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events"]
+__all__ = ["Kind", "native_functions", "raise_again", "with_events"]
 
 NO_DUALS = "a gradient is compiled only for jitted functions of real states"
 
@@ -131,22 +131,6 @@ def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
     """Return what the engine calls for `fun`, the function of the state alone if there is one, and its signature."""
     alone = getattr(fun, "of_state", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
-
-
-def function_alone(
-    fun: Callable[..., Any], kind: Kind, name: str, params: np.ndarray | None, *, second_order: bool = False
-) -> NativeFunctions:
-    """Return `NativeFunctions` with only a right-hand side `fun` of the signature `kind`, `name` in messages."""
-    rhs = _native(fun, kind, name)
-    return NativeFunctions(
-        rhs=rhs.entry,
-        inv=(),
-        grad=(),
-        event=(),
-        params=np.zeros(0) if params is None else params,
-        second_order=second_order,
-        owner={"rhs": [rhs], "inv": [], "grad": [], "event": []},
-    )
 
 
 def with_events(

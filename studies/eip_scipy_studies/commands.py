@@ -19,7 +19,6 @@ class Entry(NamedTuple):
 
 
 COMMANDS = {
-    "list": Entry("listing:Listing", "list commands, methods, problems and data sets"),
     "doctor": Entry("doctor:Doctor", "list what is installed, and test in seconds whether it works"),
     "solar-system": Entry(
         "solar.solar_system:SolarSystem",
@@ -54,7 +53,6 @@ COMMANDS = {
     "work-precision": Entry(
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
-    "view": Entry("view:View", "write a page that plays a saved run"),
     "bench": Entry(
         "bench.command:Bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
@@ -66,25 +64,14 @@ COMMANDS = {
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
     ),
-    "study control": Entry("measurements.control:Control", "step control by the error before and after the projection"),
     "study ensembles": Entry(
         "measurements.ensembles:Ensembles", "ensembles: cost of a member, gain from threads and workers, memory"
     ),
     "study exoplanets": Entry(
         "measurements.exoplanets:Exoplanets", "three systems of exoplanets compared with WHFast and IAS15"
     ),
-    "study far": Entry("measurements.far:Far", "ten bodies over 100 000 years by several methods"),
-    "study gpe": Entry(
-        "measurements.gpe:EquationCost", "cost of the Gross-Pitaevskii equation compared with its transforms and RK4"
-    ),
     "study gpe-efficiency": Entry("condensates.efficiency:AllRuns", "the paper's test of efficiency with all its runs"),
-    "study gpe-methods": Entry("measurements.gpe_methods:BaseMethods", "RK4 and splittings on the paper's ring"),
-    "study gpe-mpi": Entry("measurements.gpe_mpi:RanksCost", "the Gross-Pitaevskii equation on ranks of MPI"),
-    "study gradients": Entry(
-        "measurements.gradients:Gradients", "compiled gradients compared with gradients written by hand"
-    ),
     "study growth": Entry("measurements.growth:Growth", "growth of the error of position over 10 000 years"),
-    "study import-time": Entry("measurements.import_time:ImportTime", "duration of imports"),
     "study long-orbits": Entry(
         "measurements.long_orbits:LongOrbits", "effect of projection and compensated sums over 1000 years"
     ),
@@ -95,29 +82,12 @@ COMMANDS = {
     "study multistep": Entry(
         "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
     ),
-    "study nystrom-defaults": Entry(
-        "measurements.nystrom_defaults:NystromDefaults", "two options of the Nyström methods that could be defaults"
-    ),
-    "study orbit-balances": Entry(
-        "measurements.orbit_balances:OrbitBalances", "cost and gain of each quantity of the orbits as a balance"
-    ),
-    "study overhead": Entry(
-        "measurements.overhead:Overhead", "cost of a step in solve_ivp compared with SciPy's classes"
-    ),
-    "study particle-reference": Entry(
-        "measurements.references:ParticleReference", "reference states of the charged particles"
-    ),
     "study recommend": Entry("measurements.recommend:Recommended", "true errors of recommended runs on the hard cases"),
     "study relativity": Entry(
         "measurements.relativity:Relativity", "ten bodies with relativity compared with WHFast and IAS15"
     ),
-    "study ring-grids": Entry("measurements.ring_grids:RingGrids", "the paper's ring on several grids"),
-    "study scene-reference": Entry("measurements.references:SceneReference", "reference states of the hard problems"),
     "study solar-cloud": Entry(
         "measurements.solar_cloud:SolarCloud", "an ensemble of solar systems compared with REBOUND"
-    ),
-    "study solar-reference": Entry(
-        "measurements.solar_reference:SolarReference", "reference states of the solar system, computed in 80 bits"
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
     "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
@@ -126,20 +96,10 @@ COMMANDS = {
         "derivatives by start and parameters: errors, cost, chaos, a stability map",
     ),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
-    "study waves": Entry("measurements.waves:Waves", "error against cost on waves, compared with SciPy's DOP853"),
     "study with-and-without": Entry(
         "measurements.with_and_without:WithAndWithout",
         "the figures with and without invariants: a comet and a satellite",
     ),
-    "study written": Entry("measurements.written:Written", "cost of a problem written as an expression"),
-}
-# Former options by command, and the command that replaces each.
-MOVED = {
-    ("solar-system", "--frontier"): "solar-system frontier",
-    ("solar-system", "--truth"): "solar-system truth",
-    ("solar-system", "--forces"): "solar-system truth --forces",
-    ("charged-particle", "--field"): "charged-particle uniform, or charged-particle tokamak",
-    ("charged-particle", "--orbit"): "charged-particle tokamak --orbit",
 }
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints of commands that take minutes, and options that are positive numbers."""
+"""Checkpoints of commands that take minutes, and options: methods, metrics and positive numbers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import eip_scipy
 from eip_scipy.solvers import EIPSolver
 
 from .report import UsageError, check_folder
 from .study import option
+
+METRICS = ("error", "euclidean")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +66,12 @@ def number(what: str, fits: Callable[[Any], bool], convert: Callable[[str], Any]
 
 
 positive = number("a positive number", lambda value: 0 < value < math.inf)
+
+
+def fixed_step_methods() -> dict[str, type[EIPSolver]]:
+    """Return the solver classes of `eip_scipy` that have a tableau of coefficients, by their names."""
+    found = {name: getattr(eip_scipy, name) for name in eip_scipy.__all__ if name.startswith("EIP")}
+    return {name: value for name, value in found.items() if hasattr(value, "TABLEAU")}
 
 
 def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:

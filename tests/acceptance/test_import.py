@@ -43,7 +43,7 @@ def test_steps_bring_no_ensembles_and_no_problems():
 
 def test_no_name_brings_the_studies():
     """Neither the public names nor the public modules load the studies; `python -m eip_scipy` does."""
-    modules = "checkpoint, integrations, methods, native_kernels, plotting, problems, results, solvers"
+    modules = "checkpoint, integrations, methods, plotting, problems, results, solvers"
     assert loaded(f"from eip_scipy import *\nfrom eip_scipy import {modules}", ["eip_scipy_studies"]) == []
     assert loaded("import eip_scipy.__main__", ["eip_scipy_studies", "numpy"]) == ["eip_scipy_studies"]
 

@@ -14,7 +14,6 @@ from numba import njit
 from eip_scipy import EIPGJ12, EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate
 from eip_scipy.engine.native import BUILD, library
 from eip_scipy.problems import ForceConstants, kepler, nbody
-from eip_scipy_studies.comparators import implicit_midpoint
 
 Y0 = [1.6, 0.0, 0.0, 0.5]
 DOUBLES = ctypes.POINTER(ctypes.c_double)
@@ -44,9 +43,6 @@ def cases(c):
     def turning(t, y):
         return [y[1], -y[0]]
 
-    def fill(t, y, out):
-        out[:] = y[1], -y[0]
-
     momentum = library["eih.momentum"]
 
     @njit
@@ -65,7 +61,6 @@ def cases(c):
         "Nystrom": (lambda: integrate(problem, (0, 2), method=EIPRKN12, h=0.05, t_eval=[0.301, 0.7017]).y, True),
         "eih": (lambda: integrate(bodies, method=EIPRK4).y, True),
         "batches": (lambda: ensemble(problem, (0, 1), np.tile(problem.y0, (16, 1)), method=EIPRK4, h=0.05).y, True),
-        "midpoint": (lambda: implicit_midpoint(fill, (0, 1), [1.0, 0.0], 0.1).y, False),
         "library": (lambda: np.atleast_1d(library["eih.momentum"](0.0, bodies.y0, bodies.params)), False),
         "compiled": (lambda: compiled(bodies.y0, bodies.params), True),
         "stepped by hand": (lambda: stepped(turning, square), False),

@@ -23,7 +23,7 @@ from eip_scipy import EIPRK1, EIPRK4, Invariant, integrate
 from eip_scipy.problems import solar_data
 from eip_scipy_studies import report
 from eip_scipy_studies.cli import main
-from eip_scipy_studies.listing import fixed_step_methods
+from eip_scipy_studies.long_runs import fixed_step_methods
 from eip_scipy_studies.solar import errors as solar_errors
 from eip_scipy_studies.solar import runs as solar_run
 from eip_scipy_studies.solar import solar_system
@@ -358,8 +358,6 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatc
         (["--resume"], "--resume needs the folder to resume from: --checkpoint DIR"),
         (["truth", "--checkpoint", "a"], "unrecognized arguments: --checkpoint a"),
         (["frontier", "--resume"], "unrecognized arguments: --resume"),
-        (["--frontier", "--years", "10"], "--frontier is now: eip-scipy solar-system frontier\n"),
-        (["--truth"], "--truth is now: eip-scipy solar-system truth\n"),
     ],
 )
 def test_options_that_nothing_can_be_done_with(options, message, tmp_path, capsys, no_rebound):
@@ -416,8 +414,8 @@ def test_a_file_that_cannot_be_written_at_the_end_leaves_the_table(tmp_path, cap
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "expected COMMAND first, one of list, doctor, solar-system"),
-        (["solar"], "unknown COMMAND 'solar', expected one of list, "),
+        ([], "expected COMMAND first, one of doctor, solar-system"),
+        (["solar"], "unknown COMMAND 'solar', expected one of doctor, "),
         (["solar-sytem"], "did you mean 'solar-system'?"),
         (["--years", "1", "solar-system"], "expected COMMAND first"),
         (["solar-system", "--yaers", "5"], "unrecognized arguments: --yaers 5; did you mean '--years'?"),
@@ -438,7 +436,7 @@ def test_a_file_that_cannot_be_written_at_the_end_leaves_the_table(tmp_path, cap
         (["solar-system", "--json", "{folder}"], "it is a folder"),
         (["solar-system", "--out", "{file}"], "cannot write to the folder '{file}': file exists"),
         (["solar-system", "--out", "{file}/out"], "cannot write to the folder"),
-        (["list", "--json", "{missing}/list.json"], "no such file"),
+        (["doctor", "--json", "{missing}/doctor.json"], "no such file"),
     ],
 )
 def test_wrong_usage_is_one_line(tmp_path, capsys, monkeypatch, arguments, message):
@@ -467,7 +465,7 @@ def test_too_much_memory_is_one_line(tmp_path, capsys, no_rebound, monkeypatch):
     assert "not enough memory" in lines(capsys.readouterr().err)[-1]
 
 
-# --- list, version, entry points ---
+# --- version, entry points ---
 
 
 def test_a_clone_has_its_integrations(tmp_path):
@@ -480,43 +478,11 @@ def test_a_clone_has_its_integrations(tmp_path):
     assert done.stdout.split() == ["True", str(tmp_path / "integrations" / "jpl.py")]
 
 
-def test_list(capsys, tmp_path):
-    file = tmp_path / "list.json"
-    assert main(["list", "--json", str(file)]) == 0
-    text = capsys.readouterr().out
-    for name in ("solar-system", "EIPRK5", "stormer_verlet", "kepler", "de440-j2000"):
-        assert name in text
-    found = json.loads(file.read_text())
-    assert set(found["methods"]) >= {"EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5"}
-    assert set(found["problems"]) >= {"kepler", "nbody", "hamiltonian", "hard_cases", "soliton", "tokamak"}
-    assert set(found["for problems"]) >= {"find_invariants", "harmonic_trap", "orbital_elements", "pair_time"}
-    assert main(["list", "--quiet"]) == 0
-    assert capsys.readouterr().out == ""
-
-
 def test_version_and_help(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"eip_scipy {eip_scipy.__version__}\n"
     assert main(["solar-system", "--help"]) == 0
     assert "--metric" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
-def test_module_runs_on_any_terminal(encoding):
-    done = subprocess.run(
-        [sys.executable, "-m", "eip_scipy", "list"],
-        env={**os.environ, "PYTHONIOENCODING": encoding},
-        capture_output=True,
-        check=True,
-    )
-    assert "rmer-Verlet" in done.stdout.decode(encoding)
-
-
-def test_a_reader_that_leaves_is_no_error():
-    done = subprocess.run(
-        f"{sys.executable} -m eip_scipy list | head -n 1", shell=True, capture_output=True, text=True, check=True
-    )
-    assert (done.stdout, done.stderr) == ("commands:\n", "")
 
 
 # --- behind the table ---

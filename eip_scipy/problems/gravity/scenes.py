@@ -1,7 +1,7 @@
 """Problems of celestial mechanics: a satellite, and close encounters, chaos and choreography with reference states.
 
 The starts are here; the reference states are data (``data/scene_references.json``), made in 160-bit arithmetic by
-``eip-scipy study scene-reference``.
+``tools/references.py``.
 """
 
 from __future__ import annotations

@@ -174,7 +174,7 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
     Notes
     -----
     The states were integrated in 80-bit arithmetic by a summed multistep method of order 14, from the state of
-    ``solar_system("de440")`` in AU and Julian years (`eip-scipy study solar-reference`). After 10 000 years a run with
+    ``solar_system("de440")`` in AU and Julian years (`tools/solar_reference.py`). After 10 000 years a run with
     another step differs by 6e-12 AU for Mercury and by 2e-13 AU for the other bodies. A start in other units is rounded
     differently, which changes the position of Mercury by 2e-11 AU after this time.
     """

@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import FixedSteps, fields
 from eip_scipy.problems import GrossPitaevskii
+
+from . import _kernels
+from ._steps import FixedSteps
 
 __all__ = ["FieldResult", "FieldScheme", "FixedPoint", "Implicit", "march"]
 
@@ -124,13 +126,13 @@ class FixedPoint:
             mean = guess.copy()
         else:
             mean = self._means.pop(0)
-            fields.extrapolate(self._means[1], self._means[0], mean)
+            _kernels.extrapolate(self._means[1], self._means[0], mean)
         bound = self.tol * float(np.linalg.norm(scheme.psi))
         rhs(mean, values)
         residual = math.inf
         for _ in range(MOST_ITERATIONS):
             scheme.forward(values, mean)
-            fields.multiply_modes(mean, self._inverse)
+            _kernels.multiply_modes(mean, self._inverse)
             scheme.backward(mean)
             scheme.nfev += 1
             residual = rhs(mean, values)
@@ -179,10 +181,10 @@ class Implicit(FieldScheme):
 
         def rhs(mean: np.ndarray, values: np.ndarray) -> float:
             self.potential(start, mean, self._W)
-            return float(fields.right_side(start, mean, self.rotation(mean), self._W, solver.w, solver.c, values))
+            return float(_kernels.right_side(start, mean, self.rotation(mean), self._W, solver.w, solver.c, values))
 
         mean, failure = solver.solve(rhs, self.psi)
-        fields.other_end(mean, start)
+        _kernels.other_end(mean, start)
         return failure
 
 

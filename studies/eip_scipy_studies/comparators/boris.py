@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, refuse_units, run_in_place
+from ._steps import FixedStepResult, FixedSteps, add, check_state, drive, inlined
 
 __all__ = ["boris"]
 
@@ -34,7 +33,7 @@ def boris(
     ----------
     fields : callable
         ``fields(t, x, out[, params])`` fills out[:3] with E and out[3:] with B; see `ParticleField.fill`. A function
-        jitted by Numba and a C function by pointer run compiled, any other callable interpreted, in the same loop.
+        jitted by Numba runs compiled, any other callable interpreted.
     t_span : tuple of float
         Start and end; a smaller end integrates backward.
     y0 : array_like, shape (6,)
@@ -52,13 +51,6 @@ def boris(
     FixedStepResult
         A record with t (m,), y (6, m), nfev, wall_time [s] and message. Positions and velocities are those at the same
         times.
-
-    Raises
-    ------
-    TypeError
-        If the state or `params` are not made of real numbers, or `fields` is not callable.
-    ValueError
-        If an argument has a wrong value. The message gives the value and what was expected.
 
     References
     ----------
@@ -78,9 +70,24 @@ def boris(
     y = check_state(y0)
     if y.size != 6:
         raise ValueError(f"y0 must hold position and velocity, 6 components, got {y.size}")
-    refuse_units(mass=mass, charge=charge)
-    if not (mass > 0 and np.isfinite(mass) and np.isfinite(charge)):
+    if not (mass > 0 and math.isfinite(mass) and math.isfinite(charge)):
         raise ValueError(f"mass must be positive and finite, and charge finite, got {mass!r} and {charge!r}")
     steps = FixedSteps.of(t_span, h, save_every)
-    ratio = charge / mass
-    return run_in_place("boris", fields, steps, y, params, name="fields", takes=3, fills=6, constant=ratio)
+    return drive(_step, fields, steps, y, params, takes=3, fills=6, constant=charge / mass)
+
+
+@inlined
+def _step(fun, t, h, x, v, params, constant, f, work):  # type: ignore[no-untyped-def]
+    half, kick = 0.5 * h, constant * 0.5 * h
+    add(x, half, v)
+    fun(t + half, x, f, params)
+    u, w, z = v[0] + kick * f[0], v[1] + kick * f[1], v[2] + kick * f[2]
+    a, b, c = kick * f[3], kick * f[4], kick * f[5]
+    s = 2.0 / (1.0 + a * a + b * b + c * c)
+    # v' = v + v x t, then v + v' x s.
+    p, q, r = u + w * c - z * b, w + z * a - u * c, z + u * b - w * a
+    v[0] = u + s * (q * c - r * b) + kick * f[0]
+    v[1] = w + s * (r * a - p * c) + kick * f[1]
+    v[2] = z + s * (p * b - q * a) + kick * f[2]
+    add(x, half, v)
+    return 1

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import fields
 from eip_scipy.problems import GrossPitaevskii
 
+from . import _kernels
 from ._fields import FieldResult, Implicit, check_tol, march
 
 __all__ = ["CrankNicolson", "crank_nicolson"]
@@ -90,4 +90,4 @@ class CrankNicolson(Implicit):
 
     def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
         """See `Implicit`."""
-        fields.mean_density(start, mean, self.V, self.gpe.beta, out)
+        _kernels.mean_density(start, mean, self.V, self.gpe.beta, out)

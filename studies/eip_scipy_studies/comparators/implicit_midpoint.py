@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
-from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, run_in_place
+from ._steps import FixedStepResult, FixedSteps, check_state, drive, inlined
 
 __all__ = ["implicit_midpoint"]
+
+MOST_ITERATIONS = 100
+SOLVED = 1e-12  # relative change below which an iteration that no longer improves is done
 
 
 def implicit_midpoint(
@@ -28,8 +32,8 @@ def implicit_midpoint(
     Parameters
     ----------
     rhs : callable
-        ``rhs(t, y, out[, params])`` fills out. A function jitted by Numba and a C function by pointer run compiled,
-        any other callable interpreted, in the same loop.
+        ``rhs(t, y, out[, params])`` fills out. A function jitted by Numba runs compiled, any other callable
+        interpreted.
     t_span : tuple of float
         Start and end; a smaller end integrates backward.
     y0 : array_like, shape (n,)
@@ -48,13 +52,6 @@ def implicit_midpoint(
         converges if h times the norm of the Jacobian of f is below about 2; otherwise the run ends, and the states from
         there on are nan.
 
-    Raises
-    ------
-    TypeError
-        If the state or `params` are not made of real numbers, or `rhs` is not callable.
-    ValueError
-        If an argument has a wrong value. The message gives the value and what was expected.
-
     References
     ----------
     E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), theorems IV.2.1 and VI.4.2; the stopping
@@ -71,4 +68,27 @@ def implicit_midpoint(
     """
     y = check_state(y0)
     steps = FixedSteps.of(t_span, h, save_every)
-    return run_in_place("implicit-midpoint", rhs, steps, y, params, name="rhs", takes=y.size, fills=y.size)
+    return drive(_step, rhs, steps, y, params, takes=y.size, fills=y.size)
+
+
+@inlined
+def _step(fun, t, h, y, v, params, constant, f, work):  # type: ignore[no-untyped-def]
+    n = y.size
+    stage, k, before = work[0], work[1], work[2]
+    for i in range(n):
+        k[i], before[i] = 2.0 * k[i] - before[i], k[i]
+    last = math.inf
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        for i in range(n):
+            stage[i] = y[i] + 0.5 * h * k[i]
+        fun(t + 0.5 * h, stage, f, params)
+        change = size = 0.0
+        for i in range(n):
+            change, size = max(change, abs(f[i] - k[i])), max(size, abs(f[i]))
+            k[i] = f[i]
+        if change == 0.0 or (change >= last and change <= SOLVED * size):
+            for i in range(n):
+                y[i] += h * k[i]
+            return iteration
+        last = change
+    return -MOST_ITERATIONS

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import fields
 from eip_scipy.problems import GrossPitaevskii
 
+from . import _kernels
 from ._fields import FieldResult, Implicit, check_tol, march
 from .crank_nicolson import CrankNicolson
 
@@ -91,7 +91,7 @@ class LinearlyImplicit(Implicit):
 
     def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
         """See `Implicit`."""
-        fields.density(self.psi, self.V, self.gpe.beta, out)
+        _kernels.density(self.psi, self.V, self.gpe.beta, out)
 
     def _single_step(self, h: float) -> str:
         self._before[:] = self.psi

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import fields
 from eip_scipy.problems import GrossPitaevskii
 
+from . import _kernels
 from ._fields import FieldResult, FieldScheme, march
 
 __all__ = ["SAVResult", "sav_crank_nicolson"]
@@ -155,15 +155,15 @@ class _SAV(FieldScheme):
         Return r at the end of the step, and the reason for a failure, or "".
         """
         gpe, force = self.gpe, self._force
-        square = gpe.grid.cell * fields.nonlinear_force(self.psi, other, a, self.V, gpe.beta, force) + self.shift
+        square = gpe.grid.cell * _kernels.nonlinear_force(self.psi, other, a, self.V, gpe.beta, force) + self.shift
         if not square > 0:
             return math.nan, f"E1 + C is {square:.2g}, which must be positive; take a larger shift"
         s = 1 / math.sqrt(square)
         self.forward(force, self._new)
-        along, norm = fields.projections(self._new, self._modes, self._inverse, self._c)
+        along, norm = _kernels.projections(self._new, self._modes, self._inverse, self._c)
         weight = gpe.grid.cell / self.psi.size  # Parseval
         r_mean = (self.r + s * weight * along) / (1 + s * s * weight * norm)
-        fields.advance(self._modes, self._inverse, self._c * r_mean * s, self._new_modes, self._new)
+        _kernels.advance(self._modes, self._inverse, self._c * r_mean * s, self._new_modes, self._new)
         self.backward(self._new)
         self.nfev += 1
         return 2 * r_mean - self.r, ""

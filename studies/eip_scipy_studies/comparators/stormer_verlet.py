@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, run_second_order
+from ._steps import FixedStepResult, FixedSteps, add, check_state, drive, inlined, njit
 
-__all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
+__all__ = ["FORMS", "StormerVerletResult", "newton", "stormer_verlet"]
 
 FORMS = ("kick-drift-kick", "drift-kick-drift")
 
@@ -36,8 +36,7 @@ def stormer_verlet(
     Parameters
     ----------
     acc : callable
-        ``acc(t, q[, params]) -> (n/2,)``. A function jitted by Numba and a C function by pointer run compiled, any
-        other callable interpreted, in the same loop.
+        ``acc(t, q[, params]) -> (n/2,)``. A function jitted by Numba runs compiled, any other callable interpreted.
     t_span : tuple of float
         Start and end; a smaller end integrates backward.
     y0 : array_like, shape (n,)
@@ -55,20 +54,7 @@ def stormer_verlet(
     Returns
     -------
     StormerVerletResult
-        A record with t (m,), y (n, m), nfev, wall_time [s] and message.
-
-    Raises
-    ------
-    TypeError
-        If the state, `params` or the value of `acc` is not made of real numbers.
-    ValueError
-        If an argument has a wrong value, or `acc` returns a wrong shape. The message gives the value and what was
-        expected.
-
-    Notes
-    -----
-    nfev is the number of steps plus one: the first evaluation, which also checks the shape, starts the
-    kick-drift-kick form, while the drift-kick-drift form does not use it further.
+        A record with t (m,), y (n, m), nfev (the number of steps plus one), wall_time [s] and message.
 
     References
     ----------
@@ -83,16 +69,63 @@ def stormer_verlet(
     >>> bool(abs(run.y[0, -1] - np.cos(10.0)) < 1e-4)
     True
     """
-    steps = FixedSteps.of(t_span, h, save_every)
-    y = _check_halves(y0)
+    steps, y = FixedSteps.of(t_span, h, save_every), check_state(y0)
+    half = y.size // 2
+    if y.size == 0 or y.size % 2:
+        raise ValueError(f"y0 must hold q and v, an even number of components, got {y.size}")
     if form not in FORMS:
         raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
-    run = run_second_order(form, acc, steps, y, params)
+    extra = () if params is None else (check_state(params, "params"),)
+    value = acc(steps.t0, y[:half].copy(), *extra)
+    if np.iscomplexobj(value) or np.shape(value) != (half,):
+        raise ValueError(f"acc returned {value!r}, expected an array of {half} real numbers")
+    step, kicks = (_kick_drift_kick, True) if form == FORMS[0] else (_drift_kick_drift, False)
+    run = drive(step, acc, steps, y, params, takes=half, fills=half, returns=True, start=kicks)
     return StormerVerletResult(run.t, run.y, int(steps.saved[-1]) + 1, run.wall_time, run.message)
 
 
-def _check_halves(y0: Any) -> np.ndarray:
-    y = check_state(y0)
-    if y.size == 0 or y.size % 2:
-        raise ValueError(f"y0 must hold q and v, an even number of components, got {y.size}")
-    return y
+@inlined
+def _kick_drift_kick(fun, t, h, q, v, params, constant, a, work):  # type: ignore[no-untyped-def]
+    add(v, 0.5 * h, a)
+    add(q, h, v)
+    fun(t + h, q, a, params)
+    add(v, 0.5 * h, a)
+    return 1
+
+
+@inlined
+def _drift_kick_drift(fun, t, h, q, v, params, constant, a, work):  # type: ignore[no-untyped-def]
+    add(q, 0.5 * h, v)
+    fun(t + 0.5 * h, q, a, params)
+    add(v, h, a)
+    add(q, 0.5 * h, v)
+    return 1
+
+
+@njit(error_model="numpy")
+def newton(t, q, gm):  # type: ignore[no-untyped-def]
+    """Return the accelerations (3 N,) of N bodies under their mutual gravity; `gm` (N,) is G times the masses."""
+    n, k = gm.size, 0
+    out, pulls = np.zeros(3 * n), np.empty(n * (n - 1) // 2)  # r^-3 of the pairs, in a loop that vectors can take
+    for i in range(1, n):
+        for j in range(i):
+            x, y, z = q[3 * j] - q[3 * i], q[3 * j + 1] - q[3 * i + 1], q[3 * j + 2] - q[3 * i + 2]
+            pulls[k] = x * x + y * y + z * z
+            k += 1
+    for k in range(pulls.size):
+        pulls[k] = 1.0 / (pulls[k] * np.sqrt(pulls[k]))
+    k = 0
+    for i in range(1, n):
+        ax = ay = az = 0.0
+        for j in range(i):
+            x, y, z = q[3 * j] - q[3 * i], q[3 * j + 1] - q[3 * i + 1], q[3 * j + 2] - q[3 * i + 2]
+            a, b = gm[j] * pulls[k], gm[i] * pulls[k]
+            k += 1
+            ax, ay, az = ax + a * x, ay + a * y, az + a * z
+            out[3 * j] -= b * x
+            out[3 * j + 1] -= b * y
+            out[3 * j + 2] -= b * z
+        out[3 * i] += ax
+        out[3 * i + 1] += ay
+        out[3 * i + 2] += az
+    return out

@@ -15,8 +15,7 @@ from eip_scipy import Diagnostics
 from eip_scipy.solvers import EIPSolver
 
 from ..hard_cases import HardCase, hard_cases
-from ..listing import METRICS, fixed_step_methods
-from ..long_runs import named, number
+from ..long_runs import METRICS, fixed_step_methods, named, number
 from ..report import compact, table
 from ..study import Check, Figures, Rows, Session, Study, option
 

@@ -2,8 +2,8 @@
 
 A star with N - 1 light planets (G m = 1e-9 of the star's) on nearly circular, nearly coplanar orbits of semi-major axes
 from 1 to 30, random phases. EIPRKN12, with every=10 and compensated=True, takes 25 or 4 steps in the innermost period;
-IAS15 chooses its steps; leapfrog takes 400 or 800 in this period. All use one thread, as REBOUND does without OpenMP,
-except in the row that says so. Times are the least of three or more (of one for REBOUND with more than 300 bodies).
+IAS15 chooses its steps; leapfrog takes 400 or 800 in this period. REBOUND uses one thread, and so does this package
+with ``OMP_NUM_THREADS=1``. Times are the least of three or more (of one for REBOUND with more than 300 bodies).
 Errors are the largest distance of a body from its place in a run of EIPRKN12 with 50 steps. The steps that leapfrog
 needs for the error of the run with 4 steps are extrapolated by its order, 2: the more accurate runs are beyond its
 rounding errors. The share of the projection is that of the processor time, compared with runs without invariants; with
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from eip_scipy import EIPRKN12, integrate
-from eip_scipy.native_kernels import working_alone
 from eip_scipy.problems import Problem, nbody
 
 from ..report import needed, table
@@ -32,7 +31,6 @@ REPEATS, SECONDS = 3, 4.0
 PERIOD = 2 * np.pi
 STEPS, COARSE, REFERENCE = 25, 4, 50
 LEAPFROG = 400, 800
-SHARED = 128  # from this number of bodies on threads share the sums
 FEW = 300  # with fewer bodies the runs are longer
 Found = dict[int, dict[str, Any]]
 
@@ -122,11 +120,7 @@ def _ours(problem: Problem, periods: int, row: Callable[..., Row]) -> tuple[dict
     ``row(seconds, steps, end)`` makes a row from the time, the number of steps and the final state of a run.
     """
     coarse, h = f"EIPRKN12, {COARSE} steps", PERIOD / COARSE
-    shared, alone = problem.y0.size >= 6 * SHARED, working_alone()
-    actions = {"EIPRKN12": alone(partial(_seconds, problem))}
-    if shared:
-        actions["EIPRKN12, all threads"] = partial(_seconds, problem)
-    actions[coarse] = alone(partial(_seconds, problem, h=h))
+    actions = {"EIPRKN12": partial(_seconds, problem), coarse: partial(_seconds, problem, h=h)}
     seconds = least(actions, seconds=SECONDS)
     ends = {coarse: _run(problem, h=h).y[:, -1], "EIPRKN12": _run(problem).y[:, -1]}
     rows = {
@@ -147,7 +141,7 @@ def _shares(problem: Problem) -> dict[str, float]:
         "none": {"every": None, "invariants": ()},
     }
     actions = {
-        name: working_alone()(clocked(partial(_run, problem, check=False, **options), time.process_time))
+        name: clocked(partial(_run, problem, check=False, **options), time.process_time)
         for name, options in cases.items()
     }
     seconds = least(actions, seconds=SECONDS)

@@ -33,7 +33,6 @@ from ..report import compact, describe_machine, needed, table
 from ..study import Figures, Measurement, Rows, Session, option
 from ..timing import clocked, least
 from ..work_precision import curves
-from .references import particle_equations
 
 TAIL = 60  # states of the reference, three gyrations, at the end of the interval
 SPEED_STEPS, SOLVE_IVP_STEPS = 200_000, 5000
@@ -91,6 +90,24 @@ def speed_text(best: dict[str, float]) -> str:
     ]
     title = "Steps of the banana orbit, canonical form where nothing else is said"
     return "\n".join([title, "", table(head, body), "", *ratios])
+
+
+def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
+    """Return pairs (variable, rate) of the equations of motion in (x, v) in the field `name`, as expressions of heyoka.
+
+    `potential` is the factor of 1/r in the electric potential of the field "uniform"; other fields do not use it.
+    """
+    heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
+    x, y, z, u, v, w = state = heyoka.make_vars("x", "y", "z", "u", "v", "w")
+    r2 = x * x + y * y
+    if name == "uniform":
+        field = potential * r2 ** (-1.5)
+        acceleration = (field * x + v, field * y - u, 0.0 * z)
+    else:
+        half = 0.5 / r2
+        b = (-half * (2.0 * y + x * z), half * (2.0 * x - y * z), half * (r2 - heyoka.sqrt(r2)))
+        acceleration = (v * b[2] - w * b[1], w * b[0] - u * b[2], u * b[1] - v * b[0])
+    return list(zip(state, (u, v, w, *acceleration), strict=True))
 
 
 class Point(NamedTuple):

@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eip_scipy import EIPGJ14, EIPRKN12, integrate
-from eip_scipy.native_kernels import FixedSteps
 from eip_scipy.problems import Problem, SolarSystemData, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
 from eip_scipy.solvers import EIPSolver
 
-from ..comparators import StormerVerletResult, stormer_verlet
+from ..comparators import FixedSteps, StormerVerletResult, newton, stormer_verlet
 from ..long_runs import named
 
 Peer = Callable[..., Any]
@@ -223,8 +222,7 @@ def leapfrog(problem: Problem, step: float, save_every: int | None) -> StormerVe
 
     Every `save_every`-th state is saved in addition to the first and the last; None saves only these two.
     """
-    assert problem.acc is not None  # N bodies have accelerations
-    return stormer_verlet(problem.acc, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
+    return stormer_verlet(newton, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
 
 
 def rebound_run(scene: SolarScene, peer: Peer, name: str, integrator: str, per_save: int, progress: bool) -> MethodRun:

@@ -13,8 +13,7 @@ from eip_scipy.problems import SolarSystemData
 from eip_scipy.problems.gravity.solar_data import available, load
 
 from ..beside import workers
-from ..listing import METRICS, fixed_step_methods
-from ..long_runs import Checkpoints, positive
+from ..long_runs import METRICS, Checkpoints, fixed_step_methods, positive
 from ..report import UsageError, cores
 from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
 from . import report

@@ -1,28 +1,26 @@
-"""``eip-scipy study solar-reference``: states of the solar system in 80 bits, which the library carries as data.
+"""Make the states of the solar system in 80 bits that the library carries as data: ``python tools/solar_reference.py``.
 
 Ten bodies under Newton's gravitation, from the state and the masses of `solar_system` in AU and Julian years, as the
 library's own runs have them. The method is the summed predictor of Gauss and Jackson of order 14, written here in
 NumPy's long double, with compensated sums. It evaluates the accelerations at the predicted positions and has no
 corrector. The truncation error of 2000 steps a year is below the rounding error; the difference from a run with other
-steps shows how large the rounding error is.
+steps shows how large the rounding error is. With ``--taylor YEARS`` the states are compared with heyoka up to then.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from itertools import accumulate
 from math import comb
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from eip_scipy.problems import Problem, solar_system
-
-from ..report import needed
-from ..study import Figures, Session, Study, option
 
 Array = np.ndarray
 FLOAT = np.longdouble
@@ -98,7 +96,6 @@ def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
 def states(problem: Problem, years: Sequence[float], steps: int) -> Iterator[Array]:
     """Yield the states (6 N,) at ascending times `years`, by the Gauss-Jackson method with `steps` steps a year."""
     q, v = problem.y0.astype(FLOAT).reshape(2, -1, 3)
-    assert problem.params is not None
     gravity, per_year = Gravity(problem.params.astype(FLOAT)), FLOAT(steps)
     squares, one = inverse_powers(2, ORDER + 2), inverse_powers(1, ORDER + 1)
     sums = list(accumulate(squares))  # one step ahead
@@ -131,8 +128,8 @@ def states(problem: Problem, years: Sequence[float], steps: int) -> Iterator[Arr
 
 def by_taylor(problem: Problem, years: Sequence[float]) -> Iterator[Array]:
     """Yield the states (6 N,) at ascending times `years`, by heyoka in 80 bits."""
-    heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
-    assert problem.params is not None
+    import heyoka
+
     gm, start = problem.params.astype(FLOAT), problem.y0.astype(FLOAT).reshape(2, -1, 3)
     equations = heyoka.model.nbody(gm.size, masses=list(gm), Gconst=FLOAT(1))
     integrator = heyoka.taylor_adaptive(
@@ -148,58 +145,35 @@ def apart(a: Array, b: Array) -> Array:
     return np.linalg.norm((a - b)[: a.size // 2].astype(float).reshape(-1, 3), axis=1)
 
 
-class Found(NamedTuple):
-    """Times in years, the states at these times, and, for each other run, distances (N,) in AU from these states."""
-
-    years: list[float]
-    states: list[Array]
-    distances: dict[str, list[Array]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolarReference(Study[Found]):
-    """Command ``eip-scipy study solar-reference``."""
-
-    years: Sequence[float] = option(TIMES, "times of the states in Julian years", type=float, nargs="+")
-    steps: int = option(2000, "steps a year (default: %(default)s)", type=int)
-    others: int = option(
-        1500, "steps a year of a second run, which shows the rounding error (default: %(default)s)", type=int
+def main() -> None:
+    """Write the states, and print their distances from those of other runs."""
+    parser = argparse.ArgumentParser(description="Make the states of the solar system in 80 bits.")
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--years", type=float, nargs="+", default=TIMES)
+    parser.add_argument("--steps", type=int, default=2000, help="steps a year")
+    parser.add_argument("--others", type=int, default=1500, help="steps a year of a run that shows the rounding error")
+    parser.add_argument("--taylor", type=float, default=0.0, help="compare with heyoka up to this time in years")
+    given = parser.parse_args()
+    years, problem = sorted(given.years), solar_system()
+    rows = list(states(problem, years, given.steps))
+    others = {f"{given.others} steps a year": states(problem, years, given.others)}
+    others["heyoka, 80 bits"] = by_taylor(problem, [year for year in years if year <= given.taylor])
+    print("distances [AU] from other states: Mercury, and the largest of the others")
+    for name, series in others.items():
+        for year, row, other in zip(years, rows, series, strict=False):
+            distance = apart(row, other)
+            print(f"  {name:20} {year:8g} yr: {distance[1]:.1e} {np.delete(distance, 1).max():.1e}")
+    about = (
+        "Newtonian ten-body solar system from the state of problems.solar_system() in AU and Julian years: all "
+        "positions [AU], then all velocities [AU/yr], by time in Julian years; Gauss-Jackson of order 14 in 80 "
+        f"bits, {given.steps} steps a year; made by `python tools/solar_reference.py`"
     )
-    taylor: float = option(0.0, "compare with heyoka up to this time in years (default: %(default)g)", type=float)
+    kept = {
+        f"{year:g}": [np.format_float_scientific(x, precision=19) for x in row]
+        for year, row in zip(years, rows, strict=True)
+    }
+    given.file.write_text(json.dumps({"about": about, "states": kept}, indent=1) + "\n", encoding="utf-8")
 
-    def measure(self, session: Session) -> Found:
-        years, problem = sorted(self.years), solar_system()
-        with session.bar(2 * len(years), "80 bits") as bar:
-            rows, others = list[Array](), list[Array]()
-            for kept, steps in ((rows, self.steps), (others, self.others)):
-                for state in states(problem, years, steps):
-                    kept.append(state)
-                    bar.update()
-        distances = {f"{self.others} steps a year": list(map(apart, rows, others))}
-        if self.taylor:
-            early = [year for year in years if year <= self.taylor]
-            distances["heyoka, 80 bits"] = [apart(a, b) for a, b in zip(rows, by_taylor(problem, early), strict=False)]
-        return Found(years, rows, distances)
 
-    def text(self, found: Found) -> str:
-        lines = [f"distances [AU] from the states by {self.steps} steps a year: Mercury, and the largest of the others"]
-        for name, rows in found.distances.items():
-            lines += [
-                f"  {name:20} {year:8g} yr: {row[1]:.1e} {np.delete(row, 1).max():.1e}"
-                for year, row in zip(found.years, rows, strict=False)
-            ]
-        return "\n".join(lines)
-
-    def figures(self, found: Found) -> Figures:
-        """Yield the JSON file of the states. It is written with the figures, because tables are CSV files."""
-        about = (
-            "Newtonian ten-body solar system from the state of problems.solar_system() in AU and Julian years: all "
-            "positions [AU], then all velocities [AU/yr], by time in Julian years; Gauss-Jackson of order 14 in 80 "
-            f"bits, {self.steps} steps a year; made by `eip-scipy study solar-reference`"
-        )
-        rows = {
-            f"{year:g}": [np.format_float_scientific(x, precision=19) for x in row]
-            for year, row in zip(found.years, found.states, strict=True)
-        }
-        text = json.dumps({"about": about, "states": rows}, indent=1) + "\n"
-        yield "solar-reference.json", lambda path: path.write_text(text, encoding="utf-8")
+if __name__ == "__main__":
+    main()
