@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .core.inputs import reals, refuse_units, shown
+from .core.inputs import real_array, reals, shown
 from .core.jitted import NotCompilableError
 from .core.native_functions import Kind, function_alone, raise_again
 from .core.pointers import by_pointer, is_pointer
@@ -27,7 +27,7 @@ from .engine.data import Work
 from .engine.native import BUILD, Call, FailedCallError, NativeFunctions, PythonFunctions, call, working_alone
 
 __all__ = [
-    "FixedStepResult", "FixedSteps", "check_state", "fields", "refuse_units", "run_in_place", "run_second_order",
+    "FixedStepResult", "FixedSteps", "check_state", "fields", "run_in_place", "run_second_order",
     "working_alone",
 ]  # fmt: skip
 
@@ -62,12 +62,11 @@ class FixedStepResult:
 
 def _real_vector(values: Any, name: str) -> np.ndarray:
     """Return a contiguous float64 copy of a 1-D array of real numbers; `name` is the argument's name in messages."""
-    refuse_units(**{name: values})
     if np.iscomplexobj(values):
         raise TypeError(f"{name} must be real, got complex numbers")
     if np.ma.is_masked(values):
         raise ValueError(f"masked values in {name}; fill or drop them first.")
-    vector = np.array(values, dtype=float, order="C")
+    vector = real_array(name, values, TypeError)
     if vector.ndim != 1:
         raise ValueError(f"{name} must be 1-dimensional, got shape {vector.shape}")
     return vector
@@ -97,8 +96,7 @@ class FixedSteps(NamedTuple):
     @classmethod
     def of(cls, t_span: Any, h: Any, save_every: Any) -> FixedSteps:
         """Check the user's arguments `t_span`, `h` and `save_every`, and return the steps that they define."""
-        refuse_units(t_span=t_span)
-        span = reals(t_span)
+        span = reals("t_span", t_span)
         if span is None or span.shape != (2,) or not np.isfinite(span).all():
             raise ValueError(f"t_span must hold two finite numbers, got {shown(t_span)}")
         t0, t_bound = span.tolist()

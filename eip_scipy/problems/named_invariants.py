@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from ..core.balances import Balance
-from ..core.inputs import is_number, refuse_units, shown
+from ..core.inputs import is_number, shown
 from ..core.invariants import Invariant
 from ..core.names import nearest
 
@@ -39,7 +39,6 @@ def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
 
 def checked_damping(damping: float) -> float:
     """Return the damping as a float; raise ValueError if it is not a finite number >= 0."""
-    refuse_units(damping=damping)
     if not (is_number(damping) and np.isfinite(damping) and damping >= 0):
         raise ValueError(f"damping must be a finite number >= 0, got {shown(damping)}.")
     return float(damping)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...core.balances import Balance
-from ...core.inputs import is_number, refuse_units, shown
+from ...core.inputs import is_number, shown
 from ...core.invariants import Invariant, JointInvariants
 from ...core.problem import Problem
 from ..named_invariants import checked_damping, damped_invariant, named_invariant
@@ -114,7 +114,6 @@ class GrossPitaevskii:
         fft: str = "auto",
         threads: int = 1,
     ) -> None:
-        refuse_units(potential=potential, Omega=Omega, beta=beta)
         if nyquist not in NYQUIST:
             raise ValueError(f"nyquist must be 'true' or 'zero', got {nyquist!r}.")
         for name, value in (("Omega", Omega), ("beta", beta)):
@@ -496,7 +495,6 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         loss: Any = 0.0,
         **options: Any,
     ) -> None:
-        refuse_units(chemical_potential=chemical_potential, loss=loss)
         damping = checked_damping(damping)
         if not (is_number(chemical_potential) and np.isfinite(chemical_potential)):
             raise ValueError(f"chemical_potential must be a finite number, got {shown(chemical_potential)}.")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import refuse_units
+from ...core.inputs import real_array
 from .pointwise import multiply, weighted_square
 from .transforms import Axes, Transforms
 
@@ -50,7 +50,6 @@ class Grid:
     """
 
     def __init__(self, shape: Any, lower: Any, upper: Any) -> None:
-        refuse_units(lower=lower, upper=upper)
         given = np.atleast_1d(np.asarray(shape))
         if given.ndim != 1 or not 1 <= given.size <= MOST_AXES or given.dtype.kind not in "iu" or np.any(given < 2):
             raise ValueError(f"Grid: shape must be one to three integers >= 2, got {shape!r}.")
@@ -62,7 +61,7 @@ class Grid:
         self.cell = float(np.prod(self.spacing))
 
     def _ends(self, name: str, value: Any) -> np.ndarray:
-        ends = np.asarray(value, dtype=float)
+        ends = real_array(name, value)
         if ends.ndim > 1 or (ends.ndim == 1 and ends.size != self.dim) or not np.isfinite(ends).all():
             raise ValueError(f"Grid: {name} must be a finite number or {self.dim} of them, got {value!r}.")
         return np.broadcast_to(ends, (self.dim,)).copy()

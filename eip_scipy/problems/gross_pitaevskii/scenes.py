@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import refuse_units
 from .equation import FieldProblem, GrossPitaevskii
 from .grid import Grid
 
@@ -51,7 +50,6 @@ def harmonic_trap(*gamma: float) -> Potential:
     ValueError
         If called with another number of coordinates.
     """
-    refuse_units(gamma=gamma)
     return lambda *x: 0.5 * _squares(gamma, x)
 
 
@@ -69,7 +67,6 @@ def quartic_trap(alpha: float, kappa: float, *gamma: float) -> Potential:
     callable
         ``V(x[, y[, z]])``.
     """
-    refuse_units(alpha=alpha, kappa=kappa, gamma=gamma)
 
     def potential(*x: np.ndarray) -> np.ndarray:
         s = _squares(gamma, x)
@@ -126,7 +123,6 @@ def soliton(
     ValueError
         If beta is not negative, the amplitude is not positive, or the grid is too coarse for the soliton.
     """
-    refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
     gpe = _focusing("bright soliton", points, length, amplitude, beta, options)
     largest = abs(velocity) + SOLITON_WAVENUMBERS * amplitude
     if pi * points / length < largest:
@@ -177,7 +173,6 @@ def breather(
     ValueError
         If beta is not negative or the amplitude not positive.
     """
-    refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
     gpe = _focusing("breather", points, length, amplitude, beta, options)
     exact = partial(_breather, gpe.grid.points(0), length, amplitude, velocity, beta)
     step = 0.005 / amplitude**2 if h is None else h
@@ -229,7 +224,6 @@ def plane_wave(
     ValueError
         If the modes are not whole numbers, one for each axis.
     """
-    refuse_units(amplitude=amplitude, beta=beta, t_end=t_end, h=h)
     gpe = GrossPitaevskii(Grid(shape, 0.0, 2 * pi), beta=beta, **options)
     k = np.atleast_1d(modes)
     if k.shape != (gpe.grid.dim,) or np.any(k != np.round(k)):
@@ -263,7 +257,6 @@ def rotating_packet(
     -------
     FieldProblem
     """
-    refuse_units(Omega=Omega, t_end=t_end, h=h)
     grid = Grid((points, points), -2.0, 2.0)
     gpe = GrossPitaevskii(grid, harmonic_trap(1.0, 1.0), Omega=Omega, beta=1.0, **options)
     x, y = grid.mesh()

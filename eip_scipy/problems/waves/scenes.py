@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import refuse_units
 from ..gross_pitaevskii.grid import Grid
 from .korteweg_de_vries import KortewegDeVries
 from .modes import WaveProblem
@@ -55,7 +54,6 @@ def sine_gordon_breather(
         If the frequency or the velocity is out of range, or the velocity so high that the breather is narrower than two
         spacings of the grid.
     """
-    refuse_units(frequency=frequency, velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < frequency < 1 or not -1 < velocity < 1:
         raise ValueError(f"a breather needs 0 < frequency < 1 and |velocity| < 1, got {frequency!r} and {velocity!r}.")
     _require_resolved(f"a breather with velocity = {velocity:g}", sqrt(1 - velocity**2), length, points)
@@ -91,7 +89,6 @@ def sine_gordon_kinks(
     ValueError
         If the velocity is out of range, or so high that the kinks are narrower than two spacings of the grid.
     """
-    refuse_units(velocity=velocity, length=length, t_end=t_end, h=h)
     if not 0 < velocity < 1:
         raise ValueError(f"kinks need 0 < velocity < 1, got {velocity!r}.")
     _require_resolved(f"kinks with velocity = {velocity:g}", sqrt(1 - velocity**2), length, points)
@@ -176,7 +173,6 @@ def korteweg_de_vries_solitons(
         If speeds are not positive or not different, the numbers of speeds and places differ, or the fastest soliton is
         narrower than two spacings of the grid.
     """
-    refuse_units(speeds=speeds, places=places, length=length, t_end=t_end, h=h)
     c, x0 = np.atleast_1d(np.asarray(speeds, dtype=float)), np.atleast_1d(np.asarray(places, dtype=float))
     if c.ndim != 1 or not np.all(c > 0) or np.unique(c).size != c.size or x0.shape != c.shape:
         raise ValueError(

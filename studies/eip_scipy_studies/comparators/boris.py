@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, refuse_units, run_in_place
+from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, run_in_place
 
 __all__ = ["boris"]
 
@@ -78,7 +78,6 @@ def boris(
     y = check_state(y0)
     if y.size != 6:
         raise ValueError(f"y0 must hold position and velocity, 6 components, got {y.size}")
-    refuse_units(mass=mass, charge=charge)
     if not (mass > 0 and np.isfinite(mass) and np.isfinite(charge)):
         raise ValueError(f"mass must be positive and finite, and charge finite, got {mass!r} and {charge!r}")
     steps = FixedSteps.of(t_span, h, save_every)
