@@ -16,8 +16,7 @@ import rebound
 from rebound import units as rebound_units
 from scipy.optimize import OptimizeResult
 
-from eip_scipy.core.inputs import count, refuse_units, shown
-from eip_scipy.core.units import LENGTHS, TIMES
+from eip_scipy.core.inputs import count, shown
 from eip_scipy.problems.gravity.bodies import Bodies, bodies_of
 from eip_scipy.problems.gravity.forces import ForceConstants, check_forces
 from eip_scipy.problems.gravity.nbody import component_names, nbody
@@ -31,6 +30,11 @@ OURS = {ours: theirs for theirs, ours in REBOUNDX.items()} | {"j2": "gravitation
 MAGIC = b"REBOUND Binary File"
 UNKNOWN_UNITS = "as in the REBOUND simulation"
 UNSUPPORTED = "the simulation has a feature that an N-body problem of eip_scipy does not support"
+# Units of `Problem.units` in m and s.
+METRES = {"AU": 149597870700.0, "au": 149597870700.0, "m": 1.0, "cm": 0.01, "km": 1e3, "pc": 3.085677581491367e16}
+YEAR = 365.25 * 86400.0
+SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0, "yr": YEAR, "kyr": 1e3 * YEAR}
+SECONDS |= {"Myr": 1e6 * YEAR, "Gyr": 1e9 * YEAR}
 # G times a template's mass equals our G m up to the rounding of one product and one quotient.
 SAME = 1e-15
 
@@ -71,8 +75,7 @@ def problem_from_simulation(
     -------
     Problem
         In the simulation's units of length and time, with params = sim.G times the masses, and `G`. Test particles have
-        mass 0. The distances exit_max_distance and exit_min_distance are terminal `events` of the problem. If
-        ``sim.units`` are set, quantities of astropy are converted to them.
+        mass 0. The distances exit_max_distance and exit_min_distance are terminal `events` of the problem.
 
     Raises
     ------
@@ -390,8 +393,20 @@ def _units(sim: rebound.Simulation) -> str:
     if names["length"] is None or names["time"] is None:
         return UNKNOWN_UNITS
     length, time = float(rebound_units.lengths_SI[names["length"]]), float(rebound_units.times_SI[names["time"]])
-    parts = (length, LENGTHS, "m"), (time, TIMES, "s")
+    parts = (length, METRES, "m"), (time, SECONDS, "s")
     return ", ".join(next((n for n, own in known.items() if own == si), f"{si!r} {base}") for si, known, base in parts)
+
+
+def _in_si(text: str) -> list[float]:
+    """Return the units of length and time in a text such as "AU, yr" or "km, 5022642.9 s", in m and s, or []."""
+    parts, found = text.replace("Julian year", "yr").split(","), []
+    for part, known in zip(parts, (METRES, SECONDS), strict=False):
+        number, _, name = part.strip().rpartition(" ")
+        try:
+            found.append(float(number or 1) * known[name])
+        except (KeyError, ValueError):
+            return []
+    return found if len(parts) == 2 else []
 
 
 def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
@@ -441,7 +456,6 @@ def _force_names(extras: Any) -> list[str]:
 
 def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) -> tuple[float, np.ndarray]:
     """Return the time and the state that the arguments of `to_simulation` select."""
-    refuse_units(y=y, t=t)
     problem = bodies.problem
     rows = 0 if run is problem else len(run.t)
     if row is not None and y is not None:
@@ -490,8 +504,8 @@ def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | 
     None if the problem has no units of length and time, or if REBOUND has no name for one of the three units.
     """
     tables, found = (rebound_units.lengths_SI, rebound_units.times_SI), []
-    for table, unit in zip(tables, problem.unit_system or (), strict=False):
-        found += [name for name, si in table.items() if math.isclose(si, unit.si, rel_tol=1e-9)][:1]
+    for table, unit in zip(tables, _in_si(problem.units), strict=False):
+        found += [name for name, si in table.items() if math.isclose(si, unit, rel_tol=1e-9)][:1]
     if len(found) < 2:
         return None
     length, time = found

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.core.inputs import refuse_units
-from eip_scipy.core.units import as_epoch, exact_sum
+from eip_scipy.core.inputs import real_array, shown
 from eip_scipy.problems.gravity.solar_data import (
     AU_KM,
     SOLAR_SYSTEM_JSON,
     SolarSystemData,
+    exact_sum,
     gm_from_km3_s2,
     to_barycentre,
 )
@@ -146,9 +146,9 @@ def initial_data(epoch_jd_tdb: Any, path: _StrPath | None = None, *, moon: bool 
 
     Parameters
     ----------
-    epoch_jd_tdb : float or (float, float) or astropy.time.Time
+    epoch_jd_tdb : float or (float, float)
         Julian date, TDB. One float64 resolves 40 microseconds; two parts are added without loss, e.g.
-        ``(2456690.5, 20.3 / 24)``. Or a time of astropy, in any scale: it is converted to TDB.
+        ``(2456690.5, 20.3 / 24)``. For a time of astropy: ``eip_scipy.integrations.astropy.julian_date(time)``.
     path : path-like, optional
         See `kernel_path`.
     moon : bool, optional
@@ -204,7 +204,7 @@ def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = No
 
     Parameters
     ----------
-    epoch_jd_tdb : float or (float, float) or astropy.time.Time
+    epoch_jd_tdb : float or (float, float)
         See `initial_data`.
     days : ndarray, shape (m,)
         Days since the epoch; negative before it.
@@ -224,7 +224,7 @@ def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = No
         If a time is outside the kernel's span, which is named, or if the kernel lacks a body.
     """
     day, rest = _two_part(epoch_jd_tdb)
-    refuse_units(days=days)
+    days = real_array("days", days)
     path = kernel_path(path)
     whole = np.round(days)
     with _open(path) as kernel:
@@ -255,7 +255,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _two_part(epoch: Any) -> tuple[float, float]:
     """Split an epoch into a whole number of days and the rest; jplephem takes the two, so that no digits are lost."""
-    first, second = as_epoch("epoch_jd_tdb", epoch)
+    parts = real_array("epoch_jd_tdb", epoch).ravel().tolist()
+    if len(parts) > 2 or not np.isfinite(parts).all():
+        raise ValueError(f"epoch_jd_tdb: expected a Julian date in TDB, in one or two parts, got {shown(epoch)}.")
+    first, second = (*parts, 0.0)[:2]
     day = float(round(first))
     return day, (first - day) + second
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.core.inputs import count, refuse_units
+from eip_scipy.core.inputs import count, is_number, real_array
 
 try:
     import rebound
@@ -150,7 +150,6 @@ def megno(gm: Any, y: Any, *, t_end: float, dt: float, seed: int = 1) -> tuple[f
     deviation : ndarray, shape (6 N,)
         The tangent vector at the start.
     """
-    refuse_units(t_end=t_end, dt=dt)
     sim = simulation(gm, y)
     n = sim.N
     sim.integrator, sim.dt = "whfast", dt
@@ -316,8 +315,7 @@ def ias15_steps(
 
 
 def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    refuse_units(gm=gm, y=y)
-    gm, y = np.array(gm, dtype=float), np.array(y, dtype=float)
+    gm, y = real_array("gm", gm), real_array("y", y)
     if gm.ndim != 1 or gm.size < 2:
         raise ValueError(f"gm must hold at least two bodies in one dimension, got shape {gm.shape}")
     if y.shape != (6 * gm.size,):
@@ -330,8 +328,7 @@ def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
-    refuse_units(h=h, t_end=t_end)
-    if not (h > 0 and math.isfinite(h)):
+    if not (is_number(h, "h") and h > 0 and math.isfinite(h)):
         raise ValueError(f"h must be positive and finite, got {h!r}")
     if (n_steps is None) == (t_end is None):
         raise ValueError("give either n_steps or t_end, and not both")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .inputs import is_number, real_array, refuse_units, shown
+from .inputs import is_number, real_array, shown
 
 __all__ = ["Packed", "are_same", "extra_arguments", "floats", "names", "parameter_values", "scalars"]
 
@@ -35,7 +35,6 @@ def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
         found = tuple(args)
     except TypeError:
         raise TypeError(f"args must be a tuple, got {shown(args)}; write args=(x,) for a single argument.") from None
-    refuse_units(args=found)
     return tuple(item.copy() for item in found) if _is_array(found) else found
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .inputs import flag, reals, refuse_units, shown
+from .inputs import flag, reals, shown
 from .invariants import Invariant, OwnArguments
 from .pointers import GRADIENT, address_hint, by_pointer
 
@@ -144,8 +144,7 @@ def _directions(components: Any, weights: Any) -> tuple[np.ndarray, np.ndarray] 
         if weights is not None:
             raise ValueError("Balance: weights are given without components; give both, or omit weights.")
         return None
-    refuse_units(components=components, weights=weights)
-    found = reals(components)
+    found = reals("components", components)
     if (
         found is None
         or found.ndim not in (1, 2)
@@ -157,7 +156,7 @@ def _directions(components: Any, weights: Any) -> tuple[np.ndarray, np.ndarray] 
     if found.min() < 0 or found.max() > LARGEST_INDEX or np.unique(found).size < found.size:
         raise ValueError(f"Balance: components must be different indices >= 0, got {shown(components)}.")
     places = found.astype(np.int64).reshape(len(found), -1)
-    sizes = np.ones(len(places)) if weights is None else reals(weights)
+    sizes = np.ones(len(places)) if weights is None else reals("weights", weights)
     if sizes is None or sizes.shape != (len(places),) or not ((sizes > 0) & (sizes < np.inf)).all():
         raise ValueError(f"Balance: weights must be {len(places)} positive numbers, got {shown(weights)}.")
     return places, np.repeat(sizes[:, None], places.shape[1], 1)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..engine.data import Grouping
-from .inputs import refuse_units, shown
+from .inputs import shown
 
 __all__ = ["INDEX", "blocks_of", "kinds_of"]
 
@@ -20,7 +20,6 @@ SMALL = 2**10
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
     """Return the checked option ``blocks`` as groups of floats of a state of n components of `width` floats each."""
-    refuse_units(blocks=blocks)
     if blocks is None:
         return _consecutive(1, n, width)
     if isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):

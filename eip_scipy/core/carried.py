@@ -11,7 +11,7 @@ import numpy as np
 
 from ..engine.native import Call, Rates, call
 from .arguments import scalars
-from .inputs import refuse_units, shown
+from .inputs import numbers, shown
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 
 __all__ = ["Carried", "bound", "real_value", "time_shift"]
@@ -33,16 +33,12 @@ def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None
     """Return the value of the function `what` at t as an array; raise an error if it is not real or not `expected`."""
     if isinstance(value, float) and not expected:
         return np.array(float(value))
-    refuse_units(**{f"{what} returned": value})
-    try:
-        found = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        found = np.asarray(None)
-    if found.dtype.kind == "c":
+    found = numbers(f"{what} returned", value)
+    if found is not None and found.dtype.kind == "c":
         raise ValueError(
             f"{what} returned complex values at t={t:g}; expected a real number or a real array of shape (l,)."
         )
-    if found.dtype.kind not in "fiub":
+    if found is None:
         raise TypeError(
             f"{what} returned {shown(value)} at t={t:g}; expected a real number or a real array of shape (l,)."
         )

@@ -10,14 +10,16 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import legint, legval
+from numpy.polynomial.polynomial import polyder, polyint, polyval
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..engine import data
 from ..engine.data import Dense, Work
 from ..engine.native import Engine
-from .kept_dense import AtRealTimes, KeptDenseOutput, kept
+from .inputs import reals, shown
 from .runs import Run
-from .steppers import form
+from .steppers import Form, form
 
 __all__ = ["ExactEnds", "Interpolants", "ManifoldDenseOutput", "solution"]
 
@@ -48,7 +50,8 @@ class Interpolants:
         events: int = 0,
         errors: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
-        self.record = _record(run, events)
+        self._form = form(run.tableau, run.tableau.has_history and run.method.multistep.brief)
+        self.record = _record(run, self._form, events)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # all threads share one buffer
         engine.sample(self.record)
@@ -83,6 +86,13 @@ class Interpolants:
         self.warn()
         return out.T
 
+    def unprojected(self, piece: Array) -> UnprojectedDenseOutput:
+        """Return the interpolant without the functions of the run, from its floats."""
+        kind, rows, weights, *_ = self._form
+        m = self._n * self._dtype.itemsize // 8
+        parts = piece[3 : 3 + (2 + rows) * m].reshape(2 + rows, m).copy()
+        return UnprojectedDenseOutput(float(piece[0]), float(piece[1]), kind, parts, weights, self._dtype)
+
     def roots(self) -> tuple[Array, Array, Array]:
         """Return indices (k,), times (k,) and states (k, n) of the events found since the last call of `roots`."""
         record = self.record
@@ -111,10 +121,9 @@ class Interpolants:
             )
 
 
-def _record(run: Run, events: int) -> Dense:
+def _record(run: Run, shape: Form, events: int) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
-    brief = run.tableau.has_history and run.method.multistep.brief
-    kind, rows, weights, A, c, own_slopes = form(run.tableau, brief)
+    kind, rows, weights, A, c, own_slopes = shape
     stages = run.method.b.size
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
     carried = run.invariants.balances.places.size
@@ -146,6 +155,16 @@ def _record(run: Run, events: int) -> Dense:
     )
 
 
+class AtRealTimes(DenseOutput):
+    """Dense output that raises a TypeError for times that are not real numbers."""
+
+    def __call__(self, t: Any) -> Array:
+        """Return the states at a time or at times (m,), as (n,) or (n, m)."""
+        if type(t) is not float and reals("t", t) is None:
+            raise TypeError(f"dense output is defined at real times, got {shown(t)}.")
+        return super().__call__(t)
+
+
 class ExactEnds(AtRealTimes):
     """Dense output of `inner` that returns exactly the states `y_old` and `y` at the ends, without rounding."""
 
@@ -159,14 +178,74 @@ class ExactEnds(AtRealTimes):
         return np.where(t == self.t, self._y[column], out)
 
 
+class UnprojectedDenseOutput(AtRealTimes):
+    """The interpolant of a step without its projection, which needs no functions: the content of a pickle.
+
+    `parts` are the floats of the states at both ends, and of the further rows of an interpolant of this `kind`, with
+    its `weights`, see `Form`. The engine has the same formulas.
+    """
+
+    def __init__(self, t_old: float, t: float, kind: int, parts: Array, weights: Array, dtype: np.dtype) -> None:
+        super().__init__(t_old, t)
+        self._kind, self._parts, self._weights, self._dtype = kind, parts, weights, dtype
+
+    def __reduce__(self) -> Any:
+        arguments = self.t_old, self.t, self._kind, self._parts, self._weights, self._dtype
+        return UnprojectedDenseOutput, arguments
+
+    def _call_impl(self, t: Array) -> Array:
+        times = np.array(t, float, ndmin=1)
+        out = self._floats((times - self.t_old) / (self.t - self.t_old))
+        for end, state in ((self.t_old, self._parts[0]), (self.t, self._parts[1])):
+            out[:, times == end] = state[:, None]
+        found = np.ascontiguousarray(out.T).view(self._dtype).T
+        return found[:, 0] if t.ndim == 0 else found
+
+    def _floats(self, s: Array) -> Array:
+        """Return the floats (m, k) of the states at the shares s (k,) of the step."""
+        h, start, rows = self.t - self.t_old, self._parts[0][:, None], self._parts[2:]
+        rest, half = 1.0 - s, self._parts.shape[1] // 2
+        if self._kind == data.CUBIC:
+            r = rows[..., None]
+            return start + s * (r[0] + rest * (rest * r[1] - s * r[2]))
+        if self._kind == data.QUINTIC:
+            place = rows.reshape(6, half)
+            return np.concatenate([polyval(s, place), polyval(s, polyder(place)) / h])
+        if self._kind == data.SEVENTH:
+            out = np.zeros((2 * half, s.size))
+            for k, row in enumerate(rows[::-1]):
+                out = (out + row[:, None]) * (rest if k % 2 else s)
+            return start + out
+        if self._kind == data.POLYNOMIAL:
+            return polyval(s, np.vstack([start.T, rows[:-1]])) + _share(s) * rows[-1][:, None]
+        if self._kind == data.NYSTROM:  # accelerations in Legendre polynomials of the step
+            a = rows[:-1].reshape(-1, half)[: len(self._weights)]
+            v, q = (legval(2 * s - 1, legint(a, k, lbnd=-1, scl=0.5)) for k in (1, 2))
+            return self._moved(h * s, h * h * q, h * v) + _share(s) * rows[-1][:, None]
+        back, nodes = int(rows[-1, 0]), rows[-1, 1]  # accelerations at nodes, and the step in units of their distance
+        h = h / nodes
+        order = self._weights.shape[1]
+        a = self._weights[back * order : (back + 1) * order].T @ rows[:-2].reshape(-1, half)[:order]
+        v, q = (polyval(s * nodes, polyint(a, k)) for k in (1, 2))
+        return self._moved(h * nodes * s, h * h * q, h * v) + _share(s) * rows[-2][:, None]
+
+    def _moved(self, passed: Array, q: Array, v: Array) -> Array:
+        """Return the state after a time `passed`, in which accelerations add q to positions and v to velocities."""
+        start, half = self._parts[0][:, None], self._parts.shape[1] // 2
+        return np.concatenate([start[:half] + passed * start[half:] + q, start[half:] + v])
+
+
+def _share(s: Array) -> Array:
+    """Return the share, at the shares s of a step, of what an interpolant misses at the end of the step."""
+    return s * s * (3.0 - 2.0 * s)
+
+
 class ManifoldDenseOutput(AtRealTimes):
     """An interpolant over one step, see `Interpolants`; `piece` are the floats of the interpolant.
 
-    A pickle does not hold functions of the run. It holds the polynomial through projected states at Chebyshev nodes of
-    the step, whose degree of 8, 16, 32 or 64 is chosen by its error. This polynomial meets the states at both ends
-    exactly. In between it is within 1e-12 of the largest value of each component, and usually within 1e-14. It is less
-    accurate if the projected interpolant is not smooth, which happens in steps so long that it lies far from the
-    manifold. A copy (`copy.copy`, `copy.deepcopy`) is such an interpolant again, not the polynomial.
+    A pickle does not hold the functions of the run: samples of an unpickled interpolant are not projected, so that they
+    are as accurate as SciPy's and do not meet the invariants; the states at both ends are the same. A copy by
+    `copy.deepcopy` shares the functions.
     """
 
     def __init__(self, interpolants: Interpolants, piece: Array) -> None:
@@ -174,17 +253,13 @@ class ManifoldDenseOutput(AtRealTimes):
         self._interpolants, self._piece = interpolants, piece
 
     def __copy__(self) -> ManifoldDenseOutput:
-        return ManifoldDenseOutput(self._interpolants, self._piece)
+        return self  # it is immutable
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ManifoldDenseOutput:
-        return ManifoldDenseOutput(self._interpolants, self._piece.copy())
-
-    def kept(self) -> KeptDenseOutput:
-        """Return the polynomial that a pickle holds."""
-        return kept(self.t_old, self.t, lambda times: self._interpolants.states(self._piece, times))
+        return self
 
     def __reduce__(self) -> Any:
-        return self.kept().__reduce__()
+        return self._interpolants.unprojected(self._piece).__reduce__()
 
     def _call_impl(self, t: Array) -> Array:
         times = np.array(t, float, ndmin=1)
@@ -199,10 +274,10 @@ class _Pieces(Sequence[ManifoldDenseOutput]):
         self._interpolants, self._pieces = interpolants, pieces
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _Pieces:
-        return _Pieces(self._interpolants, self._pieces.copy())
+        return self  # it is immutable
 
     def __reduce__(self) -> Any:
-        return list, ([piece.kept() for piece in self],)
+        return list, ([self._interpolants.unprojected(piece) for piece in self._pieces],)
 
     def __len__(self) -> int:
         return len(self._pieces)

@@ -11,7 +11,7 @@ import numpy as np
 from ..engine.data import FrameRows
 from ..engine.native import BUILD
 from .blocks import INDEX
-from .inputs import refuse_units
+from .inputs import numbers
 
 __all__ = ["frame_rows", "spanned"]
 
@@ -29,13 +29,13 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     """
     if frame is None:
         return NO_FRAME
-    refuse_units(frame=frame)
-    try:
-        C, S = (np.atleast_2d(np.asarray(a)) for a in frame)
-    except (TypeError, ValueError):
-        raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).") from None
+    pair = tuple(frame) if np.iterable(frame) else ()
+    matrices = [found for a in pair if (found := numbers("frame", a)) is not None]
+    if len(pair) != 2 or len(matrices) != 2:
+        raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).")
+    C, S = map(np.atleast_2d, matrices)
     k = C.shape[0]
-    if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
+    if k == 0 or C.shape != (k, n) or S.shape != (n, k):
         raise ValueError(
             f"frame: C has shape {C.shape} and S {S.shape}; expected real or complex numbers of shapes (k, {n}) and "
             f"({n}, k) with k >= 1."

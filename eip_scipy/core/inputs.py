@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "count", "filled", "flag", "has_unit", "is_date", "is_number", "is_plain", "real_array", "reals", "refuse_units",
-    "require_arguments", "shown",
+    "count", "filled", "flag", "is_number", "numbers", "real_array", "reals", "require_arguments", "shown",
 ]  # fmt: skip
 
 PLAIN = frozenset((int, float, complex, str, bool, type(None), np.float64, np.complex128))
 DATES = (datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
+NO_UNITS = ("", "dimensionless")
 SHOWN = 120
 LARGEST_COUNT = 2**63 - 1  # largest 64-bit integer
 
@@ -30,96 +30,93 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
-def refuse_units(**arguments: Any) -> None:
-    """Raise TypeError for values with a unit and for dates, because NumPy would silently drop the unit.
+def numbers(name: str, value: Any) -> np.ndarray | None:
+    """Return a value as a new array of float64 or complex128, or None if it does not consist of numbers.
 
-    The keywords are the names of the user's arguments. Items of lists, tuples and object arrays are checked too.
+    Objects that Python can convert, such as numbers of SymPy and mpmath, are converted. A TypeError that contains the
+    argument's `name` is raised for dates and for values with a unit, because NumPy would silently drop the unit.
     """
-    for name, value in arguments.items():
-        if type(value) in PLAIN or is_plain(value):
-            continue
-        for item in _leaves(value):
-            if is_date(item):
-                raise TypeError(
-                    f"{name}: {shown(item)} is a date or a duration; expected plain numbers. Count time in the unit of "
-                    "the equations, for instance (t - t0).to_value('day') with astropy."
-                )
-            if has_unit(item):
-                raise TypeError(
-                    f"{name}: {shown(item)} has a unit; expected plain numbers, in the units of the equations. Convert "
-                    "it first: x.to_value('AU') with astropy, x.m_as('AU') with pint."
-                )
-
-
-def is_plain(value: Any) -> bool:
-    """Return True if a value is certainly a plain number, an array of numbers, or a list or tuple of plain numbers."""
-    kind = type(value)
-    if kind is np.ndarray:
-        return value.dtype.kind in "fiubc"
-    return kind in PLAIN or (kind in (tuple, list) and all(type(item) in PLAIN for item in value))
-
-
-def _leaves(value: Any) -> Any:
-    """Yield the items of nested lists, tuples and object arrays, or a single value; plain numbers are left out."""
-    if type(value) in (list, tuple):
-        for item in value:
-            if type(item) not in PLAIN:
-                yield from _leaves(item)
-    elif type(value) is np.ndarray and value.dtype.kind == "O":
-        yield from _leaves(value.ravel().tolist())
-    elif not is_plain(value):
-        yield value
-
-
-def is_date(value: Any) -> bool:
-    """Return True if a value is a date, a time or a duration."""
-    if isinstance(value, DATES) or getattr(getattr(value, "dtype", None), "kind", "") in ("m", "M"):
-        return True
-    return hasattr(value, "jd1") and hasattr(value, "jd2")  # times of astropy have no unit
-
-
-def has_unit(value: Any) -> bool:
-    """Return True if a value has a unit, as quantities of astropy, pint and unyt do."""
-    numeric = hasattr(value, "__float__") or hasattr(type(value), "__array__")
-    return numeric and any(getattr(value, name, None) is not None for name in ("unit", "units"))
-
-
-def reals(value: Any) -> np.ndarray | None:
-    """Return a value as a new array of floats, or None if it does not consist of real numbers."""
+    _refuse_units(name, value)
     try:
         found = np.asarray(value)
         if found.dtype.kind == "O":
-            numbers = found.ravel().tolist()
-            if any(isinstance(number, (str, complex, np.complexfloating)) for number in numbers):
-                return None
-            return np.array([float(number) for number in numbers]).reshape(found.shape)
-    except (TypeError, ValueError, OverflowError):
+            found = _converted(found)
+    except (TypeError, ValueError, OverflowError):  # for instance rows of different lengths
         return None
-    return np.array(found, dtype=float, order="C") if found.dtype.kind in "fiub" else None
+    kind = found.dtype.kind
+    return np.array(found, complex if kind == "c" else float, order="C") if kind in "fiubc" else None
+
+
+def _converted(objects: np.ndarray) -> np.ndarray:
+    """Return an array of Python objects as an array of floats, or of complex numbers if some are not real."""
+    items = objects.ravel().tolist()
+    if any(isinstance(item, str) for item in items):  # float would read the text
+        raise TypeError
+    try:
+        if not any(isinstance(item, np.complexfloating) for item in items):  # float would drop the imaginary part
+            return np.array([float(item) for item in items]).reshape(objects.shape)
+    except TypeError:  # not all are real
+        pass
+    return np.array([complex(item) for item in items]).reshape(objects.shape)
+
+
+def _refuse_units(name: str, value: Any) -> None:
+    """Raise a TypeError for a date or a number with a unit, also in lists, tuples and arrays of objects."""
+    if type(value) in PLAIN or (type(value) is np.ndarray and value.dtype.kind in "fiubc"):
+        return
+    if type(value) in (list, tuple):
+        if not PLAIN.issuperset(map(type, value)):
+            for item in value:
+                _refuse_units(name, item)
+        return
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        _refuse_units(name, value.ravel().tolist())
+    unit = getattr(value, "unit", getattr(value, "units", None))
+    is_date = isinstance(value, DATES) or hasattr(value, "jd1")  # a time of astropy
+    is_date |= getattr(getattr(value, "dtype", None), "kind", "") in ("m", "M")
+    if is_date or (unit is not None and str(unit) not in NO_UNITS):
+        raise TypeError(
+            f"{name}: {shown(value)} has a unit or is a date; expected plain numbers, in the units of the equations. "
+            "Convert it first: eip_scipy.integrations.astropy.plain does this for the arguments of a problem."
+        )
+
+
+def reals(name: str, value: Any) -> np.ndarray | None:
+    """Return a value as a new array of floats as `numbers` does, or None if it does not consist of real numbers."""
+    found = numbers(name, value)
+    return None if found is None or found.dtype.kind == "c" else found
 
 
 def real_array(name: str, value: Any, error: type[Exception] = ValueError) -> np.ndarray:
     """Return a value as a new array of floats; raise `error` if it is not real, and TypeError if it has a unit."""
-    refuse_units(**{name: value})
-    found = reals(value)
+    found = reals(name, value)
     if found is None:
         raise error(f"{name} must be an array of numbers, got {shown(value)}; expected real ones.")
     return found
 
 
-def is_number(value: Any) -> bool:
-    """Return True if a value is a real number that a float can represent; False for a bool and for an array."""
+def is_number(value: Any, name: str = "") -> bool:
+    """Return True if a value is a real number that a float can represent; False for a bool and for an array.
+
+    With the `name` of an argument, a TypeError is raised if the value has a unit or is a date.
+    """
     if type(value) is float:
         return True
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    return number and reals(value) is not None
+    if name:
+        _refuse_units(name, value)
+    if isinstance(value, (bool, np.timedelta64)) or not isinstance(value, (int, float, np.integer, np.floating)):
+        return False
+    try:
+        float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        return False
+    return True
 
 
 def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
     """Return the option `name` as an int; raise ValueError unless `value` is an integer from 1 to `most`."""
     if type(value) is int and 1 <= value <= most:
         return value
-    refuse_units(**{name: value})
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer >= 1, got {shown(value)}.")
     if value > most:

@@ -17,10 +17,11 @@ from .arguments import names, scalars
 from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
-from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
+from .inputs import count, filled, flag, numbers, reals, require_arguments, shown
 from .invariant_checks import complaints, listed, reported, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
+from .states import states
 
 __all__ = ["Invariant", "InvariantSet", "as_invariants", "check_gradient", "copied", "with_args"]
 
@@ -147,7 +148,6 @@ class Invariant:
             raise TypeError(f"{own}: grad must be callable or None, got {grad!r}{address_hint(grad)}.")
         if grad is None and (in_place or uses_f):
             raise ValueError(f"{own}: in_place and uses_f describe grad, but grad is missing. Give grad or omit them.")
-        refuse_units(target=target, args=args, scale=scale)
         if not isinstance(args, tuple):
             raise TypeError(f"{own}: args must be a tuple, got {shown(args)}; write args=(x,) for a single argument.")
         if name is not None and not isinstance(name, str):
@@ -218,7 +218,7 @@ def _lacks_gradient(item: Invariant) -> bool:
 
 
 def _target(target: Any) -> Array:
-    found = reals(target)
+    found = reals("target", target)
     if found is None:
         raise ValueError(f"Invariant: target must be a number or an array of numbers, got {shown(target)}.")
     return found
@@ -226,7 +226,7 @@ def _target(target: Any) -> Array:
 
 def _scale(scale: Any) -> Any:
     """Return a scale as a float, or as an array with one entry for each value of the invariant."""
-    found = None if isinstance(scale, bool | np.bool_) else reals(scale)
+    found = None if isinstance(scale, bool | np.bool_) else reals("scale", scale)
     if found is None or found.ndim > 1 or found.size == 0 or not ((found >= 0) & (found < np.inf)).all():
         raise ValueError(
             "Invariant: scale must be a finite number >= 0, or an array with one such number for each value of fun, "
@@ -286,12 +286,8 @@ def _first_gradient(
 def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
     """Return the value of a gradient at t after checks: it has the expected shape, and is real if the state is real."""
     what = f"gradient of invariant {label!r}"
-    refuse_units(**{f"{what} returned": value})
-    try:
-        found = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        found = np.asarray(None)
-    if found.dtype.kind not in "fiubc":
+    found = numbers(f"{what} returned", value)
+    if found is None:
         raise TypeError(f"{what} returned {shown(value)} at t={t:g}, expected numbers of shape {expected}.")
     if found.shape != expected:
         raise ValueError(f"{what} has shape {found.shape}, expected {expected} for this state, at t={t:g}.")
@@ -646,8 +642,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     ValueError
         If the gradient has the wrong shape, or `fun` is missing for an invariant with ``uses_f=True``.
     """
-    refuse_units(t=t, y=y)
-    y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)
+    y = states("y", y)
     if invariant.uses_f and fun is None:
         raise ValueError("check_gradient: this invariant's grad uses f, the derivative of the state; pass fun=.")
     f = np.array(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)

@@ -11,11 +11,10 @@ from ..engine.data import EPS, NFEV, Work
 from ..methods.orders import Ordered
 from .blocks import blocks_of, kinds_of
 from .gradients import random_directions, time_of_motion, unless_error
-from .inputs import refuse_units, shown
+from .inputs import numbers, shown
 
 __all__ = ["OneStep", "OneStepMethod", "as_vector"]
 
-NUMBERS = (float, np.float64, int, complex, np.complex128)
 # Length of the first step that is compared with the derivative, in times in which the state moves by its size; the
 # factor from one step to the next, because only short steps show the derivative of a stiff system; their number.
 SHORT, SHORTER, MOST_STEPS = 1e-4, 1 / 16, 5
@@ -191,14 +190,8 @@ def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.nd
     """Return the value of a user's function at t as an array (n,); `came` begins messages, as "fun returned"."""
     if value is None:
         raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
-    # Only the first item of a list is checked: checking all of them at every stage would take longer than the function.
-    if not (type(value) in (list, tuple) and value and type(value[0]) in NUMBERS):
-        refuse_units(**{came.removesuffix(":"): value})
-    try:
-        a = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        raise ValueError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.") from None
-    if a.dtype.kind not in "fiubc":
+    a = numbers(came.removesuffix(":"), value)
+    if a is None:
         raise TypeError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.")
     if n == 1 and a.shape == ():
         a = a.reshape(1)

@@ -88,7 +88,7 @@ class PointerFunction:
             f = rest.pop(0) if self.takes_f else np.full_like(state, np.nan)
             given.append(np.ascontiguousarray(f, state.dtype))
         out = rest.pop(0) if self.shape is None else np.full(self.shape, np.nan)
-        numbers = reals(rest[0]) if len(rest) == 1 else floats(tuple(rest))
+        numbers = reals("params", rest[0]) if len(rest) == 1 else floats(tuple(rest))
         if numbers is None or (len(rest) != 1 and scalars(tuple(rest)) is None):
             raise TypeError(
                 f"{self.name} is a C function pointer: its arguments after t and y are numbers or one array of floats, "

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import library
-from .inputs import has_unit, real_array, refuse_units, shown
+from .inputs import real_array, shown
 from .invariants import Invariant, as_invariants
 from .names import nearest
 from .pointers import by_pointer
-from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
-from .units import units as known_units
 
 __all__ = [
     "BROUGHT", "Deferred", "Problem", "bind", "component_names", "library_variational", "made", "native_invariant",
@@ -24,9 +22,6 @@ __all__ = [
 # Options of the projection that a problem brings.
 BROUGHT = ("invariants", "metric", "blocks", "frame")
 MOST = 12  # components that are printed
-MOMENTS, DURATIONS = ("t_span", "t_eval", "t"), ("h", "first_step", "max_step")
-# Starting times that differ by less are equal, because a Julian date in one float has errors of up to 20 microseconds.
-SAME_S = 1e-4
 
 
 class Deferred:
@@ -91,8 +86,8 @@ class Problem:
     canonical : bool, optional
         True if the state is (q, p) of a Hamiltonian system: tangent maps are then symplectic.
     units : str
-        Units of the state and of time. If they have the form "AU, yr" (a length and a time: m, cm, km, AU, pc; s, min,
-        h, d, yr, kyr, Myr, Gyr, or a number of m or s), `integrate` converts quantities of astropy to them.
+        Units of the state and of time. `eip_scipy.integrations.astropy` understands the form "AU, yr", a length and a
+        time.
     jacobian : callable, optional
         For q'' = a(t, q): ``jacobian(t, q, dq, out, params)`` fills `out` with the derivative of the accelerations
         along dq, or with its largest part; for multistep methods such as `EIPGJ14`.
@@ -107,8 +102,7 @@ class Problem:
     component_names : tuple of str, optional
         Names of the components of the state, for tables and figures.
     epoch : (float, float), optional
-        Date of t = 0: a Julian date in TDB, in two parts. One number, or a Time of astropy in any scale, is converted
-        to such a pair.
+        Date of t = 0: a Julian date in TDB, in two parts, whose sum a single float would round to 20 microseconds.
     G : float, optional
         Gravitational constant by which the masses of bodies are multiplied in `params`, if it is known.
     events : callable or sequence of callable, optional
@@ -134,7 +128,7 @@ class Problem:
     jacobian: Callable[..., None] | None = None
     frequencies: Callable[[np.ndarray, float], tuple[np.ndarray, float]] | None = None
     component_names: tuple[str, ...] | None = None
-    epoch: Epoch | None = None
+    epoch: tuple[float, float] | None = None
     G: float | None = None
     method: Any = None
     variational: Callable[[tuple[int, ...]], Callable[..., None]] | None = None
@@ -142,15 +136,11 @@ class Problem:
     events: Any = None
 
     def __post_init__(self) -> None:
-        refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
-        refuse_units(G=self.G)
         if not _has_params(self.fun, self.params):
             raise ValueError(
                 f"params: the functions of the problem {self.name!r} contain other parameters, so that a copy of it "
                 "cannot have these. Make the problem with them, or pass params=... to integrate."
             )
-        if self.epoch is not None:
-            object.__setattr__(self, "epoch", as_epoch("epoch", self.epoch))
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
         object.__setattr__(self, "invariants", as_invariants(self.invariants))
         if self.component_names is not None:
@@ -163,8 +153,7 @@ class Problem:
         Parameters
         ----------
         t_span, y0 : optional
-            Interval and initial state; default: those of the problem. Quantities and times of astropy are converted as
-            by `integrate`.
+            Interval and initial state; default: those of the problem.
         method : type or str
             An EIP method, which receives the invariants, metric, blocks and frame, and the step `h` unless rtol, atol,
             first_step, max_step or h is given; or a method of SciPy, which receives none of these. Implicit EIP methods
@@ -187,10 +176,6 @@ class Problem:
         """
         from scipy.integrate import solve_ivp
 
-        times = {name: options[name] for name in (*MOMENTS, *DURATIONS) if name in options}
-        given = self.plain(t_span=t_span, y0=y0, **times)
-        t_span, y0 = given.pop("t_span"), given.pop("y0")
-        options |= given
         t_span, y0 = self.t_span if t_span is None else t_span, self.y0 if y0 is None else y0
         if t_span is None or y0 is None:
             missing = "t_span" if t_span is None else "y0"
@@ -210,11 +195,6 @@ class Problem:
             sol.component_names = self.component_names
         sol.units, sol.epoch = self.units, self.epoch
         return sol
-
-    @property
-    def unit_system(self) -> tuple[Unit, Unit] | None:
-        """Units of length and time if `units` names both, else None."""
-        return known_units(self.units)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -247,47 +227,7 @@ class Problem:
         """True if the problem has a method ``second_order()``, which returns the same problem with the state (q, v)."""
         return False
 
-    def plain(self, **given: Any) -> dict[str, Any]:
-        """Convert arguments of `integrate` to plain numbers in the units of the problem.
-
-        Parameters
-        ----------
-        **given
-            Any of ``t_span``, ``t_eval``, ``t`` (times: numbers, durations, or dates if the problem has an `epoch`),
-            ``h``, ``first_step``, ``max_step`` (durations), ``y0``, which is a pair (positions, velocities) if it has
-            units, and ``params``, which may be a mapping from names to values. Plain numbers and None stay unchanged.
-
-        Returns
-        -------
-        dict
-            The converted arguments, with the same names.
-
-        Raises
-        ------
-        TypeError
-            If units or dates cannot be converted because the problem has no `units` or no `epoch`, or if parameters
-            are given by name and the problem does not name them.
-        ValueError
-            If the start is a date at which the initial state of the problem is not known and `y0` is not given, or if
-            a parameter is unknown.
-        """
-        known, out = self.unit_system, dict(given)
-        for name in MOMENTS:
-            if name in given:
-                out[name] = moment(name, given[name], known, self.epoch, f"the problem {self.name!r}")
-        for name in DURATIONS:
-            if name in given:
-                out[name] = in_unit(name, given[name], (0, 1), known)
-        if isinstance(given.get("params"), Mapping):
-            out["params"] = self._named_parameters(given["params"])
-        span, start = apart(given.get("t_span")), given.get("y0")
-        if start is not None:
-            out["y0"] = self._plain_state(start)
-        elif isinstance(span, tuple | list) and span and is_time(span[0]):
-            out["t_span"] = (self._own_start(span[0], out["t_span"][0]), *out["t_span"][1:])
-        return out
-
-    def _named_parameters(self, given: Mapping[str, Any]) -> np.ndarray:
+    def named_parameters(self, given: Mapping[str, Any]) -> np.ndarray:
         """Return the values (p,) of all parameters, by default those of the problem; (members, p) for arrays."""
         known = self.parameters
         if not known:
@@ -302,35 +242,6 @@ class Problem:
         columns = [real_array(f"params[{name!r}]", value) for name, value in {**known, **given}.items()]
         return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
-    def _plain_state(self, y0: Any) -> Any:
-        """Return the state (n,) from a pair (positions, velocities) with units; return any other `y0` unchanged."""
-        names, known = self.component_names or (), self.unit_system
-        half = len(names) // 2
-        pair = isinstance(y0, tuple | list) and len(y0) == 2 and all(map(has_unit, y0))
-        if not pair or known is None or any(f"v{a}" != b for a, b in zip(names[:half], names[half:], strict=False)):
-            return y0
-        q, v = (np.ravel(in_unit("y0", part, (1, k), known)) for part, k in zip(y0, (0, -1), strict=True))
-        if not q.size == v.size == half:
-            raise ValueError(
-                f"y0: {q.size} components of positions and {v.size} of velocities; expected {half} of each."
-            )
-        return np.concatenate([q, v])
-
-    def _own_start(self, time: Any, t0: float) -> float:
-        """Return the problem's starting time if `time`, the date of `t0`, is that date; t0 if it has no dates."""
-        known = self.unit_system
-        if known is None or self.epoch is None or self.t_span is None:
-            return t0
-        own = self.t_span[0]
-        if abs(t0 - own) * known[1].si > SAME_S:
-            held = (self.epoch[0], self.epoch[1] + own * known[1].si / DAY_S)
-            raise ValueError(
-                f"t_span: the run starts at {shown(time)}, but the initial state of the problem {self.name!r} is that "
-                f"of {shown_epoch(held)}. Start at that date, or give the state at the start as y0=..., for instance "
-                "from eip_scipy.integrations.jpl.initial_data(time)."
-            )
-        return own
-
     def __repr__(self) -> str:
         def having(names: Iterable[str]) -> list[str]:
             return [name for name in names if getattr(self, name) is not None]
@@ -341,7 +252,7 @@ class Problem:
         start = "without a start" if self.y0 is None else f"{n} components, {np.asarray(self.y0).dtype}"
         interval = [] if self.t_span is None else ["t from {:g} to {:g}".format(*self.t_span)]
         interval += [] if self.h is None else [f"h = {self.h:g}"]
-        zero = "" if self.epoch is None else f"t = 0 at {shown_epoch(self.epoch)}"
+        zero = "" if self.epoch is None else f"t = 0 at JD {sum(self.epoch):.13g} TDB"
         kept = ", ".join(item.name or "one without a name" for item in self.invariants)
         functions = ", ".join(["fun", *having(("rhs", "acc", "jacobian", "reference", "events"))])
         lines = [

@@ -13,7 +13,7 @@ from ..engine.data import BAND, EPS, LARGE_SHARE, LAST_RANK
 from ..engine.trust import ProjectionWarning
 from ..methods.orders import AT_REST
 from .failures import projection_failure
-from .inputs import count, is_number, reals, refuse_units, shown
+from .inputs import count, is_number, reals, shown
 from .invariants import InvariantSet
 from .one_step import as_vector
 from .options import MOST_ITERATIONS, ProjectionOptions, weights
@@ -92,8 +92,7 @@ def project(
     >>> project(np.array([0.6, 0.81]), length, iterations=3).defect
     array([0.])
     """
-    refuse_units(t=t, sigma=sigma, f=f)
-    if not is_number(t) or not math.isfinite(t):
+    if not is_number(t, "t") or not math.isfinite(t):
         raise ValueError(f"project: t must be a finite number, got {shown(t)}.")
     t, y = float(t), initial_state(y_hat, "y_hat")
     n = y.size
@@ -146,8 +145,7 @@ def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarr
     if target is not None:
         if start is not None:
             raise ValueError("project: give target or start, not both; an invariant may also have its own target.")
-        refuse_units(target=target)
-        values = reals(target)
+        values = reals("target", target)
         if values is None or values.size != known.size or values.ndim > 1 or not np.isfinite(values).all():
             raise ValueError(f"project: target must be {known.size} finite numbers, got {shown(target)}.")
         return values.reshape(-1)

@@ -28,7 +28,7 @@ from .dense import ExactEnds, Interpolants
 from .driven import DRIVEN_BDF, DRIVEN_RADAU, Driven, Jacobian
 from .examination import is_check_due
 from .failures import failure
-from .inputs import refuse_units, shown
+from .inputs import numbers, shown
 from .invariants import InvariantSet, as_invariants
 from .jitted import with_entry
 from .multistep import times
@@ -603,8 +603,8 @@ def _checked(
 
     def flat(t: float, y: np.ndarray) -> np.ndarray:
         f = fun(t, y[:, None])
-        refuse_units(**{"fun returned": f})
-        return np.asarray(f).reshape(-1)
+        found = numbers("fun returned", f)
+        return f if found is None else found.reshape(-1)
 
     called = flat if vectorized else fun
 

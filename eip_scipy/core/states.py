@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import BUILD
-from .inputs import reals, refuse_units, shown
+from .inputs import numbers, shown
 from .jitted import is_jitted
 from .one_step import as_vector
 
@@ -49,16 +49,9 @@ def states(name: str, value: Any) -> np.ndarray:
     """Return a state, or several states, as a new float64 or complex128 array of any shape, after checks."""
     if type(value) is np.ndarray and value.dtype == float:
         return np.array(value, order="C")
-    refuse_units(**{name: value})
     if np.ma.isMaskedArray(value) and np.ma.is_masked(value):
         raise ValueError(f"masked values in {name}; fill or drop them first.")
-    found = reals(value)
-    if found is not None:
-        return found
-    try:
-        y = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        raise ValueError(f"`{name}` must be an array of numbers, got {shown(value)}.") from None
-    if y.dtype.kind != "c":
-        raise TypeError(f"`{name}` must hold numbers, got {shown(value)}, dtype {y.dtype}.")
-    return np.array(y, dtype=complex, order="C")
+    found = numbers(name, value)
+    if found is None:
+        raise TypeError(f"`{name}` must hold numbers, got {shown(value)}.")
+    return found

@@ -16,7 +16,7 @@ from ..methods.orders import AtRest
 from ..methods.runge_kutta import Tableau
 from .driven import Driven
 from .gradients import time_of_motion
-from .inputs import is_number, reals, refuse_units, shown
+from .inputs import is_number, reals, shown
 from .one_step import OneStep
 
 __all__ = [
@@ -166,8 +166,7 @@ def interval(t_span: Any) -> tuple[float, float]:
     """Return start and end of an interval, whose end may be infinite, after checks."""
     if type(t_span) is tuple and len(t_span) == 2 and all(map(_is_plain_time, t_span)):
         return float(t_span[0]), float(t_span[1])
-    refuse_units(t_span=t_span)
-    ends = reals(t_span)
+    ends = reals("t_span", t_span)
     if ends is None or ends.shape != (2,):
         raise ValueError(f"t_span must hold two numbers, got {shown(t_span)}.")
     t0, t_bound = ends.tolist()
@@ -182,7 +181,6 @@ def _is_plain_time(end: Any) -> bool:
 
 def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return both tolerances as arrays (n,), after checks."""
-    refuse_units(rtol=rtol, atol=atol)
     out = []
     for name, value in (("rtol", rtol), ("atol", atol)):
         if isinstance(value, float) and 0.0 <= value < math.inf:
@@ -190,7 +188,7 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
             same.fill(value)  # np.full takes much longer
             out.append(same)
             continue
-        a = reals(value)
+        a = reals(name, value)
         if a is None:
             raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {shown(value)}.")
         if a.ndim > 0 and a.shape != (n,):
@@ -212,8 +210,7 @@ def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool =
     With `may_be_longer` the step may be longer than the interval; it is then shortened, as the last step of any run. It
     must not be below ten spacings of floating-point numbers at the end of the interval that is farther from 0.
     """
-    refuse_units(h=h)
-    if not is_number(h) or not 0 < h < math.inf:
+    if not is_number(h, "h") or not 0 < h < math.inf:
         raise ValueError(f"`h` must be positive. Got {shown(h)}; give a real number > 0.")
     h = float(h)
     span = abs(t_bound - t0)
@@ -258,12 +255,11 @@ def saved_steps(n_steps: int, save_every: int) -> np.ndarray:
 
 def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tuple[float | None, float]:
     """Return first_step and max_step after checks, with SciPy's messages."""
-    refuse_units(first_step=first_step, max_step=max_step)
-    if not is_number(max_step) or not max_step > 0:
+    if not is_number(max_step, "max_step") or not max_step > 0:
         raise ValueError(f"`max_step` must be positive. Got {shown(max_step)}; give a real number > 0.")
     if first_step is None:
         return None, float(max_step)
-    if not is_number(first_step) or not first_step > 0:
+    if not is_number(first_step, "first_step") or not first_step > 0:
         raise ValueError(f"`first_step` must be positive. Got {shown(first_step)}; give a real number > 0.")
     if first_step > abs(t_bound - t0):
         raise ValueError(

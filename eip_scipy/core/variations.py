@@ -167,7 +167,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in
             identity[:n, :n] = np.eye(n)
         identity[n:, n * has_state :] = np.eye(p)
         return Columns(identity, tuple(own), has_state, False, in_halves)
-    found = reals(asked)
+    found = reals("variations", asked)
     values: Array = np.zeros(0) if found is None else np.array(found, float)
     if values.ndim == 1 and values.size == n:
         values = values[:, None]

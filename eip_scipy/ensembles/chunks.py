@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..engine.native import BUILD, working_alone
-from ..run.interrupts import look_for_signals
 from .own_times import OwnTimes
 from .statistics import Statistics, statistics_of
 from .tasks import Members, Plan, Task, run_members
@@ -182,6 +181,5 @@ def in_order(pool: Pool, chunks: Iterable[Chunk]) -> Iterator[tuple[Chunk, Part]
             under_way.append((chunk, pool.submit(chunk)))
         if not under_way:
             return
-        look_for_signals()
         chunk, ticket = under_way.popleft()
         yield chunk, pool.collect(chunk, ticket)

@@ -8,7 +8,7 @@ import os
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing, nullcontext
 from functools import partial
@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checkpoint.locks import absolute
+from ..checkpoint.signals import sigterm_as_ctrl_c
 from ..core.arguments import extra_arguments, floats, parameter_values
-from ..core.inputs import count, flag, is_number, refuse_units, shown
+from ..core.inputs import count, flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
 from ..core.names import nearest
@@ -33,7 +34,6 @@ from ..core.variations import Columns
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
-from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from ..run.results import WithColumns
@@ -470,7 +470,7 @@ def ensemble(
             if out is None
             else ZarrStore(out, identity, resume, plan.empty(size), _all_times(plan, own), total, plan.events)
         )
-    stopped, closed = (nullcontext(), nullcontext()) if store is None else (ended_by_sigterm(), closing(store))
+    stopped, closed = (nullcontext(), nullcontext()) if store is None else (sigterm_as_ctrl_c(), closing(store))
     with stopped, closed:
         gathered = _Gathered(plan, everyone, held, size, store, callback, doubts)
         result = gathered.run(partial(_pool, executor, plan, progress), progress)
@@ -540,7 +540,7 @@ class _Gathered:
         shown: dict[str, Any] = {"desc": self.method, "unit": "member", "unit_scale": True, "disable": not progress}
         try:
             if done < total:
-                with kept_ctrl_c(), tqdm(total=total, initial=done, **shown) as bar:
+                with tqdm(total=total, initial=done, **shown) as bar:
                     self._gather(pool(), chunks, bar)
         except BaseException as error:
             error.partial = self._of(self.whole, self.statistics, 0)  # type: ignore[attr-defined]
@@ -666,8 +666,7 @@ def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
 
 def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
     """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change."""
-    refuse_units(checkpoint_every=every)
-    if not is_number(every) or not every > 0:
+    if not is_number(every, "checkpoint_every") or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     flag("resume", resume)
     if out is not None and checkpoint is not None:
@@ -688,8 +687,8 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
         if y0s is None:
             raise TypeError("ensemble: y0s is missing; it can be omitted only for a Problem with an initial state.")
     starts = states("y0s", y0s)
-    if problem is not None:
-        params = problem.plain(params=params)["params"]
+    if problem is not None and isinstance(params, Mapping):
+        params = problem.named_parameters(params)
     own = None if params is None else np.atleast_1d(parameter_values(params))
     if own is not None and own.ndim == 1 and own.size > 1 and problem is not None and _takes_one_parameter(problem):
         own = own[:, None]  # one for each member, because they cannot be common to all

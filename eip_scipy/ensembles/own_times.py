@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..core.inputs import shown
-from ..core.problem import Problem
 from ..core.stepping import interval
 
 __all__ = ["OwnTimes", "own_times"]
@@ -63,10 +62,7 @@ class OwnTimes(NamedTuple):
 
 
 def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) -> OwnTimes:
-    """Return the rows of `t_span` and `t_eval` for each member, if they have such rows.
-
-    If `fun` is a `Problem`, times with units and dates are converted to numbers in its units.
-    """
+    """Return the rows of `t_span` and `t_eval` for each member, if they have such rows."""
     spans, times = None, None
     if _has_rows(t_span):
         for row in t_span:
@@ -74,14 +70,14 @@ def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) 
                 raise ValueError(
                     f"t_span must be (start, end), or have the shape (members, 2); got the row {shown(row)}."
                 )
-        spans = [interval(_plain(fun, "t_span", row)) for row in t_span]
+        spans = [interval(row) for row in t_span]
     if _has_rows(t_eval):
-        times = [np.array(_plain(fun, "t_eval", row), float) for row in t_eval]
+        times = [np.array(row, float) for row in t_eval]
         for k, row in enumerate(times):
             if row.ndim != 1 or row.size == 0:
                 raise ValueError(f"t_eval[{k}] must be the times of one member, 1-dimensional and not empty.")
     if spans is not None and times is None and t_eval is not None:
-        times = [np.array(_plain(fun, "t_eval", t_eval), float)] * len(spans)
+        times = [np.array(t_eval, float)] * len(spans)
     if spans is not None and times is not None and len(spans) != len(times):
         raise ValueError(
             f"t_span has {len(spans)} rows and t_eval has {len(times)}; give one row of each for each member."
@@ -102,7 +98,3 @@ def _has_rows(given: Any) -> bool:
     if isinstance(given, np.ndarray) or not isinstance(given, Sequence):
         return np.ndim(given) == 2
     return len(given) > 0 and all(np.ndim(item) == 1 for item in given)
-
-
-def _plain(fun: Any, name: str, row: Any) -> Any:
-    return fun.plain(**{name: row})[name] if isinstance(fun, Problem) else row

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from ..core.inputs import refuse_units
 from ..core.problem import Problem, bind, library_variational, native_invariant
 from ..engine.native import library
 
@@ -38,7 +37,6 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
     ValueError
         If the eccentricity is not in [0, 1).
     """
-    refuse_units(eccentricity=eccentricity, relativistic=relativistic, t_end=t_end, h=h)
     e = float(eccentricity)
     if not 0 <= e < 1:
         raise ValueError(f"eccentricity must be in [0, 1), got {eccentricity!r}.")
@@ -88,7 +86,6 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
     Problem
         With the closed form as `reference`.
     """
-    refuse_units(omega=omega, y0=y0, t_end=t_end, h=h)
     start = np.array(y0, dtype=float)
     params = np.array([omega], dtype=float)
 

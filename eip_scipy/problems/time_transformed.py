@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from ..core.inputs import refuse_units
 from ..core.invariants import Invariant
 from ..core.jitted import compilable, compiled_like, jitted
 from ..core.problem import Problem, bind
@@ -83,7 +82,6 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     which dt / ds is the local time scale: S. Mikkola, K. Tanikawa, Celestial Mechanics and Dynamical Astronomy 74
     (1999) 287-295.
     """
-    refuse_units(s_end=s_end)
     if problem.rhs is None:
         raise ValueError(
             f"time_transformed: the problem {problem.name!r} has no compiled right-hand side that fills an "
@@ -117,7 +115,6 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
 
 def reaches(t: float) -> Callable[..., float]:
     """Return a terminal event that ends a run of a transformed problem at the time `t` (not at s = t)."""
-    refuse_units(t=t)
     t = float(t)
 
     def event(s, y, params):

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.integrate import OdeSolution
 
 from ..core.inputs import is_number, shown
-from ..core.problem import Problem
 from ..core.results import Diagnostics, Multipliers, joined_sums
 from ..core.variations import StateSolution
 from .events import ContinuedEvents, as_events
@@ -34,9 +33,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     for name in FIXED:
         if name in options:
             raise TypeError(f"continue_to: {name} cannot be changed; start a new run with integrate.")
-    if isinstance(origin.request.fun, Problem):
-        t = origin.request.fun.plain(t=t)["t"]
-    if not is_number(t) or not origin.sign * (t - origin.t) > 0:
+    if not is_number(t, "t") or not origin.sign * (t - origin.t) > 0:
         raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
     request = origin.request
     asked = {name: getattr(request, name) for name in Request._fields if name not in OWN}

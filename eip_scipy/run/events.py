@@ -10,7 +10,7 @@ import numpy as np
 from scipy.integrate import DenseOutput
 
 from ..core.arguments import names
-from ..core.inputs import is_number, reals, refuse_units, require_arguments, shown
+from ..core.inputs import is_number, reals, require_arguments, shown
 from ..core.pointers import address_hint, by_pointer, is_pointer
 from ..engine.native import Call, call
 
@@ -155,8 +155,7 @@ class Events:
     def _number(self, k: int, t: float, value: Any) -> float:
         if isinstance(value, float):
             return value
-        refuse_units(**{f"event {k} returned": value})
-        found = reals(value)
+        found = reals(f"event {k} returned", value)
         if found is None or found.ndim:
             raise TypeError(f"event {k} returned {shown(value)} at t={t:.10g}, expected a real number.")
         return float(found)

@@ -29,7 +29,6 @@ from ..engine.native import PythonFunctions
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver
-from .interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
 from .prepare import DEFAULT, Prepared, Request, prepared, started_at
 from .results import IntegrationResult, Origin
 
@@ -92,10 +91,8 @@ def integrate(
         (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), ``fun`` must return (v, a); give `acceleration` instead to
         write only a. A `Problem` contains everything else; options given here take precedence.
     t_span : (float, float)
-        Start and end; time runs backward if the end is before the start. For a `Problem` with units they may be
-        durations of astropy, and with an epoch also times of astropy in any scale, see
-        :doc:`/tutorials/rebound-and-astropy`. The same applies to `t_eval`; `h`, `first_step` and `max_step` may be
-        durations.
+        Start and end; time runs backward if the end is before the start. `eip_scipy.integrations.astropy` converts
+        quantities and dates.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     acceleration : callable, optional
@@ -163,8 +160,9 @@ def integrate(
         Bound on the memory for saved states; default: half of the free memory.
     checkpoint : path-like, optional
         File that stores the run, including the saved states, so that it can be resumed. It is written at the start,
-        every `checkpoint_every` seconds, and when the run ends or is interrupted, also by SIGTERM. An existing file is
-        replaced only by the run that resumes it, and only one run at a time may use it.
+        every `checkpoint_every` seconds, and when the run ends or is interrupted, also by SIGTERM, which raises
+        KeyboardInterrupt in the main thread unless the user has installed a handler. An existing file is replaced only
+        by the run that resumes it, and only one run at a time may use it.
     checkpoint_every : float, optional
         Seconds from one checkpoint to the next; longer if writing would take more than 5 % of the time.
     resume : bool, optional
@@ -223,9 +221,8 @@ def integrate(
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
     request = Request(*map(asked.__getitem__, Request._fields))
     keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
-    stopped = nullcontext() if checkpoint is None else ended_by_sigterm()
     begin = time.perf_counter()
-    with kept_ctrl_c(), stopped, keeping as keeper:
+    with keeping as keeper:
         try:
             return Loop(prepared(request), keeper).run()
         except BaseException as error:
@@ -281,7 +278,7 @@ class Loop:
             self.keeper.end(status, message)
         except BaseException as error:
             self.wall_time += time.perf_counter() - begin
-            self.keeper.interrupted(error)  # first, because the process may be killed soon after SIGTERM
+            self.keeper.interrupted(error)  # first, because a batch system may kill the process soon after SIGTERM
             driver.run.trust.failed = True
             driver.save_now()
             partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
@@ -320,7 +317,6 @@ class Loop:
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
-            look_for_signals()
             self.keeper.keep()
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
             steps = self._chunk(self.chunk)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from ..core.inputs import is_number, refuse_units, shown
+from ..core.inputs import is_number, shown
 
 __all__ = ["check_bytes", "most_bytes"]
 
@@ -14,8 +14,7 @@ SMALL = 2**22  # number of bytes up to which the free memory is not determined, 
 
 def check_bytes(max_bytes: Any) -> None:
     """Raise ValueError unless the option ``max_bytes`` is None or a number >= 0."""
-    refuse_units(max_bytes=max_bytes)
-    if max_bytes is not None and not (is_number(max_bytes) and max_bytes >= 0):
+    if max_bytes is not None and not (is_number(max_bytes, "max_bytes") and max_bytes >= 0):
         raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..core.acceleration import BY_NAME, AccelerationField
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.driven import Jacobian
-from ..core.inputs import count, flag, is_plain, real_array, refuse_units, require_arguments, shown
+from ..core.inputs import count, flag, real_array, require_arguments, shown
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
 from ..core.multistep import times
@@ -336,8 +336,7 @@ class Prepared:
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     """Check a request and prepare its run; for `check_start` see `RunSpec.build`."""
-    request = _plain(request).with_own_events()
-    refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
+    request = _with_named_parameters(request).with_own_events()
     if request.method is None:
         request = request._replace(method=default_method(request.fun))
     method = _method(request.method)
@@ -449,20 +448,15 @@ def default_method(fun: Any) -> type[EIPSolver] | None:
 
 def started_at(request: Request) -> tuple[float, np.ndarray]:
     """Return time and state at the start; those of the problem if none are given."""
-    t_span, y0 = _given_or_brought(_plain(request))
+    t_span, y0 = _given_or_brought(request)
     return interval(t_span)[0], _state(y0)
 
 
-def _plain(request: Request) -> Request:
-    """Return the request with plain numbers for durations, units and names of parameters, which a `Problem` knows."""
-    problem = request.fun
-    if not isinstance(problem, Problem):
+def _with_named_parameters(request: Request) -> Request:
+    """Return the request with the values of all parameters if some are given by name, which a `Problem` knows."""
+    if not (isinstance(request.fun, Problem) and isinstance(request.params, Mapping)):
         return request
-    names = ("t_span", "y0", "t_eval", "h", "first_step", "max_step", "params")
-    given = {name: value for name in names if not is_plain(value := getattr(request, name)) and value is not DEFAULT}
-    if not given:
-        return request
-    return request._replace(**problem.plain(**{"t_span": request.t_span, "y0": request.y0} | given))
+    return request._replace(params=request.fun.named_parameters(request.params))
 
 
 def _second_order_hint(fun: Any) -> str:

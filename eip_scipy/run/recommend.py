@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, TypedDict, Unpack
 
 from ..core.acceleration import AccelerationField
-from ..core.inputs import flag, is_number, refuse_units, shown
+from ..core.inputs import flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
 from ..core.options import Blocks, Frame, Metric
@@ -134,14 +134,13 @@ def _right_hand_side(fun: Any, acceleration: Any, options: dict[str, Any]) -> An
 
 
 def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
-    refuse_units(error=error)
     for name in options:
         if name not in COMMON:
             raise TypeError(
                 f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} It finds method, step and "
                 "tolerances; pass other options, such as events, to the run() of its result."
             )
-    if not is_number(error) or not 0 < error < 1:
+    if not is_number(error, "error") or not 0 < error < 1:
         raise ValueError(f"error must be a number between 0 and 1, got {shown(error)}.")
     if max_nfev is not None and (not is_number(max_nfev) or not max_nfev >= 1000):
         raise ValueError(f"max_nfev must be at least 1000, got {shown(max_nfev)}.")

@@ -161,8 +161,8 @@ class IntegrationResult(WithColumns):
     Notes
     -----
     The result can be pickled. A result that was pickled or loaded does not know the functions of its run: `continue_to`
-    raises an error. In a pickled result ``sol`` holds a polynomial for each step, which agrees with the states at the
-    steps exactly and with those in between to 1e-12; in a loaded result it is None.
+    raises an error. In a pickled result ``sol`` has the same states at the steps, but those in between are not
+    projected, because that needs the functions; in a loaded result it is None.
     """
 
     t: np.ndarray
@@ -262,8 +262,7 @@ class IntegrationResult(WithColumns):
         Parameters
         ----------
         t : float
-            New end of the run, beyond the present one in its direction; as in `t_span` of `integrate` it may also be a
-            duration from t = 0 or a date, both of astropy.
+            New end of the run, beyond the present one in its direction.
         **options
             Options of `integrate` that change. `t_eval` is not repeated: pass new times, otherwise the states at both
             ends are saved. Events keep their counts: an event with ``terminal = 3`` that happened twice before ends the

@@ -16,8 +16,9 @@ import numpy as np
 from .. import checkpoint
 from ..checkpoint import CheckpointError
 from ..checkpoint.locks import Lock
+from ..checkpoint.signals import sigterm_as_ctrl_c
 from ..core.callers import users_level
-from ..core.inputs import is_number, refuse_units, shown
+from ..core.inputs import flag, is_number, shown
 from ..core.runs import Run
 from ..engine.data import NEXT_LENGTH, TIME
 from ..methods.multistep import Weights
@@ -32,8 +33,6 @@ SNAPSHOT_SECONDS = 0.2
 LEAST_RATIO = 19.0
 # Relative difference allowed between values of the same function at the same point, also on another machine.
 SAME = 1e-9
-# Rounding error of a rate, relative to its terms.
-LEAST_OF_RATES = 1e-6
 SHORT = 16
 STEP = 0
 
@@ -74,10 +73,8 @@ class Keeper:
 @contextmanager
 def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper]:
     """Yield the keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`."""
-    if not isinstance(resume, (bool, np.bool_)):
-        raise ValueError(f"resume must be True or False, got {resume!r}.")
-    refuse_units(checkpoint_every=every)
-    if not is_number(every) or not every > 0:
+    flag("resume", resume)
+    if not is_number(every, "checkpoint_every") or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     if path is None:
         if resume:
@@ -90,7 +87,7 @@ def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[K
         raise ValueError(
             "a checkpoint does not store dense output; omit dense_output=True and use t_eval or save_every."
         )
-    with closing(Lock(path)) as lock:
+    with sigterm_as_ctrl_c(), closing(Lock(path)) as lock:
         found, origin = None, ""
         if os.path.lexists(lock.path):
             if not resume:
@@ -182,67 +179,37 @@ class _FileKeeper(Keeper):
     def identify(self, settings: dict[str, Any], run: Run, derivative: Derivative, events: Events) -> None:
         self._settings, self._run, self._derivative, self._events = settings, run, derivative, events
         self._names = run.invariants.names
-        t0, y0, f0 = run.begin[:3]
-        self._start = self._known_by("start", t0, y0, f0, run.invariants.start_values)
         if self._read is None:
             return
         header, arrays = self._read
         checkpoint.require_same(self._name, header.get("settings"), settings)
-        self._require_same_functions(arrays, self._start, t0, y0, "at the start")
-        self._require_fitting(arrays, {"y": y0, "clock": np.zeros(NEXT_LENGTH + 1)})
+        self._require_fitting(arrays, {"y": run.begin.y, "clock": np.zeros(NEXT_LENGTH + 1)})
         if "state_f" in arrays:
-            t, y = float(arrays["clock"][TIME]), arrays["y"]
-            where = f"at t = {t:.10g}, where it was saved,"
-            self._require_same_functions(arrays, self._known_by_at(t, y), t, y, where)
+            self._require_same_functions(arrays)
         checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
 
-    def _known_by_at(self, t: float, y: np.ndarray) -> Arrays:
-        """Return the values at the state y of the run at t that identify the functions."""
-        return self._known_by("state", t, y, self._derivative(t, y.copy()), self._run.invariants.values(t, y))
+    def _known_by(self, arrays: Arrays) -> Arrays:
+        """Return the derivative and the invariants at the state in `arrays`, which identify the functions."""
+        t, y = float(arrays["clock"][TIME]), arrays["y"]
+        return {"state_f": self._derivative(t, y.copy()), "state_values": self._run.invariants.values(t, y)}
 
-    def _known_by(self, where: str, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray) -> Arrays:
-        """Return the values at (t, y) that identify the functions, by the names of their arrays in the file.
-
-        They are the derivative `f`, the `values` of the invariants, the rates of balances, and the values of events.
-        The names begin with `where`.
-        """
-        known_by = {f"{where}_f": f, f"{where}_values": values}
-        further = {"rates": self._run.invariants.balances.given(t, y, f), "events": self._events.values(t, y)}
-        return known_by | {f"{where}_{name}": found for name, found in further.items() if found.size}
-
-    def _require_same_functions(self, arrays: Arrays, known_by: Arrays, t: float, y: np.ndarray, where: str) -> None:
-        # Earlier versions stored no values of events.
-        known_by = {name: a for name, a in known_by.items() if name in arrays or not name.endswith("_events")}
+    def _require_same_functions(self, arrays: Arrays) -> None:
+        known_by = self._known_by(arrays)
         self._require_fitting(arrays, known_by)
         there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
+        t, f = float(arrays["clock"][TIME]), known_by["state_f"]
+        terms = self._run.invariants.term_sizes(t, arrays["y"], f)
+        sizes = np.concatenate([np.full(f.size, np.abs(f).max(initial=0.0)), terms])
         with np.errstate(invalid="ignore"):
-            labels, sizes = self._described(known_by, t, y)
             same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
         if not same.all():
             k = int(np.flatnonzero(~same)[0])
+            label = "fun" if k < f.size else f"invariant {self._names[k - f.size]!r}"
             raise CheckpointError(
-                f"the checkpoint {self._name!r} belongs to another run: {labels[k]} was {_number(there[k])} {where} "
-                f"and is {_number(here[k])} now. Resume with the functions of that run, or use another file for a new "
-                "run."
+                f"the checkpoint {self._name!r} belongs to another run: {label} was {_number(there[k])} at "
+                f"t = {t:.10g}, where it was saved, and is {_number(here[k])} now. Resume with the functions of that "
+                "run, or use another file for a new run."
             )
-
-    def _described(self, known_by: Arrays, t: float, y: np.ndarray) -> tuple[list[str], np.ndarray]:
-        """Return a name of the function and a size, for comparisons, of each of the values at (t, y) in `known_by`."""
-        run = self._run
-        parts = {name.partition("_")[2]: values for name, values in known_by.items()}
-        f, places = parts["f"], run.invariants.balances.given_places
-        labels = ["fun"] * f.size + [f"invariant {name!r}" for name in self._names]
-        sizes = [np.full(f.size, np.abs(f).max(initial=0.0)), run.invariants.term_sizes(t, y, f)]
-        if "rates" in parts:  # which may be much smaller than the terms that cancel in them
-            labels += [f"rate of balance {self._names[place]!r}" for place in places]
-            terms = np.abs(run.invariants.gradients(t, y, f)) @ np.abs(f)
-            sizes.append(LEAST_OF_RATES * terms[places] + np.abs(parts["rates"]))
-        if "events" in parts:
-            labels += [f"event {k}" for k in range(parts["events"].size)]
-            # The step stays in the interval, because the events need not be defined beyond its ends.
-            step = run.start.tau * run.stepping.span.sign * (1 if t == run.begin.t else -1)
-            sizes.append(self._events.sizes(t, y, f, step))
-        return labels, np.concatenate(sizes)
 
     def _require_fitting(self, arrays: Arrays, expected: Arrays) -> None:
         for name, a in expected.items():
@@ -323,9 +290,8 @@ class _FileKeeper(Keeper):
 
     def _state(self) -> Arrays:
         """Return the values that identify the functions at the snapshot; {} if a function raises an error."""
-        arrays = self._snapshot.arrays
         try:
-            return self._known_by_at(float(arrays["clock"][TIME]), arrays["y"])
+            return self._known_by(self._snapshot.arrays)
         except Exception:  # a function may raise again what has ended the run; the checkpoint is written all the same
             return {}
 
@@ -371,7 +337,7 @@ class _FileKeeper(Keeper):
             "settings": self._settings,
         }
         saved = {"saved_t": driver.t[:rows], "saved_y": driver.y[:rows]}
-        arrays = {**self._start, **self._state(), **snapshot.arrays, **saved}
+        arrays = {**self._state(), **snapshot.arrays, **saved}
         for k, count in enumerate(snapshot.happened):
             arrays[f"event_{k}_t"] = np.array(events.t[k][:count])
             arrays[f"event_{k}_y"] = np.array(events.y[k][:count], y0.dtype).reshape(count, y0.size)

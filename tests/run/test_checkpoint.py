@@ -50,7 +50,6 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.problems import kepler
 from eip_scipy.run import driver as _driver
 from eip_scipy.run import integrate as longrun
 from eip_scipy.run import resume
@@ -262,10 +261,7 @@ def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
     ["fixed", "adaptive, events", "Nystrom, all"]
     + [pytest.param(name, marks=pytest.mark.nightly) for name in ("compensated", "every auto", "adaptive")],
 )
-@pytest.mark.parametrize(
-    "error", [BrokenOffError, pytest.param(KeyboardInterrupt, marks=[pytest.mark.nightly, pytest.mark.slow])]
-)
-def test_broken_off_inside_a_step(name, error, tmp_path):
+def test_broken_off_inside_a_step(name, tmp_path):
     """A step may be left anywhere: its half-filled buffers are not kept."""
     fun, y0, options = CASES[name]
     whole = integrate(fun, SPAN, y0, **options)
@@ -275,11 +271,11 @@ def test_broken_off_inside_a_step(name, error, tmp_path):
         def counted(t, y, last=last, calls=calls):
             calls[0] += 1
             if calls[0] == last:
-                raise error
+                raise KeyboardInterrupt
             return fun(t, y)
 
         path = tmp_path / f"run-{last}"
-        with pytest.raises(error) as info:
+        with pytest.raises(KeyboardInterrupt) as info:
             integrate(counted, SPAN, y0, checkpoint=path, **options)
         partial = info.value.partial
         np.testing.assert_array_equal(partial.t[:-1], whole.t[: partial.t.size - 1])
@@ -288,41 +284,6 @@ def test_broken_off_inside_a_step(name, error, tmp_path):
         assert found.message.startswith(f"reached the end of the interval (resumed at step {step}")
         assert step > 0 or last == 9
         same(whole, found)
-
-
-@pytest.mark.slow
-@pytest.mark.needs_jit
-@pytest.mark.usefixtures("fine")
-def test_broken_off_inside_a_compiled_step(tmp_path):
-    @njit
-    def failing(t, y):
-        if t > 3.0:
-            raise ValueError("beyond the data")
-        return jit_orbit(t, y)
-
-    options = FIXED | JIT | {"compensated": True, "every": 4}
-    with pytest.raises(ValueError, match="beyond the data") as info:
-        integrate(failing, SPAN, Y0, checkpoint=tmp_path / "run", **options)
-    assert 90 < checkpoint_step(info.value) <= 100
-    found = integrate(jit_orbit, SPAN, Y0, checkpoint=tmp_path / "run", resume=True, **options)
-    assert found.compiled
-    same(integrate(jit_orbit, SPAN, Y0, **options), found)
-
-
-@pytest.mark.usefixtures("fine")
-@pytest.mark.parametrize(("name", "total"), [("fixed", 200), ("adaptive", 6.0)])
-def test_the_progress_bar_goes_on(name, total, tmp_path, monkeypatch):
-    fun, y0, options = CASES[name]
-    bars, bar = [], longrun._bar
-    monkeypatch.setattr(longrun, "_bar", lambda *args: bars.append(bar(*args)) or bars[-1])
-    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 30):
-        integrate(fun, SPAN, y0, checkpoint=tmp_path / "run", progress=True, **options)
-    integrate(fun, SPAN, y0, checkpoint=tmp_path / "run", resume=True, progress=True, **options)
-    first, second = bars
-    assert first.initial == 0
-    assert first.n > 0.1 * total
-    assert second.initial == pytest.approx(first.n)
-    assert second.n == pytest.approx(total)
 
 
 def checkpoint_step(error):
@@ -358,19 +319,6 @@ def test_a_result_is_there_at_once(tmp_path):
 
 
 @pytest.mark.usefixtures("fine")
-def test_a_callback_that_stops_may_be_asked_again(tmp_path):
-    """A run that was stopped for lack of time continues; one that was stopped by its states ends there again."""
-    whole = integrate(orbit, SPAN, Y0, **FIXED)
-    path = tmp_path / "run"
-    late = integrate(orbit, SPAN, Y0, checkpoint=path, callback=lambda t, y, defects: t > 3.0, **FIXED)
-    assert late.status == 1
-    assert late.t[-1] == whole.t[np.flatnonzero(whole.t > 3.0)[0]]
-    again = integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, callback=lambda t, y, defects: t > 3.0, **FIXED)
-    same(late, again)
-    same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
-
-
-@pytest.mark.usefixtures("fine")
 def test_a_run_in_portions(tmp_path):
     """Each part is stopped by its callback: every part is kept, though all end alike."""
     whole, path, steps = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", []
@@ -382,14 +330,6 @@ def test_a_run_in_portions(tmp_path):
         steps.append(checkpoint.read(path)[0]["step"])
         assert portion - 0.5 < 0.03 * steps[-1] < portion + 0.5
     same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
-
-
-@pytest.mark.usefixtures("fine")
-def test_a_callback_may_stop_at_the_start(tmp_path):
-    path = tmp_path / "run"
-    stopped = integrate(orbit, SPAN, Y0, checkpoint=path, callback=lambda *_: True, **FIXED)
-    assert (stopped.status, stopped.t.tolist()) == (1, [0.0])
-    same(integrate(orbit, SPAN, Y0, **FIXED), integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
 
 
 @pytest.mark.usefixtures("fine")
@@ -447,14 +387,6 @@ def test_the_bound_on_memory_holds(tmp_path):
         integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, max_bytes=5000, **options)
 
 
-def test_a_problem(tmp_path, monkeypatch):
-    problem = kepler(t_end=30.0)
-    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 2):
-        integrate(problem, method=EIPRK4, checkpoint=tmp_path / "run", compiled=False)
-    found = integrate(problem, method=EIPRK4, checkpoint=tmp_path / "run", resume=True, compiled=False)
-    assert found.t[-1] == 30.0
-
-
 # When checkpoints are written.
 
 
@@ -493,38 +425,6 @@ def test_writing_takes_a_twentieth_of_the_time(tmp_path, monkeypatch):
     assert gaps.size > 3
     assert (gaps >= 0.4 - 1e-9).all()
     assert (gaps <= 0.45).all()
-
-
-@pytest.mark.posix
-@pytest.mark.needs_jit
-def test_control_c_writes_a_checkpoint_within_a_second(tmp_path):
-    fun, path = njit(lambda t, y: np.array([y[1], -y[0]])), tmp_path / "run"
-    options = {"method": EIPRK4, "h": 1e-3, "save_every": 10**6, "compiled": True}
-
-    def interrupt(signum, frame):
-        raise KeyboardInterrupt
-
-    integrate(fun, (0, 1), [1.0, 2.0], **options)
-    before = signal.signal(signal.SIGALRM, interrupt)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 1.5)
-        begin = time.perf_counter()
-        with pytest.raises(KeyboardInterrupt) as info:
-            integrate(fun, (0, 1e7), [1.0, 2.0], checkpoint=path, **options)
-        seconds = time.perf_counter() - begin
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    assert seconds < 2.5
-    header, arrays = checkpoint.read(path)
-    assert header["message"] == "interrupted by KeyboardInterrupt"
-    assert checkpoint_step(info.value) == header["step"] > 1000
-    # At most half a second of the run is lost.
-    partial, t = info.value.partial, header["t"]
-    assert partial.wall_time - header["wall_time"] < 0.6
-    assert partial.t[-1] > 10.0
-    np.testing.assert_allclose(partial.y[0], np.cos(partial.t) + 2 * np.sin(partial.t), atol=1e-6)
-    np.testing.assert_allclose(arrays["y"], [np.cos(t) + 2 * np.sin(t), 2 * np.cos(t) - np.sin(t)], atol=1e-6)
 
 
 # Files that are there, that are not, and runs that do not fit.
@@ -591,6 +491,8 @@ OTHERS = {
     "t_eval": {"save_every": None, "t_eval": [0.0, 1.0]},
     "events": {"events": crossing},
     "params": {"params": [1.0]},
+    "y0": {"y0": pericentre(0.5)},
+    "t_span": {"t_span": (0, 7)},
 }
 
 
@@ -605,165 +507,80 @@ def old_run(tmp_path_factory):
 def test_other_arguments_are_named(name, old_run):
     _, path = old_run
     fun = (lambda t, y, p: orbit(t, y)) if name == "params" else orbit
-    options = FIXED | OTHERS[name]
+    options = {"t_span": SPAN, "y0": Y0, **FIXED, **OTHERS[name]}
     if name == "params":
         options["invariants"] = [Invariant(lambda t, y, p: H.fun(t, y), lambda t, y, p: H.grad(t, y), name="energy")]
     with pytest.raises(
         CheckpointError, match=rf"belongs to another run: (.*; )?{name} (is .* in the checkpoint and|differs)"
     ) as info:
-        integrate(fun, SPAN, Y0, checkpoint=path, resume=True, **options)
+        integrate(fun, checkpoint=path, resume=True, **options)
     assert "Resume with the arguments of that run, or use another file" in str(info.value)
 
 
-def test_another_start_end_or_method_of_stepping(old_run, tmp_path):
-    _, path = old_run
-    options = FIXED | {"checkpoint": path, "resume": True}
-    with pytest.raises(CheckpointError, match=r"another run: y0 is \[0.4, .* in the checkpoint and \[0.5, "):
-        integrate(orbit, SPAN, pericentre(0.5), **options)
-    with pytest.raises(CheckpointError, match=r"t_span is \[0.0, 6.0\] in the checkpoint and \[0.0, 7.0\] in"):
-        integrate(orbit, (0, 7), Y0, **options)
-    with pytest.raises(CheckpointError, match=r"another run: h is 0.03 in the checkpoint and null in this run"):
-        integrate(orbit, SPAN, Y0, **options | {"h": None})
-    path = tmp_path / "long"
-    integrate(orbit, SPAN, Y0, t_eval=np.linspace(0, 6, 50), method=EIPRK4, h=0.03, checkpoint=path)
-    with pytest.raises(CheckpointError, match=r"another run: t_eval differs\."):
-        integrate(orbit, SPAN, Y0, t_eval=np.linspace(0, 5, 50), method=EIPRK4, h=0.03, checkpoint=path, resume=True)
-
-
-def test_real_values_of_a_complex_run_are_written_as_real_numbers(tmp_path):
-    options = {"method": EIPRK4, "h": 0.1, "checkpoint": tmp_path / "run", "resume": True}
-
-    def kept(factor):
-        return Invariant(lambda t, y: factor * np.vdot(y, y).real, lambda t, y: 2 * factor * y, name="norm")
-
-    integrate(lambda t, y: 1j * y, (0, 1), [0.6, 0.8j], invariants=kept(1), **options)
-    with pytest.raises(CheckpointError, match=r"invariant 'norm' was 1 at the start and is 2 now"):
-        integrate(lambda t, y: 1j * y, (0, 1), [0.6, 0.8j], invariants=kept(2), **options)
-    with pytest.raises(CheckpointError, match=r"fun was 0\+0\.6j at the start and is 0\+1\.2j now"):
-        integrate(lambda t, y: 2j * y, (0, 1), [0.6, 0.8j], invariants=kept(1), **options)
-
-
-def test_another_function_is_seen_by_its_value_at_the_start(old_run):
-    _, path = old_run
-    options = FIXED | {"checkpoint": path, "resume": True}
-    with pytest.raises(CheckpointError, match=r"belongs to another run: fun was 2 at the start and is 2.002 now"):
-        integrate(lambda t, y: 1.001 * orbit(t, y), SPAN, Y0, **options)
-    other = Invariant(lambda t, y: 2 * H.fun(t, y), lambda t, y: 2 * H.grad(t, y), name="energy")
-    with pytest.raises(CheckpointError, match=r"invariant 'energy' was -0.5 at the start and is -1 now"):
-        integrate(orbit, SPAN, Y0, **options | {"invariants": [other, L]})
-
-
-def test_another_event_is_seen_by_its_values(tmp_path):
-    path = tmp_path / "run"
-    options = FIXED | {"checkpoint": path, "resume": True}
-
-    def far(t, y):
-        return np.hypot(y[0], y[1]) - 1.0
-
-    def later(t, y):
-        return y[1] if t == 0 else y[0]
-
-    integrate(orbit, SPAN, Y0, events=[crossing, far], **options)
-    with pytest.raises(CheckpointError, match=r"belongs to another run: event 1 was -0.6 at the start and is 0 now"):
-        integrate(orbit, SPAN, Y0, events=[crossing, crossing], **options)
-    with pytest.raises(CheckpointError, match=r"event 0 was \S+ at t = 6, where it was saved, and is \S+ now\. Resume"):
-        integrate(orbit, SPAN, Y0, events=[later, far], **options)
-    assert integrate(orbit, SPAN, Y0, events=[crossing, far], **options).status == 0
-
-
-def test_events_may_differ_by_rounding(tmp_path):
-    """At the start and at the end the values are rounding errors, and one event is not defined beyond the end."""
-    path = tmp_path / "run"
-    options = FIXED | {"checkpoint": path, "resume": True}
-    end = integrate(orbit, SPAN, Y0, **FIXED).y[:, -1]
-
-    def events(rounding):
-        def at_the_start(t, y):
-            return np.hypot(y[0], y[1]) - 0.4 + rounding
-
-        def at_the_end(t, y):
-            if not 0 <= t <= SPAN[1]:
-                raise ValueError("outside")
-            return y[0] - end[0] + rounding
-
-        return [at_the_start, at_the_end]
-
-    integrate(orbit, SPAN, Y0, events=events(1e-16), **options)
-    assert integrate(orbit, SPAN, Y0, events=events(-2e-16), **options).status == 0
-    with pytest.raises(CheckpointError, match=r"event 0 was .* at the start"):
-        integrate(orbit, SPAN, Y0, events=events(1e-9), **options)
-
-
-def test_a_file_without_values_of_events(tmp_path):
-    """Earlier versions wrote such files."""
-    path = tmp_path / "run"
-    options = FIXED | {"checkpoint": path, "resume": True, "events": [crossing, falling]}
-    whole = integrate(orbit, SPAN, Y0, **options)
-    rewritten(path, lambda h, a: [a.pop("start_events"), a.pop("state_events")])
-    same(whole, integrate(orbit, SPAN, Y0, **options))
-
-
 @pytest.mark.usefixtures("fine")
-def test_functions_may_differ_by_rounding(tmp_path, monkeypatch):
-    """The run continues, as on another processor, and its targets remain unchanged."""
+@pytest.mark.parametrize(
+    ("fun", "invariants", "match"),
+    [
+        (
+            lambda t, y: orbit(t, y) * (1.0 if t < 1.0 else 1.001),
+            [H, L],
+            r"fun was \S+ at t = \S+, where it was saved",
+        ),
+        (
+            orbit,
+            [Invariant(lambda t, y: H.fun(t, y) + (t > 1.0) * 1e-6, H.grad, name="energy"), L],
+            r"invariant 'energy' was \S+ at t = \S+, where it was saved, and is \S+ now\. Resume with",
+        ),
+        (lambda t, y: orbit(t, y) * (1 + 1e-15), [H, L], None),
+        (orbit, [Invariant(lambda t, y: H.fun(t, y) * (1 + 1e-13), H.grad, name="energy"), L], None),
+    ],
+)
+def test_another_function_is_seen_at_the_stored_state(fun, invariants, match, tmp_path, monkeypatch):
+    """Functions may differ by rounding, as on another processor; the targets remain those of the first run."""
     path = tmp_path / "run"
-    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 9):
-        integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
-    near = Invariant(lambda t, y: H.fun(t, y) * (1 + 1e-13), H.grad, name="energy")
-    options = FIXED | {"invariants": [near, L], "checkpoint": path, "resume": True}
-    assert integrate(lambda t, y: orbit(t, y) * (1 + 1e-15), SPAN, Y0, **options).status == 0
-    header, arrays = checkpoint.read(path)
-    assert header["status"] == 0
-    np.testing.assert_array_equal(arrays["target"], [H.fun(0, Y0), L.fun(0, Y0)])
-    assert near.fun(0, Y0) != H.fun(0, Y0)
+    options = FIXED | {"checkpoint": path, "invariants": invariants, "check": False, "resume": True}
+    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 100):
+        integrate(orbit, SPAN, Y0, **options | {"invariants": [H, L]})
+    before = path.read_bytes()
+    if match is None:
+        assert integrate(fun, SPAN, Y0, **options).status == 0
+        np.testing.assert_array_equal(checkpoint.read(path)[1]["target"], [H.fun(0, Y0), L.fun(0, Y0)])
+    else:
+        with pytest.raises(CheckpointError, match=f"belongs to another run: {match}"):
+            integrate(fun, SPAN, Y0, **options)
+        assert path.read_bytes() == before
 
 
-ON_ANOTHER_MACHINE = """
-import sys
-import numpy as np
-from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, integrate
-from eip_scipy.problems import nbody
-
-gm = [1.0, 1e-3, 0.3, 0.2, 0.1]
-q = [[0.0, 0, 0], [1, 0.1, 0], [0, 5, 0.3], [-8, 0, 1], [0, -12, 2]]
-v = [[0.0, 0, 0], [0, 1, 0], [-0.4, 0, 0.1], [0, -0.3, 0], [0.3, 0, 0]]
-problem = nbody(gm, q, v, t_span=(0.0, 2.0), h=0.1)
-rng = np.random.default_rng(0)
-frame = rng.standard_normal((6, 30)), rng.standard_normal((30, 6))
-runs = {"4": {"method": EIPRK4, "compensated": True, "frame": frame}, "12": {"method": EIPRKN12, "every": 2},
-        "853": {"method": EIPDOP853, "h": None, "max_step": 0.4}}
-
-def stop(t, y, d):
-    if stop.end and t > 1.0:
-        raise SystemExit
-
-stop.end = sys.argv[2] == "stop"
-ends = []
-for name, options in runs.items():
-    try:
-        run = integrate(problem, compiled=False, save_every=1, callback=stop, checkpoint=f"{sys.argv[1]}/{name}",
-                        resume=not stop.end, **options)
-    except SystemExit:
-        continue
-    assert run.success and "resumed at step" in run.message, run.message
-    ends.append(run.t[-1])
-print(ends)
-"""
+def test_values_of_a_complex_run(tmp_path):
+    options = {"method": EIPRK4, "h": 0.1, "checkpoint": tmp_path / "run", "resume": True}
+    norm = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y, name="norm")
+    integrate(lambda t, y: 1j * y, (0, 1), [0.6, 0.8j], invariants=norm, **options)
+    with pytest.raises(CheckpointError, match=r"fun was -0\.50\d*\+0\.32\d*j at t = 1, where it was saved"):
+        integrate(lambda t, y: 2j * y, (0, 1), [0.6, 0.8j], invariants=norm, **options)
 
 
-@pytest.mark.slow
-def test_a_run_goes_on_where_blas_rounds_otherwise(tmp_path):
-    """The method's low parts and the frame are the same run's whatever kernels OpenBLAS takes for the processor."""
-    for what, kernel in (("stop", {"OPENBLAS_CORETYPE": "Prescott"}), ("go on", {})):  # every x86-64 runs Prescott's
-        found = subprocess.run(
-            [sys.executable, "-c", ON_ANOTHER_MACHINE, tmp_path, what],
-            env={**os.environ, **kernel},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert found.returncode == 0, found.stderr
-    assert found.stdout == "[np.float64(2.0), np.float64(2.0), np.float64(2.0)]\n"
+def test_the_comparison_counts_no_evaluations(tmp_path):
+    assert (
+        integrate(orbit, SPAN, Y0, checkpoint=tmp_path / "run", **FIXED).nfev
+        == integrate(orbit, SPAN, Y0, **FIXED).nfev
+    )
+
+
+def test_a_function_that_no_longer_answers(tmp_path):
+    """The exception that stops the run cannot be inspected again; the run is kept nevertheless."""
+    gone = []
+
+    def fun(t, y):
+        if gone or t > 3.0:
+            gone.append(t)
+            raise RuntimeError("the licence server is down")
+        return orbit(t, y)
+
+    with pytest.raises(RuntimeError, match="licence"):
+        integrate(fun, SPAN, Y0, checkpoint=tmp_path / "run", **FIXED)
+    assert "state_f" not in checkpoint.read(tmp_path / "run")[1]
+    found = integrate(orbit, SPAN, Y0, checkpoint=tmp_path / "run", resume=True, **FIXED)
+    same(integrate(orbit, SPAN, Y0, **FIXED), found)
 
 
 def test_another_kind_of_checkpoint(tmp_path):
@@ -789,7 +606,6 @@ CHANGES = {
     "no settings": (lambda h, a: h.pop("settings"), "belongs to another run: method is null in the checkpoint"),
     "settings of another kind": (lambda h, a: h.update(settings=[1]), "belongs to another run"),
     "no time": (lambda h, a: h.update(wall_time="long"), "is not a checkpoint of this run"),
-    "no start": (lambda h, a: a.pop("start_f"), "start_f is missing"),
 }
 
 
@@ -846,12 +662,6 @@ def test_header_and_arrays(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.npz"]
 
 
-def test_the_same_content_gives_the_same_bytes(tmp_path):
-    for name in "ab":
-        checkpoint.write(tmp_path / name, {"kind": "test"}, {"x": np.arange(5)})
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
 @pytest.mark.posix
 def test_a_link_stays_a_link(tmp_path):
     target, link = tmp_path / "target", tmp_path / "link"
@@ -859,14 +669,6 @@ def test_a_link_stays_a_link(tmp_path):
     checkpoint.write(link, {"kind": "test"}, {})
     assert link.is_symlink()
     assert checkpoint.read(target) == checkpoint.read(link)
-
-
-@pytest.mark.posix
-def test_a_link_to_nowhere_yet(tmp_path):
-    link = tmp_path / "link"
-    link.symlink_to(tmp_path / "target")
-    integrate(orbit, SPAN, Y0, checkpoint=link, **FIXED)
-    assert checkpoint.read(tmp_path / "target", "integrate")[0]["status"] == 0
 
 
 def test_leftovers_of_killed_processes_are_removed(tmp_path):
@@ -910,7 +712,7 @@ def outcome(path):
     return header, {name: (a.dtype, a.tolist()) for name, a in arrays.items()}
 
 
-def test_no_changed_byte_changes_what_is_read(tmp_path):
+def test_changed_and_missing_bytes(tmp_path):
     """Some bytes are in no checksum, dates for instance; whatever they are, header and arrays are those written."""
     path = tmp_path / "a"
     raw = small_file(path)
@@ -921,31 +723,9 @@ def test_no_changed_byte_changes_what_is_read(tmp_path):
             found = outcome(path)
             refused += found == "refused"
             assert found in (known, "refused")
+        path.write_bytes(raw[:k])
+        assert outcome(path) == "refused"
     assert refused > 1.5 * len(raw)
-
-
-def test_a_run_does_not_go_on_from_a_damaged_file(old_run, tmp_path):
-    path, raw = tmp_path / "run", old_run[1].read_bytes()
-    data = raw.index(b"header.json") + 11, raw.index(b"PK\x01\x02")  # before the directory of the archive
-    for k in np.random.default_rng(1).integers(*data, size=40):
-        path.write_bytes(raw[:k])
-        with pytest.raises(
-            CheckpointError, match=r"run' is damaged, or not a checkpoint of eip_scipy: .* Restore a copy"
-        ):
-            integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
-        assert path.read_bytes() == raw[:k]
-        path.write_bytes(raw[:k] + bytes([raw[k] ^ 4]) + raw[k + 1 :])
-        known = outcome(old_run[1])
-        assert outcome(path) in (known, "refused")
-
-
-def test_each_truncation_is_seen(tmp_path):
-    path = tmp_path / "a"
-    raw = small_file(path)
-    for k in range(len(raw)):
-        path.write_bytes(raw[:k])
-        with pytest.raises(CheckpointError, match="is damaged, or not a checkpoint"):
-            checkpoint.read(path)
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -1119,72 +899,24 @@ def test_a_run_goes_on_while_the_disk_is_full(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("fine")
-def test_the_disk_stays_full(tmp_path, monkeypatch):
-    whole, path = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run"
-    advance, patches = longrun.Driver.advance, []
-
-    def fill_after_a_while(driver, k_end):
-        if driver.step > 100 and not patches:
-            patches.append(fill_disk(monkeypatch, 1))
-        return advance(driver, k_end)
-
-    monkeypatch.setattr(longrun.Driver, "advance", fill_after_a_while)
-    with pytest.warns(RuntimeWarning, match="no space left on device; it still holds step 10") as record:
-        found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
-    assert str(record[-1].message).endswith("The result is complete.")
-    assert record[-1].filename == __file__
-    same(whole, found)
-    assert "cannot write the checkpoint" in found.message
-    monkeypatch.undo()
-    same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
-
-
-@pytest.mark.usefixtures("fine")
-@pytest.mark.parametrize("reason", ["disk", "impatience"])
-def test_interrupted_with_a_full_disk(reason, tmp_path, monkeypatch):
-    """Neither hides the first exception, its partial result, or the step of the checkpoint that is there."""
-    path, calls = tmp_path / "run", [0]
+def test_interrupted_with_a_full_disk(tmp_path, monkeypatch):
+    """The disk does not hide the first exception, its partial result, or the step of the checkpoint that is there."""
+    path = tmp_path / "run"
 
     def fun(t, y):
-        calls[0] += 1
-        if calls[0] == 300:
-            if reason == "disk":
-                fill_disk(monkeypatch, 3)
-            else:
-                monkeypatch.setattr(checkpoint.os, "fsync", interrupt)
+        if t > 1.5:
+            fill_disk(monkeypatch, 3)
             raise BrokenOffError
         return orbit(t, y)
-
-    def interrupt(*args):
-        raise KeyboardInterrupt
 
     with pytest.raises(BrokenOffError) as info:
         integrate(fun, SPAN, Y0, checkpoint=path, checkpoint_every=1e9, **FIXED)
     assert info.value.partial.t[-1] > 1.0
     first, second = info.value.__notes__
-    assert ("no space left" if reason == "disk" else "interrupted again") in first
+    assert "no space left" in first
     assert f"{str(path)!r} holds step 0, t = 0: the same call with resume=True continues from there" in second
     monkeypatch.undo()
     assert checkpoint.read(path)[0]["step"] == 0
-
-
-@pytest.mark.usefixtures("fine")
-def test_interrupted_while_the_result_is_written(tmp_path, monkeypatch):
-    """The run is complete: all of it is in the partial result, and in the file as well."""
-    whole, path, write = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", checkpoint.write
-
-    def interrupt_once(path, header, arrays):
-        if header["status"] == 0:
-            raise KeyboardInterrupt
-        write(path, header, arrays)
-
-    monkeypatch.setattr(checkpoint, "write", interrupt_once)
-    with pytest.raises(KeyboardInterrupt) as info:
-        integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
-    np.testing.assert_array_equal(info.value.partial.y, whole.y)
-    assert checkpoint_step(info.value) == 200
-    monkeypatch.undo()
-    same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
 
 
 def test_a_disk_that_is_full_at_the_start_is_an_error(tmp_path, monkeypatch):
@@ -1200,39 +932,6 @@ def test_a_disk_that_is_full_at_the_start_is_an_error(tmp_path, monkeypatch):
 def python(code, *arguments):
     command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
     return subprocess.Popen(command, cwd=Path(__file__).parents[1], stderr=subprocess.PIPE, text=True)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.posix
-def test_sixty_writers_are_killed(tmp_path):
-    """kill -9 at any moment leaves the former checkpoint or the new one."""
-    code = """
-        import os, random, signal, sys, time
-        import numpy as np
-        from eip_scipy import checkpoint
-
-        path = sys.argv[1]
-        checkpoint.write(path, {"kind": "test", "k": 0}, {"x": np.zeros(50_000)})
-        for attempt in range(60):
-            before = checkpoint.read(path)[0]["k"]
-            child = os.fork()
-            if child == 0:
-                for k in range(before + 1, 10**9):
-                    checkpoint.write(path, {"kind": "test", "k": k}, {"x": np.full(50_000, k, float)})
-            time.sleep(random.Random(attempt).uniform(0.0, 0.1))
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            header, arrays = checkpoint.read(path)
-            assert header["k"] >= before
-            assert (arrays["x"] == header["k"]).all()
-        assert checkpoint.read(path)[0]["k"] > 20
-        torn = [name for name in os.listdir(os.path.dirname(path)) if name.endswith(".tmp")]
-        assert len(torn) > 10, torn
-    """
-    process = python(code, tmp_path / "run")
-    _, err = process.communicate(timeout=300)
-    assert process.returncode == 0, err
 
 
 RUN = """

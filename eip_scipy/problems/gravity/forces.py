@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import native_invariant
@@ -80,9 +79,6 @@ class ForceConstants:
     drag_radius: float | None = None
     scale_height: float | None = None
     spin: float = 0.0
-
-    def __post_init__(self) -> None:
-        refuse_units(**vars(self))
 
 
 NEEDS = {

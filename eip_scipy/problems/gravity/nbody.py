@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import has_unit, is_number, refuse_units, shown
+from ...core.inputs import is_number, real_array, shown
 from ...core.problem import Problem, bind, library_variational
-from ...core.units import apart, as_epoch, in_unit, is_time, moment
-from ...core.units import units as known_units
+from ...core.stepping import interval
 from ...engine.native import library
 from . import forces as _forces
-from .bodies import body_names, default_units, in_units
+from .bodies import body_names
 from .forces import ForceConstants
 from .orbits import balances_of_orbits, orbital_frequencies
 
@@ -41,7 +40,7 @@ def nbody(
     source: str = "",
     reference: Callable[[float], np.ndarray | None] | None = None,
     bodies: Sequence[str] | None = None,
-    epoch: Any = None,
+    epoch: tuple[float, float] | None = None,
     G: float | None = None,
     balances: str | Sequence[str] | None = None,
 ) -> Problem:
@@ -51,15 +50,13 @@ def nbody(
     ----------
     gm : array_like, shape (N,)
         G times the masses, in the units of length and time of the state; if `G` is given, the masses. 0 stands for a
-        test particle, which is attracted and does not attract. Quantities of astropy may be G m, or masses, which are
-        then multiplied by the constant of gravitation.
+        test particle, which is attracted and does not attract.
     position, velocity : array_like, shape (N, 3)
-        Plain numbers, or quantities of astropy. Either all or none of `gm`, `position` and `velocity` have units.
+        Initial state. `eip_scipy.integrations.astropy.nbody` accepts quantities of astropy.
     t_span : (float, float)
-        Start and end of the run: numbers; if the units are known, also durations or moments (Time of astropy, in any
-        scale).
+        Start and end of the run.
     h : float, optional
-        Step length, a number or a duration.
+        Step length.
     forces : str or sequence of str, optional
         Forces in addition to Newton's gravitation, all from the first body (the Sun) except "eih":
 
@@ -84,15 +81,13 @@ def nbody(
     name, source : str, optional
         See `Problem`.
     units : str, optional
-        Units of length and time, such as "AU, yr" (see `Problem`). Default for quantities: the unit of length is that
-        of `position`; the unit of time is that of `t_span` (days for moments), or else that of `velocity`.
+        Units of length and time, such as "AU, yr" (see `Problem`).
     reference : callable, optional
         See `Problem`.
     bodies : sequence of str, optional
         Names of the bodies, which become part of the components' names: x_Sun, y_Sun, ... Default: x_0, y_0, ...
-    epoch : Time or float or (float, float), optional
-        The moment of t = 0: a Time of astropy in any scale, or a Julian date in TDB, as one or two numbers. Default:
-        the start of `t_span` if it consists of moments.
+    epoch : (float, float), optional
+        Date of t = 0: a Julian date in TDB, in two parts (see `Problem`).
     G : float, optional
         The constant of gravitation. If it is given, the first argument holds the masses, which are multiplied by it:
         ``nbody([1, 1e-6], ..., G=4 * np.pi**2)`` in AU, years and solar masses. `Problem.G` stores it, so that a
@@ -150,17 +145,7 @@ def nbody(
     terms in 1/c^2; there the frame only keeps corrections from moving the centre of mass. With "1pn", "eih" and "drag"
     the accelerations depend on velocities: `acc` is None, and Nystrom methods do not apply.
     """
-    t_span = apart(t_span)
-    units = units or default_units(gm, position, velocity, t_span)
-    known = known_units(units)
-    gm, position, velocity = in_units(_gravitational(gm, G), position, velocity, known)
-    if epoch is not None:
-        epoch = as_epoch("epoch", epoch)
-    elif isinstance(t_span, tuple | list) and t_span and is_time(t_span[0]):
-        epoch = as_epoch("t_span", t_span[0])
-    t_span = moment("t_span", t_span, known, epoch, "nbody")
-    h = in_unit("h", h, (0, 1), known)
-    masses, q, v = _checked(gm, position, velocity)
+    masses, q, v = _checked(_gravitational(gm, G), position, velocity)
     chosen = _forces.check_forces(forces)
     y0 = np.concatenate([q.ravel(), v.ravel()])
     params = _forces.parameters(masses, chosen, constants) if chosen else masses
@@ -175,7 +160,7 @@ def nbody(
         rhs=rhs,
         acc=acc,
         y0=y0,
-        t_span=(float(t_span[0]), float(t_span[1])),
+        t_span=interval(t_span),
         h=h,
         params=params,
         invariants=kept,
@@ -203,20 +188,14 @@ def _gravitational(masses: Any, G: Any) -> Any:
     """Return `G` times `masses`; if `G` is None, return `masses` unchanged."""
     if G is None:
         return masses
-    refuse_units(G=G)
-    if not (is_number(G) and 0 < G < np.inf):
+    if not (is_number(G, "G") and 0 < G < np.inf):
         raise ValueError(f"nbody: G must be a positive finite number, got {shown(G)}.")
-    if any(has_unit(item) for item in (masses, *np.atleast_1d(np.asarray(masses, dtype=object)))):
-        raise TypeError(
-            "nbody: G multiplies masses that are plain numbers, but the first argument has a unit. Omit G: masses with "
-            "a unit are multiplied by the constant of gravitation, and values of G m are used unchanged."
-        )
-    return G * np.asarray(masses, dtype=float)
+    return G * real_array("gm", masses)
 
 
 def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return gm, position and velocity as arrays (N,), (N, 3), (N, 3); raise an error, or warn of unlikely speeds."""
-    masses, q, v = (np.array(x, dtype=float) for x in (gm, position, velocity))
+    masses, q, v = real_array("gm", gm), real_array("position", position), real_array("velocity", velocity)
     n = masses.size
     if masses.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
         raise ValueError(

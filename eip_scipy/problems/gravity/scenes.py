@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import is_number, real_array, refuse_units, shown
+from ...core.inputs import is_number, real_array, shown
 from ...core.problem import Problem
 from . import solar_data
 from .forces import ForceConstants
@@ -85,8 +85,7 @@ def figure_eight(periods: float = 100.0) -> Problem:
     A. Chenciner, R. Montgomery, A remarkable periodic solution of the three-body problem in the case of equal masses,
     Annals of Mathematics 152 (2000) 881-901; initial data by C. Simó, there.
     """
-    refuse_units(periods=periods)
-    if not (periods > 0 and np.isfinite(periods)):
+    if not (is_number(periods, "periods") and periods > 0 and np.isfinite(periods)):
         raise ValueError(f"figure_eight: periods must be positive and finite, got {periods!r}.")
     q = np.array([0.97000436, -0.24308753, 0.0])
     v = np.array([-0.93240737, -0.86473146, 0.0])
@@ -224,7 +223,6 @@ def satellite(
     >>> run.trusted, problem.component_names[3]
     (True, 'x_satellite')
     """
-    refuse_units(t_span=t_span, h=h)
     x, v = (real_array(key, value) for key, value in (("position", position), ("velocity", velocity)))
     if x.shape != (3,) or v.shape != (3,):
         raise ValueError(f"satellite: position has shape {x.shape} and velocity {v.shape}; expected (3,) for both.")

@@ -16,15 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import refuse_units
-from ...core.units import exact_sum
-
 __all__ = [
     "AU_KM",
     "DAY_S",
     "YEAR_D",
     "SolarSystemData",
     "available",
+    "exact_sum",
     "gm_from_km3_s2",
     "load",
     "reference_states",
@@ -85,13 +83,17 @@ class SolarSystemData:
     units: str = "AU, day"
     epoch_rest: float = 0.0
 
-    def __post_init__(self) -> None:
-        refuse_units(gm=self.gm, position=self.position, velocity=self.velocity, epoch_jd_tdb=self.epoch_jd_tdb)
-
     @property
     def y0(self) -> np.ndarray:
         """The state (q of all bodies, v of all bodies), shape (6 N,)."""
         return np.concatenate([self.position.ravel(), self.velocity.ravel()])
+
+
+def exact_sum(a: float, b: float) -> tuple[float, float]:
+    """Return the rounded sum of a and b, and the exact sum minus the rounded one."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
 
 
 def available() -> tuple[str, ...]:

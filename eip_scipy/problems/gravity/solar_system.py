@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from ...core.inputs import refuse_units
 from ...core.problem import Problem
 from .forces import ForceConstants, check_forces
 from .nbody import nbody
@@ -69,7 +68,6 @@ def solar_system(
         If data, units or forces are unknown, "drag" is given, or "moon-quadrupole" is given for data without the
         Earth-Moon barycentre.
     """
-    refuse_units(years=years, h=h)
     known = load(data) if isinstance(data, str) else data
     chosen = check_forces(forces)
     if "drag" in chosen:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import count, is_number, refuse_units, shown
+from ...core.inputs import count, is_number, reals, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_compiled
 from ...core.problem import Problem
@@ -94,13 +94,12 @@ def find_invariants(
     >>> find_invariants(kepler, [1.0, 0.0, 0.0, 1.2])
     [Invariant(y0*y3 - y1*y2)]
     """
-    refuse_units(y0=y0, t=t)
     degree = count("find_invariants: degree", degree)
-    start = np.array(y0)
-    if start.ndim != 1 or start.size == 0 or start.dtype.kind not in "iuf" or not np.isfinite(start).all():
+    start = reals("y0", y0)
+    if start is None or start.ndim != 1 or start.size == 0 or not np.isfinite(start).all():
         raise ValueError(f"find_invariants: y0 must be a real, finite state (n,), got {shown(y0)}.")
     for name, value in (("t", t), ("rtol", rtol)):
-        if not (is_number(value) and math.isfinite(value)) or (name == "rtol" and not 0 < value < 1):
+        if not (is_number(value, name) and math.isfinite(value)) or (name == "rtol" and not 0 < value < 1):
             expected = "a finite number" if name == "t" else "a number between 0 and 1"
             raise ValueError(f"find_invariants: {name} must be {expected}, got {shown(value)}.")
     size = math.comb(start.size + degree, degree) - 1 + len(terms)

@@ -154,11 +154,12 @@ class MechanicsProblem(Problem):
         if params is None:
             params = self.params
         elif isinstance(params, Mapping):
-            params = self._named_parameters(params)
+            params = self.named_parameters(params)
         return () if params is None else (np.asarray(params, float),)
 
-    def _named_parameters(self, given: Mapping[Any, Any]) -> np.ndarray:
-        return super()._named_parameters(by_name("params", given))
+    def named_parameters(self, given: Mapping[Any, Any]) -> np.ndarray:
+        """Return the values of all parameters; see `Problem.named_parameters`."""
+        return super().named_parameters(by_name("params", given))
 
     def motion_at(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the derivative (q', u') of one state, computed by functions that are not compiled."""
@@ -202,7 +203,7 @@ class MechanicsProblem(Problem):
             If the constraints cannot be met; the message names the constraint that is violated most.
         """
         if params is not None:
-            params = self._named_parameters(params) if isinstance(params, Mapping) else real_array("params", params)
+            params = self.named_parameters(params) if isinstance(params, Mapping) else real_array("params", params)
         t = (0.0 if self.t_span is None else self.t_span[0]) if t is None else float(t)
         if params is not None and params.ndim == 2:
             return np.array([self.start(q0, u0, row, t=t, independent=independent) for row in params])

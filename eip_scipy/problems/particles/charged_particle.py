@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from ...core.balances import Balance
-from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
@@ -155,7 +154,6 @@ def charged_particle(
     >>> [item.name for item in problem.invariants], bool(run.max_defect.max() < 1e-12)
     (['H', 'L'], True)
     """
-    refuse_units(position=position, velocity=velocity, t_span=t_span, h=h, mass=mass, charge=charge)
     if not isinstance(field, ParticleField):
         raise TypeError(f"charged_particle: field must be a ParticleField, got {field!r}.")
     if form not in FORMS:
@@ -259,7 +257,6 @@ def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STE
     ValueError
         If the form is unknown.
     """
-    refuse_units(t_end=t_end, h=h)
     return _paper("uniform", UNIFORM, [0.0, -1.0, 0.0], [0.1, 0.01, 0.0], form, t_end, h)
 
 
@@ -287,7 +284,6 @@ def tokamak(
     ValueError
         If the orbit or the form is unknown.
     """
-    refuse_units(t_end=t_end, h=h)
     if orbit not in ORBITS:
         raise ValueError(f"tokamak: orbit must be one of {', '.join(ORBITS)}, got {orbit!r}{nearest(orbit, ORBITS)}")
     velocity = [0.0, ORBITS[orbit] * 4.816e-4, -2.059e-3]

@@ -14,7 +14,7 @@ import numpy as np
 import sympy
 
 from ...core.balances import Balance
-from ...core.inputs import is_number, reals, refuse_units, shown
+from ...core.inputs import is_number, reals, shown
 from ...core.invariants import Invariant
 from ...core.jitted import is_jitted
 from ...core.problem import Deferred, Problem, bind
@@ -561,10 +561,9 @@ def parameter_values(params: Any) -> dict[str, float]:
         return {}
     if not isinstance(params, Mapping):
         raise TypeError(f"params must be a mapping of names to values, got {shown(params)}.")
-    refuse_units(params=list(params.values()))
     names = as_names("the keys of params", list(params))
     for name, value in zip(names, params.values(), strict=True):
-        is_constant = isinstance(value, sympy.Expr) and reals(value) is not None
+        is_constant = isinstance(value, sympy.Expr) and reals("params", value) is not None
         if not ((is_number(value) or is_constant) and math.isfinite(value)):
             raise ValueError(f"params: {name} must be a finite number, got {shown(value)}.")
     return dict(zip(names, map(float, params.values()), strict=True))
