@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, NOT_PRINTED, WRONG_USAGE, nearest
+from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, NOT_PRINTED, WRONG_USAGE, nearest
 
 PROGRAM = "eip-scipy"
 
@@ -87,9 +87,6 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=_listed(below) if below else None,
     )
-    for flag in (word.partition("=")[0] for word in words):
-        if (name, flag) in MOVED:
-            parser.exit(WRONG_USAGE, f"{parser.prog}: {flag} is now: {PROGRAM} {MOVED[name, flag]}\n")
     from .report import UsageError
 
     try:

@@ -133,14 +133,6 @@ COMMANDS = {
     ),
     "study written": Entry("measurements.written:Written", "cost of a problem written as an expression"),
 }
-# Former options by command, and the command that replaces each.
-MOVED = {
-    ("solar-system", "--frontier"): "solar-system frontier",
-    ("solar-system", "--truth"): "solar-system truth",
-    ("solar-system", "--forces"): "solar-system truth --forces",
-    ("charged-particle", "--field"): "charged-particle uniform, or charged-particle tokamak",
-    ("charged-particle", "--orbit"): "charged-particle tokamak --orbit",
-}
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -358,8 +358,6 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatc
         (["--resume"], "--resume needs the folder to resume from: --checkpoint DIR"),
         (["truth", "--checkpoint", "a"], "unrecognized arguments: --checkpoint a"),
         (["frontier", "--resume"], "unrecognized arguments: --resume"),
-        (["--frontier", "--years", "10"], "--frontier is now: eip-scipy solar-system frontier\n"),
-        (["--truth"], "--truth is now: eip-scipy solar-system truth\n"),
     ],
 )
 def test_options_that_nothing_can_be_done_with(options, message, tmp_path, capsys, no_rebound):

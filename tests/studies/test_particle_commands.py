@@ -125,8 +125,6 @@ def test_scenes_of_the_command(options, scenes, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--field", "uniform"], "--field is now: eip-scipy charged-particle uniform, or charged-particle tokamak\n"),
-        (["--orbit=banana"], "--orbit is now: eip-scipy charged-particle tokamak --orbit\n"),
         (["uniform", "--orbit", "banana"], "unrecognized arguments: --orbit"),
         (["tokomak"], "unrecognized arguments: tokomak; did you mean 'tokamak'?"),
         (["tokamak", "--orbit", "potato"], "invalid choice"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from eip_scipy_studies.cli import main
-from eip_scipy_studies.commands import COMMANDS, MOVED
+from eip_scipy_studies.commands import COMMANDS
 from eip_scipy_studies.report import UsageError
 from eip_scipy_studies.study import Check, Command, PartlyDone, Session, Study, option
 
@@ -143,13 +143,6 @@ def test_every_command_is_there_and_says_what_it_takes(name, capsys):
         positional = item.metadata.get("metavar") if item.metadata.get("positional") else None
         flag = positional or f"--{item.name.replace('_', '-')} "
         assert (flag in printed) == ("help" in item.metadata)
-
-
-@pytest.mark.parametrize(("name", "flag"), MOVED)
-def test_old_spellings_answer_with_the_new_one(name, flag, capsys):
-    assert main([name, flag, "x"]) == 2
-    assert capsys.readouterr().err == f"eip-scipy {name}: {flag} is now: eip-scipy {MOVED[name, flag]}\n"
-    assert MOVED[name, flag].partition(" --")[0].partition(",")[0] in COMMANDS
 
 
 def test_help_is_quick():
