@@ -9,8 +9,6 @@ from pathlib import Path as _Path
 from sys import version_info as _python
 from typing import TYPE_CHECKING, Any
 
-from .core.moved import moved_names as _moved_names
-
 if TYPE_CHECKING:
     from . import checkpoint as checkpoint
     from . import methods as methods
@@ -123,7 +121,6 @@ if not _Path(__file__).with_name("integrations").exists():
     __path__.append(str(_Path(__file__).parents[1]))
 
 _MODULES = ("checkpoint", "methods", "problems", "results", "solvers", "tangent_maps")
-_moved = _moved_names(__name__, stacklevel=3)
 
 
 def __getattr__(name: str) -> Any:
@@ -134,7 +131,7 @@ def __getattr__(name: str) -> Any:
     elif name == "__version__":
         value = _import_module(".core.versions", __name__).VERSION
     else:
-        return _moved(name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value
     return value
 

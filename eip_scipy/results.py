@@ -1,4 +1,4 @@
-"""Results of runs, ensembles and projections, and functions that make tables, files, figures and pages of them."""
+"""Results of runs, ensembles and projections, and functions that make tables, files and figures of them."""
 
 from .core.results import Diagnostics, Multipliers, ProjectionResult
 from .ensembles.ensemble import EnsembleResult
@@ -8,7 +8,6 @@ from .run.results import IntegrationResult
 from .run.saving import load, save
 from .run.solve_ivp import OdeResult
 from .run.tables import to_dataframe, to_xarray
-from .run.view import view
 
 __all__ = [
     "Diagnostics",
@@ -23,5 +22,4 @@ __all__ = [
     "save",
     "to_dataframe",
     "to_xarray",
-    "view",
 ]

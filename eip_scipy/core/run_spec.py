@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,7 +13,6 @@ from ..engine.native import BUILD
 from ..engine.trust import Trust
 from ..methods.orders import AT_REST
 from . import steppers
-from .acceleration import named_accelerations
 from .failures import projection_failure
 from .frame import spanned
 from .invariant_checks import Complaint, reported
@@ -38,8 +36,7 @@ class RunSpec(NamedTuple):
 
     `name` is the solver class, for messages. If `is_known`, `method` is the `tableau` of another run of these
     equations, which are not examined again. ``rhs(t, y) -> (n,)`` is checked and returns new arrays; `extra` are
-    further arguments of the invariants' functions. `fun` is the user's function or None, which is examined in case it
-    is an acceleration.
+    further arguments of the invariants' functions.
 
     ``jacobian()`` returns the Jacobian for a multistep method (see `SecondOrder`) or an implicit one, or None, and
     ``frequencies(y0, length)`` is that of `Problem`. With `level` a multistep method returns the state at the newest
@@ -57,8 +54,6 @@ class RunSpec(NamedTuple):
     projection: ProjectionOptions
     is_known: bool = False
     extra: tuple[Any, ...] = ()
-    fun: Any = None
-    in_place: bool = False
     jacobian: Callable[[], Any] = lambda: None
     frequencies: Callable[[Array, float], tuple[Array, float]] | None = None
     level: bool = False
@@ -92,15 +87,16 @@ class RunSpec(NamedTuple):
     def examined(self, y0: Array, f0: Array | None = None) -> tuple[AnyMethod, Array]:
         """Return the method after a check of the equations, see `steppers.checked`, and the derivative (n,) at y0."""
         t0 = self.stepping.span.t0
-        guard: AbstractContextManager[None] = nullcontext()
-        if self.fun is not None and self.method.of_second_order:
-            guard = named_accelerations(self.name, self.fun, self.in_place, self.extra, t0, y0)
-        with guard:
+        try:
             f0 = self.rhs(t0, y0) if f0 is None else f0
-            if self.is_known or self.is_second_order:
-                return self.method, f0
-            start = Start(t0, y0, f0, 0.0)
-            return steppers.checked(self.method, self.rhs, start, self.name, self.hint, self.sees_velocity), f0
+        except (ValueError, TypeError, IndexError) as error:
+            if self.method.of_second_order and not self.is_second_order:
+                error.add_note(f"With {self.name} too, fun(t, y) returns the derivative of y = (q, v){self.hint()}.")
+            raise
+        if self.is_known or self.is_second_order:
+            return self.method, f0
+        start = Start(t0, y0, f0, 0.0)
+        return steppers.checked(self.method, self.rhs, start, self.name, self.hint, self.sees_velocity), f0
 
     def attach_history(self, run: Run, start: Start) -> None:
         """Give a run with a multistep method its history, which begins at `start`."""

@@ -230,7 +230,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             rhs=partial(_copied, self._derivative),
             stepping=stepping,
             projection=projection,
-            fun=None if self.vectorized else self._user_fun,
             jacobian=lambda: moved,
             level=True,
             hint=lambda: f". If fun is the acceleration a(t, q), {BY_NAME}",

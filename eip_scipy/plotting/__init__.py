@@ -9,8 +9,6 @@ import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..core.moved import moved_names
-
 try:
     from matplotlib.ticker import LogLocator, NullFormatter
 except ModuleNotFoundError as error:
@@ -21,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["FLOOR", "MARKERS", "PALETTE", "log_errors", "method_styles", "typeset"]
-
-__getattr__ = moved_names(__name__)
 
 # Colours of Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and
 # wine and olive of Tol.

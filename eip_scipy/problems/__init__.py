@@ -1,6 +1,5 @@
 """Problems with invariants: functions that return a `Problem`."""
 
-from ..core.moved import moved_names
 from ..core.pointers import CFunctions
 from ..core.problem import Problem
 from .gravity import solar_data as solar_data
@@ -57,5 +56,3 @@ __all__ = [
     "tokamak",
     "uniform_field",
 ]
-
-__getattr__ = moved_names(__name__)

@@ -388,8 +388,6 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         stepping=stepping,
         projection=ProjectionOptions(**request.projection),
         extra=system.extra,
-        fun=system.fun if problem is None and system.name == "fun" else None,
-        in_place="in place" in system.form,
         jacobian=system.matrix if request.method.TABLEAU.drives else system.product,
         frequencies=None if problem is None else problem.frequencies,
         hint=partial(_second_order_hint, given),

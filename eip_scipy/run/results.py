@@ -250,12 +250,6 @@ class IntegrationResult(WithColumns):
 
         return plot(self, names, orbit=orbit, ax=ax)
 
-    def view(self, path: Any = None, *, names: Any = None, reference: Any = None) -> Any:
-        """Write a page that plays the run, see `eip_scipy.results.view`."""
-        from .view import view
-
-        return view(self, path, names=names, reference=reference)
-
     def continue_to(self, t: float, **options: Any) -> IntegrationResult:
         """Continue from the last state to a later time, with the functions and options of the run.
 
@@ -336,7 +330,7 @@ class IntegrationResult(WithColumns):
         return super().__reduce_ex__(protocol)
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray", "view"]
+        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
 
     def __getstate__(self) -> None:
         """Return None: a pickle excludes attributes that are not fields, such as the functions of the run."""

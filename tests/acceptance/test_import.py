@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 import eip_scipy
-from eip_scipy.core.moved import MOVED
 
 HEAVY = ["eip_scipy_studies", "matplotlib", "numba", "scipy", "tqdm"]
 HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm", "zarr"]
@@ -27,7 +26,7 @@ def test_the_package_alone_is_light():
     found = python("import eip_scipy, sys\nprint(*sys.modules)").split()
     assert set(found).isdisjoint(HEAVY)
     own = {name for name in found if name.startswith("eip_scipy.")}
-    assert own <= {"eip_scipy.core", "eip_scipy.core.moved"}
+    assert own == set()
 
 
 def test_names_bring_no_more_than_they_need():
@@ -92,33 +91,6 @@ def test_no_folder_or_module_has_a_public_name():
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'EIPRK7'"):
         eip_scipy.EIPRK7  # noqa: B018
-
-
-MOVED_NAMES = {
-    "from eip_scipy.comparators import boris as it": "eip_scipy_studies.comparators.boris",
-    "from eip_scipy.problems import hard_cases as it": "eip_scipy_studies.hard_cases.hard_cases",
-    "from eip_scipy.problems.hard_cases import HardCase as it": "eip_scipy_studies.hard_cases.HardCase",
-    "from eip_scipy.problems import HardCase as it": "eip_scipy_studies.hard_cases.HardCase",
-    "from eip_scipy.plotting import cost_figure as it": "eip_scipy_studies.plotting.cost_figure",
-    **{f"from eip_scipy import {name} as it": f"{home}.{name}" for name, home in MOVED["eip_scipy"].items()},
-}
-IMPORTS = """
-import sys, warnings
-for code in sys.argv[1:]:
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        exec(compile(code, "<code>", "exec"))
-    print(callable(it), *{f"{w.category.__name__} {w.filename} {w.message}" for w in found}, sep="|")
-"""
-
-
-def test_moved_names_are_found_and_say_where_they_are_now():
-    """All old names are imported in one fresh process, each with one warning that names the importing file."""
-    for (code, new), found in zip(MOVED_NAMES.items(), python(IMPORTS, *MOVED_NAMES).splitlines(), strict=True):
-        callable_, warning = found.split("|")
-        assert callable_ == "True", code
-        assert warning.startswith("DeprecationWarning <code> eip_scipy."), code
-        assert f"is now {new};" in warning, code
 
 
 def test_no_other_name_is_looked_for_in_the_studies():

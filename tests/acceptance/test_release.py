@@ -9,10 +9,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from test_docs import test_page as run_page
 
 import eip_scipy
-from eip_scipy.core.moved import REMOVED_IN
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted(path for folder in ("eip_scipy", "integrations", "studies") for path in (ROOT / folder).rglob("*.py"))
@@ -65,19 +63,6 @@ def test_configuration(capsys):
     assert all(name in text for name in (found["engine"]["build"], found["engine"]["compiler"], *found["extras"]))
     with pytest.raises(ValueError, match=r"mode must be 'stdout' or 'dicts', got 'json'\."):
         eip_scipy.show_config("json")
-
-
-@pytest.mark.parametrize("minor", ["0.2", "0.3"])
-def test_the_pages_on_what_changed(minor, capsys, tmp_path, monkeypatch):
-    run_page(f"docs/changes-{minor}.md", capsys, tmp_path, monkeypatch)
-    assert f"](changes-{minor}.md)" in (ROOT / "docs/index.md").read_text(encoding="utf-8")
-
-
-def test_moved_names_end_with_the_version_that_is_named():
-    """Version 0.4 must not have the table of moved names any more."""
-    here, end = (tuple(map(int, version.split(".")[:2])) for version in (eip_scipy.__version__, REMOVED_IN))
-    assert here == (end[0], end[1] - 1)
-    assert (ROOT / f"docs/changes-{here[0]}.{here[1]}.md").exists()
 
 
 def test_wheels_are_listed(monkeypatch):
