@@ -14,7 +14,6 @@ import eip_scipy
 from eip_scipy import (
     EIPDOP853,
     EIPGJ12,
-    EIPGJ14,
     EIPRK4,
     EIPRKN8,
     EIPRKN12,
