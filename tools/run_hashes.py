@@ -230,7 +230,7 @@ def fields() -> Iterator[tuple[str, Run]]:
     x, y = grid.mesh()
     psi = (np.exp(-(x**2 + y**2) / 2) * (1 + 0.3 * x + 0.2j * y)).astype(complex)
     for label, chosen in (("at rest", {}), ("rotating", {"Omega": 0.6}), ("zero", {"Omega": 0.3, "nyquist": "zero"})):
-        gpe = library.GrossPitaevskii(grid, library.harmonic_trap(1.0, 1.2), beta=2.0, **chosen)
+        gpe = library.GrossPitaevskii(grid, lambda x, y: 0.5 * (x**2 + 1.2**2 * y**2), beta=2.0, **chosen)
         for name in ("EIPRK4", "EIPDOP853"):
             yield (
                 f"condensate {label} {name}",

@@ -364,7 +364,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
             f"components from {variations.columns.n} on are derivatives, which overflow in long chaotic runs: shorten "
             "the interval, or use megno or lyapunov_spectrum, which rescale them"
         )
-        spec = spec._replace(columns=variations.columns, fun=None, left_out=hint)
+        spec = spec._replace(columns=variations.columns, left_out=hint)
     run = spec.build(y0, check_start=check_start)
     schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)
