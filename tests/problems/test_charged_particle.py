@@ -1,7 +1,6 @@
-"""Charged particles: fields against the paper's formulas in 30 digits, invariants, observables, user-defined fields."""
+"""Charged particles: fields against the paper's formulas in 30 digits, invariants, user-defined fields."""
 
 import math
-import re
 from dataclasses import replace
 
 import mpmath as mp
@@ -12,7 +11,6 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, Invariant, check_gradient, integrate
 from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle, tokamak, uniform_field
-from eip_scipy.problems.particle_orbits import ParticleOrbit, radial_range
 
 POINTS = [(1.05, 0.0, 0.0), (0.3, -0.9, 0.07), (-0.8, 0.7, -0.2), (1.3, 0.2, 0.5)]
 
@@ -156,7 +154,7 @@ def test_orientation_of_the_axes_does_not_matter():
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
 
 
-# --- observables ---
+# --- user-defined fields ---
 
 
 @njit
@@ -172,111 +170,6 @@ def constant_b(x, y, z):
 @njit
 def constant_e(x, y, z):
     return 0.0, 0.3, 0.0
-
-
-@njit
-def slope_phi(x, y, z):
-    return -0.3 * y
-
-
-@pytest.mark.parametrize("charge", [3.0, pytest.param(-3.0, marks=[pytest.mark.nightly, pytest.mark.slow])])
-def test_gyration_in_a_constant_field(charge):
-    """B = 2 e_z, m = 1.5: frequency |q| B / m, radius m v / (|q| B), and the E x B drift (0.15, 0, 0)."""
-    field = ParticleField(vector_potential=constant_a, magnetic=constant_b, electric=constant_e, potential=slope_phi)
-    mass, v = 1.5, np.array([0.15 + 0.4, 0.0, 0.25])
-    problem = charged_particle(field, [0.5, 1.0, 0.0], v, mass=mass, charge=charge, t_span=(0.0, 10.0), h=0.01)
-    run = integrate(problem, method=EIPRK4, save_every=1)
-    orbit = ParticleOrbit(problem, run.t, run.y)
-    omega = abs(charge) * 2.0 / mass
-    assert orbit.gyrofrequency == pytest.approx(omega)
-    np.testing.assert_allclose(orbit.gyroradius, 0.4 / omega, rtol=1e-7)
-    np.testing.assert_allclose(orbit.magnetic_moment, 0.5 * mass * 0.4**2 / 2.0, rtol=1e-7)
-    np.testing.assert_allclose(orbit.parallel_velocity, 0.25, rtol=1e-7)
-    np.testing.assert_allclose(orbit.v[:, -1], problem.velocity(run.y)[:, -1])
-    # Guiding centre: drifts with 0.15 along x and 0.25 along z; averaged, its gyration is gone.
-    drift = np.diff(orbit.averaged(orbit.guiding_centre)[:, [0, -1]], axis=1)[:, 0]
-    expected = np.array([0.15, 0.0, 0.25]) * (orbit.averaged(run.t)[-1] - orbit.averaged(run.t)[0])
-    np.testing.assert_allclose(drift, expected, atol=2e-4)
-    np.testing.assert_allclose(orbit.energy, problem.invariants[0].fun(0.0, problem.y0, problem.params), rtol=1e-11)
-    # Clockwise for a positive charge, seen along B; relative to the direction away from the axis.
-    angle = orbit.gyrophase + np.unwrap(np.arctan2(run.y[1], run.y[0]))
-    np.testing.assert_allclose(angle - angle[0], -np.sign(charge) * omega * run.t, atol=1e-5)
-
-
-def test_gyrophase_of_a_particle_that_starts_on_the_axis():
-    # The directions x there, and away from the axis afterwards, are those of one motion as long as that goes along x.
-    field = ParticleField(vector_potential=constant_a, magnetic=constant_b)
-    problem = charged_particle(field, [0.0, 0.0, 0.0], [1.0, 0.0, 0.5], t_span=(0.0, 0.01), h=0.001)
-    run = integrate(problem, method=EIPRK4, save_every=1)
-    phase = ParticleOrbit(problem, run.t, run.y).gyrophase
-    turned = np.arctan2(run.y[1, 1:], run.y[0, 1:])
-    np.testing.assert_allclose(phase[1:] + turned, phase[0] - 2.0 * run.t[1:], atol=1e-9)
-
-
-def test_drifting_gyration_in_the_papers_field():
-    problem = uniform_field(t_end=2700 * math.pi / 10)
-    run = integrate(problem, method=EIPDOP853, save_every=1)
-    orbit = ParticleOrbit(problem, run.t, run.y)
-    # Drift of the guiding centre at R = 1.1: E / B = 1e-2 / R^2, an angle of t 1e-2 / R^3, 2 % less by the gyroradius.
-    assert orbit.guiding_angle[-1] - orbit.guiding_angle[0] == pytest.approx(-run.t[-1] * 1e-2 / 1.1**3, rel=0.02)
-    assert radial_range(orbit, 1.0) == pytest.approx(0.10954, abs=1e-5)
-    assert math.isnan(radial_range(orbit, 2.0))
-    assert orbit.turns()[-1] == pytest.approx(1.0043, abs=0.001)
-    np.testing.assert_allclose(orbit.momentum, orbit.momentum[0], rtol=1e-11)
-
-
-def test_banana_tip():
-    """The first tip is found at 0.1 of the paper's interval, by a method of order 8."""
-    problem = tokamak("banana", t_end=16_000)
-    run = integrate(problem, method=EIPDOP853, h=2 * problem.h, save_every=1)
-    orbit = ParticleOrbit(problem, run.t, run.y)
-    tips = orbit.banana_tips()
-    np.testing.assert_allclose(tips.R, [1.00953], atol=2e-5)
-    k = int(np.searchsorted(run.t, tips.t[0]))
-    assert abs(orbit.parallel_velocity[k]) < 0.01 * np.abs(orbit.parallel_velocity).max()
-    assert tips.z[0] == pytest.approx(orbit.guiding_centre[2, k], abs=1e-5)
-
-
-def test_poloidal_turns_of_the_transit_orbit():
-    problem = tokamak("transit", t_end=60_000)
-    run = integrate(problem, method=EIPDOP853, h=2 * problem.h, save_every=1)
-    orbit = ParticleOrbit(problem, run.t, run.y)
-    parts = list(orbit.poloidal_turns())
-    assert len(parts) == 2
-    assert parts[0].stop == parts[1].start
-    for part in parts:
-        assert orbit.z[part].max() == pytest.approx(0.0614, abs=2e-4)
-        assert orbit.z[part].min() == pytest.approx(-0.0614, abs=2e-4)
-        assert orbit.R[part].max() - 1 < 0.06 < 1 - orbit.R[part].min()
-
-
-def test_averages_need_enough_states():
-    problem = tokamak(t_end=200.0)
-    run = integrate(problem, method=EIPRK4, save_every=10)
-    with pytest.raises(ValueError, match="Save more often"):
-        ParticleOrbit(problem, run.t, run.y).averaged(run.t)
-
-
-def test_averages_take_out_what_has_the_gyrations_period():
-    problem = uniform_field(t_end=10.0)
-    t = np.arange(100) * math.pi / 10
-    orbit = ParticleOrbit(problem, t, np.tile(problem.y0[:, None], 100))
-    np.testing.assert_allclose(orbit.averaged(3.0 + np.cos(t)), 3.0, rtol=1e-13)
-    np.testing.assert_allclose(orbit.averaged(t), t[:81] + 9.5 * math.pi / 10, rtol=1e-13)
-    backward = ParticleOrbit(problem, -t, orbit.y)
-    np.testing.assert_allclose(backward.averaged(3.0 + np.cos(t)), 3.0, rtol=1e-13)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_averages_weigh_states_by_the_spacing_of_their_times(seed):
-    """The mean of a cosine over its period is 0, whatever the times."""
-    problem = uniform_field(t_end=10.0)
-    t = np.sort(np.random.default_rng(seed).uniform(0, 20 * math.pi, 1600))
-    orbit = ParticleOrbit(problem, t, np.tile(problem.y0[:, None], t.size))
-    assert np.abs(orbit.averaged(np.cos(t))).max() < 4e-3
-
-
-# --- user-defined fields ---
 
 
 @njit
@@ -399,76 +292,6 @@ def test_differences_take_the_fields_length():
     assert jacobian[0, 2] == pytest.approx(x[1] / small * math.sin(0.5), rel=1e-11)
 
 
-def start_of_differences(field, position):
-    return charged_particle(field, position, [0.0, 0.1, 0.0], t_span=(0.0, 1.0))
-
-
-def wiggler(x, y, z):
-    return 0.0, math.sin(100 * x) / 100, 0.0
-
-
-def narrow(x, y, z):
-    """Return a vector potential that underflows to 0 within the default step."""
-    around = math.exp(-(x * x + y * y) / 1e-12)
-    return -around * y, around * x, 0.0
-
-
-@pytest.mark.parametrize("form", ["canonical", "velocity"])
-def test_a_length_that_does_not_fit_is_told(form):
-    """In SI units at 1 au the default step is lost in rounding; the length in the warning gives the exact helix."""
-    place, B, charge, mass, speed = 1.5e11, 5e-9, 1.602e-19, 1.6726e-27, 3e7
-    omega = charge * B / mass
-    field = ParticleField(lambda x, y, z: (-B * y / 2, B * x / 2, 0.0), axisymmetric=True)
-    end = 20 * 2 * math.pi / omega
-    start, velocity = [place, 0, 0], [0, 0.8 * speed, 0.6 * speed]
-    options = {"t_span": (0.0, end), "h": end / 1200, "mass": mass, "charge": charge, "form": form}
-    with pytest.warns(UserWarning, match="length=1 does not fit the field at .* relative error of 0.00") as told:
-        charged_particle(field, start, velocity, **options)
-    assert len(told) == 1
-    assert told[0].filename == __file__
-    named = float(re.search(r"set length=(\S+) ", str(told[0].message))[1])
-    problem = charged_particle(replace(field, length=named), start, velocity, **options)
-    run = integrate(problem, method=EIPDOP853)
-    exact = [place, 0.0, 0.6 * speed * end]
-    np.testing.assert_allclose(run.y[:3, -1], exact, rtol=0, atol=1e-5 * 0.8 * speed / omega)
-    assert run.max_defect[0] < 1e-10 * abs(run.target[0])
-
-
-@pytest.mark.parametrize(
-    ("field", "position", "words"),
-    [
-        (ParticleField(wiggler), [1e-3, 0.0, 0.0], "vector_potential .* give jacobian or magnetic"),
-        (ParticleField(narrow), [1e-7, 1e-7, 0.0], "vector_potential have a relative error of 1,"),
-        (ParticleField(constant_a), [1e17, 1.0, 0.0], "vector_potential have a relative error of 1,"),
-        (
-            ParticleField(constant_a, potential=lambda x, y, z: math.sin(80 * x)),
-            [1.0, 0.0, 0.0],
-            "potential .* give electric",
-        ),
-    ],
-)
-def test_lengths_too_long_or_too_short(field, position, words):
-    with pytest.warns(UserWarning, match=words) as told:
-        start_of_differences(field, position)
-    named = float(re.search(r"set length=(\S+) ", str(told[0].message))[1])
-    assert start_of_differences(replace(field, length=named), position).invariants
-
-
-@pytest.mark.parametrize(
-    ("vector_potential", "position"),
-    [
-        (constant_a, [1e6, 2e5, -3e5]),
-        (lambda x, y, z: (1.0, 2.0, 3.0), [1.0, 2.0, 3.0]),  # no field
-        (lambda x, y, z: (2 * x * y, x * x, 0.0), [1.1, 0.2, 0.3]),  # no field
-        (lambda x, y, z: (0.0, 0.0, x * x - y * y), [0.0, 1e-12, 0.0]),  # almost none where the particle starts
-        (lambda x, y, z: (-math.log(math.cosh(z)), 1e3, 0.0), [0.0, 0.0, 1e-9]),
-        (lambda x, y, z: (y * math.sqrt(x), 0.0, 0.0), [0.03, 1.0, 0.0]),  # defined in a half of space only
-    ],
-)
-def test_a_length_that_fits_is_not_told(vector_potential, position):
-    assert start_of_differences(ParticleField(vector_potential), position).invariants
-
-
 @pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
 def test_a_wrong_claim_of_symmetry_is_seen():
     field = ParticleField(lambda x, y, z: (-y, x * (1 + 0.1 * x), 0.0), axisymmetric=True)
@@ -551,72 +374,6 @@ def start(field=UNIFORM, position=(1.0, 0, 0), velocity=(0, 0.1, 0), **options):
 def test_bad_input(call, error, words):
     with pytest.raises(error, match=words):
         call()
-
-
-def dipole(x, y, z):
-    r2 = x * x + y * y + z * z
-    return 3 * x * z / r2**2.5, 3 * y * z / r2**2.5, (3 * z * z - r2) / r2**2.5
-
-
-def wire(x, y, z):
-    return -y / (x * x + y * y), x / (x * x + y * y), 0.0
-
-
-def ripple(x, y, z):
-    """Return a field that changes over 1/30 of the default length."""
-    return math.sin(200 * x) * math.cos(200 * y), -math.cos(200 * x) * math.sin(200 * y), 1e3
-
-
-def nothing(x, y, z):
-    return 0.0, 0.0, 0.0
-
-
-@pytest.mark.parametrize("place", [0.1, 1.0, 1e6])
-@pytest.mark.parametrize("field", [dipole, wire, ripple, nothing, mirror_b, constant_b, TOKAMAK.magnetic])
-@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e12])
-def test_a_field_without_divergence_passes(field, place, scale):
-    position = place * np.array([0.6, 0.5, -0.4])
-    scaled = ParticleField(magnetic=lambda x, y, z: tuple(scale * b for b in field(x, y, z)))
-    assert start(field=scaled, position=position, form="velocity").invariants
-
-
-@pytest.mark.parametrize(
-    "field",
-    [
-        lambda x, y, z: (x, 0.0, 0.0),
-        lambda x, y, z: (0.0, 0.0, 1 + z * z),  # none at z = 0, where the particle starts
-        lambda x, y, z: (0.0, 0.0, 5e4 + 1e-3 * z),
-        lambda x, y, z: tuple(b + x for b in dipole(x, y, z)),
-    ],
-)
-def test_a_field_with_a_divergence_is_refused(field):
-    with pytest.raises(ValueError, match=r"divergence of magnetic is -?[\d.e-]+ at \[.*, where its largest derivative"):
-        start(field=ParticleField(magnetic=field), form="velocity")
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        (lambda x, y, z: (1e-4 * x - x * z, -y * z, 1 + z * z), r"0\.0001"),
-        (lambda x, y, z: (x * z, y * z, 1 + z * z), r"0\.0\d+"),  # small relative to dB_x/dz where the particle starts
-    ],
-)
-def test_a_small_divergence_is_told(field, value):
-    """The field is given as by a table; the run continues, because the energy is kept all the same."""
-    with pytest.warns(UserWarning, match=f"divergence of magnetic is {value} at") as told:
-        start(field=ParticleField(magnetic=field), form="velocity")
-    assert len(told) == 1
-
-
-def test_energy_and_momentum_need_their_potentials():
-    field = ParticleField(magnetic=mirror_b, electric=well_force)
-    problem = start(field=field, form="velocity", h=0.1)
-    run = integrate(problem, method=EIPRK4, save_every=1)
-    orbit = ParticleOrbit(problem, run.t, run.y)
-    with pytest.raises(ValueError, match="potential"):
-        _ = orbit.energy
-    with pytest.raises(ValueError, match="vector_potential"):
-        _ = orbit.momentum
 
 
 @pytest.mark.slow
@@ -721,15 +478,6 @@ def test_the_total_energy_keeps_a_place():
         for kept in ((), (*problem.invariants, along))
     ]
     assert 20 * errors[1] < errors[0]
-
-
-def test_observables_of_a_field_that_varies():
-    problem = moving(ring(potential=ring_phi), "energy")
-    run = integrate(problem, method=EIPDOP853, save_every=1)
-    orbit = ParticleOrbit(problem, run.t, run.y)
-    np.testing.assert_allclose(orbit.gyrofrequency, 0.7 / 1.5 * (1 + 1e-4 * run.t) * (1 + orbit.R**2), rtol=1e-14)
-    np.testing.assert_allclose(orbit.momentum, orbit.momentum[0], rtol=1e-6)
-    assert 1e-6 < np.ptp(orbit.energy) < 1e-2
 
 
 @pytest.mark.parametrize(

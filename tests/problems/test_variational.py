@@ -1,6 +1,5 @@
 """Variational equations of problems: against differences of order 8 of their right-hand sides, at random states."""
 
-import math
 import pickle
 
 import numpy as np
@@ -10,7 +9,7 @@ from numba import njit
 from eip_scipy import EIPDOP853, equations, hamiltonian, integrate
 from eip_scipy.core import jitted
 from eip_scipy.engine.native import library
-from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle, harmonic, kepler, nbody
+from eip_scipy.problems import ParticleField, charged_particle, harmonic, kepler, nbody
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.symbolic import system
 
@@ -263,70 +262,7 @@ def test_columns_do_not_depend_on_each_other():
         np.testing.assert_array_equal(alone[60:], found)
 
 
-# --- charged particles ---
-
-
-def mirror(x, y, z):
-    """The vector potential of a magnetic mirror."""
-    return -0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0
-
-
-def mirror_jacobian(x, y, z):
-    return (0.0, -0.5 * (1 + z * z), -y * z), (0.5 * (1 + z * z), 0.0, x * z), (0.0, 0.0, 0.0)
-
-
-def well(x, y, z):
-    return 0.3 * math.exp(-x * x - 2 * y * y - z)
-
-
-def turning(t, x, y, z):
-    """A magnetic field that grows, as an array."""
-    return np.array([x * z * t, -y * z * t, 1.0 + 0.5 * t * (y * y - x * x)])
-
-
-def induced(t, x, y, z):
-    return 0.1 * y * math.cos(t), x * z, 0.2
-
-
-def table(x, y, z):
-    """Return a field of plain numbers: no dual numbers, no complex steps."""
-    return math.fsum((0.1, y * y)), math.fsum((0.2, x * z)), 1.0 + 0.2 * math.fsum((x, y)) ** 2
-
-
-FIELDS = {
-    "uniform": lambda jit: UNIFORM,
-    "tokamak": lambda jit: TOKAMAK,
-    "potentials": lambda jit: ParticleField(jit(mirror), potential=jit(well)),
-    "with jacobian": lambda jit: ParticleField(jit(mirror), jacobian=jit(mirror_jacobian)),
-    "varying": lambda jit: ParticleField(magnetic=jit(turning), electric=jit(induced), varies=True),
-    "numbers": lambda jit: ParticleField(magnetic=table),
-}
-FORMS = [(name, form) for name in FIELDS for form in ("canonical", "velocity") if name not in ("varying", "numbers")]
-FORMS += [("varying", "velocity"), ("numbers", "velocity")]
-INTERPRETED = [(*pair, False) for pair in FORMS[4:]]  # the first are compiled wherever Numba is
-GATE = [("varying", "velocity")]  # each compiles for seconds
-COMPILED = [
-    pytest.param(*pair, True, marks=[pytest.mark.needs_jit, pytest.mark.slow, *([] if pair in GATE else [NIGHTLY])])
-    for pair in FORMS[:-1]
-]
-
-
-@pytest.mark.filterwarnings("ignore:ParticleField. the divergence")
-@pytest.mark.parametrize(("name", "form", "compiled"), [*INTERPRETED, *COMPILED])
-def test_charged_particle(name, form, compiled):
-    field, rng = FIELDS[name](njit if compiled else lambda fun: fun), np.random.default_rng(6)
-    problem = charged_particle(
-        field, [0.6, -0.7, 0.3], [0.1, 0.2, -0.3], t_span=(0.2, 1.0), mass=1.3, charge=-0.8, form=form
-    )
-    assert jitted.is_jitted(problem.variational(())) == compiled
-    # Second differences, of A where its jacobian is computed, have fewer digits.
-    rtol = 1e-8 if name == "potentials" else RTOL
-    for parameters in ((), (0,), (1,), (1, 0)):
-        y = problem.y0 + rng.uniform(-0.1, 0.1, 6)
-        assert_variational(problem, y, rng, parameters, 3, 0.4, rtol)
-        assert_variational(problem, y, rng, parameters, 0 if parameters else 1, 0.4, rtol)
-    with pytest.raises(ValueError, match=r"its state, to parameter 0 \(the mass\) .*; got parameters=\(2,\)"):
-        problem.variational((2,))
+# --- charged particles, by dual numbers ---
 
 
 @pytest.mark.needs_jit

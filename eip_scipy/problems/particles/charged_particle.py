@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from importlib.resources import files
 from math import inf, pi
 from typing import Any
@@ -19,7 +19,7 @@ from ...core.balances import Balance
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
-from ._equations import CHARGE, MASS, ParticleEquations, compose, variational
+from ._equations import CHARGE, MASS, ParticleEquations, compose
 from .fields import TOKAMAK, UNIFORM, ParticleField
 
 __all__ = ["ORBITS", "ParticleProblem", "charged_particle", "tokamak", "uniform_field"]
@@ -134,7 +134,7 @@ def charged_particle(
     ValueError
         If the form is unknown, or canonical for a field without A; if the start or a function of the field is not
         finite; if the mass is not positive or the charge is 0; if functions of the field contradict each other at the
-        start, or the magnetic field has a divergence there.
+        start.
 
     Notes
     -----
@@ -192,21 +192,9 @@ def charged_particle(
         units=units,
         source=source,
         reference=reference,
-        variational=partial(_variational, equations.rhs, field, form, (float(t_span[0]), *x.tolist())),
         field=field,
         form=form,
     )
-
-
-@lru_cache(maxsize=32)
-def _variational(
-    rhs: Callable[..., None],
-    field: ParticleField,
-    form: str,
-    start: tuple[float, ...],
-    parameters: tuple[int, ...],
-) -> Callable[..., None]:
-    return variational(rhs, field.functions, form, field.length, start, parameters)
 
 
 def _invariants(

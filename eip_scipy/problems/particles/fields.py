@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf, isfinite, log, log2, nan, sqrt
+from math import isfinite, log, log2, sqrt
 from typing import Any
 
 import numpy as np
@@ -30,16 +28,6 @@ __all__ = ["TOKAMAK", "UNIFORM", "ParticleField"]
 DIFFERENCE_STEP = 2.0**-7  # step of differences, in units of `length`
 AGREEMENT = 1e-6  # largest relative difference of functions that must agree
 ROUND_OFF = 1e-10  # bound for the rounding of a difference whose true value is 0
-TINY = 1e-300
-# Largest divergence of B relative to its largest derivative. Above AGREEMENT there is only a warning, because B may be
-# interpolated in a table.
-NO_FIELD = 0.1
-FINER = (1.0, 0.25, 0.0625)  # steps of the differences, in units of the usual step
-ACCURATE, FITTING = 1e-7, 1e-12  # relative errors of differences: largest one without a warning, and the one aimed at
-# Lengths that are tried if the given one does not fit, in units of that one, the nearest first.
-LENGTHS = tuple(4.0**k for size in range(1, 31) for k in (size, -size))
-# Further points, in steps from the start: a field may be correct at one point by symmetry.
-NEAR = ((0.0, 0.0, 0.0), (2.9, -1.7, 1.3), (-2.3, 2.1, 2.7), (1.1, 3.1, -2.2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,13 +160,7 @@ class ParticleField:
         ------
         ValueError
             If a function does not return the right number of finite real numbers, the jacobian is not that of A, B is
-            not curl A or E is not -grad phi there, or B has a divergence there or nearby.
-
-        Warns
-        -----
-        UserWarning
-            If B has a small divergence, as one that is interpolated in a table may have, or `length` does not fit the
-            field there, so that B or E, computed by differences, is not accurate.
+            not curl A or E is not -grad phi there.
         """
         step, where = self._step, (t, *position)
         found = {key: self._value(key, shape, where) for key, shape in SHAPES.items() if getattr(self, key)}
@@ -192,67 +174,6 @@ class ParticleField:
             truth = np.array(difference_force(self._plain("potential"), step)(*where))
             slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * abs(found["potential"]) / self.length
             _compare("electric", found.get("electric"), truth, slack, "minus the gradient of potential")
-        if self.magnetic is not None:
-            self._check_divergence(position, t)
-        elif self.jacobian is None:
-            self._check_length("vector_potential", difference_jacobian, position, t)
-        if self.potential is not None and self.electric is None:
-            self._check_length("potential", difference_force, position, t)
-
-    def _check_length(
-        self, key: str, differences: Callable[..., Callable[..., Any]], position: np.ndarray, t: float
-    ) -> None:
-        fun = self._plain(key)
-
-        def error(length: float) -> float:
-            return _difference_error(lambda step: differences(fun, step), position, t, _difference_step(length))
-
-        found = error(self.length)
-        if not found > ACCURATE:
-            return
-        best, fitting = found, self.length
-        for factor in LENGTHS:
-            tried = error(factor * self.length)
-            if tried < best:
-                best, fitting = tried, factor * self.length
-            if best <= FITTING:
-                break
-        if not isfinite(best):
-            return  # the function is constant everywhere
-        needed = "jacobian or magnetic" if key == "vector_potential" else "electric"
-        better = f"set length={fitting:.3g} (relative error {best:.1g}), or " if fitting != self.length else ""
-        warnings.warn(
-            f"ParticleField: length={self.length:g} does not fit the field at {position}: differences of {key} have a "
-            f"relative error of {min(found, 1.0):.2g}, where at most {ACCURATE:g} was expected; {better}give {needed}.",
-            stacklevel=4,
-        )
-
-    def _check_divergence(self, position: np.ndarray, t: float) -> None:
-        points = [position + self._step * np.array(near) for near in NEAR]
-        share, divergence, largest, point = max((*self._divergence(point, t), tuple(point)) for point in points)
-        if not share > AGREEMENT:
-            return
-        said = (
-            f"ParticleField: the divergence of magnetic is {divergence:.3g} at {np.array(point)}, where its largest "
-            f"derivative is {largest:.3g}; a magnetic field has no divergence."
-        )
-        if share > NO_FIELD:
-            raise ValueError(f"{said} Correct it (or `length`, if the field changes over shorter distances).")
-        warnings.warn(said, stacklevel=4)
-
-    def _divergence(self, point: np.ndarray, t: float) -> tuple[float, float, float]:
-        """Return the divergence of B relative to its largest derivative, the divergence, and that derivative.
-
-        The best of several steps is returned, because errors of differences only increase the divergence.
-        """
-        B = self._plain("magnetic")
-        slack = ROUND_OFF * float(np.abs(B(t, *point)).max()) / self.length
-        found = []
-        for finer in FINER:
-            slopes = np.array(difference_jacobian(B, finer * self._step)(t, *point))
-            divergence, largest = float(np.trace(slopes)), float(np.abs(slopes).max())
-            found.append(((abs(divergence) - slack) / max(largest, slack, TINY), divergence, largest))
-        return min(found)
 
     def _value(self, key: str, shape: tuple[int, ...], where: tuple[float, ...]) -> np.ndarray:
         value = np.asarray(self._plain(key)(*where))
@@ -291,36 +212,6 @@ SHAPES = {"vector_potential": (3,), "jacobian": (3, 3), "potential": (), "electr
 def _difference_step(length: float) -> float:
     """Return the shift of the differences, a power of two, so that adding it causes almost no rounding."""
     return float(2.0 ** round(log2(DIFFERENCE_STEP * length)))
-
-
-def _difference_error(
-    slopes: Callable[[float], Callable[..., Any]], position: np.ndarray, t: float, step: float
-) -> float:
-    """Return the error of differences with a step near a position, relative to the largest derivative.
-
-    The result is inf if the differences are 0, or the step is lost in the rounding of the position, and nan if the
-    function cannot be evaluated. A smaller step shows an error from truncation, and a larger step exaggerates it; an
-    error from rounding is the other way round. The smaller of the two disagreements is the error.
-    """
-    points = [position + step * np.array(near) for near in NEAR]
-
-    def along(factor: float) -> np.ndarray:
-        values = slopes(factor * step)
-        return np.array([values(t, *point) for point in points])
-
-    if step < np.spacing(np.abs(position).max()):
-        return inf
-    error = nan
-    # The function may be defined only in a part of space, which the larger steps leave.
-    with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, LookupError):
-        usual = along(1.0)
-        largest = float(np.abs(usual).max())
-        if largest == 0:
-            return inf
-        error = float(np.abs(along(0.25) - usual).max()) / largest
-        if error > FITTING:
-            error = min(error, float(np.abs(along(4.0) - usual).max()) / largest)
-    return error
 
 
 def _compare(key: str, given: np.ndarray | None, expected: np.ndarray, slack: float, what: str) -> None:

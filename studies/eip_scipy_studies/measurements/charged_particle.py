@@ -25,9 +25,9 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, integrate
 from eip_scipy.problems import ParticleProblem, tokamak
-from eip_scipy.problems.particle_orbits import ParticleOrbit
 
 from ..comparators import boris, implicit_midpoint
+from ..particles.orbits import ParticleOrbit
 from ..particles.runs import SCENES, scene
 from ..report import compact, describe_machine, needed, table
 from ..study import Figures, Measurement, Rows, Session, option

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.problems.particle_orbits import ParticleOrbit
-
 from ..report import compact, table
 from ..study import Check
+from .orbits import ParticleOrbit
 from .runs import PAPER_METHODS, ParticleRun, ParticleStudy
 
 CURVE_POINTS = 40_000  # largest number of points, approximately, of an orbit's curve in a figure

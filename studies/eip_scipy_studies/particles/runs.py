@@ -11,12 +11,12 @@ import numpy as np
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, integrate
 from eip_scipy.problems import ParticleProblem, tokamak, uniform_field
-from eip_scipy.problems.particle_orbits import ParticleOrbit, radial_range
 from eip_scipy.problems.particles.charged_particle import ORBITS
 from eip_scipy.solvers import EIPSolver
 
 from ..comparators import boris, implicit_midpoint
 from ..long_runs import named
+from .orbits import ParticleOrbit, radial_range
 
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False}
 REFINEMENT = 4  # number of steps of the reference in one step
@@ -179,7 +179,7 @@ def _uniform_numbers(found: ParticleStudy, line: ParticleRun) -> dict[str, float
 def _tokamak_numbers(found: ParticleStudy, line: ParticleRun) -> dict[str, float]:
     orbit, truth = line.orbit, found.reference.orbit
     parts = list(truth.poloidal_turns())
-    tips = orbit.banana_tips().R
+    tips = orbit.bounce_points()
     off = [abs(a - b) for part in parts for a, b in zip(_extrema(orbit, part), _extrema(truth, part), strict=True)]
     moments = [orbit.magnetic_moment[part].mean() for part in parts]
     return {
