@@ -1,4 +1,4 @@
-"""Tangent maps against closed forms, complex steps and REBOUND; exponents, MEGNO, periodic orbits, fits."""
+"""Tangent maps against closed forms, complex steps and REBOUND; exponents and MEGNO."""
 
 import ctypes
 from functools import lru_cache
@@ -8,12 +8,11 @@ import pytest
 import sympy
 from c_compiler import shared_library
 from numba import njit
-from scipy.optimize import least_squares
 
 from eip_scipy import EIPDOP853, EIPRK4, equations, hamiltonian, integrate
 from eip_scipy.problems import ForceConstants, harmonic, nbody
 from eip_scipy.problems import kepler as kepler_problem
-from eip_scipy.tangent_maps import TrajectoryFit, lyapunov_spectrum, megno, periodic_orbit
+from eip_scipy.tangent_maps import lyapunov_spectrum, megno
 
 pytestmark = pytest.mark.needs_jit
 
@@ -555,201 +554,6 @@ def test_megno_of_planets_is_that_of_rebound(a, regular):
         assert run.lyapunov == pytest.approx(2 * slope, rel=0.5)
 
 
-# Periodic orbits.
-
-MU = 0.01215058560962404
-TO_EARTH, TO_MOON = "sqrt((x + mu)**2 + y**2 + z**2)", "sqrt((x - 1 + mu)**2 + y**2 + z**2)"
-HALO, LYAPUNOV = [0.8234, 0.0, 0.0224, 0.0, 0.1343, 0.0], [0.8189, 0.0, 0.0, 0.0, 0.1749, 0.0]
-MIRROR = [1, -1, 1, -1, 1, -1]
-
-
-@pytest.fixture(scope="module", params=["equations", "hamiltonian"])
-def three_bodies(request):
-    """The restricted problem, and the momenta's part of a start."""
-    if request.param == "hamiltonian":
-        H = f"(px**2 + py**2 + pz**2)/2 + px*y - py*x - (1 - mu)/{TO_EARTH} - mu/{TO_MOON}"
-        return hamiltonian(H, q="x y z", p="px py pz", params={"mu": MU}), lambda y: np.array([0, 0, 0, -y[1], y[0], 0])
-    symbols = {item: sympy.Symbol(item) for item in ("x", "y", "z", "mu")}
-    U = sympy.sympify(f"(x**2 + y**2)/2 + (1 - mu)/{TO_EARTH} + mu/{TO_MOON}", locals=symbols)
-    rates = {"x": "vx", "y": "vy", "z": "vz"}
-    rates |= {f"v{item}": str(sympy.diff(U, symbols[item])) + more
-              for item, more in (("x", " + 2*vy"), ("y", " - 2*vx"), ("z", ""))}  # fmt: skip
-    jacobi = {"C": f"2*({U}) - vx**2 - vy**2 - vz**2"}
-    return equations(rates, params={"mu": MU}, invariants=jacobi), lambda y: np.zeros(6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("symmetry", [None, MIRROR])
-@pytest.mark.parametrize(("guess", "period", "fixed"), [(HALO, 2.743, "z"), (LYAPUNOV, 2.78, "x")])
-def test_orbits_of_the_restricted_problem(three_bodies, guess, period, fixed, symmetry):
-    problem, momenta = three_bodies
-    orbit = periodic_orbit(problem, guess + momenta(guess), period, fixed=[fixed], symmetry=symmetry,
-                           method=EIPDOP853, h=0.01)  # fmt: skip
-    assert orbit.success, orbit.message
-    assert orbit.closure < 1e-11
-    assert orbit.flow_residual < 1e-11
-    assert orbit.invariant_residual < 1e-11
-    pairs = orbit.multipliers.reshape(3, 2)
-    unit = np.abs(pairs - 1).max(axis=1).argmin()
-    assert np.abs(pairs[unit] - 1).max() < 1e-5  # a Jordan block: the root of rounding
-    assert np.abs(pairs.prod(axis=1) - 1).max() < 1e-8
-    assert 1900 < abs(pairs[0, 0]) < 2300
-
-
-def test_orbit_with_a_given_period(pendulum):
-    """The half-angle formula of the pendulum's period, by the arithmetic-geometric mean."""
-    orbit = periodic_orbit(pendulum, [1.0, 0.0], 7.0, fixed=["p", "period"], method=EIPDOP853, h=0.05)
-    assert orbit.success
-    assert orbit.period == 7.0
-    a, b = 1.0, np.cos(orbit.y0[0] / 2)
-    for _ in range(6):
-        a, b = (a + b) / 2, np.sqrt(a * b)
-    assert 2 * np.pi / a == pytest.approx(7.0, abs=1e-9)
-    assert np.abs(orbit.multipliers - 1).max() < 1e-5
-
-
-def test_limit_cycle():
-    """A multiplier other than 1 is exp of the integral of the divergence; they come in no pairs."""
-
-    def van_der_pol(t, y):
-        return np.array([y[1], 0.5 * (1 - y[0] ** 2) * y[1] - y[0]])
-
-    orbit = periodic_orbit(van_der_pol, [2.0, 0.1], 6.0, method=EIPDOP853, rtol=1e-12, atol=1e-12)
-    assert orbit.success
-    assert orbit.closure < 1e-10
-    assert orbit.multipliers[0] == pytest.approx(1.0, abs=1e-9)
-    fine = integrate(van_der_pol, (0, orbit.period), orbit.y0, method=EIPDOP853, h=orbit.period / 400, save_every=1)
-    divergence = np.mean(0.5 * (1 - fine.y[0, :-1] ** 2)) * orbit.period
-    assert orbit.multipliers[1] == pytest.approx(np.exp(divergence), rel=1e-8)
-    assert np.isnan(orbit.invariant_residual)
-
-
-def test_no_orbit():
-    orbit = periodic_orbit(lambda t, y: np.ones(2), [1.0, 0.0], 1.0, fixed=["period"], method=EIPRK4, h=0.1)
-    assert not orbit.success
-    assert "closes" not in orbit.message
-
-
-DOP = {"method": EIPDOP853, "h": 0.05}
-
-
-def test_a_period_that_shrinks_to_0_is_a_failure(pendulum):
-    """The rotating pendulum does not close, and after no time everything does."""
-    orbit = periodic_orbit(pendulum, [0.0, 3.0], 2.4, **DOP)
-    assert orbit.period < 1e-10
-    assert not orbit.success
-    assert "the period shrank from 2.4 to" in orbit.message
-
-
-@pytest.mark.parametrize(
-    ("y0", "options"), [([3.1, 0.1], {}), ([3.0, 0.0], {"symmetry": [1, -1]}), ([0.0, 0.0], {})], ids=str
-)
-def test_an_equilibrium_is_a_failure(pendulum, y0, options):
-    orbit = periodic_orbit(pendulum, y0, 2.4, **options, **DOP)
-    assert abs(np.sin(orbit.y0[0])) < 1e-12
-    assert not orbit.success
-    assert "the corrections lead to an equilibrium" in orbit.message
-
-
-def test_small_orbits_far_from_0_are_orbits():
-    """The motion is 1e-8 of the size of the state."""
-    orbit = periodic_orbit(lambda t, y: np.array([y[1], -np.sin(y[0] - 1000)]), [1000 + 1e-5, 0.0], 6.3, fixed=[0],
-                           method=EIPDOP853, h=0.05)  # fmt: skip
-    assert orbit.success
-    assert orbit.period == pytest.approx(2 * np.pi, abs=1e-8)
-
-
-def forced(t, y):
-    return np.array([-y[0] + np.cos(t) + 1])
-
-
-def test_a_forced_system_needs_its_period():
-    with pytest.raises(ValueError, match=r'the equations depend on t, because fun differs .* and "period" in fixed'):
-        periodic_orbit(forced, [1.4], PERIOD, **DOP)
-    with pytest.raises(ValueError, match=r"period = 6 is not a period of the equations.*period of the forcing"):
-        periodic_orbit(forced, [1.4], 6.0, fixed=["period"], **DOP)
-    orbit = periodic_orbit(forced, [1.4], PERIOD, fixed=["period"], **DOP)
-    assert orbit.success
-    assert orbit.y0 == pytest.approx([1.5])
-
-
-def test_forces_that_jump_or_rest_at_the_start():
-    """sign(sin(t)) differs between 0 and the period as a float; a derivative of 0 at one time is not an equilibrium."""
-    jump = periodic_orbit(lambda t, y: np.array([-y[0] + np.sign(np.sin(t))]), [0.1], PERIOD, fixed=["period"],
-                          method=EIPRK4, h=0.05)  # fmt: skip
-    assert jump.success
-    rest = periodic_orbit(lambda t, y: np.array([np.sin(t)]), [1.0], PERIOD, fixed=["period"], **DOP)
-    assert rest.success
-    assert np.isnan(rest.flow_residual)
-
-
-# Fits.
-
-FINE = {"method": EIPDOP853, "rtol": 1e-11, "atol": 1e-11}
-
-
-@pytest.mark.slow
-def test_fit_of_an_orbit(kepler):
-    """Directions seen from another orbit; half of the evaluations of the run are saved at least."""
-    t = np.linspace(0.0, 12.0, 40)
-    truth = np.array([0.8, 0.1, -0.2, 1.15])
-    seen_from = 1.3 * np.array([np.cos(0.7 * t), np.sin(0.7 * t)])
-    places = dict(zip(t, seen_from.T, strict=True))
-
-    def direction(time, y):
-        d = y[:2] - places[time]
-        return d / np.hypot(*d)
-
-    def direction_slopes(time, y):
-        d = y[:2] - places[time]
-        turned = np.array([-d[1], d[0]])
-        return np.column_stack([np.outer(turned, turned) / np.hypot(*d) ** 3, np.zeros((2, 2))])
-
-    states = integrate(kepler, (0, 12), truth, t_eval=t, **FINE).y
-    data = np.array([direction(time, y) for time, y in zip(t, states.T, strict=True)]).T
-    fit = TrajectoryFit(kepler, t, data, y0=truth + 0.01, observe=(direction, direction_slopes), sigma=1e-6, **FINE)
-    by_jacobian = least_squares(fit.residuals, fit.x0, jac=fit.jacobian, x_scale="jac")
-    assert by_jacobian.x == pytest.approx(truth, abs=1e-9)
-    assert fit.evaluations == by_jacobian.nfev
-    differences = 5 * by_jacobian.njev + by_jacobian.nfev - by_jacobian.njev
-    assert fit.evaluations < 0.6 * differences
-    step = 1e-6
-    x = truth + 0.01
-    for k in range(4):
-        d = step * np.eye(4)[k]
-        slope = (fit.residuals(x + d) - fit.residuals(x - d)) / (2 * step)
-        assert fit.jacobian(x)[:, k] == pytest.approx(slope, rel=1e-5, abs=1e-5 * np.abs(slope).max())
-
-
-def test_fit_of_state_and_parameter(pendulum):
-    t = np.array([0.0, 0.5, 0.5, 1.5, 3.0])  # two of the data at one time
-    data = integrate(pendulum, (0, 3), [1.0, 0.2], params={"k": 1.3}, t_eval=np.unique(t), **FINE).y[:, [0, 1, 1, 2, 3]]
-    data[1, 2] = np.nan
-    fit = TrajectoryFit(pendulum, t, data, y0=[0.9, 0.0], free=["state", "k"], **FINE)
-    assert fit.x0 == pytest.approx([0.9, 0.0, 1.0])
-    found = least_squares(fit.residuals, fit.x0, jac=fit.jacobian)
-    assert found.x == pytest.approx([1.0, 0.2, 1.3], abs=1e-8)
-    assert found.fun.shape == (9,)
-    assert fit.evaluations == found.nfev
-    only = TrajectoryFit(pendulum, t, data[0], y0=[1.0, 0.2], free="k", observe="q", sigma=0.1, **FINE)
-    found = least_squares(only.residuals, only.x0, jac=only.jacobian)
-    assert found.x == pytest.approx([1.3], abs=1e-8)
-    earlier = TrajectoryFit(pendulum, t, data[0], y0=[1.0, 0.2], t0=-1.0, observe=[0], **FINE)
-    assert earlier.run(earlier.x0).t[0] == 0.0
-
-
-def test_fit_of_an_observable_that_returns_the_same_array_in_each_call(pendulum):
-    t, seen = np.linspace(0.0, 3.0, 7), np.empty(1)
-
-    def position(t, y):
-        seen[:] = y[0]
-        return seen
-
-    data = integrate(pendulum, (0, 3), [1.0, 0.2], t_eval=t, **FINE).y[0]
-    fit = TrajectoryFit(pendulum, t, data, y0=[1.0, 0.2], observe=(position, lambda t, y: np.eye(2)[:1]), **FINE)
-    np.testing.assert_array_equal(fit.residuals(fit.x0), np.zeros(7))
-
-
 # Bad input.
 
 
@@ -766,18 +570,6 @@ def test_fit_of_an_observable_that_returns_the_same_array_in_each_call(pendulum)
         (lambda p: megno(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, deviation="x"), ValueError, "deviation"),
         (lambda p: megno(p, (0, 1), [0, 1], metod=EIPRK4, h=0.1), TypeError, "did you mean"),
         (lambda p: megno(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, save_every=0), ValueError, "save_every"),
-        (lambda p: periodic_orbit(p, [0, 1], -1.0, method=EIPRK4, h=0.1), ValueError, "period"),
-        (lambda p: periodic_orbit(p, [0, 1], 1.0, fixed=["z"], method=EIPRK4, h=0.1), ValueError, "fixed"),
-        (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, 2], method=EIPRK4, h=0.1), ValueError, "signs"),
-        (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, -1], method=EIPRK4, h=0.1), ValueError, "symmetric"),
-        (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, 1], method=EIPRK4, h=0.1), ValueError, "sign -1"),
-        (lambda p: TrajectoryFit(p, [0, 1], np.ones((3, 2)), y0=[0, 1], **FINE), ValueError, "data"),
-        (lambda p: TrajectoryFit(p, [1, 0, 2], np.ones((2, 3)), y0=[0, 1], **FINE), ValueError, "must be in order"),
-        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], sigma=0, **FINE), ValueError, "sigma"),
-        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], free=["x"], **FINE), ValueError, "parameter"),
-        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], observe="r", **FINE), ValueError, "observe"),
-        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], observe=len, **FINE), TypeError, "Jacobian"),
-        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], **FINE).residuals([1.0]), ValueError, "x0"),
     ],
 )
 def test_bad_input(pendulum, call, error, words):
