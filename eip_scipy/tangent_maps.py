@@ -448,15 +448,15 @@ def _unit(deviation: Any, n: int) -> Array:
     """Return `deviation`, by default a random direction, as a column (n, 1) of length 1, after a check of its value."""
     if deviation is None:
         return _orthonormal(n, 1)
-    given = _numbers(deviation)
+    given = _numbers("deviation", deviation)
     if given.shape != (n,) or not np.isfinite(given).all() or not given.any():
         raise ValueError(f"deviation must be a finite vector of {n} numbers, not all 0, got {shown(deviation)}.")
     return (given / np.linalg.norm(given))[:, None]
 
 
-def _numbers(given: Any) -> Array:
+def _numbers(name: str, given: Any) -> Array:
     """Return a value as an array of floats, or an empty array if it does not consist of real numbers."""
-    found = reals(given)
+    found = reals(name, given)
     return np.zeros(0) if found is None else found
 
 
@@ -894,7 +894,7 @@ class TrajectoryFit:
 
 def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
     """Return the interval, the distinct times of the data, and for each column the index of its time among these."""
-    times = _numbers(t)
+    times = _numbers("t", t)
     if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all():
         raise ValueError(f"t must be a 1-D array of finite times, one for each column of data, got {shown(t)}.")
     if t0 is not None and not is_number(t0):
@@ -930,7 +930,7 @@ def _observed(observe: Any, names: Sequence[str]) -> tuple[Callable[..., Any], C
 
 
 def _data(data: Any, shape: tuple[int, int]) -> Array:
-    found = _numbers(data)
+    found = _numbers("data", data)
     if found.ndim == 1 and shape[0] == 1:
         found = found[None]
     if found.shape != shape or np.isinf(found).any() or np.isnan(found).all():
