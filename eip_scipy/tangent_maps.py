@@ -377,7 +377,7 @@ def _unit(deviation: Any, n: int) -> Array:
     """Return `deviation`, by default a random direction, as a column (n, 1) of length 1, after a check of its value."""
     if deviation is None:
         return _orthonormal(n, 1)
-    given = reals(deviation)
+    given = reals("deviation", deviation)
     if given is None or given.shape != (n,) or not np.isfinite(given).all() or not given.any():
         raise ValueError(f"deviation must be a finite vector of {n} numbers, not all 0, got {shown(deviation)}.")
     return (given / np.linalg.norm(given))[:, None]

@@ -29,7 +29,7 @@ from ..core.versions import VERSION, installed
 
 __all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_versions", "write"]
 
-FORMAT, SCHEMA = "eip_scipy checkpoint", 4
+FORMAT, SCHEMA = "eip_scipy checkpoint", 1
 HEADER = "header.json"
 LEFT_OVER = 3600.0
 

@@ -79,7 +79,7 @@ def integrate(
 ) -> IntegrationResult:
     """Integrate with fixed or adaptive steps, compiled if the functions are Numba functions.
 
-    The solver classes take the same step. With the same jitted functions the results agree bit by bit, compiled or not.
+    The solver classes take the same steps. Results agree to rounding, whether the functions are compiled or not.
 
     Parameters
     ----------

@@ -155,7 +155,7 @@ def _diagnostics(described: dict[str, Any], arrays: dict[str, np.ndarray]) -> Di
     trust.doubts, trust.failed = described["doubts"], described["failed"]
     slow = (arrays.pop(OF_BALANCES[0]), arrays.pop(OF_BALANCES[1])) if OF_BALANCES[0] in arrays else None
     diagnostics = Diagnostics()
-    estimated, moved = described["estimated"], described.get("moved", "")
+    estimated, moved = described["estimated"], described["moved"]
     diagnostics._attach(largest, last, correction, counters, trust, estimated=estimated, moved=moved, slow=slow)
     return diagnostics
 

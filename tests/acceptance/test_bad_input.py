@@ -14,12 +14,10 @@ from scipy.integrate import RK45, solve_ivp
 from systems import orbit, oscillator
 
 from eip_scipy import (
-    EIPDOP853,
     EIPRK1,
     EIPRK3,
     EIPRK4,
     EIPRK45,
-    Diagnostics,
     Invariant,
     ProjectionWarning,
     check_gradient,
@@ -58,114 +56,108 @@ def by_ensemble(fun=oscillator, t_span=(0, 1), y0=Y0, **options):
 
 
 both = pytest.mark.parametrize("driver", [by_scipy, by_integrate], ids=["solve_ivp", "integrate"])
-runs = pytest.mark.parametrize("driver", [by_integrate, by_ensemble], ids=["integrate", "ensemble"])
 all_of_them = pytest.mark.parametrize("driver", [by_scipy, by_integrate, by_ensemble])
 
 
-def both_ways(value):
-    """Return an invariant of this value, with a gradient and without one."""
-    return Invariant(value, square_gradient, name="H"), Invariant(value, name="H")
+def kept(value=square, grad=square_gradient, **options):
+    return {"invariants": Invariant(value, grad, name="H", **options)}
 
 
-TOLERANCES = "rtol", "atol"
+# Those of hard-cases.json that are mistakes in arguments or in what functions return, by its names.
+BAD_INPUTS = {
+    "y0_nan": ({"y0": [1.0, math.nan]}, ValueError, r"All components of the initial state `y0` must be finite\."),
+    "y0_2d": ({"y0": [[1.0, 2.0]]}, ValueError, r"`y0` must be 1-dimensional\."),
+    "y0_masked": ({"y0": np.ma.array(Y0, mask=[False, True])}, ValueError, "masked values in y0"),
+    "f_none": ({"fun": lambda t, y: None}, TypeError, "fun returned None, expected 2 numbers"),
+    "f_scalar": ({"fun": lambda t, y: 1.0}, ValueError, r"fun returned shape \(\), expected \(2,\)"),
+    "f_wrong_n": ({"fun": lambda t, y: [1, 2, 3]}, ValueError, r"fun returned shape \(3,\), expected \(2,\)"),
+    "f_column": ({"fun": lambda t, y: np.ones((2, 1))}, ValueError, r"fun returned shape \(2, 1\), expected \(2,\)"),
+    "f_complex": ({"fun": lambda t, y: 1j * y}, ValueError, "y0 is real; pass y0.astype"),
+    "step_tiny": ({"h": 1e-20, "t_span": (5, 6)}, ValueError, "`h` is too small"),
+    "rtol_neg": ({"rtol": -1e-3}, ValueError, "`rtol` must be positive"),
+    "atol_shape": ({"atol": [1e-6]}, ValueError, "`atol` has wrong shape"),
+    "inv_nan_0": (kept(lambda t, y: math.nan), ValueError, "invariant 'H' is not finite at y0"),
+    "inv_shape": (kept(lambda t, y: np.ones((2, 2))), ValueError, r"invariant 'H' returned shape \(2, 2\)"),
+    "grad_shape": (kept(grad=lambda t, y: 2 * y[:1]), ValueError, r"gradient .*'H' has shape \(1,\), expected \(2,\)"),
+    "grad_wrong": (kept(grad=lambda t, y: -2 * y), ValueError, "gradient of .*'H' is wrong: .* by differences and"),
+    "weak_start": (kept(target=5.001), ValueError, r"start violates invariant 'H' by -0\.001; .*project_initial=True"),
+}
+
+
+@all_of_them
+@pytest.mark.parametrize("name", BAD_INPUTS)
+def test_bad_inputs(driver, name):
+    options, error, match = BAD_INPUTS[name]
+    if driver is by_ensemble and name in ("y0_2d", "y0_masked"):
+        pytest.skip("its states are a matrix")
+    with pytest.raises(error, match=match):
+        driver(**options)
+
+
 WRONG_OPTIONS = [
     ("metric", "errors", "metric must be 'error', 'euclidean' or an array"),
     ("metric", [1.0, 2.0, 3.0], r"metric: weights have shape \(3,\), the state has 2"),
-    ("metric", 3.0, r"metric: weights have shape \(\)"),
     ("metric", [1.0, -1.0], "metric: weights must be finite, >= 0"),
     ("metric", [0.0, 0.0], "metric: weights must be finite, >= 0 and not all 0"),
-    ("metric", [1.0, math.nan], "metric: weights must be finite"),
+    ("metric", ["a", "b"], r"metric must be an array of numbers, got \['a', 'b'\]"),
     ("blocks", 3, "blocks = 3 does not divide the state's 2 components"),
     ("blocks", 0, "blocks = 0 does not divide"),
-    ("blocks", -2, "blocks = -2 does not divide"),
-    ("blocks", True, "blocks must be an integer or a sequence of index arrays"),
     ("blocks", 1.5, "blocks must be an integer or a sequence of index arrays"),
-    ("blocks", "ab", "blocks: "),
     ("blocks", [[0, 1], [1]], "blocks: a component is in two blocks"),
-    ("blocks", [[0, 0]], "blocks: a component is in two blocks"),
     ("blocks", [[0, 2]], "blocks: .* not an array of indices from 0 to 1"),
-    ("blocks", [[-1]], "blocks: .* not an array of indices from 0 to 1"),
     ("blocks", [[0.5]], "blocks: .* not an array of indices from 0 to 1"),
     ("frame", 3, r"frame must be a pair \(C, S\)"),
     ("frame", (np.ones((1, 3)), np.ones((3, 1))), r"frame: C has shape \(1, 3\)"),
-    ("frame", (np.ones((1, 2)), np.ones((1, 2))), r"frame: C has shape \(1, 2\) and S \(1, 2\)"),
     ("frame", (np.array([[1.0, 0.0]]), np.array([[0.0], [1.0]])), "frame: C S is singular"),
-    ("frame", (np.array([[math.nan, 0.0]]), np.array([[1.0], [1.0]])), "frame: C S is singular"),
     ("frame", (np.array([[1j, 0.0]]), np.array([[1.0], [1.0]])), "frame: C and S must be real"),
-    ("frame", (np.zeros((0, 2)), np.zeros((2, 0))), "frame"),
     ("direction", "newest", "direction must be 'new', 'old' or 'midpoint', got 'newest'"),
-    ("direction", None, "direction must be 'new', 'old' or 'midpoint', got None"),
-    ("direction", ["new"], "direction must be 'new', 'old' or 'midpoint'"),
-    ("metric", ["a", "b"], r"metric must be an array of numbers, got \['a', 'b'\]"),
-    ("metric", np.array([1j, 1.0]), "metric must be an array of numbers, got .*; expected real ones"),
-    ("blocks", [[0, [1]]], "blocks must be an integer or a sequence of index arrays"),
     ("every", 2**70, "every must be at most 9223372036854775807, got 1180591620717411303424"),
     ("iterations", 1001, "iterations must be at most 1000, got 1001"),
-    *((key, v, f"{key} must be an integer >= 1") for key in ("iterations", "every") for v in (0, -1, 1.0, "2", True)),
-    *((key, v, f"{key} must be True or False") for key in ("reuse_f", "check", "project_initial") for v in (1, None)),
+    *(("iterations", v, "iterations must be an integer >= 1") for v in (0, 1.0, "2", True)),
+    *((key, 1, f"{key} must be True or False") for key in ("reuse_f", "check", "project_initial")),
 ]
 WRONG = [
-    *(({"y0": [1.0, v]}, ValueError, r"All components of the initial state `y0` must be finite\.")
-      for v in (math.nan, math.inf, -math.inf)),
-    *(({"y0": v}, ValueError, r"`y0` must be 1-dimensional\.") for v in ([[1.0, 2.0]], 1.0, np.zeros((2, 1)))),
-    *(({"y0": v}, TypeError, "`y0` must hold numbers") for v in (["a", "b"], [1.0, None])),
-    ({"fun": lambda t, y: None}, TypeError, "fun returned None, expected 2 numbers"),
-    ({"fun": lambda t, y: 1.0}, ValueError, r"fun returned shape \(\), expected \(2,\)"),
-    ({"fun": lambda t, y: [1, 2, 3]}, ValueError, r"fun returned shape \(3,\), expected \(2,\)"),
-    ({"fun": lambda t, y: y[:1]}, ValueError, r"fun returned shape \(1,\), expected \(2,\)"),
-    ({"fun": lambda t, y: np.ones((2, 1))}, ValueError, r"fun returned shape \(2, 1\), expected \(2,\)"),
-    ({"fun": lambda t, y: 1j * y}, ValueError, "y0 is real; pass y0.astype"),
+    ({"y0": ["a", "b"]}, TypeError, "`y0` must hold numbers"),
+    ({"y0": [[1.0], [1.0, 2.0]]}, TypeError, "`y0` must hold numbers"),
+    ({"y0": [10**400, 1]}, TypeError, "`y0` must hold numbers"),
+    ({"y0": []}, ValueError, "y0 is empty"),
     ({"fun": lambda t, y: "ab"}, TypeError, "fun returned 'ab', expected 2 numbers"),
+    ({"t_span": (0, 1, 2)}, ValueError, "t_span must hold two numbers"),
+    ({"t_span": (0, None)}, ValueError, "t_span must hold two numbers"),
+    ({"t_span": (0, 1j)}, ValueError, "t_span must hold two numbers"),
+    ({"t_span": (0, 10**400)}, ValueError, "t_span must hold two numbers"),
+    ({"t_span": (0, math.inf)}, ValueError, "t_span must be finite"),
+    ({"t_span": (math.nan, 1)}, ValueError, "t_span must be finite"),
     *(({"h": v}, ValueError, r"`h` must be positive\. Got " + re.escape(repr(v)))
-      for v in (0, -0.1, math.nan, math.inf, True, "0.1", [0.1], 0.1 + 0j)),
+      for v in (0, -0.1, math.nan, math.inf, True, "0.1", 0.1 + 0j)),
     ({"h": None, "method": EIPRK1}, ValueError, "EIPRK1 has no error estimate and needs the step h="),
-    ({"h": 1e-20, "t_span": (5, 6)}, ValueError, "`h` is too small"),
-    *(({name: 0.1}, (ValueError, TypeError), name) for name in ("first_step", "max_step")),
-    *(({name: v}, ValueError, f"`{name}` must be positive")
-      for name in TOLERANCES for v in (-1e-3, math.nan, [1e-3, -1e-3], [math.nan, 1.0])),
-    *(({name: v}, ValueError, f"`{name}` has wrong shape")
-      for name in TOLERANCES for v in ([1e-6], [1e-6] * 3, np.full((2, 1), 1e-6))),
-    *(({name: v}, ValueError, f"`{name}` must be a number or an array of 2 numbers. Got")
-      for name in TOLERANCES for v in ("tight", None, 1j, np.array([1j, 1.0]), 10**400, [[1e-3], 1e-3])),
+    ({"first_step": 0.1}, ValueError, "first_step and max_step are for adaptive steps"),
+    *(({"rtol": v}, ValueError, "`rtol` must be a number or an array of 2 numbers. Got")
+      for v in ("tight", None, 1j, [[1e-3], 1e-3])),
+    ({"atol": [1e-3, math.inf]}, ValueError, "`atol` must be finite. Got .*; to exclude a component"),
     *(({name: v, "invariants": SQUARE}, ValueError, match) for name, v, match in WRONG_OPTIONS),
-    *(({"diagnostics": v}, TypeError, r"diagnostics must be a Diagnostics\(\) object")
-      for v in ({}, Diagnostics, True)),
-    *(({"invariants": item}, error, match)
-      for value, error, match in (
-          (lambda t, y: math.nan, ValueError, "invariant 'H' is not finite at y0"),
-          (lambda t, y: math.inf, ValueError, "invariant 'H' is not finite at y0"),
-          (lambda t, y: np.array([1.0, math.nan]), ValueError, r"invariant 'H\[1\]' is not finite at y0"),
-          (lambda t, y: np.ones((2, 2)), ValueError, r"invariant 'H' returned shape \(2, 2\)"),
-          (lambda t, y: 1j * (y @ y), ValueError, "invariant 'H' returned complex values"),
-          (lambda t, y: None, TypeError, "invariant 'H' returned .*None"),
-          (lambda t, y: "x", TypeError, "invariant 'H' returned"),
-      ) for item in both_ways(value)),
-    *(({"invariants": Invariant(square, grad, name="H")}, (ValueError, TypeError), f"gradient of invariant 'H'{match}")
-      for grad, match in (
-          (lambda t, y: 2 * y[:1], r" has shape \(1,\), expected \(2,\)"),
-          (lambda t, y: 2 * y[None], r" has shape \(1, 2\), expected \(2,\)"),
-          (lambda t, y: 1.0, r" has shape \(\), expected \(2,\)"),
-          (lambda t, y: None, ""),
-          (lambda t, y: 2j * y, " is complex, but y0 is real"),
-          (lambda t, y: math.nan * y, " is not finite at y0"),
-      )),
-    ({"invariants": Invariant(lambda t, y: np.full(3, y @ y), square_gradient, name="H")}, ValueError,
-     r"gradient of invariant 'H' has shape \(2,\), expected \(3, 2\)"),
-    *(({"invariants": Invariant(square, lambda t, y, factor=factor: factor * 2 * y, name="H")}, ValueError,
-       r"gradient of invariant 'H' is wrong: .* by differences and .* by grad") for factor in (-1.0, 1.001, 2.0, 0.0)),
-    *(({"invariants": Invariant(square, square_gradient, target=v, name="H")}, ValueError,
-       f"invariant 'H': target {match}")
-      for v, match in ((math.nan, "must be finite"), ([1.0, 2.0], r"has shape \(2,\)"))),
+    ({"diagnostics": {}}, TypeError, r"diagnostics must be a Diagnostics\(\) object"),
+    (kept(lambda t, y: np.array([1.0, math.nan])), ValueError, r"invariant 'H\[1\]' is not finite at y0"),
+    (kept(lambda t, y: 1j * (y @ y)), ValueError, "invariant 'H' returned complex values"),
+    (kept(lambda t, y: None), TypeError, "invariant 'H' returned .*None"),
+    ({"invariants": Invariant(lambda t, y: None, name="H")}, TypeError, "invariant 'H' returned .*None"),
+    (kept(grad=lambda t, y: None), TypeError, "gradient of invariant 'H' returned None"),
+    (kept(grad=lambda t, y: 2j * y), ValueError, "gradient of invariant 'H' is complex, but y0 is real"),
+    (kept(grad=lambda t, y: math.nan * y), ValueError, "gradient of invariant 'H' is not finite at y0"),
+    (kept(lambda t, y: np.full(3, y @ y)), ValueError, r"gradient .*'H' has shape \(2,\), expected \(3, 2\)"),
+    (kept(grad=lambda t, y: 2.002 * y), ValueError, "gradient of invariant 'H' is wrong"),
+    (kept(target=math.nan), ValueError, "invariant 'H': target must be finite"),
+    (kept(target=[1.0, 2.0]), ValueError, r"invariant 'H': target has shape \(2,\)"),
 ]  # fmt: skip
 
 
-@both
 @pytest.mark.parametrize(
     ("options", "error", "match"), WRONG, ids=lambda v: ", ".join(v) if isinstance(v, dict) else str(v)[:40]
 )
-def test_wrong_arguments(driver, options, error, match):
-    with pytest.raises(error, match=match):
-        driver(**options)
+def test_wrong_arguments(options, error, match):
+    with pytest.raises(error, match=match) as info:
+        by_integrate(**options)
+    assert len(str(info.value)) < 400
 
 
 # The state.
@@ -173,17 +165,8 @@ def test_wrong_arguments(driver, options, error, match):
 
 @both
 def test_y0_masked(driver):
-    with pytest.raises(ValueError, match="masked values in y0"):
-        driver(y0=np.ma.array(Y0, mask=[False, True]))
     plain, unmasked = driver(), driver(y0=np.ma.array(Y0, mask=[False, False]))
     np.testing.assert_array_equal(np.asarray(unmasked.y), plain.y)
-
-
-@both
-@pytest.mark.parametrize("kind", [int, np.float32, np.longdouble, list, tuple])
-def test_y0_of_other_kinds(driver, kind):
-    y0 = kind([1, 2]) if kind in (list, tuple) else np.array([1, 2], dtype=kind)
-    np.testing.assert_array_equal(driver(y0=y0).y[:, -1].astype(float), driver().y[:, -1])
 
 
 @both
@@ -195,18 +178,6 @@ def test_y0_is_not_changed(driver):
 
 
 # The right-hand side.
-
-
-@both
-def test_fun_as_list_or_integers(driver):
-    np.testing.assert_array_equal(driver(lambda t, y: [y[1], -y[0]]).y, driver().y)
-    np.testing.assert_allclose(driver(lambda t, y: [1, 2]).y[:, -1], [2.0, 4.0])
-
-
-@both
-def test_real_fun_of_a_complex_state(driver):
-    run = driver(lambda t, y: [1.0, 2.0], y0=np.array([1j, 0]))
-    np.testing.assert_allclose(run.y[:, -1], [1 + 1j, 2])
 
 
 @both
@@ -243,25 +214,12 @@ def test_fun_that_keeps_or_overwrites_its_argument(driver, invariants):
     np.testing.assert_array_equal(driver(destructive, invariants=invariants).y, good)
 
 
-@both
-def test_invariant_that_keeps_its_arguments(driver):
-    """A user's invariant may record the states it saw."""
-    kept = []
-
-    def value(t, y):
-        kept.append((y, y.copy()))
-        return y @ y
-
-    driver(invariants=Invariant(value, square_gradient))
-    assert all((now == then).all() for now, then in kept)
-
-
 class MineError(Exception):
     pass
 
 
 @both
-@pytest.mark.parametrize("error", [MineError("here"), ZeroDivisionError("x"), KeyboardInterrupt(), SystemExit(3)])
+@pytest.mark.parametrize("error", [MineError("here"), KeyboardInterrupt()])
 def test_exceptions_of_the_user_pass_unchanged(driver, error):
     def fun(t, y):
         if t > 0.5:
@@ -283,18 +241,6 @@ def check_partial(partial):
     assert partial.status == -1
     assert not partial.success
     assert "interrupted" in partial.message
-
-
-def test_partial_ends_with_the_last_accepted_state():
-    def fun(t, y):
-        if t > 0.5:
-            raise MineError
-        return oscillator(t, y)
-
-    with pytest.raises(MineError) as info:
-        integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.02, save_every=7, invariants=SQUARE)
-    np.testing.assert_allclose(info.value.partial.t, [0.0, 0.14, 0.28, 0.42, 0.5], atol=1e-15)
-    assert info.value.partial.invariants.shape == (1, 5)
 
 
 @pytest.mark.parametrize("part", ["fun", "grad", "callback"])
@@ -377,41 +323,14 @@ class TestCompiledExceptions:
 # The interval and the step.
 
 
-@pytest.mark.parametrize("step", [{"h": 0.1}, {"h": None, "method": EIPRK45}])
-@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
-@pytest.mark.parametrize(
-    "span", [(-math.inf, 0), (math.inf, 0), (-math.inf, math.inf), (math.inf, math.inf), (math.nan, 1), (0, math.nan)]
-)
-def test_start_of_t_span_finite_through_the_solver_class(span, invariants, step):
+@pytest.mark.parametrize("span", [(-math.inf, 0), (math.inf, math.inf), (math.nan, 1), (0, math.nan)])
+def test_start_of_t_span_finite_through_the_solver_class(span):
     """A run from an infinite start never arrives; the end may be infinite, because a terminal event may end the run."""
     with pytest.raises(ValueError, match=r"t_span must be finite, got .*; only its end may be infinite"):
-        by_scipy(t_span=span, invariants=invariants, **step)
+        by_scipy(t_span=span)
 
 
-@pytest.mark.parametrize(
-    ("span", "match"),
-    [
-        *((v, "must hold two numbers") for v in ((0, 1, 2), (0,), "ab", None, 1.0, (0, None))),
-        *((v, "must be finite") for v in ((0, math.inf), (math.nan, 1), (0, math.nan), (-math.inf, 0))),
-        ((math.inf, math.inf), "must be finite"),
-    ],
-)
-def test_wrong_t_span(span, match):
-    with pytest.raises(ValueError, match=f"t_span {match}"):
-        by_integrate(t_span=span)
-
-
-@pytest.mark.parametrize("span", [(0j, 1), (0, 1j), np.array([0j, 1 + 0j]), (10**400, 1), (0, 10**5000), {0: 1, 1: 2}])
-def test_t_span_of_real_numbers(span):
-    with pytest.raises(ValueError, match="t_span must hold two numbers, got"):
-        by_integrate(t_span=span)
-    with pytest.raises(ValueError, match="t_span must hold two numbers, got"):
-        by_ensemble(t_span=span)
-
-
-@pytest.mark.parametrize(
-    "ends", [(0j, 1.0), (0.0, 1j), (np.complex128(0), 1.0), ("0", 1.0), (None, 1.0), (0.0, 10**400)]
-)
+@pytest.mark.parametrize("ends", [(0j, 1.0), (None, 1.0), (0.0, 10**400)])
 def test_times_of_the_solver_class_are_real(ends):
     with pytest.raises(ValueError, match="t_span must hold two numbers, got"):
         EIPRK4(oscillator, ends[0], Y0, ends[1], h=0.1)
@@ -507,18 +426,7 @@ def test_zero_length_interval(driver, h):
 
 
 @both
-@pytest.mark.parametrize("step", [{"h": 0.1}, {"h": None, "method": EIPRK45}])
-@pytest.mark.parametrize("name", ["rtol", "atol"])
-@pytest.mark.parametrize("value", [math.inf, [1e-3, math.inf]])
-def test_tolerances_finite(driver, name, value, step):
-    with pytest.raises(ValueError, match=f"`{name}` must be finite. Got .*; to exclude a component"):
-        driver(**{name: value, **step})
-    assert driver(**{name: 1e30, **step}).status == 0
-
-
-@both
-@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
-@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
+@pytest.mark.parametrize(("method", "invariants"), [(EIPRK4, SQUARE), (EIPRK45, ())])
 def test_tolerances_without_a_scale(driver, method, invariants):
     """An error has no scale if both the start and atol are 0; the message says so and does not mention h."""
     options = {"h": None, "method": method, "atol": [1e-6, 0.0], "invariants": invariants}
@@ -526,20 +434,6 @@ def test_tolerances_without_a_scale(driver, method, invariants):
         driver(y0=[1.0, 0.0], **options)
     assert driver(y0=[1.0, 0.0], **{**options, "first_step": 0.01}).status == 0
     assert driver(y0=[1.0, 0.0], **{**options, "h": 0.1, "metric": "error"}).status == 0
-
-
-@both
-@pytest.mark.parametrize(("method", "invariants"), [(EIPRK4, ()), (EIPRK4, SQUARE), (EIPRK45, SQUARE), (EIPRK45, ())])
-def test_component_that_stays_without_a_scale(driver, method, invariants):
-    """The component has no error either; only SciPy's own steps fail, with a message that gives the cause."""
-    options = {"h": None, "atol": 0, "first_step": 0.01, "invariants": invariants, "check": False}
-    with np.errstate(invalid="ignore"):
-        run = driver(lambda t, y: np.array([y[0], 0.0]), y0=[1.0, 0.0], method=method, **options)
-    if driver is by_scipy and method is EIPRK45 and not invariants:
-        assert run.status == -1
-        assert run.message == "the error of component 1 has no scale at t=0: y and `atol` are 0 there; give atol > 0"
-    else:
-        assert run.status == 0
 
 
 def test_estimate_that_is_not_finite_is_named():
@@ -551,7 +445,7 @@ def test_estimate_that_is_not_finite_is_named():
 
 @pytest.mark.parametrize(
     ("wrong", "nearest"),
-    [("invarients", "invariants"), ("iteration", "iterations"), ("block", "blocks"), ("Rtol", "rtol")],
+    [("invarients", "invariants"), ("Rtol", "rtol")],
 )
 def test_unknown_options_name_the_nearest(wrong, nearest):
     with pytest.raises(TypeError, match=f"no option '{wrong}'.*did you mean '{nearest}'"):
@@ -562,14 +456,7 @@ def test_unknown_options_name_the_nearest(wrong, nearest):
     assert record[0].filename == __file__
 
 
-def test_unknown_option_like_no_other():
-    with pytest.raises(TypeError, match=r"no option 'zzzz'$"):
-        by_integrate(zzzz=1)
-    with pytest.warns(UserWarning, match=r"have no effect for a chosen solver: `zzzz`\.$"):
-        by_scipy(zzzz=1)
-
-
-@pytest.mark.parametrize("names", [("jac",), ("jac", "lband"), ("uband", "jac", "jac_sparsity")])
+@pytest.mark.parametrize("names", [("jac",), ("uband", "jac", "jac_sparsity")])
 def test_options_of_other_solvers_warn_as_scipy_s(names):
     """The text is SciPy's word for word, so that a filter of SciPy's warning filters this one."""
     options = dict.fromkeys(names)
@@ -584,7 +471,7 @@ def test_options_of_other_solvers_warn_as_scipy_s(names):
         by_scipy(**options, invarients=3)
 
 
-@pytest.mark.parametrize("method", ["RK45", "EIPRK4", RK45, EIPSolver, 4])
+@pytest.mark.parametrize("method", [EIPSolver, 4])
 def test_wrong_method(method):
     with pytest.raises(TypeError, match="method must be an EIP class such as EIPRK4"):
         by_integrate(method=method)
@@ -603,77 +490,50 @@ def test_missing_arguments():
 
 
 WRONG_OF_RUNS = [
-    *(("in_place", v, ValueError, "in_place must be True or False, got") for v in (1, "yes", None)),
-    *(
-        ("compiled", v, ValueError, "compiled must be True, False or None .compile if possible., got")
-        for v in ("a", 1, 0)
-    ),
-    *(("progress", v, ValueError, "progress must be True or False, got") for v in (1, "yes", None)),
-    *(("compensated", v, ValueError, "compensated must be True or False, got") for v in (1, "no")),
-    *(("resume", v, ValueError, "resume must be True or False, got") for v in (1, "yes", None)),
-    *(
-        ("max_bytes", v, ValueError, "max_bytes must be a number of bytes >= 0, got")
-        for v in ("a", math.nan, -1, 1j, True, [1])
-    ),
-    *(("save_every", v, ValueError, "save_every must be an integer >= 1") for v in (0, -1, 1.5, "1", True)),
+    *((name, 1, ValueError, f"{name} must be True or False, got") for name in ("in_place", "progress", "compensated")),
+    ("resume", "yes", ValueError, "resume must be True or False, got"),
+    ("compiled", "a", ValueError, "compiled must be True, False or None .compile if possible., got"),
+    *(("max_bytes", v, ValueError, "max_bytes must be a number of bytes >= 0, got") for v in ("a", math.nan, -1, True)),
+    *(("save_every", v, ValueError, "save_every must be an integer >= 1") for v in (0, 1.5, "1", True)),
     ("save_every", 10**30, ValueError, "save_every must be at most 9223372036854775807, got 1000"),
     ("callback", 1, TypeError, "callback must be a function callback"),
     ("events", 1, TypeError, "events must be callable, or a sequence of callables, got 1"),
-    ("events", "ab", TypeError, "events must be callable, got 'a'"),
     ("events", [None], TypeError, "events must be callable, got None"),
     ("checkpoint_every", 10**400, ValueError, "checkpoint_every must be a number of seconds > 0, got 1000"),
-    *(("h", v, ValueError, "`h` must be positive. Got") for v in (10**400, 1j, "0.1", np.array([0.1]))),
     *(
         ("params", v, TypeError, "params must be an array of numbers, got")
-        for v in (10**400, [10**400], [None], 1j, np.array([1j]), ["1"], "x", [[1], [2, 3]])
+        for v in ([10**400], [None], 1j, [[1], [2, 3]])
     ),
-    *(
-        ("t_eval", v, ValueError, "t_eval must be an array of numbers, got")
-        for v in ([1j], [0.5 + 0j], np.array([0.5 + 0j]), "ab", ["0.5"], [None], [10**400])
-    ),
-    ("y0", [10**400, 1], TypeError, "must hold numbers, got"),
-    ("y0", [[1.0], [1.0, 2.0]], ValueError, "must be an array of numbers, got"),
-    ("y0", "ab", TypeError, "must hold numbers, got"),
+    ("params", {"k": 1.0}, TypeError, r"got {'k': 1.0}\. Give the values .* params=\[1.0, 2.0\], .* args=\(mapping,\)"),
+    *(("t_eval", v, ValueError, "t_eval must be an array of numbers, got") for v in ([1j], "ab", [None], [10**400])),
 ]
 
 
-@runs
 @pytest.mark.parametrize(("name", "value", "error", "match"), WRONG_OF_RUNS, ids=lambda v: str(v)[:12])
-def test_wrong_arguments_of_runs(driver, name, value, error, match):
+def test_wrong_arguments_of_runs(name, value, error, match):
     with pytest.raises(error, match=match) as info:
-        driver(**{name: value})
+        by_integrate(**{name: value})
     assert len(str(info.value)) < 400
 
 
 @pytest.mark.parametrize("name", ["first_step", "max_step"])
-@pytest.mark.parametrize("value", [10**400, 1j, "a", np.array([0.1]), True, math.nan, 0.0, -1])
-@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
-@all_of_them
-def test_wrong_bounds_of_steps(driver, invariants, name, value):
+@pytest.mark.parametrize("value", [10**400, 1j, "a", True, math.nan, -1])
+@pytest.mark.parametrize("driver", [by_integrate, by_scipy])
+def test_wrong_bounds_of_steps(driver, name, value):
     """The error is raised at once; SciPy itself hangs on some of them."""
     with pytest.raises(ValueError, match=f"`{name}` must be positive. Got .*; give a real number > 0"):
-        driver(h=None, method=EIPRK45, invariants=invariants, **{name: value})
+        driver(h=None, method=EIPRK45, **{name: value})
 
 
-@both
-@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
-def test_bounds_of_steps_that_do_not_fit(driver, invariants):
+def test_bounds_of_steps_that_do_not_fit():
     for value in (11.0, math.inf):
         with pytest.raises(ValueError, match="`first_step` exceeds bounds"):
-            driver(t_span=(0, 10), h=None, method=EIPRK45, invariants=invariants, first_step=value)
-    with pytest.raises(ValueError, match="`max_step` must be positive"):
-        driver(h=None, method=EIPRK45, invariants=invariants, max_step=None)
+            by_integrate(t_span=(0, 10), h=None, method=EIPRK45, first_step=value)
 
 
-@both
-def test_state_without_components(driver):
+def test_state_without_components():
     """SciPy's own suite asks for it of solve_ivp."""
-    if driver is by_scipy:
-        assert driver(lambda t, y: y, y0=[]).y.shape[0] == 0
-        return
-    for step in ({}, {"h": None, "method": EIPRK45}):
-        with pytest.raises(ValueError, match="y0 is empty"):
-            driver(lambda t, y: y, y0=[], **step)
+    assert by_scipy(lambda t, y: y, y0=[]).y.shape[0] == 0
 
 
 def event(terminal=None, direction=0):
@@ -684,11 +544,10 @@ def event(terminal=None, direction=0):
     return passing
 
 
-@runs
-@pytest.mark.parametrize("value", [math.nan, math.inf, "a", -1, 1.5, [1], np.array([1, 2])])
-def test_wrong_terminal(driver, value):
+@pytest.mark.parametrize("value", [math.nan, "a", -1, 1.5, [1]])
+def test_wrong_terminal(value):
     with pytest.raises(ValueError, match="`terminal` attribute of each event must be a boolean or positive integer"):
-        driver(events=event(terminal=value))
+        by_integrate(events=event(terminal=value))
 
 
 @pytest.mark.parametrize("value", [None, False, 0, True, 1, 2, 1.0, np.int64(3), np.True_])
@@ -698,11 +557,10 @@ def test_terminal_as_scipy_takes_it(value):
     np.testing.assert_allclose(run.t_events[0], sol.t_events[0], atol=1e-10)
 
 
-@runs
-@pytest.mark.parametrize("value", [None, math.nan, "a", [1], 1j])
-def test_wrong_direction(driver, value):
+@pytest.mark.parametrize("value", [None, math.nan, "a"])
+def test_wrong_direction(value):
     with pytest.raises(ValueError, match="`direction` attribute of each event must be a number"):
-        driver(events=event(terminal=True, direction=value))
+        by_integrate(events=event(terminal=True, direction=value))
 
 
 def takes_more(t, y, m):
@@ -728,11 +586,10 @@ FORGOTTEN = [
 ]
 
 
-@all_of_them
 @pytest.mark.parametrize(("invariants", "match"), FORGOTTEN)
-def test_forgotten_args_of_an_invariant(driver, invariants, match):
+def test_forgotten_args_of_an_invariant(invariants, match):
     with pytest.raises(TypeError, match=match + r"Invariant\(\.\.\., args=\(\.\.\.,\)\)"):
-        driver(invariants=invariants)
+        by_integrate(invariants=invariants)
 
 
 TIME_LEFT_OUT = [
@@ -743,15 +600,14 @@ TIME_LEFT_OUT = [
 ]
 
 
-@all_of_them
 @pytest.mark.parametrize("invariants", TIME_LEFT_OUT)
-def test_invariants_without_the_time(driver, invariants):
+def test_invariants_without_the_time(invariants):
     names = "t, y, args\\[0\\]" if invariants.args else "t, y"
     with pytest.raises(
         TypeError,
         match=rf"'M' is called with \({names}\): .* The first argument is always the time: .* lambda {names}: ",
     ):
-        driver(invariants=invariants)
+        by_integrate(invariants=invariants)
 
 
 def test_a_method_by_its_name():
@@ -762,14 +618,6 @@ def test_a_method_by_its_name():
         by_integrate(method="LSODA")
 
 
-@pytest.mark.parametrize("driver", [by_integrate, by_ensemble], ids=["integrate", "ensemble"])
-def test_names_of_parameters_that_nobody_knows(driver):
-    with pytest.raises(
-        TypeError, match=r"got {'k': 1.0}\. Give the values .* params=\[1.0, 2.0\], .* args=\(mapping,\)"
-    ):
-        driver(params={"k": 1.0})
-
-
 def test_type_errors_within_an_invariant_pass_unchanged():
     def broken(t, y):
         return y @ y + takes_more(t, y)
@@ -778,7 +626,6 @@ def test_type_errors_within_an_invariant_pass_unchanged():
         by_integrate(invariants=Invariant(broken, square_gradient))
 
 
-@runs
 @pytest.mark.parametrize(
     ("options", "match"),
     [
@@ -789,34 +636,24 @@ def test_type_errors_within_an_invariant_pass_unchanged():
         ({"events": event(True), "params": 1.0, "fun": lambda t, y, p: y}, r"event 0 is called with \(t, y, params\)"),
     ],
 )
-def test_functions_that_take_other_arguments(driver, options, match):
+def test_functions_that_take_other_arguments(options, match):
     with pytest.raises(TypeError, match=match):
-        driver(**options)
+        by_integrate(**options)
 
 
 # Times of dense output.
 
-COMPLEX_TIMES = [0.05 + 0j, np.complex128(0.05), [0.05j], np.array([0.05 + 0j]), "0.05", ["a"]]
 
-
-@pytest.mark.parametrize("t", COMPLEX_TIMES)
-@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
-@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
-def test_times_of_dense_output_are_real(method, invariants, t):
+@pytest.mark.parametrize("t", [np.complex128(0.05), [0.05j], "0.05", ["a"]])
+def test_times_of_dense_output_are_real(t):
     """A complex one would write complex states into real buffers."""
-    sol = by_scipy(method=method, invariants=invariants, dense_output=True)
+    sol = by_scipy(method=EIPRK45, invariants=SQUARE, dense_output=True)
     for call in (sol.sol, sol.sol.interpolants[0]):
         with pytest.raises(TypeError, match=r"dense output is defined at real times, got|not supported for the input"):
             call(t)
-    np.testing.assert_allclose(sol.sol.interpolants[0](0), Y0)
     assert sol.sol([0, 1]).shape == (2, 2)
-
-
-@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
-@pytest.mark.parametrize("t_eval", [[0.5 + 0j], [1j], np.array([0.25j, 0.5])])
-def test_complex_t_eval_of_solve_ivp(t_eval, invariants):
     with pytest.raises(TypeError, match="dense output is defined at real times, got"):
-        by_scipy(t_eval=t_eval, invariants=invariants)
+        by_scipy(t_eval=[0.5 + 0j], invariants=SQUARE)
 
 
 # Saving.
@@ -861,23 +698,15 @@ def test_memory_is_estimated_before_the_run():
     assert by_integrate(h=1e-3, max_bytes=1000).t.size == 2
 
 
-def test_memory_of_the_invariants_counts_too():
-    """Fifty values at each saved state are 25 times what a state of two components needs."""
-    many = Invariant(lambda t, y: np.full(50, y @ y), lambda t, y: np.tile(2 * y, (50, 1)))
-    with pytest.raises(MemoryError, match="save_every"):
-        by_integrate(h=1e-3, save_every=1, max_bytes=30_000, invariants=many)
-
-
 # Invariants.
 
 
-@both
-def test_invariants_of_wrong_kind(driver):
-    for wrong in (Invariant, 5.0, None):  # the class itself is not an invariant either
+def test_invariants_of_wrong_kind():
+    for wrong in (Invariant, None):  # the class itself is not an invariant either
         with pytest.raises(TypeError, match=r"invariants: got .*; expected an Invariant, a function f\(t, y\)"):
-            driver(invariants=wrong)
+            by_integrate(invariants=wrong)
         with pytest.raises(TypeError, match=r"the sequence contains .*; expected Invariant objects or functions"):
-            driver(invariants=[SQUARE, wrong])
+            by_integrate(invariants=[SQUARE, wrong])
 
 
 @pytest.mark.parametrize(
@@ -892,14 +721,11 @@ def test_invariants_of_wrong_kind(driver):
         ((square,), {"args": 3}, TypeError, r"args must be a tuple, got 3; write args=\(x,\)"),
         *(
             ((square,), {"target": v}, ValueError, "target must be a number or an array of numbers, got")
-            for v in ("x", 1j, [1j], np.array([1j]), 10**400, [[1], [1, 2]], [None])
+            for v in ("x", 1j, 10**400, [[1], [1, 2]])
         ),
-        *(
-            ((square,), {"scale": v}, ValueError, "scale must be a finite number >= 0")
-            for v in ("x", 1j, True, 10**400)
-        ),
-        *(((square, square), {"in_place": v}, ValueError, "in_place must be True or False, got") for v in (1, "no")),
-        *(((square, square), {"uses_f": v}, ValueError, "uses_f must be True or False, got") for v in (1, "no")),
+        ((square,), {"scale": True}, ValueError, "scale must be a finite number >= 0"),
+        ((square, square), {"in_place": 1}, ValueError, "in_place must be True or False, got"),
+        ((square, square), {"uses_f": 1}, ValueError, "uses_f must be True or False, got"),
         ((square,), {"name": 3}, TypeError, "name must be a string, got 3"),
     ],
 )
@@ -927,24 +753,7 @@ def test_shapes_that_change_on_the_way(driver, mistake):
         driver(invariants=Invariant(value, grad, name="H"), check=False)
 
 
-@both
-def test_check_false_skips_the_check(driver):
-    assert driver(invariants=Invariant(square, lambda t, y: 1.001 * 2 * y), check=False).status == 0
-
-
-@both
-def test_wrong_component_of_a_small_part_is_found(driver):
-    """A wrong derivative by a component of 1e-9 between ones of 1e9: units do not hide it."""
-    y0 = np.array([1e9, 2e9, 1e-9, 2e-9])
-    wrong = Invariant(
-        lambda t, y: y[0] ** 2 + y[1] ** 2 + 1e36 * (y[2] ** 2 + y[3] ** 2),
-        lambda t, y: np.array([2 * y[0], 2 * y[1], 2e36 * y[2], -2e36 * y[3]]),
-    )
-    with pytest.raises(ValueError, match=r"gradient of invariant .* is wrong"):
-        driver(lambda t, y: np.array([y[1], -y[0], y[3], -y[2]]), y0=y0, invariants=wrong)
-
-
-@pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, 0.3])
+@pytest.mark.parametrize("angle", [0.0, np.pi, 0.3])
 def test_gradients_vanish_at_an_extremum(angle):
     """The squares vanish at the start up to rounding, which is all that differences see."""
     c, s = np.cos(angle), np.sin(angle)
@@ -964,27 +773,6 @@ def test_gradients_vanish_at_an_extremum(angle):
     wrong = Invariant(squares.fun, lambda t, y: gradient(t, y) + [1e-6, 0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"gradient of invariant .* is wrong"):
         integrate(orbit, (0.0, 0.01), circle, method=EIPRK4, h=0.01, invariants=wrong)
-
-
-@pytest.mark.parametrize("angle", [0.0, np.pi, 0.3, 1.0, 2.5, 4.0])
-def test_gradients_by_differences_vanish_at_an_extremum(angle):
-    """Without grad, and with functions that take no complex step, gradients there are rounding too."""
-    c, s = np.cos(angle), np.sin(angle)
-
-    def squares(t, y):
-        q, v = y[:2], y[2:]
-        return ((v @ v) * q - (q @ v) * v - q / math.sqrt(q @ q)) ** 2
-
-    def told(fun):
-        with warnings.catch_warnings(record=True) as record:
-            warnings.simplefilter("always")
-            result = integrate(orbit, (0, 0.01), [c, s, -s, c], method=EIPRK4, h=0.01, invariants=Invariant(fun))
-        return result.trusted, [str(item.message) for item in record if "has no grad" not in str(item.message)]
-
-    assert told(squares) == (True, [])
-    trusted, texts = told(lambda t, y: squares(t, y) + 1e-6 * y[:2])
-    assert not trusted
-    assert "is not an invariant of this system" in texts[0]
 
 
 @both
@@ -1023,14 +811,10 @@ def test_warnings_come_once_and_name_the_line_that_a_user_wrote(call, size):
         assert [place for text, place in said if words in text] == ["script.py"]
 
 
-@both
-def test_start_off_the_target(driver):
-    off = Invariant(square, square_gradient, target=5.001, name="H")
-    with pytest.raises(ValueError, match=r"start violates invariant 'H' by -0\.001; .*project_initial=True"):
-        driver(invariants=off)
-    assert driver(invariants=Invariant(square, square_gradient, target=5 * (1 + 1e-9))).status == 0
+def test_start_off_the_target():
+    assert by_integrate(**kept(target=5 * (1 + 1e-9))).status == 0
     with pytest.raises(ValueError, match="violates invariant"):
-        driver(invariants=Invariant(square, square_gradient, target=5 * (1 + 3e-8)))
+        by_integrate(**kept(target=5 * (1 + 3e-8)))
 
 
 # project() and check_gradient().
@@ -1041,14 +825,13 @@ def test_start_off_the_target(driver):
     [
         ({}, "invariant 'S' has no target"),
         ({"target": [1.0, 2.0]}, "target must be 1 finite numbers"),
-        ({"target": math.nan}, "target must be 1 finite numbers"),
         ({"target": 1.0, "sigma": [1.0]}, r"sigma: weights have shape \(1,\)"),
         ({"target": 1.0, "sigma": [0.0, 0.0]}, "sigma: weights must be finite"),
         ({"target": 1.0, "iterations": 0}, "iterations must be an integer >= 1"),
         ({"target": 1.0, "frame": 3}, "frame must be a pair"),
-        *(({"target": v}, "target must be 1 finite numbers, got") for v in ("a", 1j, [1j], 10**400, [[1.0]])),
-        *(({"target": 1.0, "t": v}, "t must be a finite number, got") for v in ("a", None, math.nan, 1j, [0.0])),
-        *(({"target": 1.0, "sigma": v}, "sigma must be an array of numbers, got") for v in ("a", 1j, [None, 1.0])),
+        *(({"target": v}, "target must be 1 finite numbers, got") for v in (math.nan, 1j, [[1.0]])),
+        *(({"target": 1.0, "t": v}, "t must be a finite number, got") for v in (None, math.nan, 1j)),
+        ({"target": 1.0, "sigma": "a"}, "sigma must be an array of numbers, got"),
         ({"target": 1.0, "iterations": 2**70}, "iterations must be at most 1000"),
         ({"target": 1.0, "f": [1.0]}, r"f has shape \(1,\), expected \(2,\)"),
     ],
@@ -1175,17 +958,6 @@ def test_progress_goes_to_stderr(capsys):
     assert "100%" in shown.err
     by_integrate()
     assert capsys.readouterr().err == ""
-
-
-def test_progress_bar_is_closed_when_the_run_fails(capsys):
-    def fun(t, y):
-        return oscillator(t, y) if t < 0.45 else np.full(2, np.nan)
-
-    run = by_integrate(fun, progress=True)
-    assert run.status == -1
-    shown = capsys.readouterr().err
-    assert "40%" in shown
-    assert shown.endswith("\n")
 
 
 def test_no_estimate_no_error_metric():

@@ -234,19 +234,6 @@ def test_a_checkpoint_knows_which_are_balances(tmp_path):
         )
 
 
-def test_a_checkpoint_belongs_to_its_rates(tmp_path):
-    def other(t, y, p):
-        return (1 + 1e-6) * rate(t, y, p)
-
-    file = tmp_path / "run.npz"
-    run(method=EIPRK4, h=0.1, end=5.0, checkpoint=file)
-    with pytest.raises(CheckpointError, match="rate of balance 'H' was"):
-        run(
-            Balance(energy, other, gradient, name="H"),
-            method=EIPRK4, h=0.1, end=5.0, checkpoint=file, resume=True, check=False,
-        )  # fmt: skip
-
-
 @pytest.mark.parametrize("options", RUNS)
 def test_a_run_is_continued(options):
     """Q continues from its value at the end, and starts again in a state between two steps."""

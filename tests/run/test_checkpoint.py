@@ -648,7 +648,7 @@ def test_header_and_arrays(tmp_path):
     checkpoint.write(path, {"kind": "test", "a": [1, 2.5, None], "b": "ü"}, arrays)
     header, found = checkpoint.read(path, "test")
     assert (header["kind"], header["a"], header["b"]) == ("test", [1, 2.5, None], "ü")
-    assert header["schema"] == 4
+    assert header["schema"] == 1
     assert header["arrays"] == list(arrays)
     assert header["versions"]["numpy"] == np.__version__
     assert list(found) == list(arrays)
@@ -748,7 +748,7 @@ def forged(path, name, member, header=None):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(
             "header.json",
-            json.dumps({"format": "eip_scipy checkpoint", "schema": 4, "arrays": [name[:-4]], **(header or {})}),
+            json.dumps({"format": "eip_scipy checkpoint", "schema": 1, "arrays": [name[:-4]], **(header or {})}),
         )
         archive.writestr(name, member)
 
@@ -795,7 +795,7 @@ def test_foreign_archives(tmp_path):
         checkpoint.read(path)
     for versions, named in (({}, "unknown"), ({"versions": {"eip_scipy": "0.2.0"}}, "0.2.0")):
         forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 2, **versions})
-        with pytest.raises(CheckpointError, match=rf"has schema 2, expected 4; .* that wrote it \({named}\)\."):
+        with pytest.raises(CheckpointError, match=rf"has schema 2, expected 1; .* that wrote it \({named}\)\."):
             checkpoint.read(path)
     forged(path, "x.npy", npy_bytes("<f8", (1, 1), bytes(8), fortran=True))
     with pytest.raises(CheckpointError, match="not a checkpoint"):
@@ -812,7 +812,7 @@ def test_foreign_archives(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(
             "header.json",
-            json.dumps({"format": "eip_scipy checkpoint", "schema": 4, "arrays": [f"x{k}" for k in range(40)]}),
+            json.dumps({"format": "eip_scipy checkpoint", "schema": 1, "arrays": [f"x{k}" for k in range(40)]}),
         )
         archive.writestr("x0.npy", npy_bytes("<f8", (128,), bytes(1024)))
         first = archive.filelist[-1]
