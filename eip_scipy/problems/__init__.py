@@ -1,7 +1,6 @@
 """Problems with invariants: functions that return a `Problem`."""
 
 from ..core.invariants import JointInvariants
-from ..core.pointers import CFunctions
 from ..core.problem import Problem
 from .gravity import solar_data as solar_data
 from .gravity.forces import ForceConstants
@@ -44,7 +43,6 @@ from .waves import (
 __all__ = [
     "TOKAMAK",
     "UNIFORM",
-    "CFunctions",
     "DampedGrossPitaevskii",
     "FieldProblem",
     "ForceConstants",

@@ -20,7 +20,7 @@ from ..core.jitted import NotCompilableError
 from ..core.multistep import times
 from ..core.native_functions import native_functions, with_events
 from ..core.options import ProjectionOptions
-from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
+from ..core.pointers import GRADIENT, PointerFunction, by_pointer
 from ..core.problem import BROUGHT, Problem, made
 from ..core.results import Diagnostics
 from ..core.run_spec import RunSpec
@@ -102,7 +102,7 @@ class Request(NamedTuple):
         return self._replace(events=self.fun.events) if has_own else self
 
     def with_pointers(self) -> Request:
-        """Return the request with C function pointers wrapped so that Python can call them."""
+        """Return the request with C functions wrapped so that Python can call them."""
         given = self.fun, self.acceleration, self.jacobian
         if self.events is None and all(item is None or isinstance(item, Problem) for item in given):
             return self
@@ -365,7 +365,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
             f"components from {variations.columns.n} on are derivatives, which overflow in long chaotic runs: shorten "
             "the interval, or use megno or lyapunov_spectrum, which rescale them"
         )
-        spec = spec._replace(columns=variations.columns, fun=None, left_out=hint)
+        spec = spec._replace(columns=variations.columns, left_out=hint)
     run = spec.build(y0, check_start=check_start)
     schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)
@@ -512,7 +512,7 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
         fun, in_place = fun.acceleration, fun.in_place
     if not callable(fun):
         name, what = ("acceleration", "callable") if acceleration else ("fun", "callable or a Problem")
-        raise TypeError(f"integrate: {name} must be {what}, got {fun!r}{address_hint(fun)}.")
+        raise TypeError(f"integrate: {name} must be {what}, got {fun!r}.")
     return fun, FORMS[acceleration, in_place or isinstance(fun, PointerFunction)]
 
 
