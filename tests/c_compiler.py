@@ -1,5 +1,6 @@
 """The C compiler for tests of C functions: the one that builds the package, or that of the package ziglang."""
 
+import ctypes
 import os
 import shlex
 import shutil
@@ -9,6 +10,7 @@ import sysconfig
 from importlib.util import find_spec
 
 import pytest
+from scipy import LowLevelCallable
 
 FLAGS = ["-O2", "-ffp-contract=off", "-shared", "-fPIC"]
 
@@ -27,3 +29,10 @@ def shared_library(path, *sources):
     """The library of C sources at `path`."""
     subprocess.run([*compiler(), *FLAGS, "-o", str(path), *map(str, sources), "-lm"], check=True)
     return path
+
+
+def low_level(library, name, arrays=3):
+    """The function `name` of a library, by its path, which takes a double and pointers to so many arrays of doubles."""
+    function = ctypes.CDLL(str(library))[name]
+    function.argtypes = [ctypes.c_double, *[ctypes.POINTER(ctypes.c_double)] * arrays]
+    return LowLevelCallable(function)

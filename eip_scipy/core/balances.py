@@ -9,7 +9,7 @@ import numpy as np
 
 from .inputs import flag, reals, shown
 from .invariants import Invariant, OwnArguments
-from .pointers import GRADIENT, address_hint, by_pointer
+from .pointers import GRADIENT, by_pointer
 
 __all__ = ["Balance"]
 
@@ -29,7 +29,7 @@ class Balance(Invariant):
         ``fun(t, y, *args) -> float or (l_i,)``, as for `Invariant`.
     rate : callable, optional
         ``rate(t, y, *args) -> float or (l_i,)``, the total derivative of `fun` in time along the solutions; a Python or
-        Numba function, or a C function by pointer (see Notes). Default: the rate is computed as ``grad @ f + dF/dt``
+        Numba function, or a `scipy.LowLevelCallable` (see Notes). Default: the rate is computed as ``grad @ f + dF/dt``
         with f = fun(t, y) of the system, exactly to rounding for a jitted function of a real state, otherwise with the
         gradient and differences in time. The rounding error is then that of the terms of ``grad @ f``. If relative
         errors below 1e-10 matter, give a rate that is written without the terms that cancel.
@@ -124,7 +124,7 @@ class Balance(Invariant):
         shape = (self.size,) if self.size and self.size > 1 else ()
         rate = by_pointer(rate, what, GRADIENT, takes_f=uses_f, shape=shape)
         if rate is not None and not callable(rate):
-            raise TypeError(f"Balance: rate must be callable or None, got {rate!r}{address_hint(rate)}.")
+            raise TypeError(f"Balance: rate must be callable or None, got {rate!r}.")
         directions = _directions(components, weights)
         self.subspaces = () if directions is None else (directions,)
         self.rate_function = rate

@@ -20,7 +20,7 @@ from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import count, filled, flag, numbers, reals, require_arguments, shown
 from .invariant_checks import complaints, listed, reported, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
-from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
+from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import states
 
 __all__ = ["Invariant", "InvariantSet", "as_invariants", "check_gradient", "copied", "with_args"]
@@ -62,7 +62,7 @@ class Invariant:
     Parameters
     ----------
     fun : callable
-        ``fun(t, y, *args) -> float or (l_i,)``, real. Or, like `grad`, a C function by pointer (see Notes).
+        ``fun(t, y, *args) -> float or (l_i,)``, real. Or, like `grad`, a `scipy.LowLevelCallable` (see Notes).
     grad : callable, optional
         ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Default: the gradient
         is computed. If `fun` is jitted by Numba, y is real and there are no `args`, dual numbers give a compiled
@@ -96,7 +96,7 @@ class Invariant:
     Every Runge-Kutta method keeps linear invariants. Do not list them as invariants, but pass them as the option
     ``frame``, so that the corrections do not change them.
 
-    C functions are given as `scipy.LowLevelCallable`, ctypes or cffi function pointers, of the signatures
+    C functions are given as `scipy.LowLevelCallable`, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
     ``int G(double t, const double *y, const double *f, double *out, const double *params)``; f is the derivative of
     the state only with ``uses_f=True``; otherwise its content is undefined. See :doc:`/tutorials/c-functions`.
@@ -143,9 +143,9 @@ class Invariant:
         fun = by_pointer(fun, what, shape=(size,) if size and size > 1 else ())
         grad = by_pointer(grad, f"gradient of {what}", GRADIENT, takes_f=uses_f)
         if not callable(fun):
-            raise TypeError(f"{own}: fun must be callable, got {fun!r}{address_hint(fun)}.")
+            raise TypeError(f"{own}: fun must be callable, got {fun!r}.")
         if grad is not None and not callable(grad):
-            raise TypeError(f"{own}: grad must be callable or None, got {grad!r}{address_hint(grad)}.")
+            raise TypeError(f"{own}: grad must be callable or None, got {grad!r}.")
         if grad is None and (in_place or uses_f):
             raise ValueError(f"{own}: in_place and uses_f describe grad, but grad is missing. Give grad or omit them.")
         if not isinstance(args, tuple):

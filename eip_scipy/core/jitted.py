@@ -13,8 +13,8 @@ import numpy as np
 from ..engine.native import Call, LibraryFunction
 
 __all__ = [
-    "ChangedShapeError", "NotCompilableError", "compilable", "compiled_like", "is_compiled", "is_jitted",
-    "jit_is_off", "jitted", "with_entry",
+    "ChangedShapeError", "NotCompilableError", "compilable", "compiled_call", "compiled_like", "is_compiled",
+    "is_jitted", "jit_is_off", "jitted", "jitted_call",
 ]  # fmt: skip
 
 
@@ -32,13 +32,17 @@ def is_jitted(fun: Any) -> bool:
     return isinstance(fun, getattr(sys.modules.get("numba.core.dispatcher"), "Dispatcher", ()))
 
 
-def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
-    """Return `call` with the code that Numba has compiled for states of `dtype`, or `call` itself if there is none."""
-    if not is_jitted(call.fun):
-        return call
-    from . import numba_pointers
+def compiled_call(call: Call, n: int, dtype: np.dtype[Any]) -> Call:
+    """Return `call` with the C function made from a Numba function ``fun(t, y)`` of states (n,) of the type `dtype`.
 
-    return numba_pointers.with_entry(call, dtype)
+    Return `call` itself if it has another function, or one that does not compile.
+    """
+    if not is_jitted(call.fun) or jit_is_off() or call.args or call.takes_f or call.in_place:
+        return call
+    from .native_functions import Kind
+    from .numba_pointers import compiled_or_none
+
+    return call._replace(compiled=compiled_or_none(call.fun, Kind(call.shape, n, -1, dtype.char, call.real)))
 
 
 def jit_is_off() -> bool:
@@ -67,12 +71,21 @@ def jitted(fun: Any) -> Any:
 
 
 def is_compiled(fun: Any) -> bool:
-    """Return True if Numba functions can call `fun`: if it is a Numba function or a `LibraryFunction` of the engine."""
+    """Return True if the engine calls `fun` by its address: a Numba function, or a `LibraryFunction` of the engine."""
     return is_jitted(fun) or isinstance(fun, LibraryFunction)
 
 
+def jitted_call(fun: Any) -> Any:
+    """Return a `LibraryFunction` in a form that Numba functions can call, if there is one; else `fun` itself."""
+    if not isinstance(fun, LibraryFunction) or find_spec("numba") is None or jit_is_off():
+        return fun
+    from . import library_calls
+
+    return library_calls.jitted_call(fun)
+
+
 def compiled_like(fun: Callable[..., Any], *others: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `fun` jitted if Numba is installed and all `others`, which `fun` calls, are compiled; else `fun`."""
-    if not all(is_compiled(other) for other in others):
+    """Return `fun` jitted if all `others`, which `fun` calls, are Numba functions; else `fun`."""
+    if not all(is_jitted(other) for other in others):
         return fun
     return cast(Callable[..., Any], jitted(compilable(fun)))

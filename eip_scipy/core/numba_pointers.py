@@ -1,4 +1,4 @@
-"""Numba functions for the native engine: as C function pointers, compiled when a run begins, or as compiled before."""
+"""Numba functions for the native engine: as C function pointers, compiled when a run begins."""
 
 from __future__ import annotations
 
@@ -11,24 +11,32 @@ from llvmlite import ir
 from numba import from_dtype, njit, types
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.errors import NumbaError, TypingError
-from numba.core.runtime import _nrt_python
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.np.arrayobj import populate_array
 
-from ..engine.native import Call, NumbaEntry
 from .jitted import ChangedShapeError, NotCompilableError
 from .native_functions import Kind
 
-__all__ = ["Compiled", "compiled", "refuse_addresses", "with_entry"]
+__all__ = ["Compiled", "compiled", "compiled_or_none", "refuse_addresses"]
 
-WORD, ADDRESS = ir.IntType(64), ir.IntType(8).as_pointer()
 MOST_DIMENSIONS = 4  # of arrays whose addresses are refused
 
 # Counter for the names of C functions.
 _serial = count()
-# Compiles functions that only compiled code calls. They are inlined, because only then the compiler sees that their
-# arrays need no counting of references.
-_called = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# How the number of each type in `Packed` is read from params.
+SCALARS = {"d": "params[{}]", "q": "int(params[{}])", "?": "params[{}] != 0"}
+# Statements that write `value` to `out`, by the number of dimensions; "values" are those of invariants, also in a list.
+PUT = {
+    0: ["out[0] = value"],
+    "values": ["if len(value) != out.size: raise ChangedShapeError", "for i in range(out.size): out[i] = value[i]"],
+    1: ["if value.size != out.size: raise ChangedShapeError", "for i in range(out.size): out[i] = value[i]"],
+    2: [
+        "if value.shape[0] != out.shape[0] or value.shape[1] != out.shape[1]: raise ChangedShapeError",
+        "for i in range(out.shape[0]):",
+        "    for j in range(out.shape[1]): out[i, j] = value[i, j]",
+    ],
+}
+# Inlined, because only then the compiler sees that the arrays need no counting of references.
 _inlined = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
@@ -128,115 +136,31 @@ def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tupl
 
 
 def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
-    """Return ``call(t, y, f, out, params)``, compiled by `jit`, which writes the value of `fun` to out."""
-    has_params = kind.p >= 0
-    numbers = _numbers(kind.scalars, jit)
-    bare = jit(
-        {
-            (False, False): lambda t, y, f, out, params: fun(t, y, *numbers(params)),
-            (False, True): lambda t, y, f, out, params: fun(t, y, out, *numbers(params)),
-            (True, False): lambda t, y, f, out, params: fun(t, y, f, *numbers(params)),
-            (True, True): lambda t, y, f, out, params: fun(t, y, f, out, *numbers(params)),
-        }[kind.takes_f, kind.in_place]
-        if kind.scalars
-        else {
-            (False, False, False): lambda t, y, f, out, params: fun(t, y),
-            (False, False, True): lambda t, y, f, out, params: fun(t, y, params),
-            (False, True, False): lambda t, y, f, out, params: fun(t, y, out),
-            (False, True, True): lambda t, y, f, out, params: fun(t, y, out, params),
-            (True, False, False): lambda t, y, f, out, params: fun(t, y, f),
-            (True, False, True): lambda t, y, f, out, params: fun(t, y, f, params),
-            (True, True, False): lambda t, y, f, out, params: fun(t, y, f, out),
-            (True, True, True): lambda t, y, f, out, params: fun(t, y, f, out, params),
-        }[kind.takes_f, kind.in_place, has_params]
-    )
-    if kind.in_place:
-        return bare
-    put = {0: _put_number, 1: _put_values if kind.real else _put_array, 2: _put_rows}[len(kind.shape)]
-    return jit(lambda t, y, f, out, params: put(bare(t, y, f, out, params), out))
+    """Return ``call(t, y, f, out, params)``, compiled by `jit`, which writes the value of `fun` to out.
 
-
-def _numbers(types: str, jit: Any, k: int = 0) -> Any:
-    """Return ``numbers(params)``, which returns params[k:] as a tuple of numbers of the `types`, see `Packed`."""
-    if k == len(types):
-        return jit(lambda params: ())
-    rest = _numbers(types, jit, k + 1)
-    return jit(
-        {
-            "d": lambda params: (params[k],) + rest(params),
-            "q": lambda params: (int(params[k]),) + rest(params),
-            "?": lambda params: (params[k] != 0,) + rest(params),
-        }[types[k]]
-    )
-
-
-@_called
-def _put_number(value, out):
-    out[0] = value
-
-
-@_called
-def _put_values(values, out):
-    if len(values) != out.size:
-        raise ChangedShapeError
-    for i in range(out.size):
-        out[i] = values[i]
-
-
-@_called
-def _put_array(values, out):
-    if values.size != out.size:
-        raise ChangedShapeError
-    for i in range(out.size):
-        out[i] = values[i]
-
-
-@_called
-def _put_rows(rows, out):
-    if rows.shape[0] != out.shape[0] or rows.shape[1] != out.shape[1]:
-        raise ChangedShapeError
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = rows[i, j]
-
-
-def with_entry(call: Call, dtype: np.dtype[Any]) -> Call:
-    """Return `call`, of a Numba function ``fun(t, y)``, with the function's compiled code for states of type `dtype`.
-
-    Return `call` itself if there is no such code that the engine can call. Nothing is compiled here: the code exists as
-    soon as the function has been called once with such a state.
+    It is made from text as one function, because Numba takes a third less time for it than for functions that call
+    each other.
     """
-    if call.args or call.takes_f or call.in_place or len(call.shape) > 2:
-        return call
-    state = types.Array(from_dtype(dtype), 1, "C")
-    known: Any = call.fun
-    code = known.overloads.get((types.float64, state))
-    if code is None or code.objectmode:
-        return call
-    scalar = types.float64 if call.real else state.dtype
-    shown = types.Array(scalar, len(call.shape), "C") if call.shape else scalar
-    if code.fndesc.restype != shown or not _is_as_expected(code.target_context, shown, state):
-        return call
-    address = code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
-    return call._replace(entry=NumbaEntry(address, _nrt_python.c_helpers["MemInfo_release"], code))
+    given = ["t", "y", *["f"] * kind.takes_f, *["out"] * kind.in_place]
+    if kind.scalars:
+        given += [SCALARS[letter].format(k) for k, letter in enumerate(kind.scalars)]
+    elif kind.p >= 0:
+        given.append("params")
+    dimensions = len(kind.shape)
+    put = PUT["values" if kind.real and dimensions == 1 else dimensions] if not kind.in_place else ()
+    lines = "def call(t, y, f, out, params):", f"value = fun({', '.join(given)})", *put
+    made = {"fun": fun, "ChangedShapeError": ChangedShapeError}
+    exec("\n    ".join(lines), made)
+    return jit(made["call"])
 
 
-@lru_cache(maxsize=16)
-def _is_as_expected(context: Any, value: types.Type, state: types.Array) -> bool:
-    """Return True if this version of Numba passes the argument y, `state`, and the value as the engine assumes."""
-    number = context.get_data_type(state.dtype).as_pointer()
-    returned = context.get_data_type(value)
-    if isinstance(value, types.Array):
-        data = context.get_data_type(value.dtype).as_pointer()
-        lengths = ir.ArrayType(WORD, value.ndim)
-        if returned != ir.LiteralStructType([ADDRESS, ADDRESS, WORD, WORD, data, lengths, lengths]):
-            return False
-    elif returned != ir.DoubleType():
-        return False
-    raised = context.call_conv.get_function_type(types.none, ()).args[1]
-    array = [ADDRESS, ADDRESS, WORD, WORD, number, WORD, WORD]
-    expected = ir.FunctionType(ir.IntType(32), [returned.as_pointer(), raised, ir.DoubleType(), *array])
-    return bool(context.call_conv.get_function_type(value, (types.float64, state)) == expected)
+@lru_cache(maxsize=256)
+def compiled_or_none(fun: Any, kind: Kind) -> Compiled | None:
+    """Return a Numba function as a C function, see `compiled`, or None if it does not compile."""
+    try:
+        return compiled(fun, kind, fun.__name__)
+    except NotCompilableError:
+        return None
 
 
 def refuse_addresses(kind: Any, name: str) -> None:

@@ -51,7 +51,7 @@ class Problem:
 
     `integrate` accepts a problem instead of a function: ``integrate(problem, method=EIPRK4)``; with SciPy, use
     ``problem.solve_ivp(method=EIPRK4)``. A problem prints in five lines. It can be pickled if its functions can: those
-    of this package and functions of a module can, C function pointers and lambdas cannot.
+    of this package and functions of a module can, C functions and lambdas cannot.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Problem:
         Invariants of the equations (linear ones are in `frame`), with ``args=(params,)``. They can be given as an
         Invariant, a function, or a sequence of them.
     rhs : callable, optional
-        Compiled right-hand side in place: ``rhs(t, y, out, params)``, or a C function by pointer.
+        Compiled right-hand side in place: ``rhs(t, y, out, params)``, or a `scipy.LowLevelCallable`.
     acc : callable, optional
         For q'' = a(t, q): ``acc(t, q, params) -> (n/2,)``, compiled; the state is (q, v).
     h : float, optional

@@ -30,7 +30,7 @@ from .examination import is_check_due
 from .failures import failure
 from .inputs import numbers, shown
 from .invariants import InvariantSet, as_invariants
-from .jitted import with_entry
+from .jitted import compiled_call
 from .multistep import times
 from .names import nearest
 from .one_step import OneStep, OneStepMethod
@@ -261,9 +261,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if callable(self._jacobian):
             jacobian = call(self._jacobian, (), (self.n // 2,), None, takes_f=True, in_place=True)
         rates = self._run.invariants.rates(self._run.options.adaptive)
-        dtype = self.y.dtype
-        rhs = with_entry(self._call, dtype)
-        inv, grad = (tuple(with_entry(known, dtype) for known in group) for group in self._run.invariants.calls)
+        state = self.n, self.y.dtype
+        rhs = compiled_call(self._call, *state)
+        inv, grad = (tuple(compiled_call(known, *state) for known in group) for group in self._run.invariants.calls)
         functions = PythonFunctions(rhs, inv, grad, (), second_order=False, jacobian=jacobian, rates=rates)
         self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
 

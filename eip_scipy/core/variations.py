@@ -19,7 +19,7 @@ from .blocks import INDEX
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
 from .inputs import filled, reals, require_arguments, shown
 from .invariants import Invariant
-from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
+from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off, jitted_call
 from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import as_derivative
 
@@ -319,7 +319,7 @@ class Variations:
 
 def _has_address(fun: Any) -> bool:
     """Return True if a function belongs to the library or is jitted, so that the engine calls it by its address."""
-    return isinstance(fun, LibraryFunction) or (is_jitted(fun) and not jit_is_off())
+    return is_compiled(fun) and not (is_jitted(fun) and jit_is_off())
 
 
 def right_hand_side(
@@ -343,10 +343,10 @@ def _of_columns_in_order(
     check = _Comparison.at_start(_derivative(fun, form, y0), t0, y0, list(parameters), extra)
     if jvp is not None:
         _require_products(check, jvp)
-        if is_compiled(fun) and is_jitted(jvp) and not jit_is_off():
+        if is_jitted(jitted_call(fun)) and is_jitted(jvp) and not jit_is_off():
             from .jitted_columns import rhs_by_products
 
-            return rhs_by_products(fun, form, jvp, n, columns.count), "jvp"
+            return rhs_by_products(jitted_call(fun), form, jvp, n, columns.count), "jvp"
 
         def products(t: float, y: Array, M: Array, extra: tuple) -> Array:
             found = np.empty((len(M), n))
@@ -502,10 +502,10 @@ def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
     """Return a right-hand side of a state that is that of `rhs` at `places` and constant elsewhere, in place."""
     if np.array_equal(places.ravel(), np.arange(places.size)):
         return rhs
-    if is_compiled(rhs) and not jit_is_off():
+    if is_jitted(jitted_call(rhs)) and not jit_is_off():
         from .jitted_columns import rearranged
 
-        return rearranged(rhs, tuple(places.ravel().tolist()))
+        return rearranged(jitted_call(rhs), tuple(places.ravel().tolist()))
 
     def in_place(t: float, Y: Array, out: Array, *extra: Any) -> None:
         found = np.empty(places.size)

@@ -373,20 +373,16 @@ class LibraryFunction:
         """Address of `call_by_handle`, whose signature is in library.cpp."""
 
     @property
-    def fits_address(self) -> int:
-        """
-        Address of ``bool fits(int64_t n, int64_t p)``, which returns True if the function accepts states of n numbers and p parameters.
-        """
-
-    @property
     def numbers(self) -> int:
         """
         Number of numbers, or of rows of the state's size, that the function fills; if it is negative, its absolute value is the number for each orbit.
         """
 
     @property
-    def fills_states(self) -> bool:
-        """True if the function fills rows of the state's size."""
+    def returns_numbers(self) -> bool:
+        """
+        True if the function returns as many numbers for states of any size, and does not take f.
+        """
 
     @property
     def octet_address(self) -> int:

@@ -35,14 +35,6 @@ VARIABLE = "EIP_SCIPY_ENGINE"
 AGAIN = "python -m pip install --no-build-isolation --no-deps --editable ."
 
 
-class NumbaEntry(NamedTuple):
-    """The code that Numba compiled for ``fun(t, y)``, in Numba's calling convention."""
-
-    address: int
-    release: int  # address of the function that gives up a reference to the memory of a returned array
-    owner: Any  # keeps the code in memory
-
-
 class Call(NamedTuple):
     """A user's function in Python: ``fun(t, y[, f][, out], *args)``.
 
@@ -50,8 +42,8 @@ class Call(NamedTuple):
     used directly if it is an array of the shape `shape` (a float for ``()``) and of the dtype of the state (float if
     `real`). ``convert(value, t)`` converts any other value to such an array, or raises an error.
 
-    `entry` is the code that Numba compiled for the function, which is called instead of it. The function itself is
-    called if that code raises an exception or returns an array of another shape.
+    The attribute ``address`` of `compiled` is that of a C function ``int (t, y, out, params)`` made from ``fun(t, y)``,
+    which is called instead of it. The function itself is called if the C function returns another status than 0.
     """
 
     fun: Callable[..., Any]
@@ -61,7 +53,7 @@ class Call(NamedTuple):
     real: bool = False
     takes_f: bool = False
     in_place: bool = False
-    entry: NumbaEntry | None = None
+    compiled: Any = None
 
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: Any) -> Call:

@@ -62,9 +62,7 @@ def _of_eight(native: Native) -> tuple[Any, int]:
             raise NotCompilableError(f"{one.__name__} of this package is written for one member at a time")
         return one, native.floats
     if isinstance(one, PointerFunction):
-        if not one.octet_address:
-            raise NotCompilableError(f"{one.name} is a C function without a version for eight members (see CFunctions)")
-        return one.octet_address, native.floats
+        raise NotCompilableError(f"{one.name} is a C function, which is called for one member at a time")
     from ..core.numba_pointers import compiled  # both load Numba
     from .octets.type import OCTET
 

@@ -1,6 +1,5 @@
 """Problems with invariants: functions that return a `Problem`."""
 
-from ..core.pointers import CFunctions
 from ..core.problem import Problem
 from .gravity import solar_data as solar_data
 from .gravity.forces import ForceConstants
@@ -22,7 +21,6 @@ from .time_transformed import centre_time, pair_time, reaches, time_transformed
 __all__ = [
     "TOKAMAK",
     "UNIFORM",
-    "CFunctions",
     "FieldProblem",
     "ForceConstants",
     "Grid",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..core.invariants import Invariant
-from ..core.jitted import compilable, compiled_like, jitted
+from ..core.jitted import compilable, compiled_like, jitted, jitted_call
 from ..core.problem import Problem, bind
 from ..core.states import own_values
 
@@ -93,7 +93,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
             "Pass dataclasses.replace(problem, y0=..., t_span=...)."
         )
     params = np.zeros(0) if problem.params is None else problem.params
-    rhs = _transformed_rhs(problem.rhs, jitted(g))
+    rhs = _transformed_rhs(jitted_call(problem.rhs), jitted(g))
     n, blocks, frame = problem.y0.size, problem.blocks, problem.frame
     if frame is not None:
         frame = np.pad(frame[0], ((0, 0), (0, 1))), np.pad(frame[1], ((0, 1), (0, 0)))
@@ -151,7 +151,7 @@ def _transformed_invariant(item: Invariant, problem: Problem) -> Invariant:
             f"time_transformed: {item!r} depends on t, but the gradient with respect to the state (y, t) is known only "
             "for invariants of y. Pass dataclasses.replace(problem, invariants=...) without it."
         )
-    fun, grad = _transformed_functions(item.function, item.gradient, item.uses_f)
+    fun, grad = _transformed_functions(jitted_call(item.function), jitted_call(item.gradient), item.uses_f)
     return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
 
 

@@ -11,7 +11,7 @@ from scipy.integrate import DenseOutput
 
 from ..core.arguments import names
 from ..core.inputs import is_number, reals, require_arguments, shown
-from ..core.pointers import address_hint, by_pointer, is_pointer
+from ..core.pointers import by_pointer, is_pointer
 from ..engine.native import Call, call
 
 __all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
@@ -162,23 +162,23 @@ class Events:
 
 
 def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
-    """Return one event or a sequence of events as a tuple, after checks; C function pointers are wrapped for Python."""
+    """Return one event or a sequence of events as a tuple, after checks; C functions are wrapped for Python."""
     if events is None:
         return ()
-    if callable(events) or is_pointer(events):
+    if callable(events) or is_pointer(events):  # which is a tuple
         events = (events,)
     try:
         given = tuple(events)
     except TypeError:
-        what = f"{shown(events)}{address_hint(events)}"
-        raise TypeError(f"events must be callable, or a sequence of callables, got {what}.") from None
+        raise TypeError(f"events must be callable, or a sequence of callables, got {shown(events)}.") from None
     items = []
     for k, event in enumerate(given):
         found = by_pointer(event, f"event {k}", shape=())
         if found is not event:
-            found.terminal, found.direction = getattr(event, "terminal", None), getattr(event, "direction", 0)
+            for name, default in ("terminal", None), ("direction", 0):  # a function of ctypes may have them too
+                setattr(found, name, getattr(event, name, getattr(event.function, name, default)))
         if not callable(found):
-            raise TypeError(f"events must be callable, got {shown(found)}{address_hint(found)}.")
+            raise TypeError(f"events must be callable, got {shown(found)}.")
         items.append(found)
     return replaced(events, items)
 

@@ -20,7 +20,7 @@ from ..core.jitted import NotCompilableError
 from ..core.multistep import times
 from ..core.native_functions import native_functions, with_events
 from ..core.options import ProjectionOptions
-from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
+from ..core.pointers import GRADIENT, PointerFunction, by_pointer
 from ..core.problem import BROUGHT, Problem, made
 from ..core.results import Diagnostics
 from ..core.run_spec import RunSpec
@@ -102,7 +102,7 @@ class Request(NamedTuple):
         return self._replace(events=self.fun.events) if has_own else self
 
     def with_pointers(self) -> Request:
-        """Return the request with C function pointers wrapped so that Python can call them."""
+        """Return the request with C functions wrapped so that Python can call them."""
         given = self.fun, self.acceleration, self.jacobian
         if self.events is None and all(item is None or isinstance(item, Problem) for item in given):
             return self
@@ -506,7 +506,7 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
         fun, in_place = fun.acceleration, fun.in_place
     if not callable(fun):
         name, what = ("acceleration", "callable") if acceleration else ("fun", "callable or a Problem")
-        raise TypeError(f"integrate: {name} must be {what}, got {fun!r}{address_hint(fun)}.")
+        raise TypeError(f"integrate: {name} must be {what}, got {fun!r}.")
     return fun, FORMS[acceleration, in_place or isinstance(fun, PointerFunction)]
 
 

@@ -2,6 +2,8 @@
 
 import ctypes
 
+from scipy import LowLevelCallable
+
 from eip_scipy import EIPRK4, Invariant, integrate
 
 library = ctypes.CDLL("./libkepler.so")
@@ -10,17 +12,19 @@ for function in (library.kepler, library.kept, library.turn):
     function.argtypes = [ctypes.c_double, floats, floats, floats]
 library.kept_gradient.argtypes = [ctypes.c_double, floats, floats, floats, floats]
 
-turn = library.turn
-turn.direction = 1  # from approach to departure: the pericentre
+library.turn.direction = 1  # from approach to departure: the pericentre
+energy_and_momentum = Invariant(
+    LowLevelCallable(library.kept), LowLevelCallable(library.kept_gradient), size=2, name="HL"
+)
 run = integrate(
-    library.kepler,
+    LowLevelCallable(library.kepler),
     (0, 200),
     [1.6, 0, 0, 0.5],
     method=EIPRK4,
     h=0.03,
     params=[1.0],
-    invariants=Invariant(library.kept, library.kept_gradient, size=2, name="HL"),
-    events=turn,
+    invariants=energy_and_momentum,
+    events=LowLevelCallable(library.turn),
 )
 print(run.compiled, set(run.calls.values()))
 kept = run.max_defect.max() < 1e-11

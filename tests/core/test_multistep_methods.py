@@ -1,6 +1,5 @@
 """Multistep methods through integrate and solve_ivp: orders, values between steps, bits, and refused arguments."""
 
-import ctypes
 import math
 from dataclasses import replace
 
@@ -8,7 +7,7 @@ import mpmath
 import numba
 import numpy as np
 import pytest
-from c_compiler import shared_library
+from c_compiler import low_level, shared_library
 from scipy.integrate import solve_ivp
 from systems import JIT_H, JIT_L
 
@@ -256,10 +255,8 @@ def test_c_functions(tmp_path):
     """C functions by pointer, with params, give the bits of Python functions that compute the same."""
     source = tmp_path / "functions.c"
     source.write_text(C_FUNCTIONS)
-    library = ctypes.CDLL(str(shared_library(tmp_path / "functions.so", source)))
-    pointer = ctypes.POINTER(ctypes.c_double)
-    for name, count in (("acceleration", 3), ("jacobian", 4)):
-        getattr(library, name).argtypes = [ctypes.c_double, *[pointer] * count]
+    library = shared_library(tmp_path / "functions.so", source)
+    acceleration, product = low_level(library, "acceleration"), low_level(library, "jacobian", 4)
 
     def in_python(t, q, out, params):
         r = math.sqrt(q[0] * q[0] + q[1] * q[1])
@@ -273,12 +270,12 @@ def test_c_functions(tmp_path):
         out[:] = [w * (along * q[k] - dq[k]) for k in range(2)]
 
     given = {"method": EIPGJ14, "h": STEP, "params": [1.0], "in_place": True}
-    native = integrate(acceleration=library.acceleration, t_span=(0, 20), y0=Y0, jacobian=library.jacobian, **given)
+    native = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=product, **given)
     python = integrate(acceleration=in_python, t_span=(0, 20), y0=Y0, jacobian=times, **given)
     assert native.calls == {"acceleration": "pointer", "jacobian": "pointer"}
     assert np.array_equal(native.y, python.y)
     with pytest.raises(TypeError, match="jacobian is a C function of the signature"):
-        integrate(acceleration=library.acceleration, t_span=(0, 20), y0=Y0, jacobian=library.acceleration, **given)
+        integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=acceleration, **given)
 
 
 def test_events():

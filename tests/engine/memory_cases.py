@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 from numba import njit
+from scipy import LowLevelCallable
 
 from eip_scipy import EIPGJ12, EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate
 from eip_scipy.engine.native import BUILD, library
@@ -22,10 +23,10 @@ DOUBLES = ctypes.POINTER(ctypes.c_double)
 def functions_of(path):
     """The C functions that the cases use."""
     c = ctypes.CDLL(path)
-    found = {name: getattr(c, name) for name in ("kepler", "energy", "energy_gradient", "turn", "decay", "momentum")}
+    found = {name: c[name] for name in ("kepler", "energy", "energy_gradient", "turn", "decay", "momentum")}
     for name, function in found.items():
         function.argtypes = [ctypes.c_double, *[DOUBLES] * (4 if name.endswith("gradient") else 3)]
-    return found
+    return {name: LowLevelCallable(function) for name, function in found.items()}
 
 
 def cases(c):

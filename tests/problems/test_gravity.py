@@ -9,9 +9,9 @@ from itertools import combinations
 import mpmath
 import numpy as np
 import pytest
-from numba import njit
 
 from eip_scipy import EIPGJ12, EIPGJ14, EIPRKN12, integrate
+from eip_scipy.core.jitted import jitted_call
 from eip_scipy.engine.native import library
 from eip_scipy.problems import nbody
 from eip_scipy.problems.gravity import orbits
@@ -186,64 +186,23 @@ def test_bodies_at_one_place_are_not_finite(n, pair):
     assert not np.isfinite(energy(0.0, y, gm))
 
 
-@njit
-def _repeated(y, gm, times):
-    """Add up the results of the function, inlined in a loop and in a larger function."""
-    out, total = np.empty(y.size), 0.0
-    for _ in range(times):
-        rhs(0.0, y, out, gm)
-        total += energy(0.0, y, gm)
-    return out, total / times
-
-
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("n", SIZES)
-def test_the_same_bits_inside_another_compiled_function(n):
-    gm, y = bodies(n)
-    inside, mean = _repeated(y, gm, 4)
-    np.testing.assert_array_equal(inside[3 * n :].reshape(-1, 3), accelerations(gm, y))
-    assert mean == energy(0.0, y, gm)
-
-
-@pytest.mark.needs_jit
-def test_accelerations_inside_another_compiled_function():
+def test_the_same_bits_from_the_package_s_own_jitted_functions():
+    """They call the library with contiguous arrays, or fill a part of a larger array with rows."""
     gm, y = bodies(5)
-    inside = njit(lambda q, gm: acc(0.0, q, gm))(y[:15], gm)
-    np.testing.assert_array_equal(inside, acc(0.0, y[:15], gm))
-
-
-@njit
-def _filled(y, out, gm):
-    rhs(0.0, y, out, gm)
-    return out
-
-
-@pytest.mark.needs_jit
-@pytest.mark.parametrize("arrange", ["strided", "of floats of half the size", "shared", "partly shared"])
-def test_arrays_of_any_memory_inside_a_compiled_function(arrange):
-    gm, y = bodies(3)
-    if arrange == "of floats of half the size":
-        y = y.astype(np.float32)
-    expected = np.empty(y.size)
-    rhs(0.0, y.astype(float), expected, gm)
-    room = np.empty(3 * y.size, y.dtype)
-    start, out = {
-        "strided": (room[::3], room[1::3]),
-        "of floats of half the size": (room[: y.size], room[y.size : 2 * y.size]),
-        "shared": (room[: y.size], room[: y.size]),
-        "partly shared": (room[: y.size], room[1 : y.size + 1]),
-    }[arrange]
-    start[:] = y
-    np.testing.assert_array_equal(_filled(start, out, gm), expected.astype(y.dtype))
-
-
-@pytest.mark.needs_jit
-def test_wrong_sizes_inside_a_compiled_function():
-    gm, y = bodies(3)
-    with pytest.raises(ValueError, match=r"gravity\.rhs was called with an array out of another size"):
-        _filled(y, np.empty(4), gm)
-    with pytest.raises(ValueError, match=r"gravity\.rhs was called with a state, derivative or params"):
-        _filled(y[:-1], np.empty(y.size - 1), gm)
+    f, of_energy, of_momentum, expected = np.empty(30), np.empty(30), np.empty((3, 31)), np.empty((3, 30))
+    rhs(0.0, y, f, gm)
+    jitted_call(energy_gradient)(0.0, y, f, of_energy, gm)
+    jitted_call(momentum_gradient)(0.0, y, of_momentum[:, :-1], gm)
+    energy_gradient(0.0, y, f, again := np.empty(30), gm)
+    momentum_gradient(0.0, y, expected, gm)
+    np.testing.assert_array_equal(of_energy, again)
+    np.testing.assert_array_equal(of_momentum[:, :-1], expected)
+    assert jitted_call(energy)(0.0, y, gm) == energy(0.0, y, gm)
+    np.testing.assert_array_equal(jitted_call(momentum)(0.0, y, gm), momentum(0.0, y, gm))
+    assert jitted_call(acc) is acc
+    with pytest.raises(ValueError, match=r"gravity\.rhs was called with a state or params of the wrong size"):
+        jitted_call(rhs)(0.0, y[:-1], np.empty(29), gm)
 
 
 PRINT = """

@@ -6,7 +6,6 @@ import pickle
 import mpmath
 import numpy as np
 import pytest
-from numba import config, njit
 
 from eip_scipy import EIPDOP853, EIPGJ14, integrate
 from eip_scipy.engine.native import library
@@ -376,20 +375,6 @@ def test_bound_functions_have_none_for_eight_members():
     whole = library["gravity.rhs"]
     assert whole.octet_address
     assert not whole.bound(np.ones(4)).octet_address
-
-
-@pytest.mark.skipif(config.DISABLE_JIT, reason="needs compiled code")
-@pytest.mark.parametrize("name", ["orbits.energy", "orbits.laplace_rate"])
-def test_use_from_a_jitted_function_is_a_clear_error(name):
-    function = library[name]
-    for called in (function, function.bound(np.ones(20)), next(iter(library.values())).bound(np.ones(20))):
-
-        @njit
-        def use(y, called=called):
-            return called(0.0, y, y)
-
-        with pytest.raises(Exception, match="cannot be called by jitted functions"):
-            use(np.ones(12))
 
 
 def test_ten_bodies_over_a_century():

@@ -1,12 +1,11 @@
 """One meaning of `fun` for all methods: the derivative of y = (q, v); accelerations have a separate argument."""
 
-import ctypes
 import math
 import pickle
 
 import numpy as np
 import pytest
-from c_compiler import shared_library
+from c_compiler import low_level, shared_library
 from numba import njit
 from scipy.integrate import solve_ivp
 
@@ -72,10 +71,7 @@ def exact(t):
 def pointer(folder):
     source = folder / "spring.c"
     source.write_text(C_SOURCE)
-    library = ctypes.CDLL(str(shared_library(folder / "spring.so", source)))
-    array = ctypes.POINTER(ctypes.c_double)
-    library.acceleration.argtypes = [ctypes.c_double, array, array, array]
-    return library.acceleration
+    return low_level(shared_library(folder / "spring.so", source), "acceleration")
 
 
 @pytest.mark.parametrize("method", SECOND_ORDER)

@@ -1,11 +1,8 @@
 """`args` of integrate and ensemble: passed on as SciPy does, natively if they are numbers."""
 
-import ctypes
-from pathlib import Path
-
 import numpy as np
 import pytest
-from c_compiler import shared_library
+from c_compiler import low_level, shared_library
 from numba import njit
 from scipy.integrate import solve_ivp
 
@@ -15,9 +12,6 @@ from eip_scipy.ensembles import tasks
 from eip_scipy.problems import kepler
 
 Y0, SPAN, K, M = np.array([1.0, 0.5]), (0.0, 10.0), 2.0, 3
-NUMBERS = ctypes.POINTER(ctypes.c_double)
-VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBERS)
-GRADIENT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
 
 
 def oscillator(t, y, k, m):
@@ -145,13 +139,13 @@ int gradient(double t, const double *y, const double *f, double *out, const doub
 
 def test_c_functions_get_numbers_as_params(tmp_path):
     (tmp_path / "oscillator.c").write_text(C_SOURCE)
-    c = ctypes.CDLL(str(shared_library(Path(tmp_path) / "oscillator.so", tmp_path / "oscillator.c")))
-    pointers = [kind((name, c)) for name, kind in (("rhs", VALUE), ("energy", VALUE), ("gradient", GRADIENT))]
+    library = shared_library(tmp_path / "oscillator.so", tmp_path / "oscillator.c")
+    pointers = [low_level(library, name, arrays) for name, arrays in (("rhs", 3), ("energy", 3), ("gradient", 4))]
     functions = pointers[0], Invariant(*pointers[1:], name="H"), None
     expected = run(JITTED, events=None)
     np.testing.assert_array_equal(run(functions).y, expected.y)
     np.testing.assert_array_equal(run(functions, compiled=False).y, expected.y)
-    with pytest.raises(TypeError, match="fun is a C function pointer: its arguments after t and y are numbers"):
+    with pytest.raises(TypeError, match="fun is a C function: its arguments after t and y are numbers"):
         run(functions, args=(K, "steel"))
 
 

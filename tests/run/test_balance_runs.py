@@ -1,11 +1,11 @@
 """Balances in `integrate` and `ensemble`: compiled and interpreted, checkpoints, continuations, events, C functions."""
 
-import ctypes
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.integrate
-from c_compiler import shared_library
+from c_compiler import low_level, shared_library
 from numba import njit
 
 from eip_scipy import (
@@ -25,7 +25,6 @@ from eip_scipy import (
 from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.run import resume
 
-NUMBERS = ctypes.POINTER(ctypes.c_double)
 # A quartic oscillator whose stiffness varies slowly: amplitude and frequency of that are the parameters.
 PARAMS = np.array([1e-3, 0.3])
 START = np.array([1.0, 0.3])
@@ -161,10 +160,9 @@ def library(tmp_path_factory):
     folder = tmp_path_factory.mktemp("balances")
     source = folder / "functions.c"
     source.write_text(SOURCE, encoding="utf-8")
-    found = ctypes.CDLL(str(shared_library(folder / "functions.so", source)))
-    for name in ("fun", "energy", "rate"):
-        getattr(found, name).argtypes = [ctypes.c_double, *[NUMBERS] * (4 if name == "rate" else 3)]
-    return found
+    path = shared_library(folder / "functions.so", source)
+    arrays = {"fun": 3, "energy": 3, "rate": 4}
+    return SimpleNamespace(**{name: low_level(path, name, count) for name, count in arrays.items()})
 
 
 @pytest.mark.parametrize("given", [True, False])

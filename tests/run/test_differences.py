@@ -1,18 +1,13 @@
 """C functions without gradients: accuracy of the differences, and the bits of both ways to compute them."""
 
-import ctypes
-
 import numpy as np
 import pytest
-from c_compiler import shared_library
+from c_compiler import low_level, shared_library
 from numba import njit
 from systems import jit_orbit, orbit, pericentre
 
 from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate, project
 from eip_scipy.core.invariants import LARGE, InvariantSet
-
-NUMBERS = ctypes.POINTER(ctypes.c_double)
-VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBERS)
 
 # In C, and in Python for complex steps.
 FUNCTIONS = {
@@ -65,8 +60,8 @@ def c(tmp_path_factory):
     text = "int {}(double t, const double *y, double *out, const double *p) {{ out[0] = {}; return 0; }}\n"
     source = SYSTEM + "".join(text.format(name, given) for name, (given, _) in FUNCTIONS.items())
     (folder / "functions.c").write_text(source)
-    library = ctypes.CDLL(str(shared_library(folder / "functions.so", folder / "functions.c")))
-    return lambda name: VALUE((name, library))
+    library = shared_library(folder / "functions.so", folder / "functions.c")
+    return lambda name: low_level(library, name)
 
 
 def gradient(invariant, y):

@@ -1,12 +1,11 @@
 """Tangent maps against closed forms, complex steps and REBOUND; exponents and MEGNO."""
 
-import ctypes
 from functools import lru_cache
 
 import numpy as np
 import pytest
 import sympy
-from c_compiler import shared_library
+from c_compiler import low_level, shared_library
 from numba import njit
 
 from eip_scipy import EIPDOP853, EIPRK4, equations, hamiltonian, integrate
@@ -244,9 +243,7 @@ def in_c(name, folder):
     arguments = "double t, const double *Y, const double *dY, double *out, const double *P"
     source = folder / "product.c"
     source.write_text(f"#include <math.h>\nint product({arguments}) {{\n{chr(10).join(lines)}\nreturn 0; }}\n")
-    product = ctypes.CDLL(str(shared_library(folder / "product.so", source))).product
-    product.argtypes = [ctypes.c_double, *[ctypes.POINTER(ctypes.c_double)] * 4]
-    return product
+    return low_level(shared_library(folder / "product.so", source), "product", 4)
 
 
 def system(name, source, folder):

@@ -4,6 +4,7 @@
 
 #include <nanobind/stl/vector.h>
 
+#include "data.hpp"
 #include "library.hpp"
 
 namespace eip {
@@ -74,15 +75,18 @@ PyObject *call(PyObject *self, PyObject *arguments, PyObject *names) noexcept {
     return nullptr;
 }
 
-// Call a function for one state from compiled code that no exception may pass through. Returns 0, or 1 if the function
-// did not get the memory that it needs.
-int call_by_handle(const void *handle, double t, const double *y, const double *f, double *out, const double *params,
-                   int64_t n, int64_t p) {
+// Call a function for one state from compiled code that no exception may pass through. Returns the number if `out` is null,
+// else 0; NaN if the sizes are wrong, or if the function did not get the memory that it needs.
+double call_by_handle(const void *handle, double t, const double *y, const double *f, double *out, const double *params,
+                      int64_t n, int64_t p) {
+    const LibraryFunction &function = *static_cast<const LibraryFunction *>(handle);
+    if (!function.fits(n, p)) return NOT_A_NUMBER;
+    double number = 0.0;
     try {
-        static_cast<const LibraryFunction *>(handle)->one(t, y, f, out, params, n, p);
-        return 0;
+        function.one(t, y, f, out ? out : &number, params, n, p);
+        return number;
     } catch (const std::exception &) {
-        return 1;
+        return NOT_A_NUMBER;
     }
 }
 
@@ -121,16 +125,12 @@ void add_library(nb::module_ &module) {
             "call_address", [](const Function &) { return address(call_by_handle); },
             "Address of `call_by_handle`, whose signature is in library.cpp.")
         .def_prop_ro(
-            "fits_address", [](const Function &f) { return address(f.fits); },
-            "Address of ``bool fits(int64_t n, int64_t p)``, which returns True if the function accepts states of n "
-            "numbers and p parameters.")
-        .def_prop_ro(
             "numbers", [](const Function &f) { return f.numbers == 0 ? 1 : f.numbers; },
             "Number of numbers, or of rows of the state's size, that the function fills; if it is negative, its "
             "absolute value is the number for each orbit.")
         .def_prop_ro(
-            "fills_states", [](const Function &f) { return !f.is_numbers(); },
-            "True if the function fills rows of the state's size.")
+            "returns_numbers", [](const Function &f) { return f.value == Value::NUMBERS; },
+            "True if the function returns as many numbers for states of any size, and does not take f.")
         .def_prop_ro(
             "octet_address", [](const Function &f) { return f.own.empty() ? address(f.eight) : 0; },
             "Address of the version for eight states at once; 0 if there is none.")

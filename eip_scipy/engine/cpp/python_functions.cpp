@@ -56,12 +56,12 @@ PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb:
         floats_ *= dimensions_[k];
     }
     take_library();
-    const nb::handle entry = kept_attribute(description, "entry", kept);
-    if (entry.is_none()) return;
+    const nb::handle compiled = kept_attribute(description, "compiled", kept);
+    if (compiled.is_none()) return;
     require(args_.empty() && !takes_f_ && !in_place_, "engine: compiled code must be that of fun(t, y)");
-    code_ = reinterpret_cast<NumbaCode *>(nb::cast<uintptr_t>(entry.attr("address")));
-    release_ = reinterpret_cast<NumbaRelease *>(nb::cast<uintptr_t>(entry.attr("release")));
-    require(code_ && release_, "engine: compiled code needs addresses");
+    pointer_ = reinterpret_cast<ValuePointer>(nb::cast<uintptr_t>(compiled.attr("address")));
+    require(pointer_, "engine: compiled code needs an address");
+    state_.resize(components_ * width_of(type_));
 }
 
 // Numbers of the library and their gradients are computed without a detour through Python. Other arguments than they
@@ -80,34 +80,10 @@ void PythonCall::take_library() {
     if (same && found->fits(components_, n_params_) && found->filled(components_) == floats_) library_ = found;
 }
 
-// Call the code that Numba compiled; false if it raised an exception, or its value has another shape.
-bool PythonCall::by_numba(double t, const double *y, double *out) const {
-    const int64_t size = width_of(type_) * static_cast<int64_t>(sizeof(double));
-    double few[32];  // a copy of the state, because the function may overwrite it
-    std::vector<double> many;
-    double *state = few;
-    if (components_ * size > static_cast<int64_t>(sizeof few)) {
-        many.resize(components_ * size / sizeof(double));
-        state = many.data();
-    }
-    std::memcpy(state, y, components_ * size);
-    void *exception = nullptr;
-    int64_t value[5 + 4];  // a number, or an array of at most two dimensions
-    if (code_(value, &exception, t, nullptr, nullptr, components_, size, state, components_, size) != 0) return false;
-    if (n_dimensions_ == 0) {
-        std::memcpy(out, value, sizeof(double));
-        return true;
-    }
-    const int64_t *shape = value + 5, *strides = shape + n_dimensions_;
-    int64_t stride = width_of(value_type_) * static_cast<int64_t>(sizeof(double));
-    bool fits = true;
-    for (int k = n_dimensions_ - 1; k >= 0; --k) {
-        fits = fits && shape[k] == dimensions_[k] && strides[k] == stride;
-        stride *= shape[k];
-    }
-    if (fits) std::memcpy(out, reinterpret_cast<const void *>(value[4]), floats_ * sizeof(double));
-    if (value[0] != 0) release_(reinterpret_cast<void *>(value[0]));
-    return fits;
+// Call the compiled function; false if it raised an exception, or its value has another shape.
+bool PythonCall::by_pointer(double t, const double *y, double *out) const {
+    copy(y, state_.data(), std::ssize(state_));
+    return pointer_(t, state_.data(), out, nullptr) == 0;
 }
 
 void PythonCall::operator()(double t, const double *y, const double *f, double *out, nb::handle owner) const {
@@ -115,7 +91,7 @@ void PythonCall::operator()(double t, const double *y, const double *f, double *
         library_->one(t, y, f, out, params_, components_, n_params_);
         return Ending::leave_if_begun();
     }
-    if (code_ && by_numba(t, y, out)) return;
+    if (pointer_ && by_pointer(t, y, out)) return;
     PyObject *arguments[5 + MOST_ARGUMENTS];  // t, y, f and out before them, and the place of the callee
     const nb::object time_object = time(t), y_object = copied(y, components_, type_);
     nb::object f_object, out_object;

@@ -13,12 +13,6 @@ namespace eip {
 // The largest number of further arguments of a function.
 constexpr int MOST_ARGUMENTS = 8;
 
-// A function fun(t, y) that Numba has compiled: it returns 0, or another number after an exception. An array is passed as
-// the owner of its memory, its Python object, its number of items, their size, data, shape and strides.
-using NumbaCode = int32_t(void *value, void **exception, double t, void *memory, void *parent, int64_t items,
-                          int64_t item_size, const double *data, int64_t shape, int64_t stride);
-using NumbaRelease = void(void *memory);
-
 // One function: fun(t, y[, f][, out], *args). Its value is used as it is if it is a float or an array of the right
 // kind. Otherwise `convert(value, t)` converts it, or raises an error.
 class PythonCall {
@@ -33,7 +27,7 @@ class PythonCall {
 
   private:
     void take_library();
-    bool by_numba(double t, const double *y, double *out) const;
+    bool by_pointer(double t, const double *y, double *out) const;
     bool take_list(PyObject *value, double *out) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
@@ -41,8 +35,8 @@ class PythonCall {
     const LibraryFunction *library_ = nullptr;
     const double *params_ = nullptr;
     int64_t n_params_ = 0;
-    NumbaCode *code_ = nullptr;
-    NumbaRelease *release_ = nullptr;
+    ValuePointer pointer_ = nullptr;
+    mutable std::vector<double> state_;  // a copy for `pointer_`, because the function may overwrite it
     std::vector<nb::handle> args_;
     npy_intp dimensions_[2];
     int n_dimensions_, type_, value_type_;

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core.inputs import count, is_number, reals, shown
 from ...core.invariants import Invariant
-from ...core.jitted import compiled_like, is_compiled
+from ...core.jitted import compiled_like, is_jitted
 from ...core.problem import Problem
 from .polynomials import Term, functions, written
 from .search import Search, Surroundings
@@ -137,4 +137,4 @@ def _of_state(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of y from a function of (t, y) that does not depend on t, or from a function of y."""
     if isinstance(fun, np.ufunc) or len(inspect.signature(fun).parameters) != 2:
         return fun
-    return compiled_like(lambda y: fun(0.0, y), fun) if is_compiled(fun) else partial(fun, 0.0)
+    return compiled_like(lambda y: fun(0.0, y), fun) if is_jitted(fun) else partial(fun, 0.0)

@@ -52,8 +52,8 @@ def functions(
     Both are jitted if the given functions and `like`, the user's right-hand side, are jitted. Otherwise they can be
     pickled if the given functions can.
     """
-    compiled = [like, *(function for term, _ in terms for function in (term.fun, term.grad))]
-    if not all(map(is_compiled, compiled)):
+    compiled = [function for term, _ in terms for function in (term.fun, term.grad)]
+    if not all(map(is_compiled, [like, *compiled])):
         return Functions(*(_Interpreted(polynomial, terms, n, which) for which in Functions._fields))
     found = _of_polynomial(polynomial, n)
     for term, coefficient in terms:

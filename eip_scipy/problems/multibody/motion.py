@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.jitted import compilable, compiled_like, is_compiled, is_jitted, jitted
+from ...core.jitted import compilable, compiled_like, is_jitted, jitted
 from ...engine.native import BUILD
 
 __all__ = ["Motion", "Sizes", "changed", "motion", "new_floats", "new_like", "plain", "solve", "vector"]
@@ -127,7 +127,7 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
     """
     nq, n, m = sizes
     matrices = sizes.matrices
-    compiles = is_compiled(fill)
+    compiles = is_jitted(fill)
     solve_now, new = (jitted(compilable(item)) for item in (solve, new_floats)) if compiles else (_solve_any, new_like)
 
     def solved(t, y, rates, accelerations, multipliers, *params):

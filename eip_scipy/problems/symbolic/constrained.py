@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import sympy
 
-from ...core.jitted import compilable, compiled_like, is_compiled, jitted
+from ...core.jitted import compilable, compiled_like, is_jitted, jitted
 from ..multibody.motion import new_floats, new_like
 from ..multibody.parts import Energy, Outputs, Parts
 from .brackets import slope
@@ -165,7 +165,7 @@ def _with_inputs(
 
 
 def _with_input(fill: Callable[..., None], function: Callable[..., float], n: int) -> Callable[..., None]:
-    compiles = is_compiled(fill) and is_compiled(function)
+    compiles = is_jitted(fill) and is_jitted(function)
     new = jitted(compilable(new_floats)) if compiles else new_like
 
     def wider(t, y, out, *params):
