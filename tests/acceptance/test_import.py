@@ -10,7 +10,7 @@ import eip_scipy
 from eip_scipy.core.moved import MOVED
 
 HEAVY = ["eip_scipy_studies", "matplotlib", "numba", "scipy", "tqdm"]
-HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm", "zarr"]
+HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm"]
 
 
 def python(code, *arguments):

@@ -9,7 +9,6 @@ import subprocess
 import threading
 import time
 import warnings
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ TESTS = Path(__file__).parents[1]
 Y0 = pericentre(0.6)
 SPAN = (0.0, 6.0)
 OPTIONS = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7, "compiled": False}
-needs_zarr = pytest.mark.skipif(find_spec("zarr") is None, reason="needs zarr")
 posix = pytest.mark.posix
 
 
@@ -48,11 +46,7 @@ def kept_by_ensemble(place, **more):
     return members(checkpoint=place, **more)
 
 
-def kept_in_zarr(place, **more):
-    return members(out=place, **more)
-
-
-KEEPING = [kept_by_integrate, kept_by_ensemble, pytest.param(kept_in_zarr, marks=needs_zarr)]
+KEEPING = [kept_by_integrate, kept_by_ensemble]
 keeping = pytest.mark.parametrize("keep", KEEPING)
 
 
@@ -133,23 +127,6 @@ def test_a_relative_path_in_a_folder_that_is_gone(keep, tmp_path, monkeypatch):
         keep("kept")
 
 
-@needs_zarr
-def test_a_zarr_group_may_need_new_folders(tmp_path):
-    whole = kept_in_zarr(tmp_path / "a" / "b" / "kept")
-    same(whole, kept_in_zarr(tmp_path / "a" / "b" / "kept", resume=True))
-
-
-@needs_zarr
-def test_a_zarr_group_at_a_url():
-    pytest.importorskip("fsspec", reason="needs fsspec, through which Zarr opens URLs")
-    place = f"memory://eip-scipy-{os.getpid()}/kept"
-    whole = kept_in_zarr(place)
-    with pytest.raises(CheckpointError, match="exists"):
-        kept_in_zarr(place)
-    same(whole, kept_in_zarr(place, resume=True))
-    assert not Path("memory:").exists()
-
-
 # One run at a time.
 
 IN_USE = rf"in use by another run \(process {os.getpid()} on \S+, this one\)\. Wait until that run ends"
@@ -181,9 +158,8 @@ def test_a_second_call_is_refused(keep, tmp_path, monkeypatch):
 
 def test_runs_of_different_kinds(tmp_path):
     def callback(*_):
-        for other in (kept_by_ensemble, kept_in_zarr) if find_spec("zarr") else (kept_by_ensemble,):
-            with pytest.raises(CheckpointError, match=IN_USE):
-                other(tmp_path / "kept")
+        with pytest.raises(CheckpointError, match=IN_USE):
+            kept_by_ensemble(tmp_path / "kept")
 
     run(tmp_path / "kept", callback=callback)
 
@@ -369,44 +345,6 @@ def test_a_folder_in_the_place_of_the_file(keep, tmp_path):
     assert content(tmp_path) == ["kept"]
 
 
-@needs_zarr
-@pytest.mark.parametrize("then", ["another", "nothing"])
-def test_another_group(then, tmp_path):
-    place, states = tmp_path / "kept", []
-
-    def action():
-        os.rename(place, tmp_path / "ours")
-        if then == "another":
-            kept_in_zarr(tmp_path / "other", h=0.2)
-            os.rename(tmp_path / "other", place)
-            states.append(tree(place))
-
-    with pytest.raises(CheckpointError, match="no longer the group that this ensemble writes to") as info:
-        kept_in_zarr(place, callback=at_once(action))
-    assert info.value.partial.status.tolist() == [0] * 6 + [-2] * 5
-    assert place.exists() == (then == "another")
-    if states:
-        assert [tree(place)] == states
-    same(members(), kept_in_zarr(tmp_path / "ours", resume=True))
-
-
-def tree(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@needs_zarr
-def test_attributes_that_users_add(tmp_path):
-    import zarr
-
-    place = tmp_path / "kept"
-
-    def note():
-        zarr.open_group(place, mode="r+").attrs["comment"] = "a sweep"
-
-    assert kept_in_zarr(place, callback=at_once(note)).success
-    assert zarr.open_group(place, mode="r").attrs["comment"] == "a sweep"
-
-
 # Functions are compared at the step of the checkpoint, too.
 
 
@@ -491,28 +429,6 @@ def test_a_function_that_no_longer_answers(tmp_path):
     same(integrate(orbit, SPAN, Y0, **OPTIONS), run(tmp_path / "kept", resume=True))
 
 
-@pytest.mark.parametrize("keep", [kept_by_ensemble, pytest.param(kept_in_zarr, marks=needs_zarr)])
-def test_members_of_functions_that_differ_later(keep, tmp_path):
-    def other(t, y):
-        return oscillator(t, y) * (1.0 if t < 0.9 else 1.001)
-
-    def square(t, y):
-        return SQUARE.fun(t, y) + (0.0 if t < 0.9 else 1e-6)
-
-    def callback(part):
-        if part.first == 3:
-            raise KeyboardInterrupt
-
-    place = tmp_path / "kept"
-    with pytest.raises(KeyboardInterrupt):
-        keep(place, callback=callback)
-    for wrong in ({"fun": other}, {"invariants": Invariant(square, SQUARE.grad, name="S")}):
-        with pytest.raises(CheckpointError, match="had other values at the end of a member from number 3 on"):
-            keep(place, resume=True, check=False, **wrong)
-    same(members(), keep(place, resume=True))
-    same(members(), keep(place, resume=True, fun=lambda t, y: oscillator(t, y) * (1 + 1e-14)))
-
-
 # SIGTERM.
 
 TERMINATED = """
@@ -547,7 +463,6 @@ def terminated(forker):
     [
         kept_by_ensemble,
         pytest.param(kept_by_integrate, marks=pytest.mark.slow),
-        pytest.param(kept_in_zarr, marks=[needs_zarr, pytest.mark.slow]),
     ],
 )
 def test_sigterm_waits_for_the_checkpoint(keep, tmp_path, terminated):
@@ -728,16 +643,6 @@ def test_an_ensemble_on_a_disk_that_fills_up(small_disk):
     same(members(), found)
     (small_disk / "filler").unlink()
     same(members(), kept_by_ensemble(place, resume=True))
-
-
-@needs_zarr
-def test_a_group_on_a_disk_that_fills_up(small_disk):
-    place = small_disk / "kept"
-    with pytest.raises(CheckpointError, match=r"cannot write to .*kept': No space left on device") as info:
-        kept_in_zarr(place, callback=at_once(lambda: fill(small_disk)))
-    assert info.value.partial.status.tolist() == [0] * 6 + [-2] * 5
-    (small_disk / "filler").unlink()
-    same(members(), kept_in_zarr(place, resume=True))
 
 
 @posix
