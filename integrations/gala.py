@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ._orbits import run_orbits
+from eip_scipy import EIPDOP853, Invariant, integrate
 
 try:
     from gala.dynamics import Orbit, PhaseSpacePosition
@@ -25,26 +25,17 @@ __all__ = ["integrate_orbit"]
 def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None = None, **time_spec: Any) -> Orbit:
     """Integrate orbits as ``integrate_orbit`` of gala's potentials does, with the invariants kept.
 
-    The energy (Jacobi's integral in a rotating frame) is kept unless the potential depends on time, and L_z if the
-    potential is symmetric about the z axis and the frame does not rotate about another axis. To find out, the rates of
-    change of both are computed at random states. Forces come from gala's C functions, called from Python, if the
-    potential has them. gala's own ``integrate_orbit`` accepts only gala's integrators.
+    The energy (Jacobi's integral in a rotating frame) and L_z are kept if their rates of change are 0 at random states.
 
     Parameters
     ----------
     hamiltonian : gala.potential.PotentialBase or gala.potential.Hamiltonian
-    w0 : gala.dynamics.PhaseSpacePosition or array_like
-        One initial state (positions and velocities) or several, each of which is integrated by itself. An array, shape
-        (2 n,) or (2 n, orbits) in n dimensions, has the units of the potential.
+    w0 : gala.dynamics.PhaseSpacePosition or array_like, shape (2 n,) or (2 n, orbits)
+        One initial state or several. An array has the units of the potential.
     options : dict, optional
-        Options of `eip_scipy.integrate`. Defaults: ``method`` `EIPDOP853`, ``rtol`` and ``atol`` 1e-10 (as gala's
-        integrator "dopri853" in C) unless ``h`` is given, and the invariants above.
+        Options of `eip_scipy.integrate`. Default: `EIPDOP853`, ``rtol = atol = 1e-10``, and the invariants above.
     **time_spec
         Times as gala takes them: ``dt, n_steps``; ``dt, t1, t2``; ``t``.
-
-    Returns
-    -------
-    gala.dynamics.Orbit
 
     Raises
     ------
@@ -54,41 +45,54 @@ def integrate_orbit(hamiltonian: Any, w0: Any, *, options: dict[str, Any] | None
     system = _System(Hamiltonian(hamiltonian))
     units = system.hamiltonian.units
     start = w0 if isinstance(w0, PhaseSpacePosition) else PhaseSpacePosition.from_w(np.asarray(w0, dtype=float), units)
-    times = parse_time_specification(units, **time_spec)
-    rows = run_orbits(system, start.w(units).T, times, options or {})
-    w = rows.T if start.shape else rows[0].T
+    starts, times = np.ascontiguousarray(start.w(units).T), parse_time_specification(units, **time_spec)
+    given = {"method": EIPDOP853} | ({} if "h" in (options or {}) else {"rtol": 1e-10, "atol": 1e-10}) | (options or {})
+    given.setdefault("invariants", _conserved(system, starts[0], times))
+    runs = [integrate(system, (times[0], times[-1]), w, t_eval=times, **given) for w in starts]
+    for k, run in enumerate(runs):
+        if not run.success:
+            raise RuntimeError(f"orbit {k}: {run.message}")
+    w = np.stack([run.y for run in runs], axis=-1) if start.shape else runs[0].y
     return Orbit.from_w(w, units=units, t=times * units["time"], hamiltonian=system.hamiltonian)
 
 
-class _System:
-    """Hamiltonian of gala: a call with a time and one state (q, p) returns its derivative, shape (2 n,).
+def _conserved(system: _System, w: np.ndarray, times: np.ndarray) -> list[Invariant]:
+    """Return those of the energy and L_z whose rates of change are 0 at random states of the size of w = (q, p)."""
+    n, rng = system.n, np.random.default_rng(1)
+    J = np.zeros((2 * n, 2 * n))
+    found: list[Any] = [("energy", system.energy, lambda t, y, f: np.append(-f[n:], f[:n]))]
+    if n > 1:
+        J[[0, n + 1], [n + 1, 0]], J[[1, n], [n, 1]] = 1.0, -1.0
+        found.append(("L_z", lambda t, y: float(y @ J @ y / 2), lambda t, y, f: J @ y))
+    distance = np.linalg.norm(w[:n]) or 1.0
+    speed = np.linalg.norm(w[n:]) + (distance * np.linalg.norm(system(times[0], w)[n:])) ** 0.5
+    for _ in range(6):
+        t, apart = times[0] + rng.random() * (times[-1] - times[0]), 1e-5 * distance / speed
+        y = np.append(distance * rng.normal(size=n), speed * rng.normal(size=n)) / n**0.5
+        f = system(t, y)
+        sizes = [2 * apart * np.abs(grad(t, y, f) * f).sum() for _, _, grad in found]
+        changes = [fun(t + apart, y + apart * f) - fun(t - apart, y - apart * f) for _, fun, _ in found]
+        found = [item for item, change, size in zip(found, changes, sizes, strict=True) if abs(change) <= 1e-6 * size]
+    return [Invariant(fun, grad, uses_f=True, name=name) for name, fun, grad in found]
 
-    `energy` returns the value of the Hamiltonian, which in a rotating frame is Jacobi's integral.
-    """
+
+class _System:
+    """Derivative and energy of a state (q, p), by the C functions of gala if the potential has them."""
 
     def __init__(self, hamiltonian: Any) -> None:
-        self.hamiltonian = hamiltonian
-        self._potential = potential = hamiltonian.potential
-        self._forces = potential.c_instance if hamiltonian.c_enabled else None
-        self._n = n = potential.ndim
+        self.hamiltonian, potential = hamiltonian, hamiltonian.potential
+        c = potential.c_instance if hamiltonian.c_enabled else None
+        self._gradient, self._energy = (potential._gradient, potential._energy) if c is None else (c.gradient, c.energy)
+        self.n = n = potential.ndim
         omega = np.ravel(hamiltonian.frame.parameters["Omega"].value) if hamiltonian.frame.parameters else np.zeros(3)
         x, y, z = omega if omega.size == 3 else (0, 0, omega[0])
-        # Omega x q in matrix form; 0 in a frame at rest.
-        self._turn = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])[:n, :n] if omega.any() else None
+        self._turn = np.array([[0.0, -z, y], [z, 0, -x], [-y, x, 0]])[:n, :n]  # Omega x q in matrix form
 
     def __call__(self, t: float, w: np.ndarray) -> np.ndarray:
-        n, at, out = self._n, np.array([t]), np.empty(w.size)
-        q = w[:n].reshape(n, 1)
-        gradient = self._potential._gradient(q, t=at) if self._forces is None else self._forces.gradient(q, at)
-        out[:n] = w[n:]
-        np.negative(gradient[:, 0], out=out[n:])
-        if self._turn is not None:
-            out[:n] -= self._turn @ w[:n]
-            out[n:] -= self._turn @ w[n:]
-        return out
+        q, p = w[: self.n], w[self.n :]
+        force = self._gradient(q.reshape(self.n, 1), np.array([t]))[:, 0]
+        return np.append(p - self._turn @ q, -force - self._turn @ p)
 
     def energy(self, t: float, w: np.ndarray) -> float:
-        n, at = self._n, np.array([t])
-        q, p = w[:n].reshape(1, n), w[n:]
-        value = self._potential._energy(q, t=at) if self._forces is None else self._forces.energy(q, at)
-        return float(p @ p / 2 + value[0] - (0 if self._turn is None else p @ self._turn @ w[:n]))
+        q, p = w[: self.n], w[self.n :]
+        return float(p @ p / 2 + self._energy(q.reshape(1, self.n), np.array([t]))[0] - p @ self._turn @ q)

@@ -19,17 +19,13 @@ EXTRAS = {
     "matplotlib": ("plot", "figures"),
     "sympy": ("sympy", "hamiltonian, equations"),
     "rebound": ("rebound", "simulations of REBOUND; WHFast and IAS15 to compare with"),
-    "heyoka": ("heyoka", "Taylor series, projected"),
+    "heyoka": ("heyoka", "Taylor series to compare with"),
     "gala": ("gala", "orbits in gala's potentials"),
-    "galpy": ("galpy", "orbits in galpy's potentials"),
-    "qutip": ("qutip", "Schrödinger's equation in qutip"),
     "astropy": ("astro", "quantities and times"),
     "jplephem": ("jpl", "JPL's ephemerides"),
     "xarray": ("xarray", "results as datasets"),
     "pandas": ("pandas", "results as data frames"),
-    "zarr": ("zarr", "ensembles on disk"),
     "dask": ("distributed", "ensembles on a cluster"),
-    "mpi4py": ("mpi", "states over many processes"),
     "ducc0": ("fft", "faster Fourier transforms"),
 }
 

@@ -70,7 +70,7 @@ class Run:
         return self.start.y
 
     def engine(
-        self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
+        self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True
     ) -> Engine:
         """Return the engine of the run, which it `begins` or continues; work.K[0] must hold the derivative there."""
         in_python = self.tableau.in_python
@@ -79,7 +79,6 @@ class Run:
             estimates=in_python and self.tableau.has_estimate,
             drives=self.tableau.drives,
             joint=None if functions.native else self.options.joint,
-            **others,
         )
         needed = hooks if hooks != Hooks() else None
         engine, w = Engine(self.method, self.options, self.work, functions, schedule, needed), self.work

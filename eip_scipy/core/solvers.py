@@ -125,8 +125,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     """
 
     TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep | Driven]
-    # True if the state is one of several parts, which are projected together.
-    _in_parts: ClassVar[bool] = False
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
     _COLUMNS: ClassVar[Columns | None] = None  # columns of derivatives behind the state
@@ -246,7 +244,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         # The steps continue from `_raw`. If it waits for its projection, `y` is its projected copy.
         self._raw = self._raw_old = run.y0
         self._waits = False, False  # whether the states at both ends of the last step wait for a projection
-        self._shows = run.shows and not self._in_parts
+        self._shows = run.shows
         self._steps = 0
 
     def _drive(self, *, begins: bool) -> None:
@@ -265,7 +263,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         rhs = compiled_call(self._call, *state)
         inv, grad = (tuple(compiled_call(known, *state) for known in group) for group in self._run.invariants.calls)
         functions = PythonFunctions(rhs, inv, grad, (), second_order=False, jacobian=jacobian, rates=rates)
-        self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
+        self._engine = self._run.engine(functions, self._schedule, begins=begins)
 
     def _settle(self) -> None:
         """Store the attributes after a step, so that the next step detects which of them the user has set."""
@@ -427,10 +425,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         shared, copied = self._state()
         new._revive(shared, copy.deepcopy(copied, memo))
         return new
-
-    def _hooks(self) -> dict[str, Any]:
-        """Return the parts of a step that a subclass computes itself, see `Hooks`."""
-        return {}
 
     def _count(self) -> int:
         """Update nfev, njev and nlu, and return how many suspicious corrections and errors the engine has counted."""

@@ -1,1 +1,1 @@
-"""Many runs of one problem: tasks, chunks, stores, statistics, vectorised members."""
+"""Many runs of one problem: tasks, chunks, checkpoints, vectorised members."""

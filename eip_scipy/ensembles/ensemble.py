@@ -38,11 +38,10 @@ from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from ..run.results import WithColumns
 from ..run.tables import dataset, default_names, to_dataframe
-from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order, run_elsewhere
-from .own_times import OwnTimes, own_times
+from .checkpoints import EnsembleFile
+from .chunks import Chunk, Part, Pool, cores, run_elsewhere, thread_pool
+from .reduction import placed
 from .side_by_side import LANES
-from .statistics import Statistics, merge
-from .store import CheckpointStore, Store, ZarrStore, location, require_same_functions
 from .tasks import FAILED, NOT_RUN, Members, Plan, Task
 
 __all__ = ["EnsembleResult", "ensemble"]
@@ -59,7 +58,7 @@ SHOWN = 5
 # Fields of a request that an ensemble handles itself, those that it does not have, and its own parameters.
 HANDLED = {"fun", "acceleration", "t_span", "params", "callback", "max_bytes", "progress"}
 ALONE = HANDLED | {"y0", "diagnostics", "projection"}
-OWN = ("y0s", "executor", "reduce", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(HANDLED))
+OWN = ("y0s", "executor", "reduce", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(HANDLED))
 
 
 class EnsembleKeywords(ProjectionDetails, total=False):
@@ -115,20 +114,21 @@ class EnsembleResult(WithColumns):
         Names of the l invariants.
     nfev, njev, nlu, n_rejected_projections : ndarray, shape (members,)
         Evaluations of the right-hand side and of the gradients, factorisations, and rejected projections.
-    times : ndarray, shape (m,) or (members, m)
-        Times of the saved states; empty if no states are saved. If members have different times, there is one row for
-        each member, padded with nan.
-    trajectories : ndarray or zarr.Array or None, shape (members, n, m)
-        Saved states; nan after the end of a member that ended early. None if no states are saved or they were reduced.
-    invariants : ndarray or zarr.Array, shape (members, l) or (members, l, m)
+    times : ndarray, shape (m,)
+        Times of the saved states; empty if no states are saved.
+    trajectories : ndarray or None, shape (members, n, m)
+        Saved states; nan after the end of a member that ended early. None if no states are saved or ``reduce=`` was
+        given.
+    invariants : ndarray, shape (members, l) or (members, l, m)
         Values of the invariants in the saved states if `trajectories` has them, else in the last states.
     target : ndarray, shape (members, l)
         Values to which the invariants of each member were projected.
     t_events, y_events : list of list of ndarray, or None
         If there are events, ``t_events[k]`` and ``y_events[k]`` are those of member k, as in
         `scipy.integrate.solve_ivp`: one array for each event.
-    statistics : Statistics or None
-        Statistics over all members, if ``reduce=`` was given.
+    reduced : ndarray or None, shape (members, ...)
+        Value of the function ``reduce=`` for each member, nan for members that failed or did not run. None without
+        ``reduce=``.
     variations : ndarray, shape (members, n, k) or (members, m, n, k)
         Columns of derivatives if ``variations=`` was given, in the saved states if `trajectories` has them, else in the
         last states. `stm` and `sensitivities` are parts of it; `columns` is as in `IntegrationResult`.
@@ -165,12 +165,12 @@ class EnsembleResult(WithColumns):
     nlu: np.ndarray
     n_rejected_projections: np.ndarray
     times: np.ndarray
-    trajectories: Any
-    invariants: Any
+    trajectories: np.ndarray | None
+    invariants: np.ndarray
     target: np.ndarray
     t_events: list[list[np.ndarray]] | None
     y_events: list[list[np.ndarray]] | None
-    statistics: Statistics | None
+    reduced: np.ndarray | None
     first: int
     stopped: bool
     wall_time: float
@@ -195,12 +195,10 @@ class EnsembleResult(WithColumns):
         Returns
         -------
         xarray.Dataset
-            Dataset with the names of the Zarr group that `out` writes, and more: ``y`` (member, component), ``t_end``,
-            ``status``, ``message``, ``trusted``, ``max_correction`` (member), ``max_defect``, ``target`` (member,
-            invariant), and the counts. If trajectories are in memory, also ``states`` (member, component, time) and
-            ``invariants`` (member, invariant, time), with ``row`` and ``times`` (member, row) instead of ``time`` if
-            members have different times; otherwise ``end_invariants`` (member, invariant). To open the group written
-            by `out`, use ``xarray.open_zarr(out, consolidated=False)``.
+            Dataset with ``y`` (member, component), ``t_end``, ``status``, ``message``, ``trusted``, ``max_correction``
+            (member), ``max_defect``, ``target`` (member, invariant), and the counts. If trajectories are in memory,
+            also ``states`` (member, component, time) and ``invariants`` (member, invariant, time); otherwise
+            ``end_invariants`` (member, invariant).
 
         Raises
         ------
@@ -214,21 +212,17 @@ class EnsembleResult(WithColumns):
         variables["message"] = ("member",), self.message.astype(str)
         variables["max_defect"] = ("member", "invariant"), self.max_defect
         variables["target"] = ("member", "invariant"), self.target
-        if isinstance(self.invariants, np.ndarray) and self.invariants.ndim == 2:
+        if self.invariants.ndim == 2:
             variables["end_invariants"] = ("member", "invariant"), self.invariants
         coordinates: dict[str, Any] = {
             "member": self.first + np.arange(self.t.size),
             "component": list(component_names(self.component_names if names is None else names, self.y.shape[1])),
             "invariant": list(self.names),
         }
-        if isinstance(self.trajectories, np.ndarray):
-            axis = "time" if self.times.ndim == 1 else "row"
-            variables["states"] = ("member", "component", axis), self.trajectories
-            variables["invariants"] = ("member", "invariant", axis), self.invariants
-            if self.times.ndim == 1:
-                coordinates["time"] = self.times
-            else:
-                variables["times"] = ("member", "row"), self.times
+        if self.trajectories is not None:
+            variables["states"] = ("member", "component", "time"), self.trajectories
+            variables["invariants"] = ("member", "invariant", "time"), self.invariants
+            coordinates["time"] = self.times
         attributes = {name: self[name] for name in ("method", "h", "success", "stopped", "wall_time")}
         return dataset(variables, coordinates, attributes)
 
@@ -237,11 +231,7 @@ class EnsembleResult(WithColumns):
         return to_dataframe(self, names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`.
-
-        Trajectories in the Zarr group of `out` stay there: after `load`, `trajectories` is None and `invariants` holds
-        the values in the last states.
-        """
+        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`."""
         from ..run.saving import save
 
         save(self, path)
@@ -258,7 +248,7 @@ class EnsembleResult(WithColumns):
         -------
         matplotlib.figure.Figure
             For each component the median of all members in time, with bands that contain 50 % and 90 % of them; if no
-            states are saved at common times, the distribution of the last states. Further panels show the largest error
+            states are saved, the distribution of the last states. Further panels show the largest error
             of each invariant in each member, and how many members reached the end, were ended by an event, are not to
             be trusted, failed or did not run. A notebook shows the figure automatically.
 
@@ -323,9 +313,8 @@ def ensemble(
     executor: Any = None,
     save_every: int | None = None,
     t_eval: Any = None,
-    reduce: Any = None,
+    reduce: Callable[[Any], Any] | None = None,
     callback: Callable[[EnsembleResult], Any] | None = None,
-    out: Any = None,
     checkpoint: Any = None,
     checkpoint_every: float = 60.0,
     resume: bool = False,
@@ -343,11 +332,11 @@ def ensemble(
     ----------
     fun : callable or Problem
         As for `integrate`.
-    t_span : (float, float) or array_like, shape (members, 2)
-        Start and end: the same for all members, or a row for each.
+    t_span : (float, float)
+        Start and end, the same for all members.
     y0s : array_like, shape (members, n)
-        Initial states; one state (n,) for all if `params`, `t_span` or `t_eval` has a row for each member. Default: the
-        initial state of a `Problem`.
+        Initial states; one state (n,) for all if `params` has a row for each member. Default: the initial state of a
+        `Problem`.
     acceleration : callable, optional
         Instead of `fun`, as for `integrate`.
     params : array_like of float, shape (p,) or (members, p), optional
@@ -363,37 +352,32 @@ def ensemble(
     invariants : Invariant or sequence of Invariant, optional
         Invariants to keep: each member keeps the values at its own start. If `params` differ, the functions receive the
         parameters as the last argument and must have no args.
-    executor : None, int, "dask", distributed.Client, DaskExecutor or concurrent.futures.Executor, optional
+    executor : None, int, "dask", distributed.Client or concurrent.futures.Executor, optional
         Where members run. None: threads on all cores. A number: this number of threads. If functions are not compiled:
-        one thread. A client or an executor: its workers. "dask": the configured Dask cluster
-        (``DASK_SCHEDULER_ADDRESS``), or a local cluster with one process for each core; see
+        one thread. A client or an executor, such as ``mpi4py.futures.MPIPoolExecutor()``: its workers. "dask": the
+        configured Dask cluster (``DASK_SCHEDULER_ADDRESS``), or a local cluster with one process for each core; see
         `eip_scipy.integrations.dask`.
     save_every : int, optional
         Save every `save_every`-th step of each member in ``.trajectories``; fixed steps only.
-    t_eval : array_like or sequence of array_like, optional
-        Times to save at instead: the same for all members, or a row (members, m) or an array for each. Members with
-        different intervals or times are prepared and run one after the other, which takes some milliseconds for each;
-        they accept neither `save_every` nor `reduce`.
-    reduce : "state" or callable, optional
-        Statistics over members (mean, variance, extremes) of the saved states, or of the last states if none are saved.
-        A function ``reduce(t, y) -> float or (k,)``: statistics of its values. Trajectories are then stored only in
-        `out`.
+    t_eval : array_like, optional
+        Times to save at instead, the same for all members.
+    reduce : callable, optional
+        ``reduce(result) -> float or array``, called with the result of each member that did not fail. The result has
+        the fields of `integrate`, with the same bits, except `diagnostics`, `sol`, `calls` and `wall_time`. The values
+        are stacked in ``.reduced``; trajectories are not kept.
     callback : callable, optional
         ``callback(part)``, called after each chunk of members, in order, with an `EnsembleResult` of that chunk; return
         True to stop.
-    out : path-like, optional
-        Zarr group to which results are written chunk by chunk, for trajectories that do not fit into memory; xarray can
-        open it. The path of a folder, or a URL.
     checkpoint : path-like, optional
-        Without `out`: a file that stores finished members, see `eip_scipy.checkpoint`. It is written every
-        `checkpoint_every` seconds, and when the ensemble ends or is interrupted.
+        File that stores finished members, see `eip_scipy.checkpoint`. It is written every `checkpoint_every` seconds,
+        and when the ensemble ends or is interrupted.
     checkpoint_every : float, optional
         Seconds from one checkpoint to the next; longer if writing would take more than 5 % of the time.
     resume : bool, optional
-        Continue with the content of `out` or `checkpoint`, with the same arguments: only missing members run, and the
-        result agrees bit by bit. If there is no content, start at the beginning.
+        Continue with the members that `checkpoint` does not contain, with the same arguments: the result agrees bit by
+        bit with that of an ensemble without interruption. If there is no file, start at the beginning.
     chunk : int, optional
-        Number of members that run together; results do not depend on it, except for the last bits of `reduce`.
+        Number of members that run together; results do not depend on it.
     progress : bool, optional
         Show a progress bar with the remaining time.
     max_bytes : float, optional
@@ -401,9 +385,8 @@ def ensemble(
     **keywords
         Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
         direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step, variations,
-        jvp, symplectic. Members with derivatives run one after the other, and accept neither `out` nor `reduce`. Events
-        are stored for each member in ``.t_events`` and ``.y_events``; a terminal event ends its member. `check`
-        examines one member.
+        jvp, symplectic. Members with derivatives run one after the other. Events are stored for each member in
+        ``.t_events`` and ``.y_events``; a terminal event ends its member. `check` examines one member.
 
     Returns
     -------
@@ -418,14 +401,13 @@ def ensemble(
     MemoryError
         If results would need more than `max_bytes`.
     CheckpointError
-        If `out` or `checkpoint` exists without ``resume=True``, is damaged, belongs to other arguments or functions, or
-        is used by another ensemble, or if `out` can no longer be written.
+        If `checkpoint` exists without ``resume=True``, is damaged, belongs to other arguments or functions, or is used
+        by another ensemble.
 
     Notes
     -----
-    Members run in chunks, whose size does not depend on the number of workers, and chunks are collected in order, so
-    that statistics also agree bit by bit for any number of workers. If the ensemble is interrupted (Ctrl-C, or an
-    exception raised by the callback), the attribute ``partial`` of the exception is the result up to that point.
+    Members run in chunks, which are collected in order. If the ensemble is interrupted (Ctrl-C, or an exception raised
+    by `callback` or `reduce`), the attribute ``partial`` of the exception is the result up to that point.
 
     Examples
     --------
@@ -439,50 +421,36 @@ def ensemble(
     ((5, 4), True, True)
     """
     options: dict[str, Any] = dict(keywords)
-    _check_options(options, reduced=out is not None or reduce is not None)
+    _check_options(options)
     _check_choices(reduce, callback, progress, max_bytes)
     if invariants is not DEFAULT:
         options["invariants"] = invariants
-    out, checkpoint = _places(out, checkpoint, checkpoint_every, resume)
-    own = own_times(fun, t_span, t_eval, save_every, reduce)
-    everyone = _inputs(fun, y0s, params, options, own)
+    checkpoint = _place(checkpoint, checkpoint_every, resume)
+    everyone = _inputs(fun, y0s, params, options)
     total = len(everyone.y0s)
-    keep = reduce is None or out is not None
     method = default_method(fun) or EIPRK4 if method is None else method
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
     common["acceleration"] = acceleration
     request = Request.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
-    request = request.with_own_events().with_pointers()._replace(**own.of(0))
+    request = request.with_own_events().with_pointers()
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
-    task = Task(request, reduce, keep, total, own.padded.shape[1] if own else None)
-    plan, doubts = _first_that_starts(task, everyone)
+    plan = _first_that_starts(Task(request, total, reduce), everyone)
     everyone = everyone._replace(y0s=np.ascontiguousarray(everyone.y0s, plan.dtype))
     size = _chunk_size(plan, total, request.function) if chunk is None else count("chunk", chunk)
-    held = plan.times.size if reduce is None and out is None else 0
-    _check_memory(plan, total, held, max_bytes)
-    store: Store | None = None
-    if out is not None or checkpoint is not None:
-        stored = reduce if out is None else None  # statistics of the states in `out` can be computed anew
-        identity = plan.identity(everyone.y0s, everyone.params, size, own, stored)
-        store = (
-            CheckpointStore(checkpoint, identity, resume, checkpoint_every)
-            if out is None
-            else ZarrStore(out, identity, resume, plan.empty(size), _all_times(plan, own), total, plan.events)
-        )
-    stopped, closed = (nullcontext(), nullcontext()) if store is None else (sigterm_as_ctrl_c(), closing(store))
-    with stopped, closed:
-        gathered = _Gathered(plan, everyone, held, size, store, callback, doubts)
+    _check_memory(plan, total, max_bytes)
+    file = None if checkpoint is None else EnsembleFile(checkpoint, checkpoint_every, resume, plan, everyone)
+    with nullcontext() if file is None else sigterm_as_ctrl_c(), nullcontext() if file is None else closing(file):
+        gathered = _Gathered(plan, everyone, size, file, callback)
         result = gathered.run(partial(_pool, executor, plan, progress), progress)
     _warn(result, np.flatnonzero((result.status >= 0) & ~result.trusted))
     return result
 
 
 def _check_choices(reduce: Any, callback: Any, progress: Any, max_bytes: Any) -> None:
-    if not (reduce is None or reduce == "state" or callable(reduce)):
-        raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {shown(reduce)}.")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be a function callback(part), got {shown(callback)}.")
+    for name, given, form in (("reduce", reduce, "reduce(result)"), ("callback", callback, "callback(part)")):
+        if given is not None and not callable(given):
+            raise TypeError(f"{name} must be a function {form}, got {shown(given)}.")
     flag("progress", progress)
     check_bytes(max_bytes)
 
@@ -507,26 +475,22 @@ def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
 class _Gathered:
     """The finished members so far, from which the result is made.
 
-    `everyone` has the inputs of all members, `chunk` is the number of members in a chunk, and `store` writes `out` or
-    `checkpoint`, if one is given. `held` is the number of saved states that are kept in memory for each member.
-    `doubts` holds, by member, the findings of the checks at the start.
+    `everyone` has the inputs of all members, `chunk` is the number of members in a chunk, and `file` is the checkpoint,
+    if there is one.
     """
 
     def __init__(
         self,
         plan: Plan,
         everyone: Chunk,
-        held: int,
         chunk: int,
-        store: Store | None,
+        file: EnsembleFile | None,
         callback: Callable[[EnsembleResult], Any] | None,
-        doubts: dict[int, str],
     ) -> None:
-        self.everyone = everyone
-        self.plan, self.chunk, self.store, self.callback, self.doubts = plan, chunk, store, callback, doubts
+        self.plan, self.everyone, self.chunk, self.file, self.callback = plan, everyone, chunk, file, callback
         self.method = plan.task.request.method.__name__
-        self.whole = Members.empty(len(everyone.y0s), plan.size, plan.dtype, len(plan.names), held)
-        self.statistics: Statistics | None = None
+        self.whole = Members.empty(len(everyone.y0s), plan.size, plan.dtype, len(plan.names), plan.held)
+        self.reduced: np.ndarray | None = None
         self.stopped, self.one_by_one = False, ""
         self._begin = time.perf_counter()
 
@@ -534,8 +498,10 @@ class _Gathered:
         """Run all chunks that are not stored yet in the pool that ``pool()`` makes, and return the result."""
         from tqdm import tqdm
 
-        done = self._stored()
-        total = len(self.whole.t)
+        done, total = 0, len(self.whole.t)
+        if self.file is not None and self.file.finished:
+            done = self.file.finished
+            self._take(0, Part(self.file.members, self.file.reduced))
         chunks = (self.everyone.part(first, first + self.chunk) for first in range(done, total, self.chunk))
         shown: dict[str, Any] = {"desc": self.method, "unit": "member", "unit_scale": True, "disable": not progress}
         try:
@@ -543,86 +509,64 @@ class _Gathered:
                 with tqdm(total=total, initial=done, **shown) as bar:
                     self._gather(pool(), chunks, bar)
         except BaseException as error:
-            error.partial = self._of(self.whole, self.statistics, 0)  # type: ignore[attr-defined]
+            error.partial = self._of(self.whole, self.reduced, 0)  # type: ignore[attr-defined]
             raise
-        return self._of(self.whole, self.statistics, 0)
-
-    def _stored(self) -> int:
-        """Read the results of the stored members, compare their functions, and return the number of these members."""
-        if self.store is None:
-            return 0
-        done, statistics = self.store.finished, self.store.statistics
-        for first in range(0, done, self.chunk):
-            members = self.store.read(first, min(first + self.chunk, done))
-            part = Part(members, None) if statistics is not None else finished(self.plan.task, self.plan, members)
-            self._take(first, part)
-            if first + self.chunk >= done:
-                last = self.everyone.part(first, done)
-                here = self.plan.known_by(last.y0s, last.params, members)
-                require_same_functions(self.store.path, self.store.known_by(first), *here, first)
-        self.statistics = self.statistics if statistics is None else statistics
-        return done
+        return self._of(self.whole, self.reduced, 0)
 
     def _gather(self, pool: Pool, chunks: Iterator[Chunk], bar: Any) -> None:
         with ExitStack() as stack:
             stack.callback(pool.close)
-            if self.store is not None:
-                stack.callback(self.store.flush)  # first, because the process may be killed soon
-            for chunk, part in in_order(pool, chunks):
+            if self.file is not None:
+                stack.callback(self.file.flush)  # first, because the process may be killed soon
+            for chunk, part in pool.in_order(chunks):
                 self._take(chunk.first, part)
-                if self.store is not None:
-                    known_by, _ = self.plan.known_by(chunk.y0s, chunk.params, part.members)
-                    self.store.write(chunk.first, part.members, known_by, self.whole, self.statistics)
+                done = chunk.first + len(part.members.t)
+                if self.file is not None:
+                    self.file.write(done, self.whole, self.reduced)
                 bar.update(len(part.members.t))
-                if self.callback is not None and self.callback(self._of(part.members, part.statistics, chunk.first)):
+                if self.callback is not None and self.callback(self._of(part.members, part.reduced, chunk.first)):
                     self.stopped = True
                     return
 
     def _take(self, first: int, part: Part) -> None:
         members, last = part.members, first + len(part.members.t)
+        if part.reduced is not None:
+            self.reduced = placed(self.reduced, len(self.whole.t), slice(first, last), part.reduced)
         for name, whole in self.whole._asdict().items():
-            if not name.startswith("saved") or whole.shape[1]:
-                whole[first:last] = getattr(members, name)
-        self.statistics = merge(self.statistics, part.statistics)
+            whole[first:last] = getattr(members, name)
         self.one_by_one = part.one_by_one or self.one_by_one
 
-    def _of(self, members: Members, statistics: Statistics | None, first: int) -> EnsembleResult:
-        plan, counters, times = self.plan, members.counters, _all_times(self.plan, self.everyone.own)
-        trajectories = members.saved.swapaxes(1, 2) if members.saved.shape[1] else None
-        ends = members.values
-        invariants = ends if trajectories is None else members.saved_values.swapaxes(1, 2)
-        if members is self.whole and self.store is not None and self.store.states is not None:
-            trajectories, invariants = self.store.states, self.store.saved_values
+    def _of(self, members: Members, reduced: np.ndarray | None, first: int) -> EnsembleResult:
+        plan, counters = self.plan, members.counters
+        trajectories = members.saved.swapaxes(1, 2) if plan.held else None
         none = [(np.zeros(0), np.zeros((0, plan.size), plan.dtype))] * plan.events  # of a member that did not run
         events = [found or none for found in members.happened]
-        trusted, message = members.trusted.copy(), np.array(members.message, dtype=object)
-        for k in range(len(trusted)) if self.doubts else ():
-            if trusted[k] and first + k in self.doubts:
-                trusted[k], message[k] = False, f"{message[k]}; {self.doubts[first + k]}"
+        if reduced is None and plan.task.reduce is not None:  # all members failed
+            reduced = np.full(len(members.t), np.nan)
         result = EnsembleResult(
             y=members.y,
             t=members.t,
             status=members.status,
-            message=message,
+            message=np.array(members.message, dtype=object),
             failed=np.flatnonzero(members.status == FAILED),
             success=bool((members.status >= 0).all()),
             max_defect=members.max_defect,
             max_correction=members.max_correction,
             side_by_side=members.side_by_side,
             one_by_one=self.one_by_one,
-            trusted=trusted,
+            trusted=members.trusted,
             names=plan.names,
             nfev=counters[:, NFEV],
             njev=counters[:, NJEV],
             nlu=counters[:, NLU],
             n_rejected_projections=counters[:, REJECTED],
-            times=times if times.ndim == 1 else times[first : first + len(members.t)],
+            times=plan.times if plan.is_saving else np.zeros(0),
             trajectories=trajectories,
-            invariants=invariants,
+            invariants=members.values if trajectories is None else members.saved_values.swapaxes(1, 2),
             target=members.target,
             t_events=[[t for t, _ in member] for member in events] if plan.events else None,
             y_events=[[y for _, y in member] for member in events] if plan.events else None,
-            statistics=statistics,
+            reduced=reduced,
             first=first,
             stopped=self.stopped,
             wall_time=time.perf_counter() - self._begin,
@@ -634,7 +578,6 @@ class _Gathered:
         if plan.variations is not None:
             _separate(result, plan.variations.columns)
             result["columns"] = plan.ready.described_columns
-        object.__setattr__(result, "_ends", ends)  # an attribute, not a field
         return result
 
 
@@ -648,15 +591,7 @@ def _separate(result: EnsembleResult, columns: Columns) -> None:
         result["y_events"] = [[columns.own(rows) for rows in member] for member in result.y_events]
 
 
-def _all_times(plan: Plan, own: OwnTimes) -> np.ndarray:
-    """Return the times of saved states, with a row for each member if their times differ."""
-    return plan.times if own.times is None else own.padded
-
-
-def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
-    """Check the options of `integrate`; `reduced` is True if the states go into statistics or the store of `out`."""
-    if reduced and options.get("variations") is not None:
-        raise ValueError("ensemble: variations= cannot be combined with out= or reduce=; omit one of them.")
+def _check_options(options: dict[str, Any]) -> None:
     known = set(Request._fields) - ALONE | set(ProjectionOptions.names())
     for name in options:
         if name not in known:
@@ -664,23 +599,20 @@ def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
     Events(options.get("events"))  # raises an error if they are wrong
 
 
-def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
-    """Return `out` and `checkpoint` as absolute paths after checks, so that the working directory may change."""
+def _place(checkpoint: Any, every: Any, resume: Any) -> str | None:
+    """Return `checkpoint` as an absolute path after checks, so that the working directory may change."""
     if not is_number(every, "checkpoint_every") or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     flag("resume", resume)
-    if out is not None and checkpoint is not None:
-        raise ValueError("got both out= and checkpoint=; omit checkpoint, because out already stores finished members.")
-    for name, path in (("out", out), ("checkpoint", checkpoint)):
-        if path is not None and not isinstance(path, (str, os.PathLike)):
-            raise TypeError(f"{name} must be a path, got {path!r}.")
-    if resume and out is None and checkpoint is None:
-        raise ValueError("resume=True needs a place to resume from: pass out= or checkpoint=.")
-    return None if out is None else location(out), None if checkpoint is None else absolute(checkpoint)
+    if checkpoint is not None and not isinstance(checkpoint, (str, os.PathLike)):
+        raise TypeError(f"checkpoint must be a path, got {checkpoint!r}.")
+    if resume and checkpoint is None:
+        raise ValueError("resume=True needs a file to resume from: pass checkpoint=.")
+    return None if checkpoint is None else absolute(checkpoint)
 
 
-def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: OwnTimes) -> Chunk:
-    """Return all members as one `Chunk`: states (m, n), parameters (m, p), p = 0 if there are none, and own `times`."""
+def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any]) -> Chunk:
+    """Return all members as one `Chunk`: states (m, n) and parameters (m, p), p = 0 if there are none."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
         y0s = None if problem is None else problem.y0
@@ -694,17 +626,10 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
         own = own[:, None]  # one for each member, because they cannot be common to all
     if starts.ndim == 1 and own is not None and own.ndim == 2:
         starts = np.tile(starts, (len(own), 1))
-    elif starts.ndim == 1 and times:
-        starts = np.tile(starts, (times.members, 1))
     if starts.ndim != 2 or starts.size == 0:
         raise ValueError(
-            f"y0s must have the shape (members, n), got {starts.shape}; one state (n,) is possible only if params, "
-            "t_span or t_eval has a row for each member."
-        )
-    if times and times.members != len(starts):
-        raise ValueError(
-            f"{times.name} has {times.members} rows for {len(starts)} members; give one row for each member, or one "
-            "for all."
+            f"y0s must have the shape (members, n), got {starts.shape}; one state (n,) is possible only if params has "
+            "a row for each member."
         )
     if own is None:
         brought = None if problem is None or problem.rhs is None else problem.params
@@ -722,7 +647,7 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
         )
     if options.get("args") is not None:
         own = floats(extra_arguments(options["args"], params))
-    return Chunk(0, starts, own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size)), times)
+    return Chunk(0, starts, own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size)))
 
 
 def _takes_one_parameter(problem: Problem) -> bool:
@@ -743,17 +668,17 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
     )
 
 
-def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str]]:
+def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
     """Return the plan, made from the first member with a valid start; raise the first error if none has one.
 
-    At most `TRIED` of the members `everyone`, spread over all, are tried. Also return the findings of the checks at
-    the start, by member: they apply to all members with the same parameters.
+    At most `TRIED` of the members `everyone`, spread over all, are tried. A finding of the checks at the start applies
+    to all members with the same parameters.
     """
     first: Exception | None = None
     starts, params = everyone.y0s, everyone.params
     for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
         own = None if task.request.params is None else params[k].copy()
-        request = task.request._replace(y0=starts[k].copy(), params=own, **everyone.own.of(k))
+        request = task.request._replace(y0=starts[k].copy(), params=own)
         tried = dataclasses.replace(task, request=request)
         try:
             ready = tried.prepared(request.y0, own, check_start=True)
@@ -762,10 +687,10 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
         except Exception as error:
             first = first or error
         else:
-            found = ready.run.trust.message
-            ready.run.trust.doubts.clear()
-            alike: list[int] = np.flatnonzero((params == params[k]).all(axis=1)).tolist() if found else []
-            return Plan(tried, ready), dict.fromkeys(alike, found)
+            if found := ready.run.trust.message:
+                ready.run.trust.doubts.clear()
+                tried = dataclasses.replace(tried, doubt=(params[k].copy(), found))
+            return Plan(tried, ready)
     assert first is not None
     # A transposed y0s fails in the user's function, whose error may not explain that; jitted code explains nothing.
     first.add_note(
@@ -790,12 +715,13 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
     return LANES * max(LEAST_OCTETS, math.ceil(size / LANES))
 
 
-def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:
-    """Raise MemoryError if the results, with `rows` saved states for each member, would need too much memory."""
+def _check_memory(plan: Plan, members: int, max_bytes: float | None) -> None:
+    """Raise MemoryError if the results would need too much memory."""
+    rows = plan.held
     each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) * (3 + rows) + N_COUNTERS + 4)
     bound = most_bytes(members * each, max_bytes)
     if members * each > bound:
-        many = f"{rows} states per member would be stored. Save fewer (save_every, t_eval), use reduce= or out="
+        many = f"{rows} states per member would be stored. Save fewer (save_every, t_eval), use reduce="
         advice = many if rows else "The last state of each member would be stored. Run the members in parts"
         raise MemoryError(
             f"{members} members of {plan.size} components need {members * each / 1e9:.3g} GB, the bound is "
@@ -805,20 +731,26 @@ def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) 
 
 def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
     """Return the pool that runs the chunks."""
-    task, key = plan.task, uuid.uuid4().hex
     if executor is None or isinstance(executor, (int, np.integer)):
         plan.compile(progress=progress)
-        workers = cores() if executor is None else count("executor", executor)
-        return ThreadPool(plan, workers if plan.why_not is None else 1)
+        threads = cores() if executor is None else count("executor", executor)
+        return thread_pool(plan, threads if plan.why_not is None else 1)
+    run = partial(run_elsewhere, plan.task, uuid.uuid4().hex)
     if isinstance(executor, Executor):
-        return FuturesPool(executor, partial(run_elsewhere, task, key), cores())
-    kind = type(executor)
-    if executor == "dask" or kind.__module__.partition(".")[0] == "distributed" or kind.__name__ == "DaskExecutor":
+        return Pool(executor, run, partial(_workers, executor))
+    if executor == "dask" or type(executor).__module__.partition(".")[0] == "distributed":
         if pointers := plan.ready.pointers:
             raise pointers[0].unpicklable()  # Dask's own message for it is very long
         # Imported by name, because the integrations depend on this package and need further libraries.
-        return import_module("eip_scipy.integrations.dask").pool(executor, task, key)
+        found, workers, end = import_module("eip_scipy.integrations.dask").connected(executor)
+        return Pool(found, run, workers, end)
     raise TypeError(
         f"executor must be None, a number of threads, 'dask', a dask.distributed Client or an executor of "
         f"concurrent.futures, got {executor!r}."
     )
+
+
+def _workers(executor: Executor) -> int:
+    """Return the number of workers of an executor, of `mpi4py.futures` or of Python, or else the number of cores."""
+    found = (getattr(executor, name, None) for name in ("num_workers", "_max_workers"))
+    return next((number for number in found if isinstance(number, int) and number > 0), cores())

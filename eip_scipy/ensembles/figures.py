@@ -34,12 +34,9 @@ def plot(result: Any, names: Any = None) -> Any:
 
 
 def _states(result: Any) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return saved times and states (members, n, m); None and last states (members, n, 1) without common times."""
-    times = result.times
-    if times.ndim == 2 and times.size and np.array_equal(times, np.broadcast_to(times[0], times.shape)):
-        times = times[0]
-    if isinstance(result.trajectories, np.ndarray) and times.ndim == 1 and times.size > 1:
-        return times, result.trajectories
+    """Return saved times and states (members, n, m); None and last states (members, n, 1) if none are saved."""
+    if result.trajectories is not None and result.times.size > 1:
+        return result.times, result.trajectories
     last = np.where((result.status >= 0)[:, None], result.y, np.nan)
     return None, last[:, :, None]
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from .happened import Flat, flattened, unflattened
-from .statistics import Statistics
 
 __all__ = ["expanded", "packed", "shortened", "unpacked"]
 
@@ -20,13 +19,6 @@ def packed(result: Any) -> dict[str, Any]:
     """Return the fields of a result as arrays and values that JSON can hold."""
     fields = dict(result)
     fields["messages"] = shortened(fields.pop("message"))
-    if not isinstance(fields["trajectories"], np.ndarray):
-        fields["trajectories"] = None
-    if not isinstance(fields["invariants"], np.ndarray):  # they are in the store, as the trajectories are
-        fields["invariants"] = vars(result).get("_ends")
-    statistics = fields.pop("statistics")
-    if statistics is not None:
-        fields |= {f"statistics.{name}": value for name, value in vars(statistics).items()}
     times, states = fields.pop("t_events"), fields.pop("y_events")
     if times is not None:
         pairs = [list(zip(t, y, strict=True)) for t, y in zip(times, states, strict=True)]
@@ -39,9 +31,7 @@ def packed(result: Any) -> dict[str, Any]:
 def unpacked(fields: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a result from the output of `packed`."""
     fields = dict(fields)
-    fields["message"] = np.array(expanded(fields.pop("messages"), 0, len(fields["t"])), dtype=object)
-    found = {name: fields.pop(f"statistics.{name}", None) for name in Statistics.__dataclass_fields__}
-    fields["statistics"] = None if found["t"] is None else Statistics(**found)
+    fields["message"] = np.array(expanded(fields.pop("messages"), len(fields["t"])), dtype=object)
     events = [fields.pop(f"events.{name}", None) for name in Flat._fields]
     fields["t_events"] = fields["y_events"] = None
     if events[0] is not None:
@@ -60,6 +50,6 @@ def shortened(messages: Sequence[str]) -> dict[str, Any]:
     return {"usual": usual, "others": {str(k): str(text) for k, text in enumerate(messages) if text != usual}}
 
 
-def expanded(found: dict[str, Any], first: int, last: int) -> list[str]:
-    """Return the messages of members `first` to `last` - 1 from the output of `shortened`."""
-    return [found["others"].get(str(k), found["usual"]) for k in range(first, last)]
+def expanded(found: dict[str, Any], members: int) -> list[str]:
+    """Return the messages of all `members` from the output of `shortened`."""
+    return [found["others"].get(str(k), found["usual"]) for k in range(members)]

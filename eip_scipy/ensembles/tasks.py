@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,23 +25,11 @@ from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
 from ..run.prepare import Prepared, Request, prepared
-from ..run.resume import Keeper, plain
+from ..run.resume import Keeper
 from .happened import Happened, happened
-from .own_times import OwnTimes
 from .side_by_side import need_compiling, octet_functions, why_one_by_one
 
-__all__ = [
-    "AT_ENDS",
-    "COMPARED",
-    "FAILED",
-    "LISTS",
-    "NOT_RUN",
-    "Members",
-    "Plan",
-    "StoppedError",
-    "Task",
-    "run_members",
-]
+__all__ = ["FAILED", "LISTS", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
 
 FAILED, NOT_RUN = -1, -2
 # Number of steps in the first call of the engine, and the target duration of a call.
@@ -53,11 +40,7 @@ BY_MEMBER = (
     "suspects",
 )
 LEAST_WORK = 3e7  # floats times steps, one or two seconds: compiling functions for eight members takes as long
-COMPARED = 16
-AT_ENDS = 2  # values of an event by which it is recognised: at the start and at the end of a member
 LISTS = "message", "happened"  # fields of Members that are lists; the others are arrays
-NOTHING: Mapping[str, Any] = MappingProxyType({})
-SHARED = OwnTimes()
 
 
 class StoppedError(Exception):
@@ -69,20 +52,14 @@ class Task:
     """The part of an ensemble that all members share, in a form that can be sent to other processes."""
 
     request: Request  # arguments of `integrate` for one member with a valid start
-    reduce: Any = None  # quantity of which `Statistics` are computed: a callable, "state", or None if there are none
-    keep: bool = True  # True if the saved states themselves are needed
     members: int = 1  # total number of members
-    rows: int | None = None  # largest number of saved states of a member, if members have different intervals or times
+    reduce: Callable[[Any], Any] | None = None  # function of the result of a member, whose value replaces saved states
+    doubt: tuple[np.ndarray, str] | None = None  # parameters for which the checks at the start found the given fault
 
-    def prepared(
-        self, y0: np.ndarray, params: np.ndarray | None, own: Mapping[str, Any] = NOTHING, *, check_start: bool = False
-    ) -> Prepared:
-        """Return the run of one member, prepared as `integrate` does; without parameters if the request has none.
-
-        `own` contains the `t_span` and `t_eval` of the member, if they differ between members.
-        """
+    def prepared(self, y0: np.ndarray, params: np.ndarray | None, *, check_start: bool = False) -> Prepared:
+        """Return the run of one member, prepared as `integrate` does; without parameters if the request has none."""
         params = None if self.request.params is None else params
-        return prepared(self.request._replace(y0=y0, params=params, **own), check_start=check_start)
+        return prepared(self.request._replace(y0=y0, params=params), check_start=check_start)
 
 
 class Members(NamedTuple):
@@ -102,15 +79,6 @@ class Members(NamedTuple):
     values: np.ndarray  # (m, l): values of the invariants in the last states
     target: np.ndarray  # (m, l)
     happened: list[Happened]  # times and states of the events of each member
-
-    @classmethod
-    def joined(cls, parts: Sequence[Members]) -> Members:
-        """Return the members of several parts, in order."""
-        fields: dict[str, Any] = {}
-        for name in cls._fields:
-            given = [getattr(part, name) for part in parts]
-            fields[name] = [item for part in given for item in part] if name in LISTS else np.concatenate(given)
-        return cls(**fields)
 
     @classmethod
     def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
@@ -149,14 +117,16 @@ class Plan:
         self.one_by_one = ""
         self.names = tuple(run.invariants.names)
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
-        self.t_bound, self.h = schedule.span.t_bound, run.stepping.h
+        self.h = run.stepping.h
         # Times at which states are saved; none if only the last state is needed.
-        self.times = saved_times(schedule) if task.rows is None else np.full(task.rows, np.nan)
+        self.times = saved_times(schedule)
+        self.is_saving = self.times.size > 0
+        self.held = self.times.size if task.reduce is None else 0  # number of saved states that results keep
+        if task.reduce is not None and not self.is_saving:
+            self.times = np.array([self.t0])
         self.events = len(self.ready.system.events.functions)
         self.variations = self.ready.variations
         self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
-        first = np.concatenate([run.work.K[0], run.invariants.start_values])
-        self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
         self._together, self._idle = False, list[Sweeper]()
 
     def compile(self, *, progress: bool = False) -> Plan:
@@ -165,7 +135,6 @@ class Plan:
         loop = Loop(replace(ready, request=ready.request._replace(progress=progress)), Keeper())
         own_targets = any(item.target is not None for item in invariants.items)
         reasons = {
-            "members have different intervals or times": self.task.rows is not None,
             "the runs have derivatives": self.variations is not None,
             "the runs have balances": invariants.balances.items,
             # The shifts of the differences depend on the start.
@@ -185,57 +154,6 @@ class Plan:
         """Return buffers for `m` members."""
         return Members.empty(m, self.size, self.dtype, len(self.names), self.times.size)
 
-    def states(self, members: Members) -> tuple[np.ndarray, np.ndarray]:
-        """Return times (m,) and states (members, m, n): the saved ones, else the last ones; nan if a member failed."""
-        if self.times.size:
-            return self.times, members.saved
-        last = np.where((members.status >= 0)[:, None], members.y, np.nan)
-        return np.array([self.t_bound]), last[:, None]
-
-    def identity(
-        self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes, reduce: Any
-    ) -> dict[str, Any]:
-        """Return the data, in a form for JSON, by which a resumed ensemble is recognised as this one.
-
-        They are the settings, including the number of members per chunk, `chunk`; and the first `COMPARED` of these
-        numbers at the start that `task` contains: all components of f, followed by the values of the invariants. The
-        values of `reduce` follow, if it is a function. It is None if no statistics are stored.
-        """
-        settings = self.ready.identity(starts, params) | {"chunk": chunk}
-        settings |= {name: plain(value) for name, value in own.identity.items()}
-        start = list(self._start_values)
-        if callable(reduce):
-            with suppress(Exception):  # it need not have a value at the start
-                value = reduce(self.t0, self.ready.run.y0.copy())
-                start += map(repr, np.atleast_1d(np.asarray(value, self.dtype)).tolist())
-        return {"settings": settings | {"reduce": "a function" if callable(reduce) else reduce}, "start": start}
-
-    def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
-        """Return values of the functions at the end of the first member that did not fail, and their sizes.
-
-        There are at most `COMPARED` components of f, all invariants, and all events, both at the start of this member
-        and at its end. The size of a component is the largest one of f, that of an invariant is the size of its terms,
-        and that of an event is given by `Events.sizes`. A resumed ensemble compares its functions by these values. Both
-        arrays are empty if all members failed, or a value cannot be evaluated or is not finite.
-        """
-        nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
-        if not ended.size:
-            return nothing, nothing
-        k = int(ended[0])
-        t, y = float(members.t[k]), members.y[k].copy()
-        try:
-            ready = self.task.prepared(y0s[k], params[k])
-            f, invariants = ready.system.derivative(t, y.copy()), ready.run.invariants
-            values, sizes = invariants.values(t, y), invariants.term_sizes(t, y, f)
-            events = _of_events(ready, t, y, f)
-        except Exception:
-            return nothing, nothing
-        f = f.view(float)
-        some = f[np.linspace(0, f.size - 1, min(f.size, COMPARED)).astype(int)]
-        sizes = np.concatenate([np.full(some.size, np.abs(f).max()), sizes, events[1]])
-        found = np.concatenate([some, values, events[0]]), sizes
-        return found if np.isfinite(found).all() else (nothing, nothing)
-
     @contextmanager
     def driver(self) -> Iterator[Sweeper | None]:
         """Yield a `Sweeper` that no other thread is using; None if each member needs its own run."""
@@ -249,18 +167,6 @@ class Plan:
             mine = Sweeper(Loop(self.task.prepared(request.y0, request.params), Keeper()), self.task.members)
         yield mine
         self._idle.append(mine)
-
-
-def _of_events(ready: Prepared, t: float, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values and sizes of a member's events, at its start and its end (t, y); 0 if they are not finite."""
-    events, begin = ready.system.events, ready.run.begin
-    step = ready.run.start.tau * ready.schedule.span.sign  # into the interval: beyond it events need not be defined
-    places = (begin.t, begin.y, begin.f, step), (t, y, f, -step)
-    values, sizes = (
-        np.nan_to_num(np.concatenate(found), posinf=0.0, neginf=0.0)
-        for found in ([events.values(*place[:2]) for place in places], [events.sizes(*place) for place in places])
-    )
-    return values, sizes
 
 
 def saved_times(schedule: Schedule) -> np.ndarray:
@@ -282,13 +188,7 @@ def saved_times(schedule: Schedule) -> np.ndarray:
     return times
 
 
-def run_members(
-    plan: Plan,
-    y0s: np.ndarray,
-    params: np.ndarray,
-    stop: threading.Event | None = None,
-    own: OwnTimes = SHARED,
-) -> Members:
+def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> Members:
     """Run members with the initial states `y0s` (m, n) and the parameters `params` (m, p), and return their results.
 
     A member that fails, also by an exception in the user's functions, has the status `FAILED` and a message with the
@@ -301,7 +201,11 @@ def run_members(
             driver.run(plan, y0s, params, out, watch)
         else:
             for k in range(len(y0s)):
-                _alone(plan, k, y0s[k], params[k], out, watch, own.of(k))
+                _alone(plan, k, y0s[k], params[k], out, watch)
+    if plan.task.doubt is not None:
+        of, text = plan.task.doubt
+        for k in np.flatnonzero(out.trusted & (params == of).all(axis=1)).tolist():
+            out.trusted[k], out.message[k] = False, f"{out.message[k]}; {text}"
     return out
 
 
@@ -318,21 +222,13 @@ class _Watch:
             raise StoppedError
 
 
-def _alone(
-    plan: Plan,
-    k: int,
-    y0: np.ndarray,
-    params: np.ndarray,
-    out: Members,
-    watch: _Watch,
-    own: Mapping[str, Any] = NOTHING,
-) -> None:
-    """Run member `k` as `integrate` does, and store its results in `out`; `own` is that of `Task.prepared`."""
+def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
+    """Run member `k` as `integrate` does, and store its results in `out`."""
     try:
-        loop = Loop(plan.task.prepared(y0, params, own), Keeper())
+        loop = Loop(plan.task.prepared(y0, params), Keeper())
     except Exception as error:
         places = slice(None) if plan.variations is None else plan.variations.columns.places
-        out.y[k, places], out.t[k] = y0, own.get("t_span", (plan.t0,))[0]
+        out.y[k, places], out.t[k] = y0, plan.t0
         out.status[k], out.message[k] = FAILED, _reason(error)
         return
     broken = False
@@ -343,9 +239,8 @@ def _alone(
     except Exception as error:
         status, message, broken = FAILED, _reason(error), True
     _store(loop, k, status, loop.explained(message), out, loop.driver.y[: loop.driver.rows], broken=broken)
-    wanted = own.get("t_eval", plan.times)
-    rows = min(loop.driver.rows, wanted.size) if plan.times.size else 0
-    same = np.flatnonzero(loop.driver.t[:rows] != wanted[:rows])
+    rows = min(loop.driver.rows, plan.times.size)
+    same = np.flatnonzero(loop.driver.t[:rows] != plan.times[:rows])
     rows = int(same[0]) if same.size else rows
     out.saved[k, :rows] = loop.driver.y[:rows]
     out.saved_values[k, :rows] = _values(loop.driver, loop.driver.t[:rows], loop.driver.y[:rows])
@@ -448,7 +343,7 @@ class Sweeper:
         out.target[:] = _values(driver, np.full(m, plan.t0), np.ascontiguousarray(y0s), params)
         ran = np.flatnonzero(~np.isnan(out.t))
         out.values[ran] = _values(driver, out.t[ran], out.y[ran], params[ran])
-        if plan.times.size and plan.task.keep:
+        if plan.times.size:
             members, rows = np.nonzero(~np.isnan(out.saved).any(axis=2))
             times = plan.times[rows]
             out.saved_values[members, rows] = _values(driver, times, out.saved[members, rows], params[members])
@@ -471,7 +366,7 @@ class Sweeper:
     def _each(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> data.Members:
         """Return the inputs of the members and the buffers for their results."""
         driver, m = self.loop.driver, len(y0s)
-        y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))
+        y0s, params = (np.require(a, requirements=["A", "C", "W"]) for a in (y0s, params))
         kept = plan.times.size > 0
         return data.Members(
             starts=y0s,

@@ -34,8 +34,7 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
     ----------
     result : IntegrationResult, EnsembleResult or OdeResult
         Result of `integrate`, `ensemble` or `scipy.integrate.solve_ivp`. All fields are saved, including those that
-        were added later, except functions: ``sol``, and the functions of the run. Trajectories in the Zarr group of an
-        ensemble stay there.
+        were added later, except functions: ``sol``, and the functions of the run.
     path : path-like
         File to write, with any name; an existing file is replaced in one step when the new one is complete. The file is
         an npz archive, which `numpy.load` can open, with ``header.json`` for everything that is not an array.

@@ -193,7 +193,7 @@ def dataset(variables: dict[str, Any], coordinates: dict[str, Any], attributes: 
 
 
 def _attribute(value: Any) -> Any:
-    """Return an attribute in a form that NetCDF and Zarr can store: NaN for None, and 1 or 0 for a boolean."""
+    """Return an attribute in a form that NetCDF can store: NaN for None, and 1 or 0 for a boolean."""
     if value is None:
         return np.nan
     return int(value) if isinstance(value, (bool, np.bool_)) else value

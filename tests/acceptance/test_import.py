@@ -9,7 +9,7 @@ import pytest
 import eip_scipy
 
 HEAVY = ["eip_scipy_studies", "matplotlib", "numba", "scipy", "tqdm"]
-HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm", "zarr"]
+HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm"]
 
 
 def python(code, *arguments):

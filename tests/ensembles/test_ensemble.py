@@ -1,19 +1,12 @@
-"""`ensemble`: members equal single runs bit for bit, on any number of workers; failures, statistics, stores."""
+"""`ensemble`: members equal single runs bit for bit, on any number of workers; failures, executors."""
 
-import contextlib
-import json
 import multiprocessing
 import os
-import pickle
 import signal
-import subprocess
-import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
-from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,8 +25,7 @@ from systems import (
     pericentre,
 )
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, Invariant, checkpoint, ensemble, integrate
-from eip_scipy.checkpoint import CheckpointError
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, Invariant, ensemble, integrate
 from eip_scipy.ensembles.tasks import Plan, Task, run_members
 from eip_scipy.methods.nystrom import RKN1210
 from eip_scipy.methods.runge_kutta import RK5
@@ -72,9 +64,8 @@ def same(one, other):
     for name in ("y", "t", "status", "message", "max_defect", "max_correction", "nfev", "njev", "nlu", "times"):
         equal_nan = name != "message"
         assert np.array_equal(one[name], other[name], equal_nan=equal_nan), name
-    if one.statistics is not None:
-        for name in ("count", "mean", "squares", "min", "max"):
-            np.testing.assert_array_equal(getattr(one.statistics, name), getattr(other.statistics, name))
+    if one.reduced is not None:
+        np.testing.assert_array_equal(one.reduced, other.reduced)
 
 
 # A member is the single run.
@@ -284,7 +275,7 @@ def test_no_member_leaves_a_trace(options):
 
 @pytest.mark.slow
 @needs_jit
-@pytest.mark.parametrize("more", [{}, {"save_every": 10, "reduce": "state"}])
+@pytest.mark.parametrize("more", [{}, {"save_every": 10, "reduce": lambda run: run.y.max(axis=1)}])
 def test_bits_do_not_depend_on_the_number_of_threads(more):
     y0s = starts(100)
     y0s[17] = np.nan
@@ -398,34 +389,6 @@ def test_projection_fails_in_one_member():
     assert (run.t[9], *run.y[9]) == (own.t[-1], *own.y[:, -1])
 
 
-# Statistics.
-
-
-def test_statistics_are_those_of_the_trajectories():
-    y0s = starts(30)
-    y0s[4] = np.nan
-    options = {"h": 0.1, "invariants": [H, L], "save_every": 15, "chunk": 7}
-    kept = ensemble(orbit, SPAN, y0s, **options).trajectories
-    run = ensemble(orbit, SPAN, y0s, reduce="state", **options)
-    assert run.trajectories is None
-    found = run.statistics
-    np.testing.assert_array_equal(found.t, run.times)
-    np.testing.assert_array_equal(found.count, 29)
-    np.testing.assert_allclose(found.mean, np.nanmean(kept, axis=0), atol=1e-15)
-    np.testing.assert_allclose(found.var, np.nanvar(kept, axis=0), rtol=1e-12)
-    np.testing.assert_allclose(found.std, np.nanstd(kept, axis=0), rtol=1e-12)
-    np.testing.assert_array_equal(found.min, np.nanmin(kept, axis=0))
-    np.testing.assert_array_equal(found.max, np.nanmax(kept, axis=0))
-    assert repr(found).startswith(f"Statistics of 29 members at {len(run.times)} times, {y0s.shape[1]} quantities")
-
-
-def test_statistics_of_a_function_of_the_last_states():
-    run = ensemble(oscillator, (0, 1), np.eye(2), h=0.1, reduce=lambda t, y: t * (y @ y))
-    assert run.statistics.mean.shape == (1, 1)
-    np.testing.assert_allclose(run.statistics.mean, [[1.0]], rtol=1e-5)
-    assert run.statistics.count.tolist() == [2]
-
-
 def test_members_in_columns_are_told():
     def unpacked(t, y):
         position, velocity = y
@@ -434,22 +397,6 @@ def test_members_in_columns_are_told():
     with pytest.raises(ValueError, match="too many values to unpack") as info:
         ensemble(unpacked, (0, 1), np.ones((2, 5)), method=EIPRK4, h=0.1)
     assert info.value.__notes__ == ["ensemble: the rows of y0s are members; y0s has 2 rows of 5 components."]
-
-
-def test_wrong_statistics():
-    with pytest.raises(ValueError, match="reduce must be 'state' or a function"):
-        ensemble(oscillator, (0, 1), np.eye(2), h=0.1, reduce="mean")
-    with pytest.raises(TypeError, match="expected a number or a 1-D array"):
-        ensemble(oscillator, (0, 1), np.eye(2), h=0.1, reduce=lambda t, y: np.eye(2))
-    with pytest.raises(TypeError, match="expected real numbers"):
-        ensemble(lambda t, y: -1j * y, (0, 1), 1j * np.eye(2), h=0.1, reduce="state")
-
-
-def test_statistics_far_from_zero_do_not_cancel():
-    """The variance of numbers near 1e8, whose squares differ in the last digits only."""
-    y0s = 1e8 + np.random.default_rng(0).standard_normal((200, 1))
-    run = ensemble(lambda t, y: np.zeros(1), (0, 1), y0s, h=1.0, reduce="state", chunk=8)
-    np.testing.assert_allclose(run.statistics.var[0, 0], np.var(y0s), rtol=1e-6)
 
 
 # Chunks: callbacks, interruption, memory.
@@ -494,7 +441,7 @@ def test_ctrl_c_within_a_second():
 
 def test_memory_is_refused_before_it_is_taken():
     many = np.broadcast_to([1.0, 0.0], (1000, 2))
-    with pytest.raises(MemoryError, match=r"1000 members of 2 components need 0\.0162 GB.*save_every.*reduce=.*out="):
+    with pytest.raises(MemoryError, match=r"1000 members of 2 components need 0\.0162 GB.*save_every.*reduce="):
         ensemble(oscillator, (0, 1), many, h=0.001, save_every=1, max_bytes=1e7)
     with pytest.raises(MemoryError, match="Run the members in parts"):
         ensemble(oscillator, (0, 1), many, h=0.001, max_bytes=1e4)
@@ -528,8 +475,10 @@ def test_progress(capsys):
         ({"chunk": 0}, ValueError, "chunk must be an integer >= 1"),
         ({"save_every": 0}, ValueError, "save_every must be an integer >= 1"),
         ({"save_every": 1, "h": None}, ValueError, "needs fixed steps"),
-        ({"resume": True}, ValueError, "resume=True needs a place to resume from"),
-        ({"out": "a", "checkpoint": "b"}, ValueError, "got both out= and checkpoint=; omit checkpoint"),
+        ({"resume": True}, ValueError, "resume=True needs a file to resume from"),
+        ({"reduce": "state"}, TypeError, r"reduce must be a function reduce\(result\), got 'state'"),
+        ({"t_span": [(0, 1), (0, 2)]}, ValueError, "t_span must hold two numbers"),
+        ({"t_eval": [[0.5], [1.0]]}, ValueError, "`t_eval` must be 1-dimensional"),
         ({"checkpoint": 3}, TypeError, "checkpoint must be a path"),
         ({"checkpoint": "a", "checkpoint_every": 0}, ValueError, "checkpoint_every must be a number of seconds"),
         ({"invariants": Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,)), "params": [[1], [2]]},
@@ -538,7 +487,7 @@ def test_progress(capsys):
 )  # fmt: skip
 def test_bad_input(options, error, match):
     with pytest.raises(error, match=match):
-        ensemble(oscillator, (0, 1), **({"y0s": np.eye(2), "h": 0.1} | options))
+        ensemble(oscillator, **({"t_span": (0, 1), "y0s": np.eye(2), "h": 0.1} | options))
 
 
 def test_what_fails_in_every_member_is_raised():
@@ -629,363 +578,3 @@ def test_an_executor_that_is_closed_meanwhile(cancel, tmp_path):
     run = ensemble(oscillator, (0, 1), y0s, resume=True, callback=lambda part: ran.append(part.first), **options)
     assert run.success
     assert ran[0] == done
-
-
-# Stores.
-
-STORED = {"h": 0.1, "invariants": SQUARE, "save_every": 4, "chunk": 3}
-
-
-ZARR = pytest.param("out", marks=pytest.mark.skipif(find_spec("zarr") is None, reason="needs zarr"))
-both_stores = pytest.mark.parametrize("where", [ZARR, "checkpoint"])
-
-
-def stored(fun=oscillator, **options):
-    y0s = np.random.default_rng(3).standard_normal((11, 2))
-    y0s[5] = np.nan
-    return ensemble(fun, (0, 1), y0s, **STORED | options)
-
-
-def test_store_holds_what_memory_does(tmp_path):
-    pytest.importorskip("zarr", reason="needs zarr")
-    plain, kept = stored(), stored(out=tmp_path / "run.zarr")
-    same(plain, kept)
-    np.testing.assert_array_equal(kept.trajectories[:], plain.trajectories)
-    xarray = pytest.importorskip("xarray", reason="needs xarray")
-    with xarray.open_zarr(tmp_path / "run.zarr", consolidated=False) as data:
-        assert data.states.dims == ("member", "component", "time")
-        np.testing.assert_array_equal(data.time, plain.times)
-        np.testing.assert_array_equal(data.states.sel(time=plain.times[1]), plain.trajectories[:, :, 1])
-        np.testing.assert_array_equal(data.status, plain.status)
-        assert data.message.values[5] == plain.message[5]
-        assert data.attrs["eip_scipy_ensemble"]["settings"]["h"] == 0.1
-
-
-@both_stores
-@pytest.mark.parametrize("more", [{}, {"reduce": "state"}, {"save_every": None}])
-def test_resume_runs_what_is_missing(where, tmp_path, more):
-    def broken_off(part):
-        if part.first == 3:
-            raise KeyboardInterrupt
-
-    def ran_on(part):
-        ran.append(part.first)
-
-    ran = []
-    options = {where: tmp_path / "kept", **more}
-    whole = stored(**more)
-    with pytest.raises(KeyboardInterrupt):
-        stored(callback=broken_off, **options)
-    resumed = stored(resume=True, callback=ran_on, **options)
-    assert ran == [6, 9]
-    same(whole, resumed)
-    again = stored(resume=True, callback=ran_on, **options)
-    assert ran == [6, 9]
-    same(whole, again)
-    if again.trajectories is not None:
-        np.testing.assert_array_equal(again.trajectories[:], stored().trajectories)
-
-
-@pytest.mark.parametrize(("first", "then"), [(0, 1), (0, "state"), ("state", 0), ("state", None), (None, 1)])
-def test_statistics_of_two_quantities_are_not_mixed(first, then, tmp_path):
-    """A checkpoint keeps the statistics of the members so far; `out` keeps the states."""
-
-    def broken_off(part):
-        if part.first == 3:
-            raise KeyboardInterrupt
-
-    of = {0: lambda t, y: y[0], 1: lambda t, y: 2 * y[0], "state": "state", None: None}
-    with pytest.raises(KeyboardInterrupt):
-        stored(callback=broken_off, reduce=of[first], checkpoint=tmp_path / "kept")
-    with pytest.raises(CheckpointError, match="reduce"):
-        stored(resume=True, reduce=of[then], checkpoint=tmp_path / "kept")
-    same(stored(reduce=of[first]), stored(resume=True, reduce=of[first], checkpoint=tmp_path / "kept"))
-
-
-@both_stores
-def test_resume_starts_where_there_is_nothing(where, tmp_path):
-    same(stored(), stored(resume=True, **{where: tmp_path / "kept"}))
-
-
-@both_stores
-def test_a_store_is_not_overwritten_nor_mixed_up(where, tmp_path):
-    place = {where: tmp_path / "kept"}
-    stored(**place)
-    with pytest.raises(CheckpointError, match="Pass resume=True to continue the ensemble"):
-        stored(**place)
-    with pytest.raises(CheckpointError, match=r"another run: h is 0\.1 in the checkpoint and 0\.2 in this run"):
-        stored(resume=True, h=0.2, **place)
-    with pytest.raises(CheckpointError, match="y0 differs"):
-        ensemble(oscillator, (0, 1), np.ones((11, 2)), resume=True, **place, **STORED)
-    with pytest.raises(CheckpointError, match=r"at the start \(stored: [-0-9., e]*; now: [-0-9., e]*\)"):
-        stored(lambda t, y: 2 * oscillator(t, y), resume=True, **place)
-    with pytest.raises(CheckpointError, match="chunk is 3 in the checkpoint and 4 in this run"):
-        stored(resume=True, chunk=4, **place)
-
-
-@both_stores
-def test_another_machine_is_a_warning(where, tmp_path, monkeypatch):
-    place = {where: tmp_path / "kept"}
-    with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "_machine", lambda: "another machine")
-        whole = stored(**place)
-    with pytest.warns(UserWarning, match="machine another machine, here") as seen:
-        same(whole, stored(resume=True, **place))
-    assert seen[0].filename == __file__
-
-
-@both_stores
-def test_what_is_no_store(where, tmp_path):
-    place = tmp_path / "other"
-    place.write_text("something") if where == "checkpoint" else place.mkdir()
-    with pytest.raises(CheckpointError, match=r"is not an ensemble of eip_scipy|not a checkpoint of eip_scipy"):
-        stored(resume=True, **{where: place})
-
-
-def test_a_chunk_without_its_status_runs_again(tmp_path):
-    """Imitate a kill between the arrays of a chunk."""
-    zarr = pytest.importorskip("zarr", reason="needs zarr")
-    path = tmp_path / "run.zarr"
-    whole = stored(out=path)
-    group = zarr.open_group(path, mode="r+")
-    group["status"][6:9] = -2
-    group["y"][6:9] = 1e9
-    ran = []
-    same(whole, stored(out=path, resume=True, callback=lambda part: ran.append(part.first)))
-    assert ran == [6, 9]
-
-
-def test_a_store_that_was_not_begun_yet(tmp_path):
-    """Imitate a kill between the creation of the group and that of its arrays."""
-    zarr = pytest.importorskip("zarr", reason="needs zarr")
-    zarr.open_group(tmp_path / "run.zarr", mode="w", attributes={"eip_scipy_ensemble": None})
-    same(stored(), stored(out=tmp_path / "run.zarr", resume=True))
-
-
-class Trap:
-    """Object that makes a folder when it is unpickled."""
-
-    def __init__(self, path):
-        self._path = path
-
-    def __reduce__(self):
-        return os.mkdir, (str(self._path),)
-
-
-def trapped(path, trap, zarr_format):
-    """Put a status whose codec unpickles, in a format that can name it, in the place of the store's own."""
-    zarr, numcodecs = pytest.importorskip("zarr"), pytest.importorskip("numcodecs")
-    attributes = dict(zarr.open_group(path, mode="r").attrs)
-    group = zarr.open_group(path, mode="w", zarr_format=zarr_format, attributes=attributes)
-    where = path
-    if zarr_format == 3:  # a group of format 3 with an array of format 2 in it
-        where = path / "status"
-        (path / "y").mkdir()
-    else:
-        group.create_array("y", shape=(11, 2), chunks=(3, 2), dtype=float)
-        where = path / "status"
-    where.mkdir(exist_ok=True)
-    described = {
-        "zarr_format": 2, "shape": [11], "chunks": [3], "dtype": "|O", "compressor": None, "fill_value": None,
-        "order": "C",
-        "filters": [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 4}],
-    }  # fmt: skip
-    (where / ".zarray").write_text(json.dumps(described))
-    (where / ".zattrs").write_text("{}")
-    for chunk in range(4):
-        (where / str(chunk)).write_bytes(pickle.dumps(Trap(trap)))
-    if zarr_format == 3:
-        found = json.loads((path / "zarr.json").read_text())
-        found["consolidated_metadata"] = {
-            "kind": "inline", "must_understand": False, "metadata": {"status": described | {"attributes": {}}},
-        }  # fmt: skip
-        (path / "zarr.json").write_text(json.dumps(found))
-    return numcodecs
-
-
-@pytest.mark.parametrize("zarr_format", [2, 3])
-def test_a_strangers_store_runs_no_code(zarr_format, tmp_path, monkeypatch):
-    """The codec that unpickles is allowed to, as in numcodecs and Zarr before they refused it."""
-    zarr = pytest.importorskip("zarr")
-    path, trap = tmp_path / "run.zarr", tmp_path / "sprung"
-    stored(out=path)
-    numcodecs = trapped(path, trap, zarr_format)
-    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
-    with zarr.config.set({"array.allow_unsafe_pickle_decode": True}):
-        with pytest.raises(CheckpointError, match="is not an ensemble of eip_scipy") as refused:
-            stored(out=path, resume=True)
-        assert not trap.exists()
-        if zarr_format == 2:
-            assert "it is a Zarr group of format 2, whose metadata may name code to run" in str(refused.value)
-            with contextlib.suppress(Exception):
-                zarr.open_group(path, mode="r")["status"][:]
-            assert trap.exists()  # so the trap works
-
-
-@pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr version 3 specification")
-def test_a_codec_from_elsewhere_is_refused_in_each_array(tmp_path):
-    pytest.importorskip("zarr")
-    path = tmp_path / "run.zarr"
-    options = {"save_every": 2, "events": lambda t, y: y[0]}
-    stored(out=path, **options)
-    described = sorted(path.glob("*/zarr.json"))
-    assert {"y", "target", "end_invariants", "invariants", "event_t"} <= {item.parent.name for item in described}
-    for item in described:
-        text, name = item.read_text(), item.parent.name
-        changed = json.loads(text)
-        changed["codecs"].append({"name": "numcodecs.zlib", "configuration": {"level": 1}})
-        item.write_text(json.dumps(changed))
-        with pytest.raises(CheckpointError, match=rf"its array '{name}' is stored with numcodecs\.zlib; expected "):
-            stored(out=path, resume=True, **options)
-        item.write_text(text)
-    stored(out=path, resume=True, **options)
-
-
-@pytest.mark.parametrize("what", ["shape", "chunks"])
-def test_a_forged_size_is_refused_in_each_array(what, tmp_path):
-    """Reading it would take any amount of memory."""
-    pytest.importorskip("zarr")
-    path = tmp_path / "run.zarr"
-    options = {"save_every": 2, "events": lambda t, y: y[0]}
-    stored(out=path, **options)
-    for item in sorted(path.glob("*/zarr.json")):
-        text, name = item.read_text(), item.parent.name
-        changed = json.loads(text)
-        sizes = changed["shape"] if what == "shape" else changed["chunk_grid"]["configuration"]["chunk_shape"]
-        if (name, what) in (("time", "chunks"), ("event_t", "shape")):
-            continue  # not read; one entry for each event that the counts have
-        sizes[-1] = 10**12
-        item.write_text(json.dumps(changed))
-        with pytest.raises(CheckpointError, match=rf"is damaged: its array '{name}' has the shape"):
-            stored(out=path, resume=True, **options)
-        item.write_text(text)
-    same(stored(**options), stored(out=path, resume=True, **options))
-
-
-def test_what_is_no_store_is_named(tmp_path):
-    """A group in place of an array, codecs in a wrong order, and a label that is not a mapping."""
-    pytest.importorskip("zarr")
-    path = tmp_path / "run.zarr"
-    stored(out=path)
-    where = path / "status" / "zarr.json"
-    text = where.read_text()
-    where.write_text(json.dumps({"zarr_format": 3, "node_type": "group", "attributes": {}}))
-    with pytest.raises(CheckpointError, match="is not an ensemble of eip_scipy: its 'status' is not an array"):
-        stored(out=path, resume=True)
-    changed = json.loads(text)
-    changed["codecs"].append(changed["codecs"][0])
-    where.write_text(json.dumps(changed))
-    with pytest.raises(CheckpointError, match="is not an ensemble of eip_scipy"):
-        stored(out=path, resume=True)
-    where.write_text(text)
-    own = json.loads((path / "zarr.json").read_text())
-    own["attributes"]["eip_scipy_ensemble"] = [1, 2]
-    (path / "zarr.json").write_text(json.dumps(own))
-    with pytest.raises(CheckpointError, match=r"its attribute 'eip_scipy_ensemble' is \[1, 2\], not a mapping"):
-        stored(out=path, resume=True)
-
-
-@pytest.mark.parametrize("array", ["y", "states"])
-@pytest.mark.parametrize("how", ["lost", "cut", "overwritten"])
-def test_a_damaged_file_of_finished_members(how, array, tmp_path):
-    """Name the members whose states cannot be read."""
-    pytest.importorskip("zarr", reason="needs zarr")
-    path = tmp_path / "run.zarr"
-    stored(out=path)
-    chunk = path / array / "c" / "/".join("200" if array == "states" else "20")
-    if how == "lost":
-        chunk.unlink()
-    else:
-        chunk.write_bytes(chunk.read_bytes()[:10] if how == "cut" else b"something else" * 20)
-    says = "member 6 is marked as finished, but its states are missing"
-    if how != "lost":
-        says = "the results of the members 6 to 8 cannot be read: "
-    with pytest.raises(CheckpointError, match=rf"run\.zarr' is damaged: {says}.*\. Restore a copy of the group, or"):
-        stored(out=path, resume=True)
-
-
-def test_a_damaged_file_of_the_status(tmp_path):
-    """Name what cannot be read; a lost file makes its members run again."""
-    pytest.importorskip("zarr", reason="needs zarr")
-    path = tmp_path / "run.zarr"
-    whole = stored(out=path)
-    chunk = path / "status" / "c" / "2"
-    chunk.write_bytes(b"")
-    with pytest.raises(CheckpointError, match=r"run\.zarr' is damaged: the status of the members cannot be read"):
-        stored(out=path, resume=True)
-    chunk.unlink()
-    same(whole, stored(out=path, resume=True))
-
-
-def test_members_that_end_before_their_first_saved_state(tmp_path):
-    """Their rows are NaN, and nothing is missing."""
-    pytest.importorskip("zarr", reason="needs zarr")
-
-    def early(t, y):
-        return t - 0.2
-
-    early.terminal = True
-    options = {"out": tmp_path / "run.zarr", "events": early, "save_every": None, "t_eval": [0.5, 1.0]}
-    whole = stored(**options)
-    assert (whole.status == 1).sum() == 10
-    same(whole, stored(resume=True, **options))
-
-
-def test_checkpoints_in_time(tmp_path):
-    """Each chunk, where the seconds are over; and a file in use is whole."""
-    path, seen = tmp_path / "kept", []
-
-    def callback(part):
-        seen.append(checkpoint.read(path, "ensemble")[0]["finished"])
-
-    stored(checkpoint=path, checkpoint_every=1e-9, callback=callback)
-    assert seen[0] == 3
-    assert sorted(seen) == seen
-
-
-def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
-    """The result exists all the same, and so does the former file."""
-    path, write = tmp_path / "kept", checkpoint.write
-
-    def full(*arguments):
-        if path.exists():
-            raise CheckpointError("cannot write the checkpoint: no space left on device")
-        write(*arguments)
-
-    monkeypatch.setattr(checkpoint, "write", full)
-    with pytest.warns(RuntimeWarning, match="no space left on device; the previous checkpoint is kept"):
-        same(stored(), stored(checkpoint=path))
-    assert checkpoint.read(path, "ensemble")[0]["finished"] == 0
-
-
-def test_without_zarr(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(ImportError, match=r'out= needs zarr: pip install "eip_scipy\[zarr\]"'):
-        stored(out=tmp_path / "run.zarr")
-
-
-KILLED = """
-import os, signal, sys, numpy as np
-sys.path.insert(0, {tests!r})
-from systems import SQUARE, oscillator
-from eip_scipy import ensemble
-def callback(part):
-    if part.first == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-y0s = np.random.default_rng(3).standard_normal((11, 2))
-y0s[5] = np.nan
-ensemble(oscillator, (0, 1), y0s, h=0.1, invariants=SQUARE, save_every=4, chunk=3, {where}={path!r}, callback=callback,
-         checkpoint_every=1e-9)
-"""
-
-
-@pytest.mark.posix
-@both_stores
-def test_a_killed_run_goes_on(where, tmp_path):
-    path = str(tmp_path / "kept")
-    code = KILLED.format(tests=str(Path(__file__).parents[1]), where=where, path=path)
-    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
-    ran = []
-    same(stored(), stored(resume=True, callback=lambda part: ran.append(part.first), **{where: path}))
-    assert ran[-2:] == [6, 9]
-    assert ran[0] > 0

@@ -41,10 +41,9 @@ def differences(kind: str, run: Any) -> Iterator[str]:
     pairs = {name: (getattr(whole(kind), name), getattr(run, name)) for name in names}
     if kind == "adaptive":
         pairs |= {name: (whole(kind)[name][0], run[name][0]) for name in ("t_events", "y_events")}
-    if kind == "members":
-        pairs |= {f"statistics.{n}": (v, getattr(run.statistics, n)) for n, v in vars(whole(kind).statistics).items()}
-    if kind == "trajectories":
-        pairs["trajectories"] = whole(kind).trajectories, run.trajectories[:]
+    if kind in ("members", "trajectories"):
+        name = "reduced" if kind == "members" else "trajectories"
+        pairs[name] = whole(kind)[name], run[name]
     for name, (a, b) in pairs.items():
         if not np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f"):
             yield f"{name}: {b!r} where the whole run has {a!r}"
@@ -52,7 +51,7 @@ def differences(kind: str, run: Any) -> Iterator[str]:
 
 def done(kind: str, path: Path) -> int:
     """Return the number of steps or members in a checkpoint; -1 without one."""
-    if kind == "trajectories" or not path.exists():
+    if not path.exists():
         return -1
     header, _ = checkpoint.read(path)
     return int(header["step" if kind in SINGLE else "finished"])

@@ -1,7 +1,6 @@
 """Modules that the server imports once, so that its forked runs need not import and compile anything."""
 
 import tqdm
-import zarr  # noqa: F401
 
 tqdm.tqdm.monitor_interval = 0  # no thread: it would be lost by a fork, with what it holds
 

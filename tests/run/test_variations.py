@@ -305,12 +305,6 @@ def test_members_go_on_from_a_checkpoint_with_the_same_derivatives(tmp_path):
     np.testing.assert_array_equal(ensemble(pendulum, SPAN, starts, **options, **file, resume=True).stm, whole.stm)
 
 
-@pytest.mark.parametrize("option", [{"reduce": "state"}, {"out": "group"}])
-def test_derivatives_of_members_are_not_reduced(option):
-    with pytest.raises(ValueError, match="cannot be combined with out= or reduce="):
-        ensemble(pendulum, SPAN, np.ones((2, 2)), method=EIPDOP853, h=0.1, variations="state", **option)
-
-
 def test_a_member_that_fails_leaves_the_others_alone():
     def fun(t, y):
         if y[0] < -0.5:

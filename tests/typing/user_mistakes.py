@@ -47,7 +47,7 @@ longer = integrate(fun, (0, 1), [1.0, 0.0], method=EIPDOP853, invariants=energy,
 members = ensemble(fun, (0, 1), np.ones((3, 2)), h=0.1, method=EIPRK4, invariants=energy, args=(2.0,), every=2)
 largest: float = max(longer.max_defect.max(), members.max_defect.max())
 choice = recommend(fun, (0, 1), [1.0, 0.0], invariants=energy, params=[2.0], metric="euclidean")
-print(longer.diagnostics.moved + longer.message, members.statistics, choice.reason, largest)
+print(longer.diagnostics.moved + longer.message, members.reduced, choice.reason, largest)
 # Each statement below has the error that is named: where types do not show it, mypy reports an unused ignore.
 solve_ivp(fun, (0, 1), [1.0, 0.0], hh=0.01)  # type: ignore[call-arg]
 solve_ivp(fun, (0, 1), [1.0, 0.0], invariants=3)  # type: ignore[arg-type]

@@ -38,8 +38,8 @@ from eip_scipy_studies.measurements.ensembles import starts
 members = {members}
 y0s = starts(members)
 base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-run = ensemble(kepler(), (0, 300 * {h}), y0s, h={h}, save_every=3, reduce="state")
-assert run.success and run.statistics.count.min() == members
+run = ensemble(kepler(), (0, 300 * {h}), y0s, h={h}, save_every=3, reduce=lambda run: run.y.max())
+assert run.success and run.reduced.shape == (members,)
 print(base, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 
@@ -97,8 +97,12 @@ def threads(members: int, steps: int, repeats: int) -> dict[str, dict[str, float
 
 def workers(members: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
     """Return the times, as from `in_turns`, of an ensemble on one worker of Dask, and on two."""
-    local_client = needed("eip_scipy.integrations.dask").local_client
-    clients = {"one Dask worker": local_client(1), "two Dask workers": local_client(2)}
+    distributed = needed("distributed", '"eip_scipy[distributed]"')
+    here = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    clients = {
+        name: distributed.Client(distributed.LocalCluster(n_workers=count, **here))
+        for count, name in enumerate(("one Dask worker", "two Dask workers"), 1)
+    }
     try:
         for client in clients.values():
             seconds(members, 10, client)  # exclude the one-time work of a worker
