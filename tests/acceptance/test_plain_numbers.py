@@ -127,7 +127,6 @@ ARGUMENTS = [
     *((problems.kepler, name, 0.5) for name in ("eccentricity", "relativistic", "t_end", "h")),
     *((problems.harmonic, name, 0.5) for name in ("omega", "t_end", "h")),
     *((problems.solar_system, name, 0.5) for name in ("years", "h")),
-    *((problems.tokamak, name, 0.5) for name in ("t_end", "h")),
     *((ForceConstants, name, 1.0) for name in ("c", "j2", "moon")),
     (problems.figure_eight, "periods", 1.0),
 ]
