@@ -114,8 +114,8 @@ class IntegrationResult(WithColumns):
     nfev, njev, nlu : int
         Numbers of evaluations of the right-hand side and of the invariants' gradients, and of factorisations in
         projections. For `EIPRadau` and `EIPBDF`, `njev` and `nlu` also count the Jacobians of the right-hand side and
-        the factorisations in steps. For a one-step method of another kind (`Lawson`, `Splitting`), `nfev` also counts
-        the evaluations that replace the right-hand side.
+        the factorisations in steps. For a one-step method of another kind, `nfev` also counts the evaluations that
+        replace the right-hand side.
     status : int
         0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
     message : str

@@ -281,9 +281,9 @@ int PythonHooks::project_elsewhere(const Step &step) {
 
 bool PythonHooks::all_agree(bool here) { return nb::bool_(agree_(nb::bool_(here))).is(nb::bool_(true)); }
 
-// One Newton step by the functions of `JointInvariants`: the one that `project_step` takes in the euclidean metric, its
-// dead bands, bounds and verdict included. False where that needs more: gradients nearly parallel, or a projection that
-// does not hold; nothing is counted then.
+// One Newton step by the functions `moments` and `shift` of the invariants of a field: the one that `project_step` takes
+// in the euclidean metric, its dead bands, bounds and verdict included. False where that needs more: gradients nearly
+// parallel, or a projection that does not hold; nothing is counted then.
 bool PythonHooks::project_jointly(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;

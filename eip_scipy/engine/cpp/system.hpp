@@ -40,7 +40,7 @@ struct Step;
 enum class Known { NOTHING, ENERGY, ALL };
 
 // Parts of a step that Python code replaces: the raw step of a user-defined one-step method, the end of the step by a
-// subclass, the projection by `JointInvariants`, which may decline, and the projection of a state whose parts lie on
+// subclass, the joint projection of a field, which may decline, and the projection of a state whose parts lie on
 // several processes. Such processes also have to agree whether a raw result is finite. The codes are those of the step.
 // If `drives`, the raw step is that of a solver which controls its error and its length: `drive` makes it, and with
 // `again` repeats one whose projection has failed.

@@ -6,7 +6,6 @@ The paper is Cai, Gong & Wang.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.resources import files
@@ -65,16 +64,7 @@ class ParticleProblem(Problem):
         return float(self.params[CHARGE])
 
     def velocity(self, y: Any) -> np.ndarray:
-        """Return the velocities of states: (p - q A(x)) / m in the canonical form.
-
-        Parameters
-        ----------
-        y : array_like, shape (6, m)
-
-        Returns
-        -------
-        ndarray, shape (3, m)
-        """
+        """Return the velocities (3, m) of states (6, m): (p - q A(x)) / m in the canonical form."""
         y = np.asarray(y, dtype=float)
         if self.form == "velocity":
             return y[3:]
@@ -91,11 +81,8 @@ def charged_particle(
     mass: float = 1.0,
     charge: float = 1.0,
     form: str = "canonical",
-    name: str = "charged-particle",
-    units: str = "",
-    source: str = "",
-    reference: Callable[[float], np.ndarray | None] | None = None,
     balances: str | None = None,
+    **options: Any,
 ) -> ParticleProblem:
     """Return the problem of one charged particle in a field, m x'' = q (E(t, x) + x' x B(t, x)).
 
@@ -111,14 +98,12 @@ def charged_particle(
     mass, charge : float, optional
     form : {"canonical", "velocity"}, optional
         The state: (x, p) with p = m x' + q A(x), or (x, x'). A field that varies in time needs "velocity".
-    name, units, source : str, optional
-        See `Problem`.
-    reference : callable, optional
-        See `Problem`.
     balances : {"energy", "kinetic"}, optional
         Keep an energy as a `Balance` instead of the invariant "H"; this needs the form "velocity". "kinetic" keeps the
         kinetic energy "T", which changes at the rate q v . E. "energy" keeps the total energy "H", which changes at the
         rate q (dphi/dt - v . dA/dt), if the field varies and has a potential; otherwise it keeps "T".
+    **options
+        Further fields of `Problem`, such as `name` and `reference`.
 
     Returns
     -------
@@ -132,9 +117,8 @@ def charged_particle(
     TypeError
         If `field` is not a ParticleField.
     ValueError
-        If the form is unknown, or canonical for a field without A; if the start or a function of the field is not
-        finite; if the mass is not positive or the charge is 0; if functions of the field contradict each other at the
-        start.
+        If an argument is wrong, the canonical form has a field without A, or functions of the field are not finite or
+        contradict each other at the start.
 
     Notes
     -----
@@ -179,7 +163,6 @@ def charged_particle(
     equations = compose(field.functions, form)
     momentum = v if form == "velocity" else params[MASS] * v + params[CHARGE] * field.along("A", x[:, None])[:, 0]
     return ParticleProblem(
-        name=name,
         fun=bind(equations.rhs, params),
         rhs=equations.rhs,
         y0=np.concatenate([x, momentum]),
@@ -189,11 +172,9 @@ def charged_particle(
         invariants=_invariants(equations, field, form, params, balances),
         blocks=3,
         component_names=("x", "y", "z", *(("vx", "vy", "vz") if form == "velocity" else ("px", "py", "pz"))),
-        units=units,
-        source=source,
-        reference=reference,
         field=field,
         form=form,
+        **{"name": "charged-particle", **options},
     )
 
 
@@ -239,11 +220,6 @@ def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STE
     -------
     ParticleProblem
         With invariants "H" and "L", and `reference` states at each hundredth of the paper's interval.
-
-    Raises
-    ------
-    ValueError
-        If the form is unknown.
     """
     return _paper("uniform", UNIFORM, [0.0, -1.0, 0.0], [0.1, 0.01, 0.0], form, t_end, h)
 
@@ -266,11 +242,6 @@ def tokamak(
     -------
     ParticleProblem
         With invariants "H" and "L", and `reference` states at each hundredth of the paper's interval.
-
-    Raises
-    ------
-    ValueError
-        If the orbit or the form is unknown.
     """
     if orbit not in ORBITS:
         raise ValueError(f"tokamak: orbit must be one of {', '.join(ORBITS)}, got {orbit!r}{nearest(orbit, ORBITS)}")

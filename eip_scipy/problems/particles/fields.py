@@ -35,8 +35,7 @@ class ParticleField:
     """An electromagnetic field, defined by functions of ``(x, y, z)``, or of ``(t, x, y, z)`` if it varies in time.
 
     Give A, with its derivatives if they are known, or B, or both; and phi or E, or both, if there is an electric field.
-    With Numba functions (lazily jitted, with three floats as arguments and a float or a tuple of floats as value) the
-    equations of a particle are compiled; with other callables they are interpreted.
+    With Numba functions, which return a float or a tuple of floats, the equations of a particle are compiled.
 
     Attributes
     ----------
@@ -54,21 +53,13 @@ class ParticleField:
     axisymmetric : bool
         Whether A and phi do not change under rotations about the z axis; then L = x p_y - y p_x is an invariant.
     varies : bool
-        Whether the first argument of all functions is the time, ``A(t, x, y, z)`` and so on. `electric` is then needed.
-        It is the whole field, ``-grad phi - dA/dt``, including the part that the varying magnetic field induces.
+        Whether the first argument of all functions is the time, ``A(t, x, y, z)`` and so on. `electric`, the whole
+        field ``-grad phi - dA/dt``, is then needed.
     length : float
         A length over which the field changes by some tens of per cent, in the unit of the positions. It determines the
         step of the differences. The default does not fit positions in metres in the field of a planet or a star, or
         in a trap of micrometres.
     name : str
-
-    Raises
-    ------
-    TypeError
-        If a function is not callable.
-    ValueError
-        If neither A nor B is given, `jacobian` is given without A, a field that varies has no `electric`, or the length
-        is not positive and finite.
 
     Notes
     -----
@@ -102,14 +93,12 @@ class ParticleField:
 
     @property
     def _step(self) -> float:
-        return _difference_step(self.length)
+        # A power of two, so that adding it to a position causes almost no rounding.
+        return float(2.0 ** round(log2(DIFFERENCE_STEP * self.length)))
 
     @cached_property
     def functions(self) -> FieldFunctions:
-        """Return all functions of the field; functions that were not given are computed from the others.
-
-        A and its jacobian are None if A was not given, and phi is None if E was given without phi.
-        """
+        """Return all functions of the field; those that were not given are computed from the others if possible."""
         step = self._step
         given = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
         own = (None if fun is None else own_values(jitted(fun)) for fun in given)
@@ -149,19 +138,7 @@ class ParticleField:
         return own_values((lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where)))
 
     def check(self, position: np.ndarray, t: float = 0.0) -> None:
-        """Check that the given functions agree with each other at one point and time.
-
-        Parameters
-        ----------
-        position : ndarray, shape (3,)
-        t : float, optional
-
-        Raises
-        ------
-        ValueError
-            If a function does not return the right number of finite real numbers, the jacobian is not that of A, B is
-            not curl A or E is not -grad phi there.
-        """
+        """Raise ValueError if functions return wrong numbers of values, or contradict each other, at a point (3,)."""
         step, where = self._step, (t, *position)
         found = {key: self._value(key, shape, where) for key, shape in SHAPES.items() if getattr(self, key)}
         if self.vector_potential is not None:
@@ -185,19 +162,7 @@ class ParticleField:
         return value
 
     def along(self, key: str, position: Any, t: Any = 0.0) -> np.ndarray:
-        """Return the values of a function of the field at many points.
-
-        Parameters
-        ----------
-        key : {"A", "phi", "E", "B"}
-        position : array_like, shape (3, m)
-        t : float or array_like, shape (m,), optional
-            Times, for a field that varies.
-
-        Returns
-        -------
-        ndarray, shape (3, m), or (m,) for phi
-        """
+        """Return "A", "E", "B" (3, m) or "phi" (m,) at points (3, m), and times (m,) for a field that varies."""
         fun, points = getattr(self.functions, key), np.ascontiguousarray(np.transpose(position), dtype=float)
         size = 1 if key == "phi" else 3
         out = np.empty((len(points), size))
@@ -207,11 +172,6 @@ class ParticleField:
 
 
 SHAPES = {"vector_potential": (3,), "jacobian": (3, 3), "potential": (), "electric": (3,), "magnetic": (3,)}
-
-
-def _difference_step(length: float) -> float:
-    """Return the shift of the differences, a power of two, so that adding it causes almost no rounding."""
-    return float(2.0 ** round(log2(DIFFERENCE_STEP * length)))
 
 
 def _compare(key: str, given: np.ndarray | None, expected: np.ndarray, slack: float, what: str) -> None:

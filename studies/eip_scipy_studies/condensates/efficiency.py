@@ -1,11 +1,9 @@
 """The paper's test of efficiency: error against processor time for the NLS equation, EIP compared with other schemes.
 
-Two problems on 64 x 64 points of [0, 2 pi)^2, beta = 1, to t = 1. The paper's plane wave is a stationary state: the
-gradients of mass and energy are parallel, so that a projection onto both has rank 1 (counted in the table), |psi|^2 is
-constant, so that the linear systems of LIC (`linearly_implicit`) need no iteration, and splittings are exact. None of
-this holds for the modulated wave. Explicit steps are limited by the grid, the others are not. Times are processor
-seconds, the least of several runs taken in turn, minus the least time of a run of a single step, which removes the
-set-up of up to 20 ms. All methods use the same library of transforms.
+Two problems on 64 x 64 points of [0, 2 pi)^2, beta = 1, to t = 1. The paper's plane wave is a stationary state: a
+projection onto mass and energy has rank 1, the linear systems of LIC (`linearly_implicit`) need no iteration, and
+splittings are exact. None of this holds for the modulated wave. Times are processor seconds, the least of several runs
+taken in turn, minus the least time of a run of a single step, which removes the set-up of up to 20 ms.
 """
 
 from __future__ import annotations
@@ -47,10 +45,10 @@ SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
 
 
 class Contender(NamedTuple):
-    """A method of the test.
+    """A method of the test, and the lengths ``steps(problem)`` of the steps at which it is run.
 
     ``run(problem, h, t_end)`` returns the first and the last state (n, 2), the number of pairs of transforms, and a
-    remark for the table. ``steps(problem)`` returns the lengths of the steps at which the method is run.
+    remark for the table.
     """
 
     run: Callable[[FieldProblem, float, float], tuple[np.ndarray, int, str]]
@@ -79,10 +77,7 @@ def runge_kutta(*names: str) -> Contender:
 
 
 def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Contender:
-    """Return the one-step method ``base(gpe)`` with projection onto `names`, run with the step lengths `steps`.
-
-    Without names it is the plain method.
-    """
+    """Return the one-step method ``base(gpe)`` with projection onto `names`, if any, and the step lengths `steps`."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> Any:
         return _own(problem, h, t_end, lambda gpe: eip_method(base(gpe)), names)
@@ -114,10 +109,7 @@ METHODS = {
 
 
 def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
-    """Return the problem of a modulated plane wave, and its final state (n,) by SciPy's DOP853.
-
-    DOP853 runs at its tightest tolerance.
-    """
+    """Return the problem of a modulated plane wave, and its final state (n,) by SciPy's DOP853 at its tightest."""
     gpe = plane_wave((points, points)).equation
     assert gpe is not None
     x, y = gpe.grid.mesh()
@@ -128,11 +120,7 @@ def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
 
 
 class Trial:
-    """A problem with its exact state (n,) at the end, and the results of its runs.
-
-    For each (name of a method, h) `rows` has a dict with the results of this run: "method", "h", the entries of the
-    dict that `errors` returns, "seconds", "pairs" (the number of pairs of transforms) and "remark".
-    """
+    """A problem with its exact state (n,) at the end, and the results of its runs by (name of a method, h)."""
 
     def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:
         self.problem, self.exact = problem, exact
@@ -156,10 +144,7 @@ class Trial:
         return run
 
     def errors(self, y: np.ndarray) -> dict[str, float]:
-        """Return the errors of the final state of `y` (n, 2): maximum, L2 norm, and relative errors of mass and energy.
-
-        `y` are the states at the start and at the end.
-        """
+        """Return errors of the final state of `y` (n, 2), the states at start and end; those of invariants relative."""
         gpe, (start, end) = self.problem.equation, y.T
         assert gpe is not None
         difference = end - self.exact
@@ -171,7 +156,7 @@ class Trial:
         }
 
     def methods(self) -> dict[str, tuple[Callable[[float], tuple[float, np.ndarray]], Sequence[float]]]:
-        """Return, by the name of each method, its function `runner` and the lengths of its steps."""
+        """Return the `runner` and the lengths of the steps of each method."""
         return {name: (self.runner(name), method.steps(self.problem)) for name, method in METHODS.items()}
 
     def measure(self, repeats: int, callback: Callable[[], Any]) -> None:
@@ -191,8 +176,7 @@ class Trial:
     def slope(self, name: str) -> float:
         """Return the order of a method: the slope of a line fitted to the logarithms of error and h.
 
-        It is nan if fewer than two errors lie between round-off and the largest that is fitted, for example for a
-        splitting on the plane wave, which is exact.
+        It is nan without two errors in the fitted range, as for a splitting on the plane wave, which is exact.
         """
         h, error = self.column(name, "h"), self.column(name, "error_max")
         clean = np.flatnonzero((error > FIT_BETWEEN[0]) & (error < FIT_BETWEEN[1]))[-FITTED:]
@@ -211,11 +195,7 @@ Found = dict[str, Trial]
 
 @dataclass(frozen=True, kw_only=True)
 class Efficiency(Study[Found]):
-    """``reproduce fig-efficiency``: all methods on both waves, with `points` points along each axis.
-
-    The least time of `repeats` runs of each method and step counts. `orders` are the expected slopes, the orders of the
-    methods, and `stem` is that of the names of the files.
-    """
+    """``reproduce fig-efficiency``: all methods on both waves; `orders` are the expected slopes."""
 
     points: int = 64
     repeats: int = 3
@@ -232,10 +212,7 @@ class Efficiency(Study[Found]):
         return trials
 
     def checks(self, found: Found) -> list[Check]:
-        """Compare slopes with the orders of the methods, and invariant errors of EIP-ME on the modulated wave with 0.
-
-        Slopes that are nan are not compared.
-        """
+        """Compare known slopes with the orders, and invariant errors of EIP-ME on the modulated wave with 0."""
         slopes = [
             _checked(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
             for wave, trial in found.items()
@@ -270,7 +247,7 @@ class Efficiency(Study[Found]):
         }
 
     def figures(self, found: Found) -> Figures:
-        """Draw error against step and against time, with a row of panels for each wave."""
+        """Draw error against step and against time."""
         from ..plotting import CostPanel, cost_figure
 
         rows = []

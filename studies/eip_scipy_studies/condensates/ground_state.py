@@ -24,18 +24,13 @@ NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
 # The search of `lowest_ring` over numbers of vortices and windings.
 WALK_TOLERANCE, WALK_ITERATIONS = 1e-3, 150
 NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
-# Part of the vortices of a rigid rotation that a single row in the ring holds: only where the walk starts.
-ROW = 0.4
+ROW = 0.4  # of the vortices of a rigid rotation are in a single row in the ring, where the walk starts
 BREAK_SYMMETRY = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class GroundState:
-    """A stationary state, a minimum of the energy unless the start had a symmetry that the minimum lacks.
-
-    `psi` is the field, of mass 1, `energy` and `mu` are its energy and chemical potential, and `residual` is the norm
-    of H psi - mu psi. `message` says why the search ended after its `iterations`.
-    """
+    """A stationary state: a field of mass 1, its energy and chemical potential, and the norm of H psi - mu psi."""
 
     psi: np.ndarray
     energy: float
@@ -49,10 +44,9 @@ class GroundState:
 def ground_state(gpe: GrossPitaevskii, start: Any, *, tol: float = 1e-8, max_iterations: int = 10_000) -> GroundState:
     """Minimise the energy among fields of mass 1 from the field `start`, until the residual is at most `tol`.
 
-    The method uses the combined preconditioner and the coefficient of Polak and Ribiere of the paper by Antoine, Levitt
-    and Tang, with an exact line search: the energy of cos(a) psi + sin(a) p is a polynomial of degree 4 in cosine and
-    sine, whose coefficients need no further transform. One iteration costs the linear part of one field, and one pair
-    of transforms for the preconditioner.
+    The method uses the combined preconditioner and the coefficient of Polak and Ribiere of the paper, with an exact
+    line search: the energy of cos(a) psi + sin(a) p is a polynomial of degree 4 in cosine and sine, whose coefficients
+    need no further transform.
     """
     psi = gpe.as_field(start)
     return _Descent(gpe, psi / sqrt(gpe.mass(psi))).run(tol, max_iterations)
@@ -131,9 +125,8 @@ class _Descent:
         nn, nq, mm, mq, qq = g * np.array(quartic_sums(self.psi, self.p)) / norm ** np.array([0, 2, 2, 3, 4])
         a, b = self.inner(self.psi, self.image), self.inner(self.p, self.image) / norm
         c = self.inner(self.p, self.p_image) / norm**2
-        tangent = _least_energy(
-            (a + nn, 2 * self.inner(r, self.p) / norm, a + c + 2 * nq + 4 * mm, 2 * b + 4 * mq, c + qq)
-        )
+        slope = 2 * self.inner(r, self.p) / norm
+        tangent = _least_energy((a + nn, slope, a + c + 2 * nq + 4 * mm, 2 * b + 4 * mq, c + qq))
         cosine = 1 / hypot(1.0, tangent)
         sine = tangent * cosine / norm
         rotate(self.psi, self.p, cosine, sine)
@@ -151,10 +144,7 @@ def _least_energy(e: tuple[float, float, float, float, float]) -> float:
 
 
 class _Preconditioner:
-    """Operator D (a - Laplace / 2)^(-1) D with D = (a + W)^(-1/2), for a typical energy a.
-
-    W is V minus its minimum plus ``|beta| |psi|^2``, so that D is defined for every sign of V and beta.
-    """
+    """Operator D (a - Laplace / 2)^(-1) D, D = (a + W)^(-1/2), W = V - min V + ``|beta| |psi|^2``, typical energy a."""
 
     def __init__(self, gpe: GrossPitaevskii) -> None:
         self._gpe = gpe
@@ -188,8 +178,7 @@ class _Preconditioner:
 def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     """Return the Thomas-Fermi density of mass 1, (mu - V + Omega^2 r^2 / 2) / beta where this is positive, and else 0.
 
-    The equation has beta > 0 and a trap that confines the condensate in spite of the rotation. A ValueError is raised
-    if the density reaches the ends of the box.
+    A ValueError is raised if the density reaches the ends of the box.
     """
     r2 = sum(a**2 for a in gpe.grid.mesh()[:2]) if gpe.Omega else 0.0
     well = gpe.V - 0.5 * gpe.Omega**2 * r2
@@ -207,10 +196,7 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
 
 
 def imprint(gpe: GrossPitaevskii, positions: Any) -> np.ndarray:
-    """Return the Thomas-Fermi amplitude with singly charged vortices at the `positions` (k, 2).
-
-    In three dimensions these are lines along z. The mass is near 1.
-    """
+    """Return the Thomas-Fermi amplitude with singly charged vortices, or lines along z, at the `positions` (k, 2)."""
     density = thomas_fermi(gpe)
     x, y, *_ = gpe.grid.mesh()
     psi = np.sqrt(density).astype(complex)
@@ -228,18 +214,13 @@ def polygon(count: int, radius: float) -> np.ndarray:
 
 
 def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
-    """Return the Thomas-Fermi amplitude of a ring with `count` vortices at equal distances on its mean circle.
-
-    The radius of the circle is the root of the mean square radius, and `winding` the winding number of the phase inside
-    the circle.
-    """
+    """Return the Thomas-Fermi amplitude of a ring with `count` vortices on its mean circle, around a `winding`."""
     psi = imprint(gpe, polygon(count, sqrt(_mean_square_radius(gpe))))
     x, y, *_ = gpe.grid.mesh()
     return psi * np.exp(1j * winding * np.arctan2(y, x))
 
 
 def _mean_square_radius(gpe: GrossPitaevskii) -> float:
-    """Return the mean of x^2 + y^2 over the Thomas-Fermi density."""
     density = thomas_fermi(gpe)
     x, y, *_ = gpe.grid.mesh()
     return float(((x**2 + y**2) * density).sum() / density.sum())
@@ -286,8 +267,8 @@ def lowest_ring(
 
     No descent leads from a state to one with another winding of the phase around the hole. Therefore short searches are
     made from starts with pairs (count of vortices, winding), and ``report(count, winding, energy)`` is called for each:
-    from each pair the search goes on to its neighbour of lowest energy, until no neighbour is lower. The last search,
-    to the residual `tol`, starts from the best state with noise, whose seed is `seed`, to break its symmetry.
+    from each pair the search goes on to its neighbour of lowest energy, until no neighbour is lower. The last search
+    starts from the best state with noise, to break its symmetry.
     """
     x, y = gpe.grid.mesh()
     r2 = (x**2 + y**2)[thomas_fermi(gpe) > 0]

@@ -42,9 +42,8 @@ class VortexLines(QuenchStudy):
     The trap is round. The stationary state at the slower rotation therefore continues to rotate at this rate, and lags
     behind the frame that rotates faster.
 
-    There are `points` points along each axis. `energies_known` is the allowed error of the known energies, of the start
-    (a saddle) and of the lower state, and `turn_known` that of the angle of the lines [rad], which is 0.1 of the
-    distance between two points of the grid there.
+    `energies_known` is the allowed error of the known energies, of the start (a saddle) and of the lower state, and
+    `turn_known` that of the angle of the lines [rad], 0.1 of the distance between two points of the grid there.
     """
 
     points: int = LINE_POINTS
@@ -126,11 +125,7 @@ def chemical_potential(gpe: GrossPitaevskii, psi: np.ndarray) -> float:
 
 
 def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
-    """Return a line that gives the distance of the reference's final state from the closed form.
-
-    The closed form is the start, turned and multiplied by exp(-i mu t). `before` is the equation with the slower
-    rotation, of which the start is a stationary state.
-    """
+    """Return a line with the distance of the reference's end from the start, turned and multiplied by exp(-i mu t)."""
     assert made.reference is not None
     start = made.problem.y0
     mu, turn = chemical_potential(before, start), OMEGA_AFTER - OMEGA_BEFORE
@@ -151,10 +146,7 @@ def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
 
 
 def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
-    """Return the surface of equal density `LEVEL` in the k-th saved state.
-
-    The sector of the surface that contains the line `Motion.followed` is marked.
-    """
+    """Return the surface of equal density `LEVEL` in the k-th saved state, with the line `Motion.followed` marked."""
     from ..plotting import SurfacePanel
 
     surface = density_surface(made.equation, _field(made, k), LEVEL)

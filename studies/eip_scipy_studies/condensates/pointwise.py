@@ -1,13 +1,11 @@
-"""Functions of fields point by point, and sums over fields, compiled by Numba.
+"""Functions of fields point by point, and sums over fields with the same bits on every machine, compiled by Numba.
 
-Fields are contiguous complex arrays. The functions see them as floats (Re, Im, Re, Im ...). Sums are computed in an
-order of their own, so that they have the same bits on every machine.
+Fields are contiguous complex arrays, which the functions see as floats (Re, Im, Re, Im ...).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -26,12 +24,9 @@ QUARTERS, SHIFT = float.fromhex("0x1.45f306dc9c883p-1"), float.fromhex("0x1.8p52
 def of_fields(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of fields and numbers that calls `function`, compiled, with flat arrays of floats."""
     compiled = njit(error_model="numpy")(function)
-
-    @wraps(function)
-    def call(*arguments: Any) -> Any:
-        return compiled(*(a.reshape(-1).view(float) if isinstance(a, np.ndarray) else a for a in arguments))
-
-    return call
+    return lambda *arguments: compiled(
+        *(a.reshape(-1).view(float) if isinstance(a, np.ndarray) else a for a in arguments)
+    )
 
 
 @of_fields
@@ -94,10 +89,7 @@ def quartic_sums(psi, p):
 
 @of_fields
 def local_flow(psi, V, beta, h):
-    """Multiply psi by ``exp(-i h (V + beta |psi|^2))``, to 1e-15 for angles up to 1e6.
-
-    Sine and cosine are their Taylor polynomials on [-pi/4, pi/4], without a branch, so that a loop becomes vector code.
-    """
+    """Multiply psi by ``exp(-i h (V + beta |psi|^2))``, by Taylor polynomials: to 1e-15 for angles up to 1e6."""
     for i in range(V.size):
         x, y = psi[2 * i], psi[2 * i + 1]
         angle = h * (V[i] + beta * (x * x + y * y))
@@ -109,8 +101,7 @@ def local_flow(psi, V, beta, h):
         c = -1.0 / 3628800 + q * (1.0 / 479001600 + q * (-1.0 / 87178291200 + q * (1.0 / 20922789888000)))
         c = 1 - q * (0.5 - q * (1.0 / 24 + q * (-1.0 / 720 + q * (1.0 / 40320 + q * c))))
         turn = k - 4 * ((0.25 * k - 0.375 + SHIFT) - SHIFT)  # 0, 1, 2 or 3 quarters
-        odd = (turn == 1.0) | (turn == 3.0)
-        cosine, sine = (s, c) if odd else (c, s)
+        cosine, sine = (s, c) if (turn == 1.0) | (turn == 3.0) else (c, s)
         re = -cosine if (turn == 1.0) | (turn == 2.0) else cosine
         im = sine if turn >= 2.0 else -sine
         psi[2 * i] = re * x - im * y

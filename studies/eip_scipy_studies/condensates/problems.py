@@ -14,26 +14,19 @@ import numpy as np
 
 from eip_scipy.problems import FieldProblem, Grid, GrossPitaevskii
 
-Potential = Callable[..., Any]
 
+def quartic_trap(alpha: float, kappa: float, *gamma: float) -> Callable[..., Any]:
+    """Return the trap V = (1 - alpha) / 2 s + kappa / 4 s^2, s = sum_a (gamma_a x_a)^2, one gamma for each axis."""
 
-def harmonic_trap(*gamma: float) -> Potential:
-    """Return the trap V = s / 2 with s = sum_a (gamma_a x_a)^2, for one frequency gamma_a along each axis."""
-    return lambda *x: 0.5 * _squares(gamma, x)
-
-
-def quartic_trap(alpha: float, kappa: float, *gamma: float) -> Potential:
-    """Return the trap V = (1 - alpha) / 2 s + kappa / 4 s^2 with s = sum_a (gamma_a x_a)^2."""
-
-    def potential(*x: np.ndarray) -> np.ndarray:
-        s = _squares(gamma, x)
+    def potential(*x: np.ndarray) -> Any:
+        s: Any = sum((g * a) ** 2 for g, a in zip(gamma, x, strict=True))
         return 0.5 * (1 - alpha) * s + 0.25 * kappa * s * s
 
     return potential
 
 
-def _squares(gamma: tuple[float, ...], x: tuple[np.ndarray, ...]) -> Any:
-    return sum((g * a) ** 2 for g, a in zip(gamma, x, strict=True))
+harmonic_trap = partial(quartic_trap, 0.0, 0.0)
+"""``harmonic_trap(*gamma)``: the trap V = s / 2."""
 
 
 def soliton(
@@ -94,8 +87,7 @@ def rotating_packet(
 def ring_condensate(kappa: float = 0.3, points: int = 256) -> GrossPitaevskii:
     """Return the paper's fast rotating ring: V = -0.1 r^2 + kappa / 4 r^4 on [-10, 10]^2, Omega = 3.5, beta = 1000.
 
-    With the paper's 256 points along each axis, the phase at the ring's radius r turns by Omega r dx = 1.8 between
-    neighbouring points, which are dx apart.
+    With 256 points the phase turns by up to 1.8 between neighbouring points.
     """
     grid = Grid((points, points), -10.0, 10.0)
     return GrossPitaevskii(grid, quartic_trap(1.2, kappa, 1.0, 1.0), Omega=3.5, beta=1000.0)

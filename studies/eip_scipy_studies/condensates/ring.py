@@ -27,10 +27,7 @@ class Ring(QuenchStudy):
     """Command ``eip-scipy gpe ring``.
 
     The tightened ring contracts, keeps its angular momentum, and so turns faster than the rotating frame, in which its
-    vortices turn anticlockwise: `sense` is 1.
-
-    ``condensate(kappa, points)`` returns the equation, see `ring_condensate`. `kappas` determine the trap before and
-    after the quench.
+    vortices turn anticlockwise. `kappas` determine the trap before and after the quench.
     """
 
     start: Path | None = option(
@@ -65,10 +62,7 @@ class Ring(QuenchStudy):
         return f"Ring, kappa = {self.kappas[0]:g} -> {self.kappas[1]:g}"
 
     def measure(self, session: Session) -> QuenchRuns:
-        """Do all runs from the ground state.
-
-        The ground state is read from the file `start` or from the folder of the checkpoints, or computed.
-        """
+        """Do all runs from the ground state, read from a file or computed."""
         before, after = (self.condensate(kappa, self.points) for kappa in self.kappas)
         if self.start is not None:
             start = load_state(self.start, before)
@@ -99,11 +93,7 @@ class Ring(QuenchStudy):
 
 
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
-    """Return one panel for each saved state, all cropped to the region that the condensate reaches in any state.
-
-    The panels show the density and the vortices. The saved states are the columns of `y`, and `moved` has the vortices
-    of each of them.
-    """
+    """Return one panel for each saved state, a column of `y`, cropped to the region that the condensate reaches."""
     from ..plotting import FieldPanel
 
     fields = np.abs(gpe.grid.field(y)) ** 2

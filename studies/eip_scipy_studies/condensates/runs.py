@@ -39,9 +39,8 @@ def field_check(what: str, value: Any, passed: bool) -> Check:
 class FieldRun:
     """One method's run: saved times (m,), absolute errors (m,), seconds, and evaluations of the right-hand side.
 
-    The errors of mass and energy are their changes since the start, that of the field is the norm of the difference
-    from the reference. `n_rank_reduced` is the number of projections in which the gradients were parallel, as at a
-    stationary state.
+    The errors of mass and energy are changes since the start, that of the field is the norm of the difference from the
+    reference. `n_rank_reduced` counts projections with parallel gradients, as at a stationary state.
     """
 
     t: np.ndarray
@@ -57,10 +56,8 @@ class FieldRun:
 class QuenchRuns:
     """The runs of a quench: those of `METHODS` that were done, by name (`lines`).
 
-    `problem` is the one after the quench, with the step of RK4; it starts from the stationary state before the quench.
-    `reference` and `fields` are the states (n, m) of the reference and of the method `SHOWN`, whose fields are drawn,
-    and `moved` are the vortices in the run of `SHOWN`. `more` are checks in addition to those of all quenches, and
-    `notes` lines for the head of the table.
+    `problem` is the one after the quench, with the step of RK4. `reference` and `fields` are the states (n, m) of the
+    reference and of the method `SHOWN`, and `moved` are the vortices in the latter.
     """
 
     problem: FieldProblem
@@ -80,21 +77,14 @@ class QuenchRuns:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The vortices at the times `t` (m,); in three dimensions their positions in the middle plane.
-
-    `angle` (m,) is the angle by which the vortices have turned about the centre since the start, positive anticlockwise
-    [rad]: the sum of the medians of their turns from one state to the next.
-    """
+    """The vortices at the times `t` (m,), and the `angle` (m,) by which they have turned about the centre [rad]."""
 
     t: np.ndarray
     vortices: list[Vortices]
     angle: np.ndarray
 
     def off(self, k: int, x: Any, y: Any) -> Any:
-        """Return polar angles of points (x, y) relative to that of a reference vortex in the k-th state, in (-pi, pi].
-
-        The reference is the vortex with the largest x at the start, turned by `angle`.
-        """
+        """Return polar angles of points in the k-th state, relative to the first vortex with the largest x, turned."""
         a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
         return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
 
@@ -115,8 +105,7 @@ def _line(gpe: GrossPitaevskii, run: Any, reference: np.ndarray) -> FieldRun:
 def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
     """Find the vortices in all states `fields` (n, m) at the times `t` (m,), and the angle by which they have turned.
 
-    From one state to the next, the angle of each vortex is extrapolated and matched with the nearest one; the angle of
-    `Motion` increases by the median of the turns.
+    From one state to the next, the angle of each vortex is extrapolated and matched with the nearest one.
     """
     found = [vortices(gpe, y) for y in fields.T]
     angles = [np.arctan2(*v.positions.T[::-1]) for v in found]
@@ -128,10 +117,7 @@ def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
 
 
 def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
-    """Return the median turn of vortices from angles `old` to `new`.
-
-    Each old angle plus `guess` is matched with the nearest new one. Without vortices the turn is `guess`.
-    """
+    """Return the median turn of vortices; each `old` angle plus `guess` is matched with the nearest `new` one."""
     if not (old.size and new.size):
         return guess
     difference = np.angle(np.exp(1j * (new[None, :] - old[:, None] - guess)))
@@ -151,19 +137,14 @@ def _cells(line: FieldRun) -> list[str]:
     return [compact(line.wall_time, 3), str(line.nfev), *errors, str(line.n_rank_reduced)]
 
 
-def _radius(found: Vortices) -> str:
-    return f"{np.hypot(*found.positions.T).mean():.3f}" if found.charges.size else "-"
-
-
 @dataclass(frozen=True, kw_only=True)
 class QuenchStudy(Checkpoints, Study[QuenchRuns]):
     """Base class of the commands on condensates whose trap or rotation changes at t = 0, a quench.
 
-    `stem` is that of the names of the files. The runs by RK4 have the step `step`; the reference, with which they are
-    compared, is a run by EIPDOP853 with `reference_step`. `saved` is the time between two saved states, short enough to
-    follow the vortices. At the times `snapshots` fields are drawn and vortices are counted. `sense` is the direction in
-    which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise. `energy_kept` is the bound on the
-    absolute error of the energy in runs that keep it.
+    The runs by RK4 have the step `step`, the reference, by EIPDOP853, `reference_step`. `saved` is the time between two
+    saved states, short enough to follow the vortices. At the times `snapshots` fields are drawn and vortices counted.
+    `sense` is the direction in which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
+    `energy_kept` is the bound on the absolute error of the energy in runs that keep it.
     """
 
     seed: int = option(0, "seed of the random starts (default: %(default)s)", type=int, metavar="N")
@@ -190,10 +171,9 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
 
     def do_runs(self, gpe: GrossPitaevskii, start: np.ndarray, session: Session) -> QuenchRuns:
-        """Run the reference and each of `METHODS`, and follow the vortices in the run of `SHOWN`.
+        """Run the reference and each of `METHODS` from `start`, and follow the vortices in the run of `SHOWN`.
 
-        `gpe` is the equation after the quench, and `start` the stationary state before it. A RuntimeError is raised if
-        a run fails, and PartlyDone with the completed runs if the user interrupts them after at least one of `METHODS`.
+        PartlyDone is raised with the completed runs if the user interrupts them after at least one of `METHODS`.
         """
         made = QuenchRuns(gpe.problem(start, self.t_end, self.step, name=self.stem))
         run = partial(self._run, made, session.shown)
@@ -204,12 +184,11 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
                 made.lines[name] = _line(gpe, done, made.reference)
                 if name == SHOWN:
                     made.fields = done.y
+                    made.moved = motion(gpe, done.t, done.y)
         except KeyboardInterrupt:
             if not made.lines:
                 raise
-            made.moved = _moved(made)
             raise PartlyDone(made) from None
-        made.moved = _moved(made)
         return made
 
     def _run(
@@ -262,9 +241,10 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         ]
         if moved is not None:
             where = [
-                (f"t = {moved.t[k]:.2f}", [str(len(v.charges)), _radius(v), f"{moved.angle[k]:+.3f}"])
+                (f"t = {moved.t[k]:.2f}", [str(len(v.charges)), radius, f"{moved.angle[k]:+.3f}"])
                 for k in self.shown(moved.t)
                 for v in (moved.vortices[k],)
+                for radius in (f"{np.hypot(*v.positions.T).mean():.3f}" if v.charges.size else "-",)
             ]
             out += [
                 f"Vortices, in the rotating frame; turned: positive anticlockwise, {AXES}",
@@ -312,10 +292,6 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
     @abstractmethod
     def pictures(self, found: QuenchRuns) -> Figures:
         """Draw the fields at the times `snapshots`; yield the file names and figures."""
-
-
-def _moved(made: QuenchRuns) -> Motion | None:
-    return None if made.fields is None else motion(made.equation, made.lines[SHOWN].t, made.fields)
 
 
 def _rows(made: QuenchRuns) -> Rows:

@@ -17,12 +17,10 @@ SMALL_TURN = pi / 32  # shears stretch what they turn by a fortieth of its radiu
 class LinearFlow:
     """The flow exp(-i (time T - angle Lz)) with T = -Laplace / 2: a rotation by `angle` and free motion for `time`.
 
-    The default of `angle`, ``gpe.Omega * time``, gives the flow of the equation's linear part. The flow is exact in
-    time. Without rotation it is one factor of all modes. With rotation there are three factors, of the modes along x, y
-    and x again: ``exp(-i (a k^2 / 2 + c y k))``, ``exp(-i (b q^2 / 2 - d x q))`` and the first once more, with c =
-    tan(angle / 2), d = sin(angle), a = time / (1 + cos(angle)), b = time cos(angle). They follow from the classical
-    motion, which determines the flow of a quadratic Hamiltonian (Bernier, Crouseilles & Li, J. Comput. Phys. 443 (2021)
-    110518). On the grid the flow is unitary to round-off.
+    The default of `angle` gives the flow of the equation's linear part. Without rotation the flow is one factor of all
+    modes. With rotation there are three factors, of the modes along x, y and x again, which follow from the classical
+    motion: ``exp(-i (a k^2 / 2 + c y k))``, ``exp(-i (b q^2 / 2 - d x q))`` and the first once more, with c = tan(angle
+    / 2), d = sin(angle), a = time / (1 + cos(angle)), b = time cos(angle). On the grid the flow is unitary.
     """
 
     def __init__(self, gpe: GrossPitaevskii, time: float, angle: float | None = None) -> None:
@@ -77,8 +75,7 @@ SCHEMES = {
 class Splitting:
     """One-step method for `eip_method` that solves the linear part and the local part alternately, both exactly.
 
-    ``|psi|^2`` is constant in the local flow, which therefore only changes the phase. Every flow is unitary and
-    reversible, and so are the steps. The energy is not conserved without a projection.
+    ``|psi|^2`` is constant in the local flow, which therefore only changes the phase.
     """
 
     def __init__(self, gpe: GrossPitaevskii, scheme: str = "rkn6") -> None:

@@ -32,16 +32,13 @@ MOST_LINES, LINES_RADIUS, LINES_ITERATIONS = 4, 1.5, 1000
 VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the margin around it
 COUNT = number("an integer >= 1", lambda value: value >= 1, int)
 Update = Callable[[str], Any]
+OTHER = "Give another file, or leave out --resume or --start."
 Ends = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A stationary state, and the start from which it was found.
-
-    `label` is the property that distinguishes the start or, in the trap, the equation from the others; it heads a row
-    of the table. `published` is the published energy, if there is one.
-    """
+    """A stationary state, and the `label` of the start from which it was found or, in the trap, of the equation."""
 
     label: str
     equation: GrossPitaevskii
@@ -55,10 +52,7 @@ class Found:
 
 
 def trap(settings: GroundStates, update: Update) -> list[Found]:
-    """Return, for each angular velocity in a harmonic trap, the state of lowest energy from several starts.
-
-    ``update(text)`` shows what is being computed.
-    """
+    """Return, for each angular velocity, the state of lowest energy; ``update(text)`` shows what is being computed."""
     grid = Grid((settings.trap_points, settings.trap_points), -10.0, 10.0)
     found = []
     for Omega, published in settings.published.items():
@@ -72,16 +66,8 @@ def trap(settings: GroundStates, update: Update) -> list[Found]:
     return found
 
 
-def ring(settings: GroundStates, update: Update) -> list[Found]:
-    """Return the ground state of the paper's ring, as a list of one; `update` is as for `trap`."""
-    return [search_ring(settings.seed, update)]
-
-
 def search_ring(seed: int, update: Update) -> Found:
-    """Search over numbers of vortices and windings for the ground state of the paper's ring.
-
-    `seed` is that of the noise in `lowest_ring`, and ``update(text)`` shows which pair is being tried.
-    """
+    """Search over numbers of vortices and windings for the ground state of the paper's ring; see `lowest_ring`."""
     gpe = ring_condensate(points=RING_POINTS)
     tried: list[tuple[float, int, int]] = []
 
@@ -95,10 +81,7 @@ def search_ring(seed: int, update: Update) -> Found:
 
 
 def lines(settings: GroundStates, update: Update) -> list[Found]:
-    """Return states of the paper's 3D condensate found from noisy starts with 0 ... 4 vortex lines, and the saddle.
-
-    The saddle, the last one, is the state of `search_saddle`. `update` is as for `trap`.
-    """
+    """Return states of the paper's 3D condensate from noisy starts with 0 ... 4 vortex lines, and last the saddle."""
     gpe = line_condensate(points=LINE_POINTS)
     rng = np.random.default_rng(settings.seed)
     found = []
@@ -114,7 +97,6 @@ def search_saddle(points: int, update: Update) -> Found:
     """Return the paper's state with four vortex lines, on a grid with `points` points along each axis.
 
     It is a saddle of the energy, which the descent reaches because it keeps the square symmetry of the start.
-    `update` is as for `trap`.
     """
     update(f"lines, {SADDLE_LINES} imprinted without noise")
     gpe = line_condensate(points=points)
@@ -123,10 +105,7 @@ def search_saddle(points: int, update: Update) -> Found:
 
 
 def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
-    """Return the lower state to which the descent of the energy leads from a saddle with a little noise.
-
-    `saddle` is a field of the equation `gpe`, `seed` that of the noise, and `update` as for `trap`.
-    """
+    """Return the lower state to which the descent of the energy leads from the field `saddle` with a little noise."""
     update("lines, down from the saddle")
     start = with_noise(saddle, np.random.default_rng(seed))
     state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
@@ -134,7 +113,11 @@ def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Up
 
 
 Scene = Callable[["GroundStates", Update], list[Found]]
-SCENES: dict[str, Scene] = {"trap": trap, "ring": ring, "lines": lines}
+SCENES: dict[str, Scene] = {
+    "trap": trap,
+    "ring": lambda settings, update: [search_ring(settings.seed, update)],
+    "lines": lines,
+}
 TITLES = {
     "trap": "trap: V = r^2 / 2, beta = 100; lowest of {starts} starts for each Omega",
     "ring": "ring: V = -0.1 r^2 + 0.075 r^4, beta = 1000, Omega = 3.5; a row of vortices around a winding",
@@ -144,18 +127,13 @@ Results = dict[str, list[Found]]
 
 
 def _known(quantity: str, known: float, ours: float, matched: bool, note: str = "") -> Check:
-    """Return the check of a quantity of a state, whose known value is `known`."""
     text = f"{quantity} {known:.10g}, ours {ours:.10g}{f' ({note})' if note else ''}"
     return Check(text, matched, {"quantity": quantity, "known": known, "ours": ours, "matched": matched, "note": note})
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundStates(Study[Results]):
-    """Command ``eip-scipy gpe ground-state``.
-
-    `published` holds the published energies in the trap by angular velocity, and `trap_points` is the number of points
-    of the trap's grid along each axis.
-    """
+    """Command ``eip-scipy gpe ground-state``."""
 
     scene: Sequence[str] | None = some_of("scene", SCENES)
     starts: int = option(
@@ -177,10 +155,7 @@ class GroundStates(Study[Results]):
             return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
 
     def checks(self, found: Results) -> list[Check]:
-        """Compare energies and numbers of vortex lines with known ones.
-
-        In the trap, a lower energy than the published one is not a failure.
-        """
+        """Compare energies and numbers of vortex lines with known ones; lower energies in the trap are no failures."""
         checks = []
         for item in found.get("trap", ()):
             known, ours = self.published[item.equation.Omega], item.state.energy
@@ -220,10 +195,7 @@ class GroundStates(Study[Results]):
         return {"states": _rows(found), "checks": [check.entry for check in self.checks(found)]}
 
     def figures(self, found: Results) -> Figures:
-        """Write the lowest states of the ring and of the lines as npz files, and draw densities and vortices.
-
-        ``gpe ring`` can start from ring.npz.
-        """
+        """Write the lowest states of the ring, for ``gpe ring``, and of the lines, and draw densities and vortices."""
         for name, states in found.items():
             if name != "trap":
                 yield f"{name}.npz", partial(_save, min(states, key=lambda item: item.state.energy))
@@ -265,10 +237,7 @@ def _rows(results: Results) -> Rows:
 
 
 def panels(name: str, found: list[Found]) -> dict[str, Any]:
-    """Return the densities to draw by title, one `FieldPanel` for each state of the problem `name`.
-
-    States with vortex lines are shown in the plane z = 0, the lowest one also in x = 0.
-    """
+    """Return the densities to draw by title; lines are shown in the plane z = 0, the lowest state also in x = 0."""
     from ..plotting import FieldPanel
 
     out = {}
@@ -299,8 +268,7 @@ def cropped(
 ) -> tuple[np.ndarray, Ends]:
     """Return the middle part of a density in a plane, and its ends: lower and upper along the first and second axis.
 
-    `axes` are the axes of `grid` in this plane. The part reaches from the centre to `half` on all sides; by default it
-    contains the condensate and a margin.
+    `axes` are those of `grid` in this plane. The part reaches to `half`, by default beyond the condensate.
     """
     if half is None:
         seen = (np.any(density > VISIBLE * density.max(), axis=1 - k) for k in (0, 1))
@@ -320,24 +288,20 @@ def save_state(path: Path, item: Found) -> Path:
 
 
 def _save(item: Found, path: Path) -> None:
-    gpe, state = item.equation, item.state
-    content: dict[str, Any] = {
-        "psi": state.psi,
-        "V": gpe.V,
-        "lower": gpe.grid.lower,
-        "upper": gpe.grid.upper,
-        "Omega": gpe.Omega,
-        "beta": gpe.beta,
-        "energy": state.energy,
-        "mu": state.mu,
-        "residual": state.residual,
-    }
-    np.savez_compressed(path, **content)
+    state = item.state
+    numbers: dict[str, Any] = {"energy": state.energy, "mu": state.mu, "residual": state.residual}
+    np.savez_compressed(path, psi=state.psi, **_content(item.equation), **numbers)
+
+
+def _content(gpe: GrossPitaevskii) -> dict[str, Any]:
+    """Return what a file has of the equation."""
+    grid = gpe.grid
+    return {"lower": grid.lower, "upper": grid.upper, "Omega": gpe.Omega, "beta": gpe.beta, "V": gpe.V}
 
 
 @contextmanager
 def searching(session: Session) -> Iterator[Update]:
-    """Show the subject of a search and the elapsed time; yield the function that sets the subject."""
+    """Show the elapsed time of a search and its subject, which the function that is yielded sets."""
     with session.bar(None, "", bar_format="{desc} [{elapsed}]") as bar:
         yield bar.set_description_str
 
@@ -345,10 +309,7 @@ def searching(session: Session) -> Iterator[Update]:
 def kept_state(
     settings: Checkpoints, session: Session, gpe: GrossPitaevskii, search: Callable[[Update], Found]
 ) -> np.ndarray:
-    """Return the initial field: with ``--resume`` the one in the folder of the checkpoints, else that of `search`.
-
-    ``search(update)`` returns the state; `update` takes the words to be shown.
-    """
+    """Return the initial field: with ``--resume`` the one in the folder of the checkpoints, else that of `search`."""
     kept = None if settings.checkpoint is None else settings.checkpoint / "state.npz"
     if kept is not None and settings.resume and kept.exists():
         return load_state(kept, gpe)
@@ -360,34 +321,18 @@ def kept_state(
 
 
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
-    """Read the field of a state that `save_state` has written, which must belong to `gpe`.
-
-    A UsageError is raised if the file cannot be read, or holds a state of another grid or equation.
-    """
+    """Read the field of a state that `save_state` has written; UsageError if it does not belong to `gpe`."""
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {name: file[name] for name in ("psi", "V", "lower", "upper", "Omega", "beta")}
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UsageError(
-            f"cannot read a state from {str(path)!r}: {error}. Give another file, or leave out --resume or --start."
-        ) from error
-    expected: dict[str, Any] = {
-        "lower": gpe.grid.lower,
-        "upper": gpe.grid.upper,
-        "Omega": gpe.Omega,
-        "beta": gpe.beta,
-        "V": gpe.V,
-    }
-    for name, value in expected.items():
+        raise UsageError(f"cannot read a state from {str(path)!r}: {error}. {OTHER}") from error
+    for name, value in _content(gpe).items():
         if np.shape(value) != content[name].shape or not np.allclose(value, content[name], rtol=1e-12):
             raise UsageError(
-                f"{str(path)!r} holds a state of another equation: its {name} differs from that of {gpe!r}. "
-                "Give a state that was computed for this equation, or leave out --resume or --start."
+                f"{str(path)!r} holds a state of another equation: its {name} differs from that of {gpe!r}. {OTHER}"
             )
     psi = content["psi"]
     if psi.shape != gpe.grid.shape or psi.dtype.kind != "c" or not np.isfinite(psi).all():
-        raise UsageError(
-            f"{str(path)!r}: psi must be a finite complex field of shape {gpe.grid.shape}. Give another file, or leave "
-            "out --resume or --start."
-        )
+        raise UsageError(f"{str(path)!r}: psi must be a finite complex field of shape {gpe.grid.shape}. {OTHER}")
     return psi

@@ -27,9 +27,9 @@ def vortices(gpe: GrossPitaevskii, psi: Any) -> Vortices:
     """Return the vortices of a field inside the condensate; in three dimensions those in the middle plane.
 
     Places where the density is below `THRESHOLD` are outside, after cores have been filled by a grey closing. From the
-    phase differences along the four edges of a cell those of the rigid rotation are subtracted, and the results are
-    reduced to (-pi, pi]. The sum of these, plus the circulation 2 Omega dx dy of the rotation, is 2 pi times the
-    charge. Without this, the phase of a fast rotating field may turn by more than pi between two points of the grid.
+    phase differences along the edges of a cell those of the rigid rotation are subtracted, because the phase of a fast
+    rotating field may turn by more than pi between two points. The sum of the rests, reduced to (-pi, pi], plus the
+    circulation 2 Omega dx dy of the rotation, is 2 pi times the charge.
     """
     psi = gpe.as_field(psi)
     top = float((np.abs(psi) ** 2).max())

@@ -6,8 +6,6 @@
 
 #include <nanobind/stl/array.h>
 
-#include <cmath>
-
 #include "../pairs.hpp"
 
 namespace eip {
@@ -60,61 +58,6 @@ void derivative_at_once(ConstField psi, ConstReals V, double beta, Field out) {
     turned_derivative(psi, V, beta, out, [&](npy_intp i) { return out.data[i]; });
 }
 
-// out += (V + beta |psi|^2) psi.
-void add_potential(ConstField psi, ConstReals V, double beta, Field out) {
-    require_one_length(psi, V, out);
-    const Released released(psi.points);
-    for (npy_intp i = 0; i < psi.points; ++i) {
-        const double a = psi.data[2 * i], b = psi.data[2 * i + 1];
-        const double v = V.data[i] + beta * (a * a + b * b);
-        out.data[2 * i] += v * a;
-        out.data[2 * i + 1] += v * b;
-    }
-}
-
-// pi / 2 in two parts (Cody & Waite): whole multiples of the first, up to 2^20 of them, are exact.
-constexpr double QUARTER = 0x1.921fb544p+0, QUARTER_LOW = 0x1.0b4611a626331p-34, QUARTERS = 0x1.45f306dc9c883p-1;
-
-// The nearest whole number, below 2^51: for vectors of every processor, as std::floor is not.
-inline double whole(double x) {
-    constexpr double SHIFT = 0x1.8p52;
-    return (x + SHIFT) - SHIFT;
-}
-
-// The phase exp(-i angle). Sine and cosine are their Taylor polynomials on [-pi/4, pi/4], without a branch: a loop over
-// angles becomes vector code. To 1e-15 for angles up to 1e6.
-inline void put_phase(double angle, double *phase) {
-    const double k = whole(angle * QUARTERS);
-    const double r = (angle - k * QUARTER) - k * QUARTER_LOW;
-    const double q = r * r;
-    double s = 1.0 / 362880 + q * (-1.0 / 39916800 + q * (1.0 / 6227020800 + q * (-1.0 / 1307674368000)));
-    s = r * (1 + q * (-1.0 / 6 + q * (1.0 / 120 + q * (-1.0 / 5040 + q * s))));
-    double c = -1.0 / 3628800 + q * (1.0 / 479001600 + q * (-1.0 / 87178291200 + q * (1.0 / 20922789888000)));
-    c = 1 - q * (0.5 - q * (1.0 / 24 + q * (-1.0 / 720 + q * (1.0 / 40320 + q * c))));
-    const double turn = k - 4 * whole(0.25 * k - 0.375);  // 0, 1, 2 or 3 quarters
-    const bool odd = (turn == 1.0) | (turn == 3.0);
-    const double cosine = odd ? s : c, sine = odd ? c : s;
-    phase[0] = turn == 1.0 || turn == 2.0 ? -cosine : cosine;
-    phase[1] = turn >= 2.0 ? sine : -sine;
-}
-
-// psi <- exp(-i h (V + beta |psi|^2)) psi.
-void local_flow(Field psi, ConstReals V, double beta, double h) {
-    require_one_length(psi, V);
-    const Released released(psi.points);
-    double phases[BLOCK];
-    const npy_intp floats = 2 * psi.points;
-    for (npy_intp begin = 0; begin < floats; begin += BLOCK) {
-        double *z = psi.data + begin;
-        const double *v = V.data + begin / 2;
-        const npy_intp count = std::min(BLOCK, floats - begin);
-        for (npy_intp i = 0; i < count; i += 2)
-            put_phase(h * (v[i / 2] + beta * (z[i] * z[i] + z[i + 1] * z[i + 1])), phases + i);
-        for (npy_intp i = 0; i < count; i += WIDTH)
-            store_some(times(load_some(phases + i, count - i), load_some(z + i, count - i)), z + i, count - i);
-    }
-}
-
 // out = i factor f.
 void turn(ConstField f, double factor, Field out) {
     require_one_length(f, out);
@@ -124,25 +67,6 @@ void turn(ConstField f, double factor, Field out) {
         out.data[2 * i] = -factor * im;
         out.data[2 * i + 1] = factor * re;
     }
-}
-
-// out = a / sqrt(shift + V + beta |psi|^2).
-void divide_by_root(ConstField a, ConstField psi, ConstReals V, double beta, double shift, Field out) {
-    require_one_length(a, psi, V, out);
-    const Released released(psi.points);
-    for (npy_intp i = 0; i < psi.points; ++i) {
-        const double x = psi.data[2 * i], y = psi.data[2 * i + 1];
-        const double weight = 1 / std::sqrt(shift + V.data[i] + beta * (x * x + y * y));
-        out.data[2 * i] = weight * a.data[2 * i];
-        out.data[2 * i + 1] = weight * a.data[2 * i + 1];
-    }
-}
-
-// a <- c a + s b.
-void rotate(Field a, ConstField b, double c, double s) {
-    require_one_length(a, b);
-    const Released released(a.points);
-    for (npy_intp i = 0; i < 2 * a.points; ++i) a.data[i] = c * a.data[i] + s * b.data[i];
 }
 
 // Sums.
@@ -274,18 +198,21 @@ std::array<double, 3> shifted(ConstField psi, ConstField f, double a, double b, 
     return lane_sums(2 * psi.points, ShiftSums{a, turning(b), out.data, {}, {}, {}}, psi.data, f.data);
 }
 
-// Re <a, b>.
-double inner(ConstField a, ConstField b) {
-    require_one_length(a, b);
-    const Released released(a.points);
-    return dot(a.data, b.data, 2 * a.points);
-}
-
-// The sum of a term of each point, in four lanes.
-template <class Term>
-double sum_of_points(npy_intp points, Term term) {
+// Sum of weight |field|^2; a weight for each point or, (rows, 1), for each row.
+double weighted_square(ConstField field, ConstReals weight) {
+    const npy_intp columns = field.columns;
+    const bool by_rows = weight.columns == 1 && weight.points * columns == field.points;
+    require(by_rows || weight.points == field.points, "weighted_square: expected a weight for each point, or row");
+    const Released released(field.points);
+    const double *z = field.data, *w = weight.data;
+    if (by_rows) {
+        double total = 0.0;
+        for (npy_intp r = 0; r < weight.points; ++r, z += 2 * columns) total += w[r] * dot(z, z, 2 * columns);
+        return total;
+    }
+    const auto term = [=](npy_intp i) { return w[i] * (z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1]); };
     std::array<double, 1> total{};
-    sum_blocks(points, total, [&](npy_intp begin, npy_intp end) {
+    sum_blocks(field.points, total, [&](npy_intp begin, npy_intp end) {
         double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
         npy_intp i = begin;
         for (; i + 4 <= end; i += 4) {
@@ -300,73 +227,18 @@ double sum_of_points(npy_intp points, Term term) {
     return total[0];
 }
 
-// Sum of weight |field|^2; a weight for each point or, (rows, 1), for each row.
-double weighted_square(ConstField field, ConstReals weight) {
-    const npy_intp columns = field.columns;
-    const bool by_rows = weight.columns == 1 && weight.points * columns == field.points;
-    require(by_rows || weight.points == field.points, "weighted_square: expected a weight for each point, or row");
-    const Released released(field.points);
-    const double *z = field.data, *w = weight.data;
-    if (by_rows) {
-        double total = 0.0;
-        for (npy_intp r = 0; r < weight.points; ++r, z += 2 * columns) total += w[r] * dot(z, z, 2 * columns);
-        return total;
-    }
-    return sum_of_points(field.points,
-                         [=](npy_intp i) { return w[i] * (z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1]); });
-}
-
-// Sum of V |psi|^2 + beta / 2 |psi|^4.
-double interaction_energy(ConstField psi, ConstReals V, double beta) {
-    require_one_length(psi, V);
-    const Released released(psi.points);
-    const double half = 0.5 * beta, *z = psi.data;
-    return sum_of_points(psi.points, [=](npy_intp i) {
-        const double n = z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1];
-        return (V.data[i] + half * n) * n;
-    });
-}
-
-// Sums of nn, nq, mm, mq and qq, where n = |psi|^2, m = Re(conj(psi) p), q = |p|^2.
-std::array<double, 5> quartic_sums(ConstField psi, ConstField p) {
-    require_one_length(psi, p);
-    const Released released(psi.points);
-    std::array<double, 5> total{};
-    sum_blocks(psi.points, total, [&](npy_intp begin, npy_intp end) {
-        std::array<double, 5> part{};
-        for (npy_intp i = begin; i < end; ++i) {
-            const double x = psi.data[2 * i], y = psi.data[2 * i + 1], u = p.data[2 * i], v = p.data[2 * i + 1];
-            const double n = x * x + y * y, m = x * u + y * v, q = u * u + v * v;
-            part[0] += n * n;
-            part[1] += n * q;
-            part[2] += m * m;
-            part[3] += m * q;
-            part[4] += q * q;
-        }
-        return part;
-    });
-    return total;
-}
-
 }  // namespace
 
 void add_condensates(nb::module_ module) {
     module.def("multiply", multiply, "field"_a, "factor"_a);
     module.def("derivative", derivative, "rest"_a, "psi"_a, "V"_a, "beta"_a, "out"_a);
     module.def("derivative_at_once", derivative_at_once, "psi"_a, "V"_a, "beta"_a, "out"_a);
-    module.def("add_potential", add_potential, "psi"_a, "V"_a, "beta"_a, "out"_a);
-    module.def("local_flow", local_flow, "psi"_a, "V"_a, "beta"_a, "h"_a);
     module.def("turn", turn, "f"_a, "factor"_a, "out"_a);
-    module.def("divide_by_root", divide_by_root, "a"_a, "psi"_a, "V"_a, "beta"_a, "shift"_a, "out"_a);
-    module.def("rotate", rotate, "a"_a, "b"_a, "c"_a, "s"_a);
     module.def("moments", moments, "psi"_a, "f"_a);
     module.def("total_mass", total_mass, "psi"_a);
     module.def("expansion", expansion, "psi"_a, "near"_a, "f"_a);
     module.def("shifted", shifted, "psi"_a, "f"_a, "a"_a, "b"_a, "out"_a);
-    module.def("inner", inner, "a"_a, "b"_a);
     module.def("weighted_square", weighted_square, "field"_a, "weight"_a);
-    module.def("interaction_energy", interaction_energy, "psi"_a, "V"_a, "beta"_a);
-    module.def("quartic_sums", quartic_sums, "psi"_a, "p"_a);
 }
 
 }  // namespace eip
