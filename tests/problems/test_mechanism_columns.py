@@ -1,6 +1,5 @@
 """Tangent maps of mechanisms: against closed forms, differences of the flow, and the same pendulum as an equation."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
