@@ -367,7 +367,7 @@ def test_bad_grids(arguments, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"potential": lambda x, y: x * 1j}, "potential must be real"),
+        ({"potential": lambda x, y: x * 1j}, "potential must be an array of numbers"),
         ({"potential": lambda x, y: np.where(x > 0, np.nan, 1.0) + y}, "not finite"),
         ({"potential": np.zeros((3, 3))}, r"shape \(3, 3\), which does not fit Grid\(\(8, 8\)"),
         ({"potential": harmonic_trap(1, 1, 1)}, "3 frequencies does not fit 2"),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...core.balances import Balance
-from ...core.inputs import is_number, shown
+from ...core.inputs import is_number, real_array, shown
 from ...core.invariants import Invariant, JointInvariants
 from ...core.problem import Problem
 from ..named_invariants import checked_damping, damped_invariant, named_invariant
@@ -431,9 +431,8 @@ class GrossPitaevskii:
 
 def on_grid(potential: Any, grid: Grid, name: str = "potential") -> np.ndarray:
     """Return the values (J[, K[, L]]) of a real quantity on the grid; `name` is its name in messages."""
-    values = np.asarray(potential(*grid.mesh()) if callable(potential) else 0.0 if potential is None else potential)
-    if values.dtype.kind not in "fiu":
-        raise ValueError(f"{name} must be real, got values of type {values.dtype}.")
+    given = potential(*grid.mesh()) if callable(potential) else 0.0 if potential is None else potential
+    values = real_array(name, given)
     try:
         values = np.broadcast_to(values, grid.shape)
     except ValueError:
