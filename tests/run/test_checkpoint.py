@@ -311,18 +311,6 @@ def test_a_result_is_there_at_once(tmp_path):
 
 
 @pytest.mark.usefixtures("fine")
-def test_each_saved_point_reaches_a_callback(tmp_path, monkeypatch):
-    """Each point reaches the callback at least once: those after the last snapshot are computed again."""
-    whole, path, seen = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", []
-    case = (orbit, Y0, FIXED | {"callback": lambda t, y, defects: seen.append(t)})
-    found, times = resumed(case, path, monkeypatch)
-    assert times > 4
-    same(whole, found)
-    assert set(seen) == set(whole.t)
-    assert len(seen) <= whole.t.size + times
-
-
-@pytest.mark.usefixtures("fine")
 def test_a_failed_run_fails_again(tmp_path):
     def fun(t, y):
         return orbit(t, y) * (np.nan if t > 3.0 else 1.0)
@@ -346,13 +334,6 @@ def test_an_endless_run(tmp_path, monkeypatch):
     with pytest.raises(BrokenOffError), broken_off(monkeypatch, 40):
         integrate(orbit, (0, np.inf), Y0, checkpoint=tmp_path / "run", **options)
     same(whole, integrate(orbit, (0, np.inf), Y0, checkpoint=tmp_path / "run", resume=True, **options))
-
-
-def test_the_bound_on_memory_holds(tmp_path):
-    path, options = tmp_path / "run", FIXED | {"save_every": 1}
-    integrate(orbit, SPAN, Y0, checkpoint=path, **options)
-    with pytest.raises(MemoryError, match="save_every"):
-        integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, max_bytes=5000, **options)
 
 
 # When checkpoints are written.
