@@ -16,7 +16,7 @@ import rebound
 from rebound import units as rebound_units
 from scipy.optimize import OptimizeResult
 
-from eip_scipy.core.inputs import count, shown
+from eip_scipy.core.inputs import count, real_array, shown
 from eip_scipy.problems.gravity.bodies import Bodies, bodies_of
 from eip_scipy.problems.gravity.forces import ForceConstants, check_forces
 from eip_scipy.problems.gravity.nbody import component_names, nbody
@@ -474,7 +474,7 @@ def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) 
         k = np.argmax(equal)
     if t is None:
         t = problem.t_span[0] if run is problem else run.t[k]
-    y, n = np.array(y, dtype=float), bodies.gm.size
+    y, n = real_array("y", y), bodies.gm.size
     if y.shape != (6 * n,):
         raise ValueError(f"to_simulation: y has the shape {y.shape}; expected ({6 * n},) for {n} bodies.")
     return float(t), y

@@ -79,7 +79,7 @@ def plain(problem: Problem, **arguments: Any) -> dict[str, Any]:
         else:
             raise TypeError(f"plain: unexpected argument {name!r}; expected {', '.join((*MOMENTS, *DURATIONS))} or y0.")
     start = _first(arguments.get("t_span"))
-    if isinstance(start, Time) and arguments.get("y0") is None and problem.t_span is not None:
+    if isinstance(start, Time) and problem.epoch and problem.t_span and arguments.get("y0") is None:
         own = problem.t_span[0]
         if abs(out["t_span"][0] - own) * time > SAME:
             date = Time(*problem.epoch, format="jd", scale="tdb") + own * time
@@ -150,8 +150,10 @@ def nbody(
         given["gm"] = constants.G * given["gm"]
     wanted = length**3 / time**2, length, length / time
     state = [_number(name, value, unit) for (name, value), unit in zip(given.items(), wanted, strict=True)]
-    span = tuple(float(t) for t in _number("t_span", t_span, time, epoch))
-    return plain_nbody(*state, t_span=span, h=_number("h", h, time), units=units, epoch=epoch, **options)
+    t0, t_end = _number("t_span", t_span, time, epoch)
+    return plain_nbody(
+        *state, t_span=(float(t0), float(t_end)), h=_number("h", h, time), units=units, epoch=epoch, **options
+    )
 
 
 def julian_date(time: Time) -> Epoch:

@@ -160,7 +160,7 @@ class AtRealTimes(DenseOutput):
 
     def __call__(self, t: Any) -> Array:
         """Return the states at a time or at times (m,), as (n,) or (n, m)."""
-        if type(t) is not float and reals("t", t) is None:
+        if type(t) not in (float, np.float64) and reals("t", t) is None:
             raise TypeError(f"dense output is defined at real times, got {shown(t)}.")
         return super().__call__(t)
 

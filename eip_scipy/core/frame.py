@@ -30,7 +30,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     if frame is None:
         return NO_FRAME
     pair = tuple(frame) if np.iterable(frame) else ()
-    matrices = [found for a in pair if (found := numbers("frame", a)) is not None]
+    matrices = [matrix for a in pair if (matrix := numbers("frame", a)) is not None]
     if len(pair) != 2 or len(matrices) != 2:
         raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).")
     C, S = map(np.atleast_2d, matrices)

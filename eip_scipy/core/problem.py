@@ -102,7 +102,8 @@ class Problem:
     component_names : tuple of str, optional
         Names of the components of the state, for tables and figures.
     epoch : (float, float), optional
-        Date of t = 0: a Julian date in TDB, in two parts, whose sum a single float would round to 20 microseconds.
+        Date of t = 0: a Julian date in TDB, in two parts, because a single float is rounded to 20 microseconds. One
+        number is converted to such a pair.
     G : float, optional
         Gravitational constant by which the masses of bodies are multiplied in `params`, if it is known.
     events : callable or sequence of callable, optional
@@ -141,6 +142,11 @@ class Problem:
                 f"params: the functions of the problem {self.name!r} contain other parameters, so that a copy of it "
                 "cannot have these. Make the problem with them, or pass params=... to integrate."
             )
+        if self.epoch is not None:
+            parts = real_array("epoch", self.epoch).ravel().tolist()
+            if len(parts) not in (1, 2) or not np.isfinite(parts).all():
+                raise ValueError(f"epoch: expected a Julian date in TDB, in one or two parts, got {shown(self.epoch)}.")
+            object.__setattr__(self, "epoch", (*parts, 0.0)[:2])
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
         object.__setattr__(self, "invariants", as_invariants(self.invariants))
         if self.component_names is not None:

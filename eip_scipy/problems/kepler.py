@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
+from ..core.inputs import real_array
 from ..core.problem import Problem, bind, library_variational, native_invariant
 from ..engine.native import library
 
@@ -86,7 +87,7 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
     Problem
         With the closed form as `reference`.
     """
-    start = np.array(y0, dtype=float)
+    start = real_array("y0", y0)
     params = np.array([omega], dtype=float)
 
     return Problem(

@@ -64,6 +64,7 @@ def by_ensemble(**options):
         (by_ensemble, "y0s", [Y0, Y0] * units.AU),
         (lambda y_hat: project(y_hat, SQUARE, target=1.0), "y_hat", Y0 * units.AU),
         (lambda gm: nbody(**BODIES | {"gm": gm}), "gm", [1, 2] * units.kg),
+        (lambda epoch: nbody(**BODIES, epoch=epoch), "epoch", Time(2451545.0, format="jd")),
         (lambda position: nbody(**BODIES | {"position": position}), "position", np.eye(2, 3) * units.AU),
     ],
 )

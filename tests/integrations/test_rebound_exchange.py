@@ -1,5 +1,6 @@
 """REBOUND's simulations and archives as problems and runs, and back."""
 
+import re
 import warnings
 
 import numpy as np
@@ -102,18 +103,15 @@ def test_there_and_back(units):
 @pytest.mark.parametrize(
     ("units", "expected"),
     [
-        (None, None),
-        (("yr", "AU", "Msun"), (149597870700.0, 31557600.0)),
-        (("yr2pi", "AU", "Msun"), (149597870700.0, 5022642.890913)),
-        (("d", "km", "Mjupiter"), (1000.0, 86400.0)),
-        (("sidereal_yr", "pc", "kg"), (3.085677581e16, 31558149.7635)),
+        (None, "as in the REBOUND simulation"),
+        (("yr", "AU", "Msun"), "AU, yr"),
+        (("yr2pi", "AU", "Msun"), r"AU, 5022642\.89\d* s"),
+        (("d", "km", "Mjupiter"), "km, d"),
+        (("sidereal_yr", "pc", "kg"), r"3\.0856775\d*e\+16 m, 31558149\.76\d* s"),
     ],
 )
 def test_units(units, expected):
-    found = exchange.problem_from_simulation(planets(units)).unit_system
-    assert (found is None) == (expected is None)
-    if expected is not None:
-        np.testing.assert_allclose([unit.si for unit in found], expected, rtol=1e-12)
+    assert re.fullmatch(expected, exchange.problem_from_simulation(planets(units)).units)
 
 
 def test_the_motion_is_that_of_rebound():

@@ -1,9 +1,8 @@
-"""Exclusive use of files, functions, signals and disks by a run, against other runs."""
+"""Exclusive use of checkpoint files by a run, against other runs and processes, and SIGTERM."""
 
 import contextlib
 import errno
 import os
-import re
 import signal
 import threading
 import time
@@ -14,7 +13,7 @@ import pytest
 from forked import Forker
 from systems import SQUARE, H, L, orbit, oscillator, pericentre
 
-from eip_scipy import EIPRK4, checkpoint, ensemble, integrate
+from eip_scipy import EIPRK4, ensemble, integrate
 from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.checkpoint.locks import Lock
 
@@ -102,16 +101,6 @@ def test_notes_name_the_file_wherever_one_is(tmp_path, monkeypatch):
     assert f"the checkpoint {str(tmp_path / 'kept')!r} holds step 0" in info.value.__notes__[-1]
 
 
-@posix
-@keeping
-def test_a_relative_path_in_a_folder_that_is_gone(keep, tmp_path, monkeypatch):
-    (tmp_path / "gone").mkdir()
-    monkeypatch.chdir(tmp_path / "gone")
-    (tmp_path / "gone").rmdir()
-    with pytest.raises(CheckpointError, match="'kept' is relative to a folder that no longer exists"):
-        keep("kept")
-
-
 # One run at a time.
 
 IN_USE = rf"in use by another run \(process {os.getpid()} on \S+, this one\)\. Wait until that run ends"
@@ -139,33 +128,6 @@ def test_a_second_call_is_refused(keep, tmp_path, monkeypatch):
     assert seen
     assert content(tmp_path) == ["kept", "link"] if link.is_symlink() else ["kept"]
     same(whole, keep(link if link.is_symlink() else place, resume=True))
-
-
-def test_runs_of_different_kinds(tmp_path):
-    def callback(*_):
-        with pytest.raises(CheckpointError, match=IN_USE):
-            kept_by_ensemble(tmp_path / "kept")
-
-    run(tmp_path / "kept", callback=callback)
-
-
-def test_a_second_thread_is_refused(tmp_path):
-    found = []
-
-    def other():
-        try:
-            run(tmp_path / "kept", resume=True)
-        except CheckpointError as error:
-            found.append(str(error))
-
-    def callback(*_):
-        thread = threading.Thread(target=other)
-        thread.start()
-        thread.join()
-
-    run(tmp_path / "kept", callback=callback)
-    assert found
-    assert all(re.search(IN_USE, text) for text in found)
 
 
 HOLDER = """
@@ -301,13 +263,6 @@ def test_one_holder_at_any_time(tmp_path):
 # Files that are moved or replaced meanwhile.
 
 
-def test_a_file_that_is_taken_away_comes_back(tmp_path):
-    place = tmp_path / "kept"
-    whole = run(place, callback=at_once(lambda: os.replace(place, tmp_path / "backup")), checkpoint_every=1e-9)
-    assert checkpoint.read(place)[0]["status"] == 0
-    same(whole, run(place, resume=True))
-
-
 @pytest.mark.parametrize("keep", [kept_by_integrate, kept_by_ensemble])
 def test_a_folder_in_the_place_of_the_file(keep, tmp_path):
     """The run ends nevertheless."""
@@ -349,25 +304,3 @@ def test_sigterm(keep, tmp_path):
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
     assert handled == [True]
-
-
-# Disks.
-
-
-@pytest.mark.parametrize("name", ["fsync", "replace"])
-def test_a_full_disk_at_the_last_moment(name, tmp_path, monkeypatch):
-    place, armed, real = tmp_path / "kept", [], getattr(os, name)
-    whole = integrate(orbit, SPAN, Y0, **OPTIONS)
-
-    def full(*arguments):
-        if armed:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return real(*arguments)
-
-    monkeypatch.setattr(os, name, full)
-    with pytest.warns(RuntimeWarning, match="no space left on device; it still holds step 0"):
-        same(whole, run(place, callback=at_once(lambda: armed.append(True))))
-    monkeypatch.undo()
-    assert checkpoint.read(place)[0]["step"] == 0
-    assert content(tmp_path) == ["kept"]
-    same(whole, run(place, resume=True))

@@ -3,13 +3,12 @@
 They write to the states they are given, leave `out` as it was, or return something else on the way than at the start.
 """
 
-import math
 import re
 
 import numpy as np
 import pytest
 from numba import njit
-from scipy.integrate import RK45, solve_ivp
+from scipy.integrate import solve_ivp
 from systems import SQUARE, oscillator
 
 from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, Invariant, check_gradient, ensemble, integrate, project
@@ -86,13 +85,6 @@ def writing_now_and_then(t, y):
     return np.array([y[1], -y[0]])
 
 
-def writing_by_a_view(t, y):
-    f = np.array([y[1], -y[0]])
-    half = y[1:]
-    half[0] = math.nan
-    return f
-
-
 @njit
 def scale(a, factor):
     for k in range(a.size):
@@ -123,7 +115,7 @@ def event_that_writes(t, y):
     return value
 
 
-WRITERS = [writing, writing_now_and_then, writing_by_a_view, writing_by_a_function]
+WRITERS = [writing, writing_now_and_then, writing_by_a_function]
 
 
 @pytest.mark.nightly
@@ -139,22 +131,6 @@ def test_right_hand_sides_that_write(how, fun, method):
     np.testing.assert_allclose(run.y, how(invariants=KEPT, **options).y, rtol=1e-14)
     if how is compiled:
         assert run.compiled
-
-
-def test_scipy_s_class_is_changed_by_them():
-    """The test above is able to fail."""
-    plain, written = (solve_ivp(f, (0, 1), Y0, method=RK45).y[:, -1] for f in (oscillator, writing))
-    assert np.abs(plain - written).max() > 1
-
-
-@both
-def test_writing_in_place(how):
-    def fun(t, y, out):
-        out[0], out[1] = y[1], -y[0]
-        y[0] = 0.0
-
-    options = {"invariants": KEPT, "in_place": True}
-    np.testing.assert_array_equal(how(fun, **options).y, how(filling, **options).y)
 
 
 @compiled_at_night
@@ -208,11 +184,6 @@ def test_gradients_that_write_to_f(how):
     np.testing.assert_array_equal(
         how(invariants=Invariant(square, grad, uses_f=True, name="S")).y, how(invariants=good).y
     )
-
-
-def test_invariants_without_gradients_that_write():
-    run = interpreted(invariants=Invariant(value_that_writes, name="S"))
-    np.testing.assert_allclose(run.invariants, 5.0, rtol=1e-13)
 
 
 @compiled_at_night
@@ -271,12 +242,6 @@ def adding(t, y, out):
     out[1] = -y[0]
 
 
-def returning_what_it_fills(t, y, out):
-    out[0] = y[1]
-    out[1] = -y[0]
-    return out
-
-
 NOT_FILLING = [
     (returning, TypeError, r"fun returned array\(.*in_place=True it must fill its argument out"),
     (half, ValueError, "fun does not fill all of its argument out, in component 1, at t=0"),
@@ -293,11 +258,6 @@ def test_functions_that_do_not_fill(how, fun, error, match):
 
 
 @both
-def test_functions_that_fill_and_return_it(how):
-    np.testing.assert_array_equal(how(returning_what_it_fills, in_place=True).y, how(filling, in_place=True).y)
-
-
-@both
 def test_functions_whose_values_are_not_finite_at_the_start(how):
     """Values that are not finite are not mistaken for values that were not filled in."""
 
@@ -311,14 +271,6 @@ def test_functions_whose_values_are_not_finite_at_the_start(how):
     assert run.message.startswith("fun returned a non-finite value at t=0")
 
 
-def test_complex_functions_that_fill_the_real_parts():
-    def fun(t, y, out):
-        out.real[:] = -y.imag
-
-    with pytest.raises(ValueError, match="fun does not fill all of its argument out, in component 0"):
-        integrate(fun, (0, 1), np.array([1j, 2.0]), method=EIPRK4, h=0.1, in_place=True)
-
-
 @both
 def test_functions_that_stop_filling(how):
     def fun(t, y, out):
@@ -330,12 +282,6 @@ def test_functions_that_stop_filling(how):
     assert run.status == -1
     assert run.message.startswith("fun returned a non-finite value at t=0.5 (component 1 is NaN; with in_place=True")
     np.testing.assert_array_equal(run.y, interpreted().y[:, : run.t.size])
-
-
-@both
-def test_accelerations_that_do_not_fill(how):
-    with pytest.raises(ValueError, match="acceleration does not fill all of its argument out"):
-        how(nothing, method=EIPRKN8, in_place=True)
 
 
 @both
@@ -370,9 +316,7 @@ def test_gradients_that_stop_filling(how):
 CHANGES = {
     "complex": (lambda y: y + 0j, ValueError, "complex"),
     "text": (lambda y: "1.0", TypeError, "'1.0'"),
-    "texts": (lambda y: ["1.0", "2.0"], TypeError, r"\['1.0', '2.0'\]"),
     "None": (lambda y: None, TypeError, "None"),
-    "no numbers": (lambda y: [1.0, None], TypeError, "None"),
     "shape": (lambda y: np.ones((3, 1)), ValueError, r"shape \(3, 1\)"),
     "ragged": (lambda y: [1.0, [2.0, 3.0]], (TypeError, ValueError), r"\[1.0, \[2.0, 3.0\]\]"),
 }
@@ -399,25 +343,17 @@ def test_right_hand_sides_that_change(how, change, error, match):
     check_error(how, info)
 
 
-@interpreters
 @changes
-@pytest.mark.parametrize("of", [lambda v: v, lambda v: v[0] if isinstance(v, np.ndarray) else v], ids=["all", "one"])
-def test_invariants_that_change(how, change, error, match, of):
-    kept = Invariant(late(square, lambda y: of(change(y))), square_gradient, name="S")
-    with pytest.raises((TypeError, ValueError), match="invariant 'S' returned") as info:
-        how(invariants=kept)
-    check_error(how, info)
+@pytest.mark.parametrize("part", ["value", "gradient"])
+def test_invariants_that_change(part, change, error, match):
+    value = late(square, change) if part == "value" else square
+    gradient = late(square_gradient, change) if part == "gradient" else square_gradient
+    with pytest.raises((TypeError, ValueError), match=r"invariant 'S' (returned|has|is)") as info:
+        interpreted(invariants=Invariant(value, gradient, name="S"))
+    check_error(interpreted, info)
 
 
-@interpreters
-@changes
-def test_gradients_that_change(how, change, error, match):
-    with pytest.raises((TypeError, ValueError), match="gradient of invariant 'S'") as info:
-        how(invariants=Invariant(square, late(square_gradient, change), name="S"))
-    check_error(how, info)
-
-
-@pytest.mark.parametrize("value", [None, 1j, "1.0", np.array([1.0]), [1.0], np.ones(2)])
+@pytest.mark.parametrize("value", [None, 1j, "1.0", [1.0]])
 @pytest.mark.parametrize("start", [-1.0, 0.5])
 def test_events_that_change(value, start):
     with pytest.raises(TypeError, match=r"event 0 returned .*expected a real number") as info:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...core.balances import Balance
+from ...core.inputs import real_array
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
@@ -198,7 +199,7 @@ def _invariants(
 
 
 def _vector(name: str, value: Any) -> np.ndarray:
-    vector = np.asarray(value, dtype=float)
+    vector = real_array(name, value)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"charged_particle: {name} must be three finite numbers, got {value!r}.")
     return vector
