@@ -57,9 +57,6 @@ COMMANDS = {
         "bench.command:Bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
-    "study balances": Entry(
-        "measurements.balances:Balances", "final errors with and without balances, where they help and where not"
-    ),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
@@ -71,7 +68,6 @@ COMMANDS = {
         "measurements.exoplanets:Exoplanets", "three systems of exoplanets compared with WHFast and IAS15"
     ),
     "study gpe-efficiency": Entry("condensates.efficiency:AllRuns", "the paper's test of efficiency with all its runs"),
-    "study growth": Entry("measurements.growth:Growth", "growth of the error of position over 10 000 years"),
     "study long-orbits": Entry(
         "measurements.long_orbits:LongOrbits", "effect of projection and compensated sums over 1000 years"
     ),
@@ -91,15 +87,7 @@ COMMANDS = {
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
     "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
-    "study tangent-maps": Entry(
-        "measurements.tangent_maps:TangentMaps",
-        "derivatives by start and parameters: errors, cost, chaos, a stability map",
-    ),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
-    "study with-and-without": Entry(
-        "measurements.with_and_without:WithAndWithout",
-        "the figures with and without invariants: a comet and a satellite",
-    ),
 }
 
 
