@@ -56,6 +56,7 @@ COMMANDS = {
     "bench": Entry(
         "bench.command:Bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
+    "bench metric": Entry("bench.metric:Metric", "the default metric against none and euclidean, case by case"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
@@ -71,10 +72,6 @@ COMMANDS = {
     "study long-orbits": Entry(
         "measurements.long_orbits:LongOrbits", "effect of projection and compensated sums over 1000 years"
     ),
-    "study metric-memory": Entry(
-        "measurements.metric_memory:MetricMemory", "the metric on problems with misleading error estimates"
-    ),
-    "study metric-table": Entry("measurements.metric_table:MetricTable", "effect of the metric on the solar system"),
     "study multistep": Entry(
         "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
     ),

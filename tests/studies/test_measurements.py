@@ -24,8 +24,6 @@ RUNS = [
     ("exoplanets", "--share 0.002 --json run.json", REBOUNDX),
     ("gpe-efficiency", "--points 16 --repeats 1 --json run.json", ()),
     ("long-orbits", "--years 1 --json run.json", ()),
-    ("metric-memory", "--only gear --json run.json", ()),
-    ("metric-table", "--years 100 --rotations 1 --json run.json", ()),
     ("multistep", "--quick --parts 1 2 4 --json run.json", REBOUND),
     ("multistep", "--quick --parts 3 --json run.json", HEYOKA),
     ("recommend", "--cases pendulum --json run.json", ()),
