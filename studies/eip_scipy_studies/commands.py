@@ -56,10 +56,8 @@ COMMANDS = {
     "bench": Entry(
         "bench.command:Bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
+    "bench metric": Entry("bench.metric:Metric", "the default metric against none and euclidean, case by case"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
-    "study balances": Entry(
-        "measurements.balances:Balances", "final errors with and without balances, where they help and where not"
-    ),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
@@ -71,14 +69,9 @@ COMMANDS = {
         "measurements.exoplanets:Exoplanets", "three systems of exoplanets compared with WHFast and IAS15"
     ),
     "study gpe-efficiency": Entry("condensates.efficiency:AllRuns", "the paper's test of efficiency with all its runs"),
-    "study growth": Entry("measurements.growth:Growth", "growth of the error of position over 10 000 years"),
     "study long-orbits": Entry(
         "measurements.long_orbits:LongOrbits", "effect of projection and compensated sums over 1000 years"
     ),
-    "study metric-memory": Entry(
-        "measurements.metric_memory:MetricMemory", "the metric on problems with misleading error estimates"
-    ),
-    "study metric-table": Entry("measurements.metric_table:MetricTable", "effect of the metric on the solar system"),
     "study multistep": Entry(
         "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
     ),
@@ -91,15 +84,7 @@ COMMANDS = {
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
     "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
-    "study tangent-maps": Entry(
-        "measurements.tangent_maps:TangentMaps",
-        "derivatives by start and parameters: errors, cost, chaos, a stability map",
-    ),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
-    "study with-and-without": Entry(
-        "measurements.with_and_without:WithAndWithout",
-        "the figures with and without invariants: a comet and a satellite",
-    ),
 }
 
 

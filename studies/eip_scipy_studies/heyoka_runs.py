@@ -6,7 +6,6 @@ package.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from time import perf_counter
@@ -21,7 +20,7 @@ except ModuleNotFoundError as error:
         'the comparison with heyoka needs heyoka: pip install "eip_scipy[heyoka]"', name="heyoka"
     ) from error
 
-__all__ = ["HeyokaRun", "largest_exponent", "run"]
+__all__ = ["HeyokaRun", "run"]
 
 
 @dataclass(frozen=True)
@@ -88,48 +87,3 @@ def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> He
         raise ValueError(f"heyoka stopped at t = {integrator.time:g}, before the end: {outcome}")
     y = integrator.state.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
     return HeyokaRun(heyoka.__version__, float(t_end), y, wall_time, int(steps))
-
-
-def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_end: float, every: float) -> float:
-    """Compute the largest Lyapunov exponent of a Hamiltonian system by heyoka's variational equations.
-
-    Parameters
-    ----------
-    energy : callable
-        ``energy(heyoka, *y)`` returns the Hamiltonian as an expression of heyoka; `y` are the components of (q, p).
-    y0, deviation : array_like, shape (n,)
-        Initial state (q, p) and tangent vector.
-    t_end, every : float
-        End of the run from t = 0, and the interval after which the vector is normalised.
-
-    Returns
-    -------
-    float
-        The exponent, per unit of time.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree or a time is not positive.
-    """
-    y, d = np.array(y0, dtype=float), np.array(deviation, dtype=float)
-    if y.ndim != 1 or y.size % 2 or d.shape != y.shape or not (t_end > 0 and every > 0):
-        raise ValueError(
-            f"y0 has shape {y.shape} and deviation {d.shape}; expected the same even number of components in both. "
-            f"t_end is {t_end!r} and every {every!r}; expected positive numbers"
-        )
-    names = heyoka.make_vars(*(f"y{k}" for k in range(y.size)))
-    H, half = energy(heyoka, *names), y.size // 2
-    rates = [*(heyoka.diff(H, p) for p in names[half:]), *(-heyoka.diff(H, q) for q in names[:half])]
-    system = heyoka.var_ode_sys(list(zip(names, rates, strict=True)), heyoka.var_args.vars)
-    integrator = heyoka.taylor_adaptive(system, y, compact_mode=True)
-    matrix, total = integrator.get_vslice(order=1), 0.0
-    pieces = max(1, round(t_end / every))
-    for k in range(1, pieces + 1):
-        integrator.state[matrix] = np.eye(y.size).ravel()
-        integrator.propagate_until(t_end * k / pieces)
-        d = integrator.state[matrix].reshape(y.size, y.size) @ d
-        size = np.linalg.norm(d)
-        total += np.log(size)
-        d /= size
-    return float(total / t_end)

@@ -212,3 +212,15 @@ def test_figures_leave_out_what_has_no_error():
     rows = [*rows_of("EIPDOP853", (1.0, 1e-6)), Row("kepler", "orbit", PYTHON, "SciPy RK45", said="no")]
     ((where, name, _),) = figures.drawn(rows, "here")
     assert (where, name) == (("kepler", "orbit", PYTHON), "bench-kepler-orbit-python.png")
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_metric_of_contacts(tmp_path):
+    """Beads in contact and a ball: the default metric is never worse than the better of none and euclidean."""
+    assert main(["bench", "metric", "--only", "Hertz", "--out", str(tmp_path), "--quiet"]) == 0
+    with open(tmp_path / "metric.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 48
+    assert sum(float(row["ratio"]) > 1.5 for row in rows) < 8
+    assert np.median([float(row["default"]) / float(row["none"]) for row in rows]) < 0.2

@@ -18,16 +18,12 @@ pytestmark = pytest.mark.needs_jit
 # Each measurement with its arguments, and with the modules without which it only says how they are installed.
 HEYOKA, REBOUND, REBOUNDX = ("heyoka",), ("rebound",), ("heyoka", "rebound", "reboundx")
 RUNS = [
-    ("balances", "--rotations 1 --system 'drag 1e-2, 5 revolutions' --json run.json", ()),
     ("bodies", "--periods 2 --bodies 10 --json run.json", REBOUND),
     ("charged-particle", "--quick --json run.json", ()),
     ("ensembles", "--members 10 --steps 100 --repeats 1 --largest 10 --json run.json", ()),
     ("exoplanets", "--share 0.002 --json run.json", REBOUNDX),
     ("gpe-efficiency", "--points 16 --repeats 1 --json run.json", ()),
-    ("growth", "--years 1 --json run.json", REBOUND),
     ("long-orbits", "--years 1 --json run.json", ()),
-    ("metric-memory", "--only gear --json run.json", ()),
-    ("metric-table", "--years 100 --rotations 1 --json run.json", ()),
     ("multistep", "--quick --parts 1 2 4 --json run.json", REBOUND),
     ("multistep", "--quick --parts 3 --json run.json", HEYOKA),
     ("recommend", "--cases pendulum --json run.json", ()),
@@ -35,9 +31,7 @@ RUNS = [
     ("solar-cloud", "--members 16 --years 1 --sample 2 --json run.json", REBOUND),
     ("speed", "--quick --json run.json", ()),
     ("stiff", "--quick --json run.json", ()),
-    ("tangent-maps", "--revolutions 2 --time 500 --starts 3 --periods 20 --grid 3 --map-periods 5 --json run.json", ()),
     ("trust", "--only pendulum --json run.json", ()),
-    ("with-and-without", "--json run.json", ()),
 ]
 NAMES = sorted({name for name, *_ in RUNS})
 

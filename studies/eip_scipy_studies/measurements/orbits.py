@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,6 @@ from ..report import needed, table
 from ..solar.cost import TimedRun, by_peer
 from ..work_precision import Runner
 
-ORDERS = tuple(permutations(range(3)))
-"""All orders of the coordinate axes. They change the rounding of steps, but, unlike rotations, no bit of a state."""
 Methods = dict[str, tuple[Runner, Sequence[float]]]
 Row = dict[str, float]
 
@@ -27,23 +24,6 @@ def by_rebound(problem: Problem, integrator: str, **options: Any) -> Runner:
     See `by_peer`.
     """
     return by_peer(problem, needed("eip_scipy.integrations.rebound").run, integrator, **options)
-
-
-def rebound_states(problem: Problem, integrator: str, times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Run an integrator of REBOUND (WHFast with steps of a day) from the start to each of `times`.
-
-    There is one run for each time, because a saved time would cut a step of IAS15. Return the seconds of the last run,
-    and the states (6 N, m) at the m times.
-    """
-    run = needed("eip_scipy.integrations.rebound").run
-    counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
-    runs = [run(problem.params, problem.y0, integrator, h=t / n, n_steps=n) for t, n in zip(times, counts, strict=True)]
-    return runs[-1].wall_time, np.array([own.y[:, -1] for own in runs]).T
-
-
-def reordered(states: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
-    """Return states (6 N,) or (6 N, m) of N bodies with the coordinate axes in the order `axes`."""
-    return states.reshape(-1, 3, *states.shape[1:])[:, axes].reshape(states.shape)
 
 
 def one_each(label: Callable[[float], str], run: Runner, steps: Iterable[float]) -> Methods:
