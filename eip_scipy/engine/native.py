@@ -138,18 +138,13 @@ class Hooks(NamedTuple):
     ``one_step(t, y, h)`` fills work.y_hat, and work.err if `estimates` is True. If `drives` is True, it is instead
     ``one_step(t, y, again)`` of a solver that controls its own error: it fills work.K too, and returns the end of its
     step and the length of the next one, or None if no step is short enough. If `again` is True, it repeats the last
-    step with a shorter length. ``project(t_old, t, last, y_new)`` projects work.y_hat, the unprojected state at t,
-    writes the result to `y_new` and returns one of the engine's codes; `last` is True for the last step of the run.
-    `joint` are invariants with functions `moments` and `shift`, which are tried before `project`. ``agree(here)``
-    returns True if the result of the step before its projection is finite on all processes that hold a part of the
-    state; `here` is True if it is finite on this process.
+    step with a shorter length. `joint` are invariants with functions `moments` and `shift`, which are tried before the
+    engine's own projection.
     """
 
     one_step: Callable[..., Any] | None = None
     estimates: bool = False
     drives: bool = False
-    project: Callable[..., Any] | None = None
-    agree: Callable[..., Any] | None = None
     joint: Any = None
 
 

@@ -87,8 +87,7 @@ template <class AnyRun>
 inline Code raw_step(const AnyRun &run, const Step &step) {
     const Code status = make_stages(run, step);
     if (status != OK) return status;
-    const bool finite = all_finite(run.work.y_hat, run.work.m);
-    if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
+    if (!all_finite(run.work.y_hat, run.work.m)) return NOT_FINITE;
     if (has_state_alone(run)) [[unlikely]]
         look_back_at_state(of_any_length(run), step);
     else

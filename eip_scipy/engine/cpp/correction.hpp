@@ -473,7 +473,6 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
 template <class AnyRun>
 inline Code project_any(const AnyRun &run, const Step &step) {
     if (run.hooks && run.hooks->joint && run.hooks->project_jointly(step)) return OK;
-    if (run.hooks && run.hooks->project) return static_cast<Code>(run.hooks->project_elsewhere(step));
     return project_step(run, step);
 }
 

@@ -150,7 +150,6 @@ class Engine {
             samples_->interpolants.capacity = pieces->shape[0];
         }
         check_room(saved);
-        if (hooks_) hooks_->set_state(y_new.object);
         return stepped([&](const Run &run) { return advance_run(run, samples(), *schedule_, k_end, from, to, saved); });
     }
 
@@ -229,7 +228,6 @@ class Engine {
         s.clock[TIME] = t;
         if (stepped_) copy(w.rate(w.stages), w.rate(0), w.balances);
         Array y_new = new_array({w.n}, type_), f_new = new_array({w.n}, type_);
-        if (hooks_) hooks_->set_state(y_new);
         const Code code = stepped([&](const Run &run) { return step_once(run, s, k, from, y_new.floats()); });
         stepped_ = true;
         copy(w.last(), f_new.floats(), w.m);
@@ -238,7 +236,6 @@ class Engine {
 
     int project(double t_old, ConstState y, double t, bool last, State y_new) {
         const Step step{t_old, t, t - t_old, checked(y, "y"), checked(y_new, "y_new"), true, last};
-        if (hooks_) hooks_->set_state(y_new.object);
         return stepped([&](const Run &run) { return project_once(run, step); });
     }
 
@@ -437,8 +434,6 @@ NB_MODULE(EIP_MODULE, m) {
     eip::add_library(m);
     eip::add_examination(m);
     eip::add_condensates(m.def_submodule("condensates"));
-    eip::add_fields(m.def_submodule("fields"));
-    eip::add_comparators(m.def_submodule("comparators"));
     eip::add_gradients(m.def_submodule("gradients"));
     eip::add_gravity(m.def_submodule("gravity"));
     eip::add_multibody(m.def_submodule("multibody"));

@@ -206,13 +206,9 @@ PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &ru
         return found.is_none() ? nb::handle() : found;
     };
     one_step_ = given("one_step");
-    project_ = given("project");
-    agree_ = given("agree");
     estimates_ = truth(hooks.attr("estimates"));
     raw = one_step_.is_valid();
     drives = truth(hooks.attr("drives"));
-    project = project_.is_valid();
-    agree = agree_.is_valid();
     const nb::handle joint_invariants = given("joint");
     joint = joint_invariants.is_valid();
     if (!joint) return;
@@ -271,15 +267,6 @@ int PythonHooks::raw_step(const Step &step) {
     if (o.adaptive && !drives) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, w.n);
     return OK;
 }
-
-int PythonHooks::project_elsewhere(const Step &step) {
-    const npy_intp n = run_.work.n;
-    const nb::object code =
-        project_(time(step.t), time(step.t_new), nb::bool_(step.last), view(step.y_new, 1, &n, type_, to_));
-    return nb::cast<int>(code);
-}
-
-bool PythonHooks::all_agree(bool here) { return nb::bool_(agree_(nb::bool_(here))).is(nb::bool_(true)); }
 
 // One Newton step by the functions `moments` and `shift` of the invariants of a field: the one that `project_step` takes
 // in the euclidean metric, its dead bands, bounds and verdict included. False where that needs more: gradients nearly

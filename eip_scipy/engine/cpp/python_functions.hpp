@@ -77,16 +77,11 @@ class PythonHooks final : public Hooks {
     int drive(double t, const double *y, bool again, double *clock) override;
     int raw_step(const Step &step) override;
     bool project_jointly(const Step &step) override;
-    int project_elsewhere(const Step &step) override;
-    bool all_agree(bool here) override;
-
-    // Sets the array to which the next steps write their states.
-    void set_state(nb::handle to) { to_ = to; }
 
   private:
     Run run_;
     int type_;
-    nb::handle to_, one_step_, project_, agree_, moments_, shift_, y_hat_, f_hat_, values_, R_, terms_, mu_;
+    nb::handle one_step_, moments_, shift_, y_hat_, f_hat_, values_, R_, terms_, mu_;
     bool estimates_ = false;
 };
 

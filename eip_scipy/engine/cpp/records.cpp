@@ -611,16 +611,6 @@ const nb::dict &Buffers::arrays(const char *only) const {
     return arrays_;
 }
 
-void Buffers::share(const Buffers &other, const nb::set &names) {
-    require(other.work.l == work.l,
-            "engine: buffers can be shared only between runs with the same number of invariant values");
-    for_each_buffer(work, blocks, type, [&]<class T>(const char *name, T *&place, int, auto) {
-        if (names.contains(name)) place = static_cast<T *>(PyArray_DATA(other.array(name).get()));
-    });
-    owner_ = nb::make_tuple(owner_, other.owner_);
-    arrays_.clear();
-}
-
 const Buffers &buffers_of(nb::handle work) {
     const Buffers *found = nullptr;
     if (!nb::try_cast(work, found) || !found) throw nb::type_error("engine: work must be an object of the class Work");
@@ -650,8 +640,6 @@ void add_records(nb::module_ &module) {
         .def(
             "arrays", [](const Buffers &own) { return own.arrays(); },
             nb::sig("def arrays(self) -> dict[str, numpy.typing.NDArray[typing.Any]]"), "Return all arrays by name.")
-        .def("share", &Buffers::share, "other"_a, "names"_a,
-             "Use the buffers of `other` with these names from now on, in place of own ones.")
         .def("__getstate__", &Buffers::state)
         .def("__setstate__", [](Buffers &own, const nb::tuple &state) { new (&own) Buffers(state); });
     Work any{};

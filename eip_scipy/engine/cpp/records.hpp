@@ -26,8 +26,6 @@ class Buffers {
     // The arrays over the buffers, by name, that were asked for: all of them, or the one of this name.
     const nb::dict &arrays(const char *only = nullptr) const;
     Array array(const char *name) const { return nb::borrow<Array>(arrays(name)[name]); }
-    // Use another run's buffers of these names from now on.
-    void share(const Buffers &other, const nb::set &names);
 
     Work work{};
     int64_t blocks;

@@ -39,20 +39,16 @@ struct Step;
 // invariant, which is System::energy, or values and gradients of all.
 enum class Known { NOTHING, ENERGY, ALL };
 
-// Parts of a step that Python code replaces: the raw step of a user-defined one-step method, the end of the step by a
-// subclass, the joint projection of a field, which may decline, and the projection of a state whose parts lie on
-// several processes. Such processes also have to agree whether a raw result is finite. The codes are those of the step.
-// If `drives`, the raw step is that of a solver which controls its error and its length: `drive` makes it, and with
-// `again` repeats one whose projection has failed.
+// Parts of a step that Python code replaces: the raw step of a user-defined one-step method, and the joint projection of
+// a field, which may decline. The codes are those of the step. If `drives`, the raw step is that of a solver which
+// controls its error and its length: `drive` makes it, and with `again` repeats one whose projection has failed.
 class Hooks {
   public:
     virtual ~Hooks() = default;
-    bool raw = false, drives = false, joint = false, project = false, agree = false;
+    bool raw = false, drives = false, joint = false;
     virtual int drive(double t, const double *y, bool again, double *clock) = 0;
     virtual int raw_step(const Step &step) = 0;
     virtual bool project_jointly(const Step &step) = 0;
-    virtual int project_elsewhere(const Step &step) = 0;
-    virtual bool all_agree(bool here) = 0;
 };
 
 // A function by pointer, or the library's own in its place, and how many floats it fills.

@@ -56,7 +56,7 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
 template <class Value, class W>
 inline void start_figures(const Value *y, const Value *f, double tau, const Method &method, const Hooks *hooks,
                           const Options &o, const W &w) {
-    const bool own = !hooks || !((hooks->raw && !hooks->drives) || hooks->joint || hooks->project);
+    const bool own = !hooks || !((hooks->raw && !hooks->drives) || hooks->joint);
     const bool known = !method.multistep && own;
     for (int64_t i = 0; i < w.l; ++i) {
         const Value *G = w.gradient(i);
