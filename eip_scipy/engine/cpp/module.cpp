@@ -150,6 +150,7 @@ class Engine {
             samples_->interpolants.capacity = pieces->shape[0];
         }
         check_room(saved);
+        if (hooks_) hooks_->set_state(y_new.object);
         return stepped([&](const Run &run) { return advance_run(run, samples(), *schedule_, k_end, from, to, saved); });
     }
 
@@ -228,6 +229,7 @@ class Engine {
         s.clock[TIME] = t;
         if (stepped_) copy(w.rate(w.stages), w.rate(0), w.balances);
         Array y_new = new_array({w.n}, type_), f_new = new_array({w.n}, type_);
+        if (hooks_) hooks_->set_state(y_new);
         const Code code = stepped([&](const Run &run) { return step_once(run, s, k, from, y_new.floats()); });
         stepped_ = true;
         copy(w.last(), f_new.floats(), w.m);
@@ -236,6 +238,7 @@ class Engine {
 
     int project(double t_old, ConstState y, double t, bool last, State y_new) {
         const Step step{t_old, t, t - t_old, checked(y, "y"), checked(y_new, "y_new"), true, last};
+        if (hooks_) hooks_->set_state(y_new.object);
         return stepped([&](const Run &run) { return project_once(run, step); });
     }
 

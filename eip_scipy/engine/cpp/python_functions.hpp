@@ -78,10 +78,13 @@ class PythonHooks final : public Hooks {
     int raw_step(const Step &step) override;
     bool project_jointly(const Step &step) override;
 
+    // Sets the array to which the next steps write their states.
+    void set_state(nb::handle to) { to_ = to; }
+
   private:
     Run run_;
     int type_;
-    nb::handle one_step_, moments_, shift_, y_hat_, f_hat_, values_, R_, terms_, mu_;
+    nb::handle to_, one_step_, moments_, shift_, y_hat_, f_hat_, values_, R_, terms_, mu_;
     bool estimates_ = false;
 };
 
