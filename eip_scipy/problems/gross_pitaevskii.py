@@ -229,7 +229,7 @@ class SpectralSum:
 class FieldProblem(Problem):
     """A `Problem` whose state is a field on the grid of its `equation`; ``equation.grid.field(y)`` shapes states."""
 
-    equation: GrossPitaevskii | None = None
+    equation: GrossPitaevskii = None  # type: ignore[assignment]  # always given
 
 
 class GrossPitaevskii:
