@@ -229,7 +229,7 @@ class SpectralSum:
 class FieldProblem(Problem):
     """A `Problem` whose state is a field on the grid of its `equation`; ``equation.grid.field(y)`` shapes states."""
 
-    equation: GrossPitaevskii | None = None
+    equation: GrossPitaevskii = None  # type: ignore[assignment]  # always given
 
 
 class GrossPitaevskii:
@@ -379,7 +379,7 @@ class GrossPitaevskii:
         return self._energy(BUILD.condensates.moments(psi, self.fun(0.0, psi.reshape(-1))))
 
     def _energy(self, sums: Any) -> float:
-        # The second sum, of Re(conj(psi) H psi), contains the interaction energy, beta / 2 times the fourth one, twice.
+        # The second sum, of Re(conj(psi) H psi), has the interaction energy, beta / 2 times the fourth one, twice.
         return float(self.grid.cell * (sums[1] - 0.5 * self.beta * sums[3]))
 
     def angular_momentum(self, psi: Any) -> float:
@@ -436,7 +436,7 @@ class GrossPitaevskii:
         invariants: Sequence[str] = ("mass", "energy"),
         **options: Any,
     ) -> FieldProblem:
-        """Return the initial value problem, with the Euclidean metric, because all points of the grid are equivalent.
+        """Return the initial value problem. Its metric is Euclidean, because all points of the grid are equivalent.
 
         Parameters
         ----------
@@ -536,9 +536,8 @@ class _KnownEnergy:
     def gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with the gradient 2 w i f at `y`, with the right-hand side f and the size w of a cell."""
         BUILD.condensates.turn(f, 2 * self._gpe.grid.cell, out)  # 2 w H psi, and H psi = i f
-        # Copies: the caller may use its arrays for something else.
         if self._near is None:
-            self._near = np.empty_like(y), np.empty_like(f)
+            self._near = np.empty_like(y), np.empty_like(f)  # copies, for the caller may use its arrays again
         for kept, given in zip(self._near, (y, f), strict=True):
             kept[:] = given
         self.note(y, f)
@@ -548,10 +547,14 @@ class _MassAndEnergy(tuple[Invariant, ...]):
     """The invariants "mass" and "energy", or one of them, whose projection takes two passes over the field.
 
     The gradients 2 w psi and 2 w H psi = 2 w i f are never stored: their products and the energy are sums over psi and
-    f. Interpreted runs with the Euclidean metric, ``direction="new"`` and one Newton step, without a frame, balances,
-    compensated summation or ``every="auto"``, call `moments` and `shift`. All other runs, and steps whose gradients are
+    f. Runs for which `core.options` allows it call `moments` and `shift`. All other runs, and steps whose gradients are
     nearly parallel, call the values and gradients of the items.
     """
+
+    _gpe: GrossPitaevskii
+    _known: _KnownEnergy
+    _mass: int | None
+    _energy: int | None
 
     def __new__(cls, items: Iterable[Invariant], gpe: GrossPitaevskii) -> _MassAndEnergy:
         self = super().__new__(cls, items)
@@ -570,11 +573,7 @@ class _MassAndEnergy(tuple[Invariant, ...]):
     def moments(
         self, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray, gram: np.ndarray, terms: np.ndarray
     ) -> None:
-        """Fill the arrays that a projection needs at the state y (n,), where f = -i H psi.
-
-        These are the invariants (l,), the products of their gradients (l, l), and the sums (l,) of ``|G_k y_k|`` over
-        the real components of the state, to which rounding errors are proportional.
-        """
+        """Fill in the invariants (l,), the products of their gradients (l, l), and the sums ``|G_k y_k|`` (l,) at y."""
         (mass, along, square, _, sizes), w = self._known.note(y, f), self._gpe.grid.cell
         m, e = self._mass, self._energy
         if m is not None:

@@ -37,10 +37,8 @@ LEVELS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 WAVES = ("plane wave", "modulated wave")
 KEPT = ("mass", "energy")
 # Known slopes in h, to 0.1 (those of CN and EIP-ME are also drawn), and the bounds of both invariant errors of EIP-ME.
-ORDERS = {
-    "RK4": 4, "EIP-M": 4, "EIP-E": 4, "EIP-ME": 4, "CN": 2, "LIC": 2, "SAV/CN": 2, "Strang": 2,
-    "splitting4-EIP": 4,
-}  # fmt: skip
+ORDERS = dict.fromkeys(("RK4", "EIP-M", "EIP-E", "EIP-ME"), 4) | dict.fromkeys(("CN", "LIC", "SAV/CN", "Strang"), 2)
+ORDERS["splitting4-EIP"] = 4
 SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
 
 
@@ -57,32 +55,24 @@ class Contender(NamedTuple):
 
 def stable_steps(problem: FieldProblem) -> list[float]:
     """Return the lengths of the steps of RK4: `SHARES` of its stability limit, shortened to divide the interval."""
-    assert problem.equation is not None
     limit = problem.equation.largest_step(problem.y0)
     return [T_END / ceil(T_END / (share * limit)) for share in SHARES]
 
 
-def _own(problem: FieldProblem, h: float, t_end: float, base: Any, names: Sequence[str]) -> Any:
-    assert problem.equation is not None
-    invariants = problem.equation.invariants(names)
-    result = integrate(problem, (0.0, t_end), method=base(problem.equation), h=h, invariants=invariants)
-    made, reduced = result.diagnostics.n_projections, result.diagnostics.n_rank_reduced
-    remark = f"rank 1 in {reduced} of {made} projections" if reduced else ""
-    return result.y, result.nfev, remark
+def ours(base: Callable[..., Any] | None, steps: Sequence[float] | None, *names: str) -> Contender:
+    """Return the one-step method ``base(gpe)``, or RK4, with projection onto the invariants `names`, if any.
 
-
-def runge_kutta(*names: str) -> Contender:
-    """Return RK4 with projection onto the invariants `names` ("mass", "energy"); without names plain RK4."""
-    return Contender(lambda problem, h, t_end: _own(problem, h, t_end, lambda gpe: EIPRK4, names), stable_steps)
-
-
-def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Contender:
-    """Return the one-step method ``base(gpe)`` with projection onto `names`, if any, and the step lengths `steps`."""
+    `steps` are the lengths of its steps, by default those of `stable_steps`.
+    """
 
     def run(problem: FieldProblem, h: float, t_end: float) -> Any:
-        return _own(problem, h, t_end, lambda gpe: eip_method(base(gpe)), names)
+        method = EIPRK4 if base is None else eip_method(base(problem.equation))
+        invariants = problem.equation.invariants(names)
+        result = integrate(problem, (0.0, t_end), method=method, h=h, invariants=invariants)
+        made, reduced = result.diagnostics.n_projections, result.diagnostics.n_rank_reduced
+        return result.y, result.nfev, f"rank 1 in {reduced} of {made} projections" if reduced else ""
 
-    return Contender(run, lambda problem: steps)
+    return Contender(run, lambda problem: stable_steps(problem) if steps is None else steps)
 
 
 def implicit(scheme: Callable[..., Any]) -> Contender:
@@ -96,22 +86,21 @@ def implicit(scheme: Callable[..., Any]) -> Contender:
 
 
 METHODS = {
-    "RK4": runge_kutta(),
-    "EIP-M": runge_kutta("mass"),
-    "EIP-E": runge_kutta("energy"),
-    "EIP-ME": runge_kutta(*KEPT),
+    "RK4": ours(None, None),
+    "EIP-M": ours(None, None, "mass"),
+    "EIP-E": ours(None, None, "energy"),
+    "EIP-ME": ours(None, None, *KEPT),
     "CN": implicit(crank_nicolson),
     "LIC": implicit(linearly_implicit),
     "SAV/CN": implicit(sav_crank_nicolson),
-    "Strang": other(lambda gpe: Splitting(gpe, "strang"), LONG),
-    "splitting4-EIP": other(Splitting, FOURTH, *KEPT),
+    "Strang": ours(lambda gpe: Splitting(gpe, "strang"), LONG),
+    "splitting4-EIP": ours(Splitting, FOURTH, *KEPT),
 }
 
 
 def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
     """Return the problem of a modulated plane wave, and its final state (n,) by SciPy's DOP853 at its tightest."""
     gpe = plane_wave((points, points)).equation
-    assert gpe is not None
     x, y = gpe.grid.mesh()
     psi0 = np.exp(1j * (x + y)) * (1 + 0.5 * np.cos(x) + 0.5 * np.sin(y))
     problem = gpe.problem(psi0, T_END, name="modulated-wave")
@@ -146,7 +135,6 @@ class Trial:
     def errors(self, y: np.ndarray) -> dict[str, float]:
         """Return errors of the final state of `y` (n, 2), the states at start and end; those of invariants relative."""
         gpe, (start, end) = self.problem.equation, y.T
-        assert gpe is not None
         difference = end - self.exact
         return {
             "error_max": float(np.abs(difference).max()),

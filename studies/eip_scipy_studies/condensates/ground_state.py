@@ -20,12 +20,11 @@ from eip_scipy.problems.gross_pitaevskii import Multiplier
 from .pointwise import add_potential, divide_by_root, inner, quartic_sums, rotate
 
 REFRESH = 20  # iterations between two evaluations of what is carried along otherwise
-NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
+NOISE, BREAK_SYMMETRY = 0.05, 1e-3  # of an amplitude: enough to leave a symmetry at once, or in the end
 # The search of `lowest_ring` over numbers of vortices and windings.
 WALK_TOLERANCE, WALK_ITERATIONS = 1e-3, 150
 NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
 ROW = 0.4  # of the vortices of a rigid rotation are in a single row in the ring, where the walk starts
-BREAK_SYMMETRY = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +234,7 @@ def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -
 def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[np.ndarray]:
     """Yield fields with triangular lattices of vortices, turned, shifted and stretched at random, with some noise.
 
-    A condensate that turns as a rigid body has Omega / pi vortices per unit area; the lattices have 0.6 to 1.2 times
-    as many, over the whole condensate and any hole in it. Without rotation (`Omega` = 0) the fields have no vortices.
+    The lattices have 0.6 to 1.2 times as many vortices as a condensate that turns as a rigid body.
     """
     rng = np.random.default_rng(seed)
     amplitude = np.sqrt(thomas_fermi(gpe))

@@ -37,10 +37,7 @@ ROOM = ((-4.0, 4.0), (-4.0, 4.0), (-6.0, 6.0))
 
 @dataclass(frozen=True, kw_only=True)
 class VortexLines(QuenchStudy):
-    """Command ``eip-scipy gpe vortex-lines``.
-
-    The trap is round. The stationary state at the slower rotation therefore continues to rotate at this rate, and lags
-    behind the frame that rotates faster.
+    """Command ``eip-scipy gpe vortex-lines``: in the round trap the state keeps its slower rotation, and lags behind.
 
     `energies_known` is the allowed error of the known energies, of the start (a saddle) and of the lower state, and
     `turn_known` that of the angle of the lines [rad], 0.1 of the distance between two points of the grid there.
@@ -120,7 +117,7 @@ def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[
 
 
 def chemical_potential(gpe: GrossPitaevskii, psi: np.ndarray) -> float:
-    """Return the mean of H, Re <H psi, psi> / <psi, psi>, of the field psi."""
+    """Return the mean of H."""
     return float(np.vdot(psi, 1j * gpe.fun(0.0, psi)).real / np.vdot(psi, psi).real)
 
 

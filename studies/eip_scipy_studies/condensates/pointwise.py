@@ -14,8 +14,7 @@ from ..report import needed
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
 
-BLOCK = 512  # points in one part of a sum
-LANES = 8
+BLOCK, LANES = 512, 8  # points in one part of a sum, and partial sums
 # pi / 2 in two parts (Cody & Waite): whole multiples of the first, up to 2^20 of them, are exact.
 QUARTER, QUARTER_LOW = float.fromhex("0x1.921fb544p+0"), float.fromhex("0x1.0b4611a626331p-34")
 QUARTERS, SHIFT = float.fromhex("0x1.45f306dc9c883p-1"), float.fromhex("0x1.8p52")

@@ -55,8 +55,7 @@ def plane_wave(
 ) -> FieldProblem:
     """Return the problem of a plane wave of the NLS equation, a stationary state H psi = omega psi.
 
-    ``psi = A exp(i (k . x - omega t))``, ``omega = |k|^2 / 2 + beta A^2``, on a box of sides 2 pi, with k the whole
-    numbers `modes`. The gradients of mass and energy are parallel: a projection onto both has rank 1.
+    ``psi = A exp(i (k . x - omega t))``, ``omega = |k|^2 / 2 + beta A^2``, on a box of sides 2 pi, k = `modes`.
     """
     gpe = GrossPitaevskii(Grid(shape, 0.0, 2 * pi), beta=beta)
     k = np.atleast_1d(modes)
@@ -85,10 +84,7 @@ def rotating_packet(
 
 
 def ring_condensate(kappa: float = 0.3, points: int = 256) -> GrossPitaevskii:
-    """Return the paper's fast rotating ring: V = -0.1 r^2 + kappa / 4 r^4 on [-10, 10]^2, Omega = 3.5, beta = 1000.
-
-    With 256 points the phase turns by up to 1.8 between neighbouring points.
-    """
+    """Return the paper's fast rotating ring: V = -0.1 r^2 + kappa / 4 r^4 on [-10, 10]^2, Omega = 3.5, beta = 1000."""
     grid = Grid((points, points), -10.0, 10.0)
     return GrossPitaevskii(grid, quartic_trap(1.2, kappa, 1.0, 1.0), Omega=3.5, beta=1000.0)
 

@@ -62,7 +62,7 @@ class Ring(QuenchStudy):
         return f"Ring, kappa = {self.kappas[0]:g} -> {self.kappas[1]:g}"
 
     def measure(self, session: Session) -> QuenchRuns:
-        """Do all runs from the ground state, read from a file or computed."""
+        """Do all runs from the ground state."""
         before, after = (self.condensate(kappa, self.points) for kappa in self.kappas)
         if self.start is not None:
             start = load_state(self.start, before)

@@ -32,7 +32,10 @@ SENSES = {1: "anticlockwise", -1: "clockwise"}
 
 def field_check(what: str, value: Any, passed: bool) -> Check:
     """Return a check with its condition in words and the measured value."""
-    return Check(f"{what}: {_value(value)}", passed, {"what": what, "value": value, "passed": passed})
+    shown = str(value)
+    if isinstance(value, float):
+        shown = compact(value, 3) if abs(value) < SMALL else f"{value:.6g}"
+    return Check(f"{what}: {shown}", passed, {"what": what, "value": value, "passed": passed})
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,6 @@ class QuenchRuns:
     @property
     def equation(self) -> GrossPitaevskii:
         """Return the equation after the quench."""
-        assert self.problem.equation is not None
         return self.problem.equation
 
 
@@ -125,13 +127,6 @@ def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
     return guess + float(np.median(difference[np.arange(old.size), nearest]))
 
 
-def _value(value: Any) -> str:
-    """Format the value of a check: floats below `SMALL`, which are errors, with 3 digits, other floats with 6."""
-    if isinstance(value, float):
-        return compact(value, 3) if abs(value) < SMALL else f"{value:.6g}"
-    return str(value)
-
-
 def _cells(line: FieldRun) -> list[str]:
     errors = (compact(float(e.max())) for e in (line.mass_error, line.energy_error, line.field_error))
     return [compact(line.wall_time, 3), str(line.nfev), *errors, str(line.n_rank_reduced)]
@@ -167,7 +162,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         return {"h": self.step, "t_end": self.t_end}
 
     def shown(self, t: np.ndarray) -> list[int]:
-        """Return the indices in the saved times `t` of those snapshots that the run has reached."""
+        """Return the indices in `t` of the snapshots that the run has reached."""
         return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
 
     def do_runs(self, gpe: GrossPitaevskii, start: np.ndarray, session: Session) -> QuenchRuns:

@@ -102,10 +102,7 @@ class Splitting:
 
 
 def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
-    """Return exp(i angle Lz) psi, the field at points turned anticlockwise by `angle` about the z axis.
-
-    The field must vanish towards the ends of the box. The rotation is made in parts of at most `SMALL_TURN`.
-    """
+    """Return exp(i angle Lz) psi, the field at points turned anticlockwise by `angle` about the z axis."""
     psi = gpe.as_field(psi).copy()
     angle = remainder(angle, 2 * pi)
     parts = max(1, ceil(abs(angle) / SMALL_TURN - 1e-9))

@@ -283,7 +283,7 @@ def cropped(
 
 
 def save_state(path: Path, item: Found) -> Path:
-    """Write a state and its equation as an npz file without pickled objects; return `path`."""
+    """Write a state and its equation as an npz file without pickled objects."""
     return write_file(path, partial(_save, item))
 
 

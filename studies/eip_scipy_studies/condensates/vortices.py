@@ -12,8 +12,7 @@ from eip_scipy.problems import GrossPitaevskii
 
 CORE = 4.0  # width of a core, in healing lengths
 THRESHOLD = 0.01  # of the largest density; phases have no meaning where there is less
-DEEP = 2.0  # a point is inside if the density with filled cores exceeds that of the surface by this factor
-SMOOTH = 2.0  # points, for an edge without teeth
+DEEP, SMOOTH = 2.0, 2.0  # factor of the surface's density inside, with filled cores; points, for an edge without teeth
 
 
 class Vortices(NamedTuple):
@@ -83,8 +82,7 @@ class Surface(NamedTuple):
 def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
     """Return the surface on which ``|psi|^2`` has a value `level`, by marching cubes (Lewiner et al. 2003).
 
-    The field, in three dimensions and 0 at the ends of the box, is interpolated to twice as many points on each axis.
-    An ImportError is raised if scikit-image is not installed.
+    The field, 0 at the ends of the box, is interpolated to twice as many points on each axis.
     """
     psi = gpe.as_field(psi)
     top = float((np.abs(psi) ** 2).max())
