@@ -152,7 +152,7 @@ class RunSpec(NamedTuple):
         trust = Trust(invariants.names, work.trust)
         return Run(
             start, start, self.stepping, method, arrays, options, work, invariants, identity, trust, self.called,
-            self.left_out, columns if columns is not None and columns.by_jvp and projection.check else None,
+            self.left_out,
         )  # fmt: skip
 
     def _check(self, run: Run, checks: bool) -> None:

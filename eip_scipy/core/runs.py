@@ -16,13 +16,12 @@ from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunction
 from ..engine.trust import Trust
 from . import steppers
 from .callers import users_level
-from .examination import Derivative, Examiner, is_check_due, unless_refused, unresolved
+from .examination import Derivative, Examiner, is_check_due, unresolved
 from .invariant_checks import listed
 from .invariants import InvariantSet
 from .options import Options
 from .results import Diagnostics, slowness
 from .stepping import AnyMethod, Stepping
-from .variations import Columns, wrong_product
 
 __all__ = ["Counted", "Run", "Start", "parts_of", "run_of"]
 
@@ -46,9 +45,7 @@ class Run:
     The invariants were measured at `begin`; `start`, of the first step, may have been moved by `project_initial`, and
     `moved` says how far. `tableau` is the method as it was given, and `method` the form of it that the engine uses for
     the steps. `identity`: see `settled`. `called` is the argument that gave the right-hand side, and `left_out` a
-    possible cause of NaN in its value, for messages. `compared` are columns of derivatives whose products with the
-    Jacobian are compared with differences during the run. `looked` and `looked_at_products` are the steps at which the
-    invariants, and these products, were checked last.
+    possible cause of NaN in its value, for messages. `looked` is the step at which the invariants were checked last.
     """
 
     begin: Start
@@ -63,9 +60,7 @@ class Run:
     trust: Trust
     called: str = "fun"
     left_out: str = ""
-    compared: Columns | None = None
     looked: int = -1
-    looked_at_products: int = -1
     moved: str = ""
     warned_of_balances: bool = False
 
@@ -127,26 +122,11 @@ class Run:
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
         """Examine a run after `steps` steps, or at its end (`ended`), and return True if it must be reported as faulty.
 
-        Steps that the engine has marked as suspicious are examined. The invariants, and products of the Jacobian by a
-        function of the user, are checked after 10, 100, 1000, ... steps, at the end, and the invariants also if the
-        corrections are too large, to find the reason. `rhs` returns a new array.
+        Steps that the engine has marked as suspicious are examined. The invariants are checked after 10, 100, 1000, ...
+        steps, at the end, and if the corrections are too large, to find the reason. `rhs` returns a new array.
         """
-        if self.trust.failed:
-            return False  # a failure has its own message
-        due = ended or is_check_due(steps)
-        if due and steps != self.looked_at_products and not self.trust.doubts:
-            self.looked_at_products = steps
-            if (wrong := self.wrong_product(rhs, t, y)) is not None:
-                self.trust.doubts.append(wrong)
-                return True
-        return self.options.watched and self._look_at_invariants(steps, ended, t, y, rhs)
-
-    def wrong_product(self, rhs: Derivative, t: float, y: np.ndarray) -> str | None:
-        """Return a sentence about a wrong product of the user's `jvp` at a state of the run, or None."""
-        return None if self.compared is None else unless_refused(partial(wrong_product, self.compared), rhs, t, y)
-
-    def _look_at_invariants(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
-        """Examine the invariants, as described in `look`."""
+        if self.trust.failed or not self.options.watched:  # a failure has its own message
+            return False
         if ended:
             self._warn_of_fast_balances()
         suspect = self.work.suspect

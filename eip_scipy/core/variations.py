@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import OdeSolution
 
-from ..engine.data import EPS, EUCLIDEAN, GIVEN
+from ..engine.data import EUCLIDEAN, GIVEN
 from ..engine.data import Columns as KeptColumns
 from ..engine.native import BUILD, LibraryFunction
 from .arguments import scalars
 from .blocks import INDEX
-from .dual_checks import shifted, wrong_duals
-from .gradients import NumericalGradient, difference_gradient, random_directions, typical_sizes, unless_error
+from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
 from .inputs import filled, reals, require_arguments, shown
 from .invariants import Invariant
 from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
@@ -26,23 +25,19 @@ from .states import as_derivative
 
 __all__ = [
     "Columns", "StateSolution", "Variations", "asked_columns", "kept_symplectic", "require_tableau",
-    "right_hand_side", "widened", "wrong_product",
+    "right_hand_side", "widened",
 ]  # fmt: skip
 
 Array = np.ndarray
 STATE = "state"
-# Largest difference between a complex step and a difference of order 6, relative to the largest component.
-AGREES = 1e-6
-# Bound for a jvp of the user, which is larger because the right-hand side may not be smooth.
-WRONG = 1e-3
-# Distance of the state, in units of its components, at which a jvp that differs from differences is compared again.
-BESIDE = 1e-6
+# Largest difference between a derivative that a run would use and a difference of order 6 of the right-hand side: as
+# shares of the component and of the largest component. A jvp of the user may itself consist of differences.
+TOLERANCES = {"jvp": (0.0, 1e-3), "dual numbers": (1e-3, 1e-12), "complex steps": (0.0, 1e-6)}
+# Distances from the start, in units of the state, at which they are compared: at the first one within the domain of the
+# function. At the start itself the function may have a kink, or terms that vanish there alone.
+DISTANCES = (1e-2, 1e-4, 1e-6, 0.0)
 COMPLEX_STEP = 2.0**-332  # a power of two, so that the product has no other error than the rounding of the function
 LEAST = 1e-3  # size for differences of a parameter that is 0
-# Lengths of the differences with which a complex step is compared where the engine finds it wrong, and the distance, in
-# roundings, of the states from which the rounding of these differences is estimated.
-LENGTHS = (1e-5, 1e-7, 1e-9)
-BLUR = 4.0
 TINY = 1e-150  # least size of a component: the product of it and a complex step does not underflow
 
 
@@ -66,8 +61,7 @@ class Columns:
     `values` (n + p, k) are the initial columns; the last p rows belong to the parameters with the indices `parameters`
     and are constant. The first n columns are the state-transition matrix from the first start if `is_transition`, which
     is kept symplectic if `symplectic`. The wide state has all positions first and then all velocities, as Nystrom
-    methods need it, if `in_halves`; otherwise one column follows the other. If `by_jvp`, products with the Jacobian
-    come from the user's `jvp`, which the run compares with differences.
+    methods need it, if `in_halves`; otherwise one column follows the other.
     """
 
     values: Array
@@ -75,7 +69,6 @@ class Columns:
     is_transition: bool
     symplectic: bool
     in_halves: bool = False
-    by_jvp: bool = False
 
     @property
     def n(self) -> int:
@@ -288,7 +281,6 @@ class Variations:
                 "orbit; omit the balances in this run."
             )
         rhs, source = products
-        columns = replace(columns, by_jvp=source == "jvp")
         compiled = _has_address(rhs) and not in_python
         items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
         return cls(columns, rhs, items, tuple(invariants), source)
@@ -348,8 +340,9 @@ def _of_columns_in_order(
 ) -> tuple[Callable[..., Any], str]:
     """Return the output of `right_hand_side` for a wide state in which one column follows the other."""
     n, parameters = columns.n, columns.parameters
+    check = _Comparison.at_start(_derivative(fun, form, y0), t0, y0, list(parameters), extra)
     if jvp is not None:
-        _require_products(columns, _derivative(fun, form, y0), jvp, t0, y0, extra)
+        _require_products(check, jvp)
         if is_compiled(fun) and is_jitted(jvp) and not jit_is_off():
             from .jitted_columns import rhs_by_products
 
@@ -368,20 +361,26 @@ def _of_columns_in_order(
 
         try:
             rhs = rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
-            way = _direction(y0, len(parameters))
-            why = wrong_duals(columns, rhs, _derivative(fun, form, y0), t0, y0, way, extra)
+            why = _wrong_duals(check, columns, rhs)
         except NotCompilableError as error:
             why = str(error)
         if why is None:
             return rhs, "dual numbers"
-    return _by_complex_steps(columns, fun, form, t0, y0, extra, why), "complex steps"
+    products = _ComplexSteps(check.derivative, y0, check.places)
+    if not unless_error(
+        lambda: check.wrong(lambda y: products(t0, y, check.way[None], extra)[0], "complex steps") is None
+    ):
+        raise ValueError(
+            "variations: the derivatives of the right-hand side cannot be computed: it does not belong to a problem "
+            f"with derivatives, {why}, and it does not support complex steps. Give jvp=..., a function "
+            "jvp(t, y, dy) that returns the product of the Jacobian with dy."
+        )
+    return _interpreted(columns, fun, form, y0, products), "complex steps"
 
 
-def _require_products(
-    columns: Columns, derivative: Callable[..., Array], jvp: Any, t0: float, y0: Array, extra: tuple
-) -> None:
-    """Raise an error unless `jvp` is the product of the Jacobian of the right-hand side, `derivative`, and a vector."""
-    if columns.parameters:
+def _require_products(check: _Comparison, jvp: Any) -> None:
+    """Raise an error unless `jvp` is the product of the Jacobian of the right-hand side and a vector."""
+    if check.places:
         raise ValueError(
             "variations: derivatives with respect to parameters cannot be computed with jvp, which gives only products "
             'with the Jacobian with respect to the state. Omit jvp, or pass variations="state" or an array of initial '
@@ -389,33 +388,114 @@ def _require_products(
         )
     if not callable(jvp):
         raise TypeError(f"jvp must be a function jvp(t, y, dy, ...) -> (n,), got {shown(jvp)}.")
-    dy, dp = _direction(y0, 0)
-    try:
-        given = jvp(t0, y0.copy(), dy.copy(), *extra)
-    except TypeError:
-        names = ["t", "y", "dy", *["params"] * len(extra)]
-        require_arguments(jvp, names, "jvp", f"Write jvp({', '.join(names)}).")
-        raise
-    found = as_derivative(given, y0.size, y0.dtype, t0, "jvp").copy()
-    right = _difference(derivative, t0, y0, dy, dp, [], extra)
-    if not _agree(found, right, WRONG):
-        k = int(np.argmax(np.abs(found - right)))
+
+    def product(y: Array) -> Array:
+        try:
+            given = jvp(check.t, y.copy(), check.way.copy(), *check.extra)
+        except TypeError:
+            names = ["t", "y", "dy", *["params"] * len(check.extra)]
+            require_arguments(jvp, names, "jvp", f"Write jvp({', '.join(names)}).")
+            raise
+        return as_derivative(given, y.size, y.dtype, check.t, "jvp").copy()
+
+    if (wrong := check.wrong(product, "jvp")) is not None:
+        k, found, right = wrong
         raise ValueError(
-            f"jvp is not the Jacobian of the right-hand side times dy: at the start, along {shown(dy)}, component {k} "
-            f"is {found[k]:.6g} where differences of fun give {right[k]:.6g}. Correct jvp."
+            f"jvp is not the Jacobian of the right-hand side times dy: near the start, along {shown(check.way)}, "
+            f"component {k} is {found:.6g} where differences of fun give {right:.6g}. Correct jvp."
         )
 
 
-def _direction(y0: Array, parameters: int) -> tuple[Array, Array]:
-    """Return a random direction for a check: dy (n,) of about the sizes of `y0`, and dp (parameters,) of size 1."""
-    rng = np.random.default_rng(0)
-    dy, dp = rng.standard_normal(y0.size), rng.standard_normal(parameters)
-    sizes = np.abs(y0)
-    return dy * np.where(sizes > 0, sizes, sizes[sizes > 0].min(initial=np.inf) if sizes.any() else 1.0), dp
+def _wrong_duals(check: _Comparison, columns: Columns, rhs: Any) -> str | None:
+    """Return a clause about what is wrong in `rhs`, the output of `rhs_by_duals`; None if nothing is found."""
+    as_derivative(check.derivative(check.t, check.y, check.extra), check.y.size, check.y.dtype, check.t, "fun")
+
+    def product(y: Array) -> Array:
+        wide = np.tile(check.way, 1 + columns.count)
+        wide[: columns.size] = np.concatenate([y, check.extra[0][check.places] if check.places else []])
+        out = np.empty_like(wide)
+        rhs(check.t, wide, out, *check.extra)
+        return out.reshape(-1, columns.size)[1:, : columns.n]
+
+    try:
+        wrong = check.wrong(product, "dual numbers")
+    except MemoryError:
+        raise
+    except Exception as error:  # fun itself raises none at the start
+        return f"it raises {type(error).__name__} with dual numbers"
+    if wrong is None:
+        return None
+    k, found, right = wrong
+    return (
+        f"component {k} of its derivative along a test direction is {right:.6g} near the start, but {found:.6g} with "
+        "dual numbers"
+    )
 
 
-def _agree(found: Array, right: Array, bound: float) -> bool:
-    return bool(np.abs(found - right).max() <= bound * max(np.abs(right).max(), np.abs(found).max()))
+class _Comparison(NamedTuple):
+    """The check of derivatives: along one direction near the start they are compared with differences of the function.
+
+    ``derivative(t, y, extra)`` is the function, and `way` (n + p,) a direction in the space of the state and of the
+    parameters `places`.
+    """
+
+    derivative: Callable[..., Array]
+    t: float
+    y: Array
+    way: Array
+    places: list[int]
+    extra: tuple
+
+    @classmethod
+    def at_start(
+        cls, derivative: Callable[..., Array], t: float, y: Array, places: list[int], extra: tuple
+    ) -> _Comparison:
+        """Return the check along a random direction whose components have about the sizes of the state's."""
+        way, sizes = np.random.default_rng(0).standard_normal(y.size + len(places)), np.abs(y)
+        way[: y.size] *= np.where(sizes > 0, sizes, sizes[sizes > 0].min(initial=np.inf) if sizes.any() else 1.0)
+        own = np.abs(extra[0][places]) if places else np.zeros(0)
+        way[y.size :] *= np.where(own > 0, own, 1.0)
+        return cls(derivative, t, y, way, places, extra)
+
+    def wrong(self, product: Callable[[Array], Array], source: str) -> tuple[int, float, float] | None:
+        """Return the index of a wrong component of ``product(y)``, its value and the difference; None if all are right.
+
+        ``product(y)``, (n,) or (k, n), has the derivatives along `way`, from the `source`, a key of `TOLERANCES`.
+        """
+        own, of_largest = TOLERANCES[source]
+        for share in DISTANCES:
+            y = self.y + share * self.way[: self.y.size]
+            found, right = unless_error(product, y) if share else product(y), self._difference(y)
+            if share == 0.0 or (found is not None and np.isfinite(right).all()):
+                break
+        found = np.atleast_2d(found)
+        with np.errstate(invalid="ignore"):
+            sizes = np.maximum(np.abs(found), np.abs(right))
+            close = np.abs(found - right) <= own * sizes + of_largest * np.nanmax(sizes, initial=0.0)
+        wrong = np.argwhere(np.isfinite(right) & ~close)
+        return (int(wrong[0, 1]), float(found[*wrong[0]]), float(right[wrong[0, 1]])) if wrong.size else None
+
+    def _difference(self, y: Array) -> Array:
+        """Return the derivative (n,) along `way` by differences of order 6; NaN where the function raises an error."""
+
+        def along(s: Array) -> Array:
+            shift = s[0] * self.way
+            found: Array | None = unless_error(_shifted, self.derivative, self.t, y, shift, self.places, self.extra)
+            return np.full(y.size, np.nan) if found is None else found
+
+        with np.errstate(all="ignore"):
+            return np.asarray(difference_gradient(along, np.zeros(1), np.full(1, 1e-2)))[..., 0]
+
+
+def _shifted(
+    derivative: Callable[..., Array], t: float, y: Array, shift: Array, places: list[int], extra: tuple
+) -> Array:
+    """Return ``derivative(t, y, extra)`` with y and the parameters `places` shifted by the n + p floats of `shift`."""
+    if places:
+        params = extra[0].astype(shift.dtype)
+        params[places] += shift[y.size :]
+        extra = (params,)
+    return derivative(t, y + shift[: y.size], extra)
 
 
 def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
@@ -471,33 +551,8 @@ def _interpreted(
     return rhs
 
 
-def _by_complex_steps(
-    columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, why: str | None
-) -> Callable[..., Any]:
-    """Return the right-hand side by complex steps, or raise a ValueError that says `why` none is compiled."""
-    derivative, places = _derivative(fun, form, y0), list(columns.parameters)
-    products = _ComplexSteps(derivative, y0, places)
-    dy, dp = _direction(y0, len(places))
-
-    def is_good() -> bool:
-        found = products.by_complex_step(t0, y0, np.concatenate([dy, dp])[None], extra)[0]
-        return _agree(found, _difference(derivative, t0, y0, dy, dp, places, extra), AGREES)
-
-    if not unless_error(is_good):
-        raise ValueError(
-            "variations: the derivatives of the right-hand side cannot be computed: it does not belong to a problem "
-            f"with derivatives, {why}, and it does not support complex steps. Give jvp=..., a function "
-            "jvp(t, y, dy) that returns the product of the Jacobian with dy."
-        )
-    return _interpreted(columns, fun, form, y0, products)
-
-
 class _ComplexSteps:
-    """Products of the Jacobian and columns: by complex steps if they are correct, otherwise by differences of order 6.
-
-    A complex step is wrong if the function uses an absolute value, a norm or a real part, perhaps only in a part of its
-    domain. Therefore the products at each state are compared with a difference along one combination of the columns, as
-    in `NumericalGradient`. The choice depends on the wide state only, so that a resumed run makes the same steps.
+    """Products of the Jacobian and columns by complex steps.
 
     ``derivative(t, y, extra)`` takes real and complex states. `places` are the indices in the run's parameters to which
     the last p components of a column belong.
@@ -510,53 +565,8 @@ class _ComplexSteps:
     def __call__(self, t: float, y: Array, M: Array, extra: tuple) -> Array:
         """Return the products (k, n) of the Jacobian at (t, y) and the rows of M (k, n + p)."""
         rows, sizes = self._scaled(y, M, extra)
-        with np.errstate(all="ignore"):  # the function may not be defined at states that the run does not visit
-            found = self._checked(t, y, rows, extra)
-        if found is None:
-            k = len(rows)
-            found = difference_gradient(lambda s: self._along(t, s, y, rows, extra), np.zeros(k), np.ones(k))
-        return found.T * sizes
-
-    def by_complex_step(self, t: float, y: Array, M: Array, extra: tuple) -> Array:
-        """Return the products by complex steps alone."""
-        rows, sizes = self._scaled(y, M, extra)
-        return self._unchecked(t, y, rows, extra).T * sizes
-
-    def _unchecked(self, t: float, y: Array, rows: Array, extra: tuple) -> Array:
         at_rest = np.zeros(len(rows))
-        return BUILD.gradients.complex_step(self._along, t, at_rest, (y, rows, extra), COMPLEX_STEP)
-
-    def _checked(self, t: float, y: Array, rows: Array, extra: tuple) -> Array | None:
-        """Return the products (n, k) with the scaled rows by complex steps; None if they disagree with differences."""
-        k = len(rows)
-        way = random_directions(k, False)[-1]
-        found = unless_error(
-            BUILD.gradients.checked_complex_step,
-            self._along, t, np.zeros(k), (y, rows, extra), COMPLEX_STEP, way, np.ones(k),
-        )  # fmt: skip
-        if found is not None:
-            return found
-        # The engine's comparison allows for the rounding of the values, but not for that of terms that cancel in them.
-        found = unless_error(self._unchecked, t, y, rows, extra)
-        wrong = found is None or unless_error(self._is_wrong, found, way, t, y, rows, extra)
-        return None if wrong else found
-
-    def _is_wrong(self, found: Array, way: Array, t: float, y: Array, rows: Array, extra: tuple) -> bool:
-        """Return True if the products `found` (n, k) differ from all differences along `way`, by more than rounding.
-
-        The rounding is estimated from the derivative at states that differ by a few roundings. Differences that are not
-        finite do not show that the products are wrong.
-        """
-        along, terms = found @ way, np.abs(found) @ np.abs(way)
-        here = self._derivative(t, y, extra)
-        blurred = [y + BLUR * EPS * np.abs(y) * d for d in (*random_directions(y.size, False), -1.0)]
-        rounding = BLUR * np.max([np.abs(self._derivative(t, state, extra) - here) for state in blurred], axis=0)
-        for length in LENGTHS:
-            above, below = (self._along(t, side * length * way, y, rows, extra) for side in (1, -1))
-            allowed = AGREES * terms + (rounding + EPS * np.abs(here)) / length
-            if not (np.abs((above - below) / (2 * length) - along) > allowed).any():
-                return False
-        return True
+        return BUILD.gradients.complex_step(self._along, t, at_rest, (y, rows, extra), COMPLEX_STEP).T * sizes
 
     def _scaled(self, y: Array, M: Array, extra: tuple) -> tuple[Array, Array]:
         """Return the rows of M, divided by powers of two, without rounding, to about the state's size; and these."""
@@ -570,50 +580,7 @@ class _ComplexSteps:
 
     def _along(self, t: float, shares: Array, y: Array, rows: Array, extra: tuple) -> Array:
         """Return the derivative at the state, and the parameters, shifted by ``shares @ rows``."""
-        return shifted(self._derivative, t, y, shares @ rows, self._places, extra)
-
-
-def _difference(
-    derivative: Callable[..., Array], t: float, y: Array, dy: Array, dp: Array, places: list[int], extra: tuple
-) -> Array:
-    """Return the derivative (n,) along (dy, dp), dp for the parameters `places`, by differences of order 6."""
-    direction = np.concatenate([dy, dp])
-
-    def along(s: Array) -> Array:
-        return shifted(derivative, t, y, s[0] * direction, places, extra)
-
-    return np.asarray(difference_gradient(along, np.zeros(1), np.full(1, 1e-2)))[..., 0]
-
-
-def wrong_product(columns: Columns, rhs: Callable[[float, Array], Array], t: float, wide: Array) -> str | None:
-    """Return a sentence about a wrong product of the Jacobian at the state in `wide`; None if none is found.
-
-    `rhs` is that of the wide state. The state moves along a random direction, which also takes the place of the
-    columns. Close to a kink neither the product nor the difference need be wrong, so that a product counts as wrong
-    only if it is so at a state close by, too.
-    """
-    own, order = wide.copy(), columns.order
-    dy = _direction(own[order[0]], 0)[0]
-    own[order[1:]] = dy
-    texts = []
-    for share in (0.0, BESIDE):
-        own[order[0]] = y = wide[order[0]] + share * dy
-
-        def moved(s: Array, y: Array = y) -> Array:
-            own[order[0]] = y + s[0] * dy
-            return rhs(t, own)[order[0]]
-
-        found = rhs(t, own)[order[1]]
-        right = difference_gradient(moved, np.zeros(1), np.full(1, 1e-2))[..., 0]
-        if not (np.isfinite(found).all() and np.isfinite(right).all()) or _agree(found, right, WRONG):
-            return None
-        k = int(np.argmax(np.abs(found - right)))
-        texts.append(
-            f"jvp is not the Jacobian of the right-hand side times dy at t={t:.6g}: along a test direction, component "
-            f"{k} is {found[k]:.6g} by jvp and {right[k]:.6g} by differences of fun, a difference of "
-            f"{abs(found[k] - right[k]):.2g}; correct jvp"
-        )
-    return texts[0]
+        return _shifted(self._derivative, t, y, shares @ rows, self._places, extra)
 
 
 class _WideInvariant:

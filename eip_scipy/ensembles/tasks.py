@@ -518,12 +518,12 @@ class Sweeper:
     def _examine(self, each: data.Members, out: Members) -> None:
         """Examine the steps that the engine has marked as suspicious, and check the invariants at the ends of members.
 
-        The invariants, and the products of the user's `jvp`, are checked at the ends of the members that did not fail,
-        in their order, up to the first member at which nothing is found.
+        The invariants are checked at the ends of the members that did not fail, in their order, up to the first member
+        at which nothing is found.
         """
         run = self.loop.driver.run
         arrived = np.flatnonzero(out.status >= 0)
-        if not (run.options.watched or run.compared is not None) or not arrived.size:
+        if not run.options.watched or not arrived.size:
             return
         suspected, at_ends = suspects(each.figures, each.suspects), True
         for k in arrived.tolist():
@@ -536,8 +536,7 @@ class Sweeper:
             examiner = replace(run.examiner, tau=tau, figures=each.figures[k], largest=0.0)
             found = examiner.examine(each.suspects[k], derivative) if suspected[k] else None
             if at_ends:
-                end = derivative, float(out.t[k]), out.y[k]
-                at_end = run.wrong_product(*end) or (examiner.complaint(*end) if run.options.watched else None)
+                at_end = examiner.complaint(derivative, float(out.t[k]), out.y[k])
                 found, at_ends = found or at_end, at_end is not None
             self._judge(k, each, out, [found] if found else [])
 
