@@ -6,6 +6,7 @@ derivatives have no impulses where they do not jump. A quantity may be conserved
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
@@ -15,7 +16,6 @@ import numpy as np
 import sympy
 
 from ..multibody.motion import plain
-from .parser import EXPANDED_TERMS, expanded_terms
 from .program import Arguments, function
 
 __all__ = ["Manifold", "NotKeptError", "Rate", "how_kept", "shortened", "slope", "vanishes"]
@@ -24,6 +24,8 @@ POINTS, TRIES = 8, 200
 DIGITS = 50
 LARGEST = sympy.Integer(10) ** 300
 ROUND_OFF = 1e-20  # bound for the rounding of a rate that is 0, relative to its terms, when computed with DIGITS
+# Largest number of terms of an expanded polynomial. With more terms algebra may take minutes.
+EXPANDED_TERMS = 2000
 # Beyond this number of operations `simplify` may take minutes, while an evaluation at points takes milliseconds.
 SIMPLIFIED_OPERATIONS = 120
 # Functions with branches, and the search for places where they change.
@@ -136,13 +138,30 @@ def vanishes(expression: Any) -> bool:
     return bool(points) and all(abs(total) <= ROUND_OFF for _, (total, _) in points)
 
 
+def _expanded_terms(expression: Any) -> int:
+    """Return an upper bound for the number of terms of the expanded expression, at most `EXPANDED_TERMS` + 1."""
+    most = EXPANDED_TERMS + 1
+    match expression:
+        case sympy.Add():
+            return min(most, sum(map(_expanded_terms, expression.args)))
+        case sympy.Mul():
+            product = 1
+            for factor in expression.args:
+                product = min(most, product * _expanded_terms(factor))
+            return product
+        case sympy.Pow(args=(base, sympy.Integer() as exponent)):
+            terms, power = _expanded_terms(base), min(abs(int(exponent)), most)
+            return min(most, math.comb(terms + power - 1, power)) if terms > 1 else 1
+    return 1
+
+
 def _expands_to_zero(expression: Any) -> bool:
-    return expanded_terms(expression) <= EXPANDED_TERMS and sympy.expand(expression) == 0
+    return _expanded_terms(expression) <= EXPANDED_TERMS and sympy.expand(expression) == 0
 
 
 def _simplifies_to_zero(expression: Any) -> bool:
     """Return True if algebra shows quickly that an expression is 0."""
-    if expanded_terms(expression) > EXPANDED_TERMS or expression.count_ops() > SIMPLIFIED_OPERATIONS:
+    if _expanded_terms(expression) > EXPANDED_TERMS or expression.count_ops() > SIMPLIFIED_OPERATIONS:
         return False
     return bool(sympy.simplify(sympy.expand(expression)) == 0)
 
