@@ -6,11 +6,12 @@ import pickle
 import numpy as np
 import pytest
 import sympy
+from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 from sympy.physics import mechanics as me
 
-from eip_scipy import EIPDOP853, Balance, EIPRadau, Invariant, ProjectionWarning, ensemble, integrate
+from eip_scipy import EIPDOP853, EIPRadau, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import mechanics, mechanism
 from eip_scipy.problems.symbolic.models import _solution
@@ -73,15 +74,22 @@ def test_speeds_without_mass_need_constraints():
 
 
 def length(t, q):
-    return [(q[0] ** 2 + q[1] ** 2 - 1) / 2]
+    return np.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2])
 
 
-PENDULUM = {"q0": [1, 0], "u0": [0, 0], "potential": lambda t, q: G * q[1]}
+def height(t, q):
+    return G * q[1]
+
+
+compiled_length, compiled_height = njit(length), njit(height)
+PLAIN = {"q0": [1, 0], "u0": [0, 0], "potential_energy": height}
+PENDULUM = PLAIN | {"potential_energy": compiled_height}
+STATE = np.array([0.8, -0.6, 0.3, 0.4])
 
 
 @pytest.fixture(scope="module")
 def pendulum():
-    return mechanism([1, 1], [0, -G], length, t_span=(0.0, 4 * float(ellipk(0.5)) / np.sqrt(G)), **PENDULUM)
+    return mechanism([1, 1], [0, -G], compiled_length, t_span=(0.0, 4 * float(ellipk(0.5)) / np.sqrt(G)), **PENDULUM)
 
 
 def test_a_pendulum_returns_after_its_period_with_the_known_tension(pendulum):
@@ -102,7 +110,7 @@ def test_a_pendulum_returns_after_its_period_with_the_known_tension(pendulum):
 def test_its_repr_says_what_is_kept(pendulum):
     text = repr(pendulum)
     assert "1 on velocities of rank 1, 1 degree of freedom" in text
-    assert "energy      invariant, u M u / 2 + potential" in text
+    assert "energy      invariant, u M u / 2 + potential_energy" in text
 
 
 def test_it_pickles_and_its_members_keep_the_constraints(pendulum):
@@ -116,31 +124,22 @@ def test_it_pickles_and_its_members_keep_the_constraints(pendulum):
     assert np.abs(found.y[:, 0] ** 2 + found.y[:, 1] ** 2 - 1).max() < 1e-12
 
 
-def untraceable(function):
-    """Return the function in a form that cannot be called with symbols."""
-
-    def call(*args):
-        assert all(float(np.real(x)) == np.real(x) for x in np.ravel(args[-1]))
-        return function(*args)
-
-    return call
-
-
-def test_functions_that_branch_are_called_as_they_are():
-    exact = mechanism([1, 1], [0, -G], length, **PENDULUM)
-    numerical = mechanism([1, 1], [0, -G], untraceable(length), **PENDULUM)
-    assert "functions are not converted to expressions" in repr(numerical)
-    assert exact.notes == ()
-    state = np.array([0.8, -0.6, 0.3, 0.4])
-    np.testing.assert_allclose(numerical.fun(0.0, state), exact.motion_at(0.0, state), atol=1e-12)
-    one, two = numerical.constraints[0].grad, exact.constraints[0].gradient.py_func
-    found, expected = np.empty((2, 4)), np.empty((2, 4))
-    one(0.0, state, found)
-    two(0.0, state, expected)
-    np.testing.assert_allclose(found, expected, atol=1e-11)
-    run_of_it = run(numerical, 1e-6, t_span=(0, 1))
-    assert run_of_it.trusted
-    assert np.abs(run_of_it.y[0] ** 2 + run_of_it.y[1] ** 2 - 1).max() < 1e-12
+@pytest.mark.needs_jit
+def test_plain_and_jitted_functions_give_the_same_motion(pendulum):
+    plain = mechanism([1, 1], [0, -G], length, **PLAIN)
+    assert "called from Python: constraints is not jitted by Numba" in repr(plain)
+    assert pendulum.notes == ()
+    for problem in (plain, pendulum):
+        # M u' + G^T lambda = F with G = q, and G u' = -u.u
+        pull = STATE[2:] @ STATE[2:] - G * STATE[1]
+        np.testing.assert_allclose(problem.fun(0.0, STATE)[2:], [-pull * STATE[0], -G - pull * STATE[1]], atol=1e-12)
+        np.testing.assert_allclose(problem.motion_at(0.0, STATE), problem.fun(0.0, STATE), atol=1e-14)
+        found = np.empty((2, 4))
+        problem.constraints[0].gradient(0.0, STATE, found)
+        np.testing.assert_allclose(found, [[0.8, -0.6, 0, 0], [0.3, 0.4, 0.8, -0.6]], atol=1e-11)
+    found = run(plain, 1e-6, t_span=(0, 1))
+    assert found.trusted
+    assert np.abs(found.y[0] ** 2 + found.y[1] ** 2 - 1).max() < 1e-12
 
 
 def test_functions_may_change_their_arguments_and_return_the_same_array():
@@ -153,10 +152,10 @@ def test_functions_may_change_their_arguments_and_return_the_same_array():
                 array *= 0.5
             return value
 
-        return untraceable(call)
+        return call
 
     def sideways(t, q, u):
-        kept[:] = u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])
+        kept[:] = np.real(u[0] * np.sin(q[2]) - u[1] * np.cos(q[2]))
         return kept
 
     def forces(t, q, u):
@@ -174,25 +173,16 @@ def test_functions_may_change_their_arguments_and_return_the_same_array():
     np.testing.assert_array_equal(state, found.y0)
 
 
-def test_functions_may_return_the_same_array_in_each_call():
-    array = np.empty(1)
-
-    def reusing(t, q):
-        array[:] = length(t, np.real(q))
-        return array
-
-    state = np.array([0.8, -0.6, 0.3, 0.4])
-    numerical = mechanism([1, 1], [0, -G], untraceable(reusing), **PENDULUM)
-    exact = mechanism([1, 1], [0, -G], length, **PENDULUM)
-    np.testing.assert_allclose(numerical.fun(0.0, state), exact.motion_at(0.0, state), atol=1e-11)
-
-
-@pytest.mark.parametrize("wrapped", [lambda f: f, untraceable])
+@pytest.mark.parametrize("wrapped", [lambda f: f, pytest.param(njit, marks=pytest.mark.needs_jit)])
 def test_constraints_may_depend_on_time(wrapped):
     # A bead on a rod that turns at the rate w: r'' = w^2 r.
     w = 2.0
     problem = mechanism(
-        [1, 1], [0, 0], wrapped(lambda t, q: [q[0] * np.sin(w * t) - q[1] * np.cos(w * t)]), q0=[1, 0], u0=[0, w]
+        [1, 1],
+        [0, 0],
+        wrapped(lambda t, q: np.array([q[0] * np.sin(w * t) - q[1] * np.cos(w * t)])),
+        q0=[1, 0],
+        u0=[0, w],
     )
     last = integrate(
         lambda t, y: problem.motion_at(t, y), (0, 1), problem.y0, method=EIPDOP853, rtol=1e-9, atol=1e-9
@@ -206,13 +196,19 @@ def test_constraints_may_depend_on_time(wrapped):
 def test_constraints_that_depend_on_time_are_met_nearly_at_rest(t_span):
     # The pivot of a pendulum turns back at t = 0.
     def swing(t, q):
-        return [(q[0] - 0.3 * np.cos(2 * t)) ** 2 + q[1] ** 2 - 1]
+        return np.array([(q[0] - 0.3 * np.cos(2 * t)) ** 2 + q[1] ** 2 - 1])
+
+    def gamma(t, q, u):
+        away, speed = q[0] - 0.3 * np.cos(2 * t), u[0] + 0.6 * np.sin(2 * t)
+        return [2 * (speed**2 + u[1] ** 2 + away * 1.2 * np.cos(2 * t))]
 
     start = {"q0": [0.9, -0.8], "u0": [0, 0], "t_span": t_span}
-    exact, numerical = (mechanism([1, 1], [0, -G], wrapped(swing), **start) for wrapped in (lambda f: f, untraceable))
+    exact = mechanism([1, 1], [0, -G], swing, gamma=gamma, **start)
+    plain, compiled = (mechanism([1, 1], [0, -G], fun, **start) for fun in (swing, njit(swing)))
     for slow in (0, 1e-14, 1e-8, 1e-3, 1):
         state = np.array([0.9, -0.8, 0.8 * slow, 0.6 * slow])
-        np.testing.assert_allclose(numerical.motion_at(0.0, state), exact.motion_at(0.0, state), atol=1e-11)
+        for found in (plain, compiled):
+            np.testing.assert_allclose(found.motion_at(0.0, state), exact.motion_at(0.0, state), atol=1e-11)
 
 
 @pytest.mark.slow
@@ -221,25 +217,6 @@ def test_a_skate_does_not_slip():
     found = run(problem, 1e-9)
     assert found.trusted
     np.testing.assert_allclose(found.y[:, -1], problem.reference(10.0), atol=1e-7)
-
-
-def test_friction_makes_the_energy_a_balance_while_it_is_slow():
-    def damped(c):
-        return mechanism([1, 1], lambda t, q, u: np.array([0, -G]) - c * u, length, **PENDULUM)
-
-    weak, strong = damped(1e-3), damped(5.0)
-    assert isinstance(weak.energy, Balance)
-    assert "balance" in weak.energy_kept
-    assert strong.energy is None
-    assert "not kept" in strong.energy_kept
-    power = mechanism(
-        [1, 1],
-        lambda t, q, u: [-1e-3 * u[0], -G - 1e-3 * u[1]],
-        length,
-        power=lambda t, q, u: -1e-3 * u @ u,
-        **PENDULUM,
-    )
-    assert power.energy.rate_function is not None
 
 
 def test_a_start_is_found_and_what_is_set_is_not_moved():
@@ -261,7 +238,7 @@ def refused(match, *args, error=ValueError, **options):
 
 def test_mass_matrices_are_symmetric():
     refused(r"entries \[0, 1\] and \[1, 0\] are 0.05 and 0.* only the diagonal", [[1, 0.05], [0, 1]], [0, -G])
-    refused("mass must be a symmetric matrix", untraceable(lambda q: np.array([[1, q[0]], [0, 1]])), [0, -G])
+    refused("mass must be a symmetric matrix", lambda q: np.array([[1, q[0]], [0, 1]]), [0, -G])
     rounded = np.array([[1.0, 0.1 * 3], [0.3, 1.0]])
     assert rounded[0, 1] != rounded[1, 0]
     mechanism(rounded, [0, -G], q0=[1, 0], u0=[0, 0])
@@ -290,7 +267,7 @@ def test_what_is_wrong_is_said():
     refused("forces has the shape", [1, 1], [0, -G, 0], length)
     refused("Give as many speeds as coordinates, or kinematics", [1], [0], None, u0=[0])
     refused("jacobian differs from the derivatives", jacobian=lambda t, q: [[q[1], q[0]]])
-    refused("gamma differs", gamma=lambda t, q, u: [-1.0])
+    refused("gamma differs", gamma=lambda t, q, u: [2 * u @ u])  # which is right at rest
     refused("constraints must be a function", [1, 1], [0, -G], [1.0], error=TypeError)
     refused("t is the time", [1], [0], q0=[1], u0=[0], coordinates="t")
     refused("t is the time", [1], [0], q0=[1], u0=[0], speeds="t")
@@ -306,23 +283,17 @@ def test_what_is_wrong_is_said():
     refused('no accelerations meet the constraints "g1\'" and "g2\'"', [1, 1], [0, -G], parallel)
     skate = {"velocity_constraints": lambda t, q, u: [u[0] ** 2 - u[1]]}
     refused("velocity_constraints must be linear in the speeds", [1, 1], [0, -G], None, **skate)
-    drag = lambda t, q, u: [-0.01 * u[0], -G - 0.01 * u[1]]  # noqa: E731
-    wrong = {"potential": lambda t, q: G * q[1], "power": lambda t, q, u: -0.02 * u @ u}
-    refused("Correct power or the energy", [1, 1], drag, length, **wrong)
 
 
-def test_given_derivatives_are_compared_and_taken():
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("jit", [lambda f: f, njit])
+def test_given_derivatives_are_compared_and_taken(jit):
     problem = mechanism(
-        [1, 1],
-        [0, -G],
-        untraceable(length),
-        jacobian=lambda t, q: np.array([[q[0], q[1]]]),
-        gamma=lambda t, q, u: [u @ u],
-        **PENDULUM,
-    )
-    exact = mechanism([1, 1], [0, -G], length, **PENDULUM)
-    state = np.array([0.8, -0.6, 0.3, 0.4])
-    np.testing.assert_allclose(problem.fun(0.0, state), exact.motion_at(0.0, state), atol=1e-14)
+        [1, 1], [0, -G], jit(length), q0=[1, 0], u0=[0, 0], jacobian=jit(lambda t, q: np.array([[q[0], q[1]]])),
+        gamma=jit(lambda t, q, u: np.array([u[0] ** 2 + u[1] ** 2])),
+    )  # fmt: skip
+    pull = STATE[2:] @ STATE[2:] - G * STATE[1]
+    np.testing.assert_allclose(problem.fun(0.0, STATE)[2:], [-pull * STATE[0], -G - pull * STATE[1]], atol=1e-14)
 
 
 # Mechanisms with known motions.
@@ -401,11 +372,11 @@ def test_a_leak_at_singular_positions_is_reported(tolerance):
     M = np.kron(np.eye(2) / 3 + np.array([[2, 1], [1, 2]]) / 6, np.eye(2))
 
     def lengths(t, q):
-        cranks = [q[0] ** 2 + q[1] ** 2 - 1, (q[2] - 1) ** 2 + q[3] ** 2 - 1]
-        return np.array([*cranks, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 1]) / 2
+        left, right = q[0] ** 2 + q[1] ** 2 - 1, (q[2] - 1) ** 2 + q[3] ** 2 - 1
+        return np.array([left, right, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 1]) / 2
 
-    options = {"q0": right.y0[:4], "u0": right.y0[4:], "t_span": (0, 10), "potential": lambda t, q: G * (q[1] + q[3])}
-    leaky = mechanism(M, forces, lengths, **options)
+    options = {"q0": right.y0[:4], "u0": right.y0[4:], "t_span": (0, 10)}
+    leaky = mechanism(M, njit(forces), njit(lengths), potential_energy=njit(lambda t, q: G * (q[1] + q[3])), **options)
     assert not leaky.energy.is_balance  # the drag is not seen near the start
     with pytest.warns(ProjectionWarning, match="energy"):
         found = run(leaky, tolerance)
@@ -733,8 +704,7 @@ def test_a_pole_of_dependent_speeds_is_none_of_the_motion():
 
 
 def test_implicit_methods_keep_the_constraints_alone():
-    pendulum = mechanism([1, 1], [0, -G], lambda t, q: [q[0] ** 2 + q[1] ** 2 - 1], q0=[1, 0], u0=[0, 0],
-                         potential=lambda t, q: G * q[1])  # fmt: skip
+    pendulum = mechanism([1, 1], [0, -G], compiled_length, **PENDULUM)
     options = {"t_span": (0, 1.0), "method": EIPRadau, "rtol": 1e-6, "atol": 1e-6}
     found = integrate(pendulum, **options)
     assert len(found.target) == 2

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from ...core.inputs import real_array, shown
 from ...core.problem import component_names
-from .motion import plain
-from .parts import Given, Parts, numerical_parts, on_copies, required_outputs
+from .differentiated import parts_of_functions
+from .energies import states_near
+from .parts import Given, Parts, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
 
@@ -38,7 +38,7 @@ def mechanism(
     jacobian: Any = None,
     gamma: Any = None,
     energy: Any = None,
-    potential: Any = None,
+    potential_energy: Any = None,
     power: Any = None,
     outputs: Any = None,
     independent: Iterable[str] | None = None,
@@ -53,8 +53,8 @@ def mechanism(
 
     The state is (q, u), and the equations are ``q' = u``, ``M u' + G^T lambda = F``, ``G u' = -gamma``, where
     G u + ... = 0 are the constraints on velocities: the derivatives of those on positions, and those given by
-    `velocity_constraints`. A run keeps all constraints, the norms of quaternions, the momenta of cyclic coordinates,
-    and the energy if it is constant or changes slowly.
+    `velocity_constraints`. A run keeps all constraints, the norms of quaternions, and the energy if it is known and
+    constant, or changes slowly.
 
     Parameters
     ----------
@@ -82,9 +82,9 @@ def mechanism(
         both are computed. If they are given, they are compared with computed derivatives at the start.
     energy : callable, optional
         ``energy(t, q, u)``, the total energy.
-    potential : callable, optional
-        ``potential(t, q)``, for the energy u M u / 2 + potential. If neither `potential` nor `energy` is given, the
-        potential of conservative forces is found by integration, if the functions can be converted to expressions.
+    potential_energy : callable, optional
+        ``potential_energy(t, q)``, for the energy u M u / 2 + potential_energy. If neither this nor `energy` is given,
+        the energy is not known.
     power : callable, optional
         ``power(t, q, u)``, the rate of change of the energy, which then becomes a `Balance`. Default: it is computed.
     outputs : mapping, optional
@@ -114,10 +114,14 @@ def mechanism(
 
     Notes
     -----
-    If SymPy is installed, the functions are called once with symbols in place of numbers. Derivatives are then exact,
-    and all functions are compiled if Numba is installed. If a function cannot be called in this way, for example
-    because it branches on a value, the functions are not converted, and derivatives are computed by complex steps or
-    differences; the repr of the problem has a note about it.
+    If all functions are jitted by Numba (except those of `outputs`), the whole problem is compiled, and first
+    derivatives come from dual numbers. Plain Python functions are called from Python, which takes much longer; first
+    derivatives then come from complex steps, or from differences if a function is not analytic. In both cases second
+    derivatives, such as `gamma`, are differences of the first ones. Next to a singular position, at which gradients of
+    constraints are dependent, their rounding is magnified: pass `gamma` if a run passes through such positions.
+
+    As in all compiled code, a number or an array that a jitted function takes from outside has the value that it had
+    when the function was compiled.
 
     Examples
     --------
@@ -126,50 +130,50 @@ def mechanism(
     >>> from eip_scipy import EIPDOP853, integrate
     >>> from eip_scipy.problems import mechanism
     >>> pendulum = mechanism([1, 1], [0, -9.81], lambda t, q: [q[0] ** 2 + q[1] ** 2 - 1], q0=[1, 0], u0=[0, 0],
-    ...                      potential=lambda t, q: 9.81 * q[1])
+    ...                      potential_energy=lambda t, q: 9.81 * q[1])
     >>> run = integrate(pendulum, (0, 10), method=EIPDOP853, rtol=1e-8, atol=1e-8)
     >>> bool(abs(run.y[0] ** 2 + run.y[1] ** 2 - 1).max() < 1e-14)
     True
     """
     given = Given(
-        mass, forces, constraints, velocity_constraints, kinematics, jacobian, gamma, energy, potential, power
+        mass, forces, constraints, velocity_constraints, kinematics, jacobian, gamma, energy, potential_energy, power
     )
-    given = _as_functions(given)
+    given = _checked(given)
     t = 0.0 if t_span is None else float(t_span[0])
     q = _given_state("q0", q0, coordinates)
     u = _given_state("u0", u0, speeds)
-    _require_shapes(given, t, q, u)
-    _require_symmetric(np.asarray(given.mass(q), float))
-    m = 0 if given.constraints is None else len(given.constraints(t, q))
-    k = 0 if given.velocity_constraints is None else len(given.velocity_constraints(t, q, u))
-    _require_linear(given, t, q, u)
+    called = given.called()
+    _require_shapes(called, t, q, u)
+    _require_symmetric(np.asarray(called.mass(q), float))
+    m = 0 if called.constraints is None else len(called.constraints(t, q))
+    k = 0 if called.velocity_constraints is None else len(called.velocity_constraints(t, q, u))
+    _require_linear(called, t, q, u)
     names = _names(coordinates, speeds, constraint_names, (q.size, u.size, m, k))
     given = given._replace(outputs=_as_outputs(outputs, names, t, q, u))
-    parts = _parts(given, names, t, q, u, np.inf if t_span is None else abs(float(t_span[1]) - t))
+    interval = np.inf if t_span is None else abs(float(t_span[1]) - t)
+    parts = parts_of_functions(given, names, t, q, u, interval)
     problem = mechanics_problem(
         name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
     )
-    _require_derivatives(given, parts, names, t, problem.y0)
+    if given.jacobian is not None or given.gamma is not None:
+        alone = parts_of_functions(given._replace(jacobian=None, gamma=None), names, t, q, u, interval, compiles=False)
+        _require_derivatives(called, alone, problem, t)
     _require_positive(parts, names, t, problem.y0, rank_tolerance)
     return problem
 
 
-def _as_functions(given: Given) -> Given:
-    """Return `given` with functions in place of arrays; raise TypeError if another item is not a function.
-
-    The functions of the user get copies of arrays, see `on_copies`.
-    """
+def _checked(given: Given) -> Given:
+    """Return `given` with arrays of floats for mass and forces; raise TypeError if another item is not a function."""
     mass, forces = given.mass, given.forces
     if not callable(mass):
         M = real_array("mass", mass)
-        mass = _constant(np.diag(M) if M.ndim == 1 else M)
+        mass = np.diag(M) if M.ndim == 1 else M
     if not callable(forces):
-        forces = _constant(np.atleast_1d(real_array("forces", forces)))
+        forces = np.atleast_1d(real_array("forces", forces))
     for name, value in given._asdict().items():
         if name not in ("mass", "forces") and value is not None and not callable(value):
             raise TypeError(f"mechanism: {name} must be a function, got {shown(value)}.")
-    given = given._replace(mass=mass, forces=forces)
-    return Given(*(None if item is None else on_copies(item) for item in given))
+    return given._replace(mass=mass, forces=forces)
 
 
 def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> dict[str, Callable[..., Any]]:
@@ -178,18 +182,12 @@ def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarr
     for name, item in found.items():
         if not callable(item):
             raise TypeError(f"mechanism: the output {name!r} must be a function f(t, q, u), got {shown(item)}.")
-        fun = on_copies(item)
-        if np.shape(value := fun(t, q, u)) != ():
+        if np.shape(value := item(t, q.copy(), u.copy())) != ():
             raise ValueError(
                 f"mechanism: the output {name!r} has the shape {np.shape(value)}; expected a number. Give each "
                 "component a name of its own."
             )
-        found[name] = fun
     return found
-
-
-def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
-    return lambda *_: value
 
 
 def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
@@ -244,7 +242,7 @@ def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
         "kinematics": ((t, q, u), (q.size,)),
         "energy": ((t, q, u), ()),
         "power": ((t, q, u), ()),
-        "potential": ((t, q), ()),
+        "potential_energy": ((t, q), ()),
     }
     for what, (args, shape) in shapes.items():
         if (fun := getattr(given, what)) is not None:
@@ -308,36 +306,29 @@ def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
             )
 
 
-def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray, interval: float) -> Parts:
-    """Return the `Parts`, made from expressions if all functions can be converted to them, else from functions."""
-    if find_spec("sympy") is None:
-        return numerical_parts(given, names, t, q, u, "SymPy is not installed", interval=interval)
-    from ..symbolic.traced import NotTraceableError, traced_parts
+def _require_derivatives(given: Given, parts: Parts, problem: MechanicsProblem, t: float) -> None:
+    """Raise ValueError if a given jacobian or gamma is wrong at a state near the start that meets the constraints.
 
-    try:
-        return traced_parts(given, names, t, q, u)
-    except NotTraceableError as error:
-        return numerical_parts(given, names, t, q, u, str(error), interval=interval)
-
-
-def _require_derivatives(given: Given, parts: Parts, names: Names, t: float, y: np.ndarray) -> None:
-    """Raise ValueError if a given jacobian or gamma differs from the computed one at the start."""
+    `parts` are the functions of the problem with computed derivatives.
+    """
+    names = problem.names
     nq, n, m = len(names.coordinates), len(names.speeds), len(names.positions)
-    q, u = y[:nq], y[nq:]
-    found = {"gamma": parts.matrices(names, t, y)[3]}
-    if m > 0:
+    for time, y in states_near(
+        t, problem.y0, problem.constraints, problem.fun, nq, problem.t_span and problem.t_span[1]
+    ):
+        q, u = y[:nq], y[nq:]
         gradient = np.empty((m + len(names.velocities), nq + n))
-        plain(parts.gradient)(t, y, gradient)
-        found["jacobian"] = gradient[:m, :nq]
-    for what, fun, args in (("jacobian", given.jacobian, (t, q)), ("gamma", given.gamma, (t, q, u))):
-        if fun is None:
-            continue
-        own, computed = np.asarray(fun(*args), float), found[what]
-        if own.shape != computed.shape:
-            raise ValueError(f"mechanism: {what} has the shape {own.shape}; expected {computed.shape}.")
-        wrong = np.abs(own - computed).max()
-        if not wrong <= 1e-6 * max(np.abs(computed).max(), np.abs(u).max(), 1e-300):
-            raise ValueError(
-                f"mechanism: {what} differs from the derivatives of the constraints by {wrong:.3g} at the start. "
-                f"Correct it, or omit it to have it computed."
-            )
+        parts.gradient(time, y, gradient)
+        computed = {"jacobian": gradient[:m, :nq], "gamma": parts.matrices(names, time, y)[3]}
+        for what, fun, args in (("jacobian", given.jacobian, (time, q)), ("gamma", given.gamma, (time, q, u))):
+            if fun is None:
+                continue
+            own, right = np.asarray(fun(*args), float), computed[what]
+            if own.shape != right.shape:
+                raise ValueError(f"mechanism: {what} has the shape {own.shape}; expected {right.shape}.")
+            wrong = np.abs(own - right).max()
+            if not wrong <= 1e-6 * max(np.abs(right).max(), np.abs(u).max(), 1e-300):
+                raise ValueError(
+                    f"mechanism: {what} differs from the derivatives of the constraints by {wrong:.3g} at a state near "
+                    "the start. Correct it, or omit it to have it computed."
+                )

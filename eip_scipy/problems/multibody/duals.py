@@ -1,4 +1,4 @@
-"""Derivatives of the accelerations of a constrained system with dual numbers; imported only for compiled functions."""
+"""Derivatives of the motion of a constrained system with dual numbers; imported only for compiled functions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...core.dual_arrays import inside
 from ...core.dual_numbers import put_slope, seed, slope, value_of
 from .motion import changed, solve
 
-__all__ = ["solve_duals"]
+__all__ = ["by_differences", "solve_duals"]
 
 _solve, _changed = inside(solve), inside(changed)
 
@@ -46,3 +46,32 @@ def solve_duals(dual: Any) -> Callable[..., int]:
         return rank
 
     return inside(solved)
+
+
+@cache
+def by_differences(fill: Any, difference: Any, dual: Any) -> Callable[..., None]:
+    """Return ``fill(t, y, out)`` for arrays of numbers of the type `dual`.
+
+    ``difference(t, y, y, dt, dy, unit, out)`` fills `out` with the derivative of `fill` along a direction.
+    """
+    lanes = dual.lanes
+
+    def filled(t, y, out):
+        values, way, found = np.empty(y.size), np.empty(y.size), np.empty(out.size)
+        for i in range(y.size):
+            values[i] = value_of(y[i])
+        fill(t, values, found)
+        for i in range(out.size):
+            out[i] = seed(dual, found[i], -1)
+        for lane in range(lanes):
+            size, moving = 0.0, 0.0
+            for i in range(y.size):
+                way[i] = slope(y[i], lane)
+                size, moving = max(size, abs(values[i])), max(moving, abs(way[i]))
+            if moving == 0.0:
+                continue
+            difference(t, values, values, 0.0, way, (size if size > 0.0 else 1.0) / moving, found)
+            for i in range(out.size):
+                out[i] = put_slope(out[i], lane, found[i])
+
+    return inside(filled)

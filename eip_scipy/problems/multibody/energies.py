@@ -58,7 +58,7 @@ def energy_of(
         if slowness < least:
             slowest, least = item, slowness
     if slowest is None:
-        return None, "not known; give energy= or potential="
+        return None, "not known; give energy= or potential_energy="
     described = (
         f"{slowest.description}, whose rate of change is about {least:.2g} of the sum of the absolute values of the "
         "terms of that rate"

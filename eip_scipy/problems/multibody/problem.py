@@ -59,8 +59,8 @@ class MechanicsProblem(Problem):
         The functions of `outputs`.
     rank_tolerance : float
         Distance within which gradients of constraints, each scaled to length 1, count as dependent.
-    origin : optional
-        The expressions from which the functions were made; None if they cannot be made again.
+    origin : tuple, optional
+        The function that made the functions of the problem, and its arguments, from which they are made again.
     """
 
     names: Names
@@ -232,7 +232,7 @@ class MechanicsProblem(Problem):
         return f"{m} on velocities{rest}, {len(self.names.positions)} of them on positions too"
 
     def __reduce__(self) -> Any:
-        """Pickle the expressions only, if there are any; the functions are made from them again."""
+        """Pickle the expressions, or the functions of the user, from which all other functions are made again."""
         if self.origin is None:
             return super().__reduce__()
         own = self._own_invariants
@@ -255,11 +255,10 @@ REMADE = {
 
 
 def _again(origin: Any, arguments: Sequence[Any], kept: Sequence[Any], others: dict[str, Any]) -> MechanicsProblem:
-    from ..symbolic.constrained import parts_of
-
     names, t_span, start, params, tolerance = arguments
     t = 0.0 if t_span is None else t_span[0]
-    problem = mechanics_problem("", parts_of(*origin), names, t, start, params, None, tolerance, t_span=t_span)
+    made, given = origin
+    problem = mechanics_problem("", made(*given), names, t, start, params, None, tolerance, t_span=t_span)
     own = problem._own_invariants
     return replace(problem, invariants=tuple(own[item] if isinstance(item, int) else item for item in kept), **others)
 

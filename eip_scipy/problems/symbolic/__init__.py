@@ -170,6 +170,7 @@ def mechanics(
     t_span: tuple[float, float] | None = None,
     inputs: Mapping[Any, Any] | None = None,
     energy: Any = None,
+    potential_energy: Any = None,
     outputs: Mapping[str, Any] | None = None,
     independent: Iterable[Any] | None = None,
     rank_tolerance: float = RANK_TOLERANCE,
@@ -198,12 +199,14 @@ def mechanics(
     inputs : mapping, optional
         Values of the functions of time in the model that are neither coordinates nor speeds. The keys are these
         functions, their names, or tuples of them. The values are numbers, expressions of t and the state, or functions
-        ``f(t, y)`` of the state y = (q, u), which return one number for each function in the key. A function that does
-        not branch is converted into an expression; any other is called by the right-hand side, and may occur in forces
-        only. Default: ``model.specifieds`` of PyDy, whose functions have the arguments (y, t).
+        ``f(t, y)`` of the state y = (q, u), which return one number for each function in the key. A function is called
+        by the right-hand side, and may occur in forces only; the problem is compiled if the function is jitted by
+        Numba. Default: ``model.specifieds`` of PyDy, whose functions have the arguments (y, t).
     energy : sympy.Expr, optional
-        The total energy. Default: the energy of the bodies, or that of the Lagrangian, plus the potential of
-        conservative loads if the sum is constant.
+        The total energy. Default: the energy of the bodies, or that of the Lagrangian, plus the potential of constant
+        loads if the sum is constant.
+    potential_energy : sympy.Expr, optional
+        The potential of loads that are not constant, such as springs, which is added to the default of `energy`.
     outputs : mapping, optional
         Expressions, by name, of quantities that are computed at saved states; see ``run.outputs``. They may contain
         derivatives of coordinates and speeds.
@@ -257,6 +260,7 @@ def mechanics(
             t_span=t_span,
             inputs=inputs,
             energy=energy,
+            potential_energy=potential_energy,
             outputs=outputs,
             independent=independent,
             rank_tolerance=rank_tolerance,

@@ -22,16 +22,13 @@ from ..multibody.parts import required_outputs
 from ..multibody.problem import MechanicsProblem, mechanics_problem
 from ..multibody.start import MET, Names, by_name
 from .brackets import without_impulses
-from .constrained import Constrained, acceleration, conservative, cyclic, filling, own_speed, parts_of
+from .constrained import Constrained, acceleration, cyclic, filling, own_speed, parts_of
 from .parser import as_expression, symbol
 from .system import parameter_values
-from .traced import NotTraceableError, traced
 
 __all__ = ["Inputs", "mechanics_of_model", "name_of", "read_inputs"]
 
 TIME = dynamicsymbols._t
-# A traced function agrees with the function itself up to rounding errors; this bound is relative.
-AGREES = 1e-9
 
 
 def name_of(item: Any) -> str:
@@ -43,17 +40,16 @@ def name_of(item: Any) -> str:
 
 
 class Inputs(NamedTuple):
-    """Values of functions of time as `expressions`, or as `called` functions ``f(t, y)`` by name, and `notes`."""
+    """Values of functions of time as `expressions`, or as functions ``f(t, y)`` by name, which are `called`."""
 
     expressions: dict[Any, Any]
     called: tuple[tuple[str, Callable[..., float]], ...]
-    notes: tuple[str, ...]
 
 
 def read_inputs(
     given: Any, known: Mapping[str, Any], state: Mapping[Any, str], start: tuple[float, np.ndarray]
 ) -> Inputs:
-    """Return the inputs, converted into expressions where that is possible.
+    """Return the inputs.
 
     `given` are those of `mechanics`. `known` are the functions of time in the model by name, `state` the names of
     coordinates and speeds in the order of the state, and `start` a time and a state at which functions are called. A
@@ -68,15 +64,10 @@ def read_inputs(
     for key, value in given.items():
         keys = [_function_of_time(item, known, state) for item in (key if isinstance(key, tuple) else (key,))]
         if callable(value) and not isinstance(value, sympy.Basic):
-            found = _traced(keys, value, state, start)
-            if found is None:
-                called += _called(keys, value)
-            else:
-                expressions |= found
+            called += _called(keys, value, start)
         else:
             expressions |= _as_expressions(keys, value)
-    notes = tuple(f"the input {name} is called as a function, not converted to an expression" for name, _ in called)
-    return Inputs(expressions, tuple(called), notes)
+    return Inputs(expressions, tuple(called))
 
 
 def _function_of_time(key: Any, known: Mapping[str, Any], state: Mapping[Any, str]) -> Any:
@@ -103,31 +94,13 @@ def _as_expressions(keys: Sequence[Any], value: Any) -> dict[Any, Any]:
     return dict(zip(keys, map(sympy.sympify, values), strict=True))
 
 
-def _traced(
-    keys: Sequence[Any], fun: Any, state: Mapping[Any, str], start: tuple[float, np.ndarray]
-) -> dict[Any, Any] | None:
-    """Return the values of `fun` as expressions, by the functions of time in `keys`; None if that is impossible."""
-    names = tuple(state.values())
-    try:
-        found = traced(keys[0].func.__name__, fun, "t", names).ravel()
-    except NotTraceableError:
-        return None
-    if found.size != len(keys):
-        raise ValueError(
-            f"inputs: the function of {', '.join(map(str, keys))} returns {found.size} numbers; expected {len(keys)}."
-        )
-    t, y = start
-    values = {symbol("t"): t, **{symbol(name): x for name, x in zip(names, y, strict=True)}}
-    own = [float(sympy.sympify(item).xreplace(values)) for item in found]
-    wanted = np.ravel(fun(t, y.copy()))
-    if not np.allclose(own, wanted, rtol=AGREES, atol=AGREES):  # `fun` depends on more than its arguments
-        return None
-    back = {symbol(name): item for item, name in state.items()} | {symbol("t"): TIME}
-    return {key: sympy.sympify(item).xreplace(back) for key, item in zip(keys, found, strict=True)}
-
-
-def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
+def _called(keys: Sequence[Any], fun: Any, start: tuple[float, np.ndarray]) -> list[tuple[str, Callable[..., float]]]:
     """Return for each function of time in `keys` its name, and a function ``f(t, y)`` of this component of `fun`."""
+    t, y = start
+    if (size := np.size(fun(t, y.copy()))) != len(keys):
+        raise ValueError(
+            f"inputs: the function of {', '.join(map(str, keys))} returns {size} numbers; expected {len(keys)}."
+        )
     return [(name_of(key), _part(fun, k if len(keys) > 1 else None)) for k, key in enumerate(keys)]
 
 
@@ -166,7 +139,6 @@ class _Equations(NamedTuple):
     velocities: list[Any]
     energies: list[tuple[str, Any]]
     kinetic: Any  # the kinetic energy, or the Lagrangian
-    active: list[Any]  # generalised forces of loads; [] if there are none or their potential is among the energies
     method: Any  # the KanesMethod, whose speeds may be any linear functions of the derivatives of coordinates
     independent: list[Any] | None
     by_speeds: dict[Any, Any]  # derivatives of coordinates as functions of speeds
@@ -181,6 +153,7 @@ def mechanics_of_model(
     t_span: tuple[float, float] | None,
     inputs: Mapping[Any, Any] | None,
     energy: Any,
+    potential_energy: Any,
     outputs: Any,
     independent: Iterable[Any] | None,
     rank_tolerance: float,
@@ -195,7 +168,7 @@ def mechanics_of_model(
     found = _of_lagrange(method) if hasattr(method, "_L") else _of_kane(method)
     converted = _Conversion(found, inputs, t, q0, u0)
     system = _system(found, converted)
-    energies = [(label, item, None) for label, item in _energies(found, energy, system, converted)]
+    energies = [(label, item, None) for label, item in _energies(found, energy, potential_energy, converted)]
     momenta = list(_momenta(found, system, converted))
     observed = [(label, converted.output(label, item, values)) for label, item in outputs.items()]
     extra = [item for _, item, *_ in (*energies, *momenta, *observed)]
@@ -219,7 +192,7 @@ def mechanics_of_model(
             None if held is None else [name_of(item) for item in held],
             rank_tolerance,
             t_span=t_span,
-            notes=(*notes, *converted.inputs.notes),
+            notes=tuple(notes),
             parameter_names=system.parameters,
             **others,
         )
@@ -314,7 +287,7 @@ class _Conversion:
             raise ValueError(
                 f"inputs: {taken.pop()!r} is also the name of the time or of a component of the state; rename it."
             )
-        parts += [*(item for _, item in found.energies), *found.active]
+        parts += [item for _, item in found.energies]
         symbols = set().union(*(sympy.sympify(item).free_symbols for item in parts))
         called = {item for item in functions if name_of(item) in self._called}
         _require_different((TIME, *self.names, *sorted(called | symbols, key=sympy.srepr)))
@@ -402,28 +375,25 @@ def _system(found: _Equations, converted: _Conversion) -> Constrained:
     return system
 
 
-def _energies(found: _Equations, energy: Any, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
+def _energies(
+    found: _Equations, energy: Any, potential_energy: Any, converted: _Conversion
+) -> Iterator[tuple[str, Any]]:
     """Yield the quantities that may be the energy.
 
     There are none if inputs are called as functions, because such a force may begin to do work later.
     """
-    if energy is not None:
-        if converted.depends_on_call(given := converted(energy)):
+    given = [("energy=", energy)] if energy is not None else []
+    if potential_energy is not None:
+        given += [(f"{label} and potential_energy=", item + potential_energy) for label, item in found.energies]
+    if not given and converted.inputs.called:
+        return
+    for label, item in given or found.energies:
+        if converted.depends_on_call(expression := converted(item)):
             raise ValueError(
-                "mechanics: energy depends on an input that is a function without an expression, and its derivatives "
-                "are needed. Give the input as an expression of t and the state."
+                "mechanics: the energy depends on an input that is a function without an expression, and its "
+                "derivatives are needed. Give the input as an expression of t and the state."
             )
-        yield "energy=", given
-        return
-    if converted.inputs.called:
-        return
-    own = [(label, converted(item)) for label, item in found.energies]
-    yield from own
-    active = [converted(item) for item in found.active]
-    potential = conservative(system, active, partial(_by_rate, found, system, converted)) if own and active else None
-    if potential is not None:
-        label, first = own[0]
-        yield f"{label} and potential of the loads", first + potential
+        yield label, expression
 
 
 def _by_rate(found: _Equations, system: Constrained, converted: _Conversion, k: int) -> list[Any]:
@@ -506,7 +476,7 @@ def _of_kane(method: Any) -> _Equations:
     by_speeds = dict(zip(method.kindiffdict(), rates, strict=True))
     frame = method._inertial
     free = KanesMethod(frame, q_ind=q, u_ind=u, kd_eqs=[dq - value for dq, value in by_speeds.items()])
-    active, _ = free.kanes_equations(bodies, loads)
+    free.kanes_equations(bodies, loads)
     velocities = list(method._k_nh * sympy.Matrix(u) + method._f_nh) if method._k_nh else []
     dependent = {*method._qdep, *method._udep}
     kinetic = sympy.Add(*(body.kinetic_energy(frame) for body in bodies))
@@ -529,7 +499,6 @@ def _of_kane(method: Any) -> _Equations:
         velocities,
         energies,
         kinetic,
-        [] if of_loads is not None and all(_is_constant(item, frame) for item in loads or ()) else list(active),
         method,
         [item for item in (*q, *u) if item not in dependent] if dependent else None,
         by_speeds,
@@ -553,20 +522,10 @@ def _of_lagrange(method: Any) -> _Equations:
         list(method.coneqs),
         [("of the Lagrangian", energy)],
         L,
-        _active_of_lagrange(method, speeds),
         None,
         None,
         {},
     )
-
-
-def _active_of_lagrange(method: Any, speeds: Sequence[Any]) -> list[Any]:
-    """Return the generalised forces of the loads of a LagrangesMethod; [] if it has no loads."""
-    frame, found = method.inertial, [sympy.Integer(0)] * len(speeds)
-    for place, vector in method.forcelist or ():
-        motion = place.vel(frame) if isinstance(place, Point) else place.ang_vel_in(frame)
-        found = [total + vector.dot(motion.diff(u, frame)) for total, u in zip(found, speeds, strict=True)]
-    return found if any(item != 0 for item in found) else []
 
 
 def _is_constant(load: Any, frame: Any) -> bool:
