@@ -48,7 +48,7 @@ def test_members_have_the_bits_of_their_runs(monkeypatch, fun):
 
 def test_members_of_mechanisms_have_the_bits_of_their_runs(monkeypatch):
     monkeypatch.setattr(tasks, "LEAST_WORK", 0)
-    problem = mechanism([1.0], lambda t, q, u: [-q[0]], q0=[1], u0=[0], t_span=SPAN)
+    problem = mechanism([1.0], numba.njit(lambda t, q, u: np.array([-q[0]])), q0=[1], u0=[0], t_span=SPAN)
     found = ensemble(problem, SPAN, STARTS, executor=1, **OPTIONS)
     for k in (0, 9):
         np.testing.assert_array_equal(found.y[k], integrate(problem, SPAN, STARTS[k], **OPTIONS).y[:, -1])

@@ -375,8 +375,14 @@ def test_a_leak_at_singular_positions_is_reported(tolerance):
         left, right = q[0] ** 2 + q[1] ** 2 - 1, (q[2] - 1) ** 2 + q[3] ** 2 - 1
         return np.array([left, right, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 1]) / 2
 
-    options = {"q0": right.y0[:4], "u0": right.y0[4:], "t_span": (0, 10)}
-    leaky = mechanism(M, njit(forces), njit(lengths), potential_energy=njit(lambda t, q: G * (q[1] + q[3])), **options)
+    def gamma(t, q, u):
+        last = (u[2] - u[0]) ** 2 + (u[3] - u[1]) ** 2
+        return np.array([u[0] ** 2 + u[1] ** 2, u[2] ** 2 + u[3] ** 2, last])
+
+    leaky = mechanism(
+        M, njit(forces), njit(lengths), q0=right.y0[:4], u0=right.y0[4:], t_span=(0, 10), gamma=njit(gamma),
+        potential_energy=njit(lambda t, q: G * (q[1] + q[3])),
+    )  # fmt: skip
     assert not leaky.energy.is_balance  # the drag is not seen near the start
     with pytest.warns(ProjectionWarning, match="energy"):
         found = run(leaky, tolerance)

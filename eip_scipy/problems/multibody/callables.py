@@ -117,8 +117,11 @@ def mechanism(
     If all functions are jitted by Numba (except those of `outputs`), the whole problem is compiled, and first
     derivatives come from dual numbers. Plain Python functions are called from Python, which takes much longer; first
     derivatives then come from complex steps, or from differences if a function is not analytic. In both cases second
-    derivatives, such as `gamma`, are differences of the first ones. As in all compiled code, a number or an array that
-    a jitted function takes from outside has the value that it had when the function was compiled.
+    derivatives, such as `gamma`, are differences of the first ones. Next to a singular position, at which gradients of
+    constraints are dependent, their rounding is magnified: pass `gamma` if a run passes through such positions.
+
+    As in all compiled code, a number or an array that a jitted function takes from outside has the value that it had
+    when the function was compiled.
 
     Examples
     --------

@@ -80,11 +80,7 @@ class _Maker:
         self.longest = interval if 0 < interval < np.inf else np.inf
 
     def _made(self, function: Callable[..., Any]) -> Any:
-        if not self.compiles:
-            return function
-        from numba import njit
-
-        return njit(function, error_model="numpy")  # not inlined, which would take much longer to compile
+        return jitted(compilable(function)) if self.compiles else function
 
     def parts(self) -> Parts:
         """Return the functions of the problem."""
@@ -143,13 +139,13 @@ class _Maker:
 
             rate = rate_by_duals(constraints, nq, (m,), False)
 
-            def along(t, q, dq, out):
+            def along_by_duals(t, q, dq, out):
                 found = rate(t, q, dq)
                 for i in range(m):
                     out[i] = found[i]
 
-            slopes = gradient_by_duals(constraints, nq, (m,), False) if given is None else self._made(as_given)
-            return self._made(along), slopes
+            by_duals = gradient_by_duals(constraints, nq, (m,), False) if given is None else self._made(as_given)
+            return self._made(along_by_duals), by_duals
 
         slopes = self._numerical_slopes()
 

@@ -73,7 +73,8 @@ class Given(NamedTuple):
         return self._mapped(lambda item: on_copies(item if callable(item) else _constant(item)))
 
     def _mapped(self, change: Callable[[Any], Any]) -> Given:
-        return Given(*(None if item is None else change(item) for item in self[:-1]), self.outputs)
+        given = {name: item for name, item in self._asdict().items() if name != "outputs" and item is not None}
+        return self._replace(**{name: change(item) for name, item in given.items()})
 
 
 def _constant(value: Any) -> Callable[..., Any]:
