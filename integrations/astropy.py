@@ -293,6 +293,7 @@ def _number(name: str, value: Any, unit: Any, epoch: Epoch | None = None) -> Any
     if not isinstance(value, units.Quantity | TimeDelta):
         return value
     try:
-        return value.to_value(unit)
+        found = value.to_value(unit)
     except units.UnitConversionError as error:
         raise units.UnitConversionError(f"{name}: {shown(value)} is not in units of {unit}: {error}.") from None
+    return float(found) if np.ndim(found) == 0 else found

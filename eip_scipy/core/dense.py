@@ -212,7 +212,7 @@ class UnprojectedDenseOutput(AtRealTimes):
             place = rows.reshape(6, half)
             return np.concatenate([polyval(s, place), polyval(s, polyder(place)) / h])
         if self._kind == data.SEVENTH:
-            out = np.zeros((2 * half, s.size))
+            out = np.zeros((start.size, s.size))
             for k, row in enumerate(rows[::-1]):
                 out = (out + row[:, None]) * (rest if k % 2 else s)
             return start + out

@@ -41,6 +41,8 @@ def test_with_invariants_samples_are_not_projected(name):
         assert drift[0] > drift[1] or name.startswith("EIPGJ")
 
 
-def test_complex_states():
-    run = integrate(lambda t, y: 1j * y, (0, 1), [1 + 0.5j], method=eip_scipy.EIPRK45, dense_output=True)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(run.sol))(TIMES / 3), run.sol(TIMES / 3))
+@pytest.mark.parametrize("method", [eip_scipy.EIPRK4, eip_scipy.EIPRK45, eip_scipy.EIPDOP853])
+@pytest.mark.parametrize("factor", [1.0, 1j])
+def test_complex_states_and_odd_numbers_of_components(method, factor):
+    run = integrate(lambda t, y: factor * y, (0, 1), [1.0 * factor], method=method, dense_output=True, rtol=1e-6)
+    np.testing.assert_allclose(pickle.loads(pickle.dumps(run.sol))(TIMES / 3), run.sol(TIMES / 3), rtol=1e-14)
