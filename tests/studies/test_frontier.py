@@ -57,20 +57,6 @@ def test_a_missing_peer_is_told_at_the_end(name, two_methods, tmp_path, capsys, 
     )
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--years", "3"], "--years must be one of 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, got 3"),
-        (["--years", "1", "--data", "paper"], "unrecognized arguments: --data paper"),
-    ],
-)
-def test_a_span_or_data_without_reference_is_refused(options, message, tmp_path, capsys):
-    assert main(["solar-system", "frontier", *options, "--out", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-
-
 @pytest.mark.needs_jit
 @pytest.mark.slow
 def test_methods_of_the_frontier_run(monkeypatch):
