@@ -42,7 +42,7 @@ def _no_command(words: list[str]) -> int:
         print(f"eip_scipy {__version__}")
         return DONE
     parser = argparse.ArgumentParser(
-        prog=PROGRAM, usage=f"{PROGRAM} COMMAND [options]", epilog=_listed(COMMANDS),
+        prog=PROGRAM, usage=f"{PROGRAM} COMMAND [options]", epilog=_listed(list(COMMANDS)),
         description="Explicit invariants-preserving integrators for SciPy.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

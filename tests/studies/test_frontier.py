@@ -95,13 +95,6 @@ def test_heyoka_on_our_states():
     assert result.wall_time > 0
 
 
-@pytest.mark.parametrize(("y0", "options"), [(np.zeros(11), {"t_end": 1.0}), (np.zeros(12), {"t_end": -1.0})])
-def test_heyoka_refuses(y0, options):
-    heyoka = pytest.importorskip("eip_scipy_studies.heyoka_runs", exc_type=ImportError)
-    with pytest.raises(ValueError, match=r"shape|positive"):
-        heyoka.run(np.ones(2), y0, **options)
-
-
 def test_heyoka_says_where_it_stopped():
     """Two bodies fall into each other, which stops heyoka."""
     heyoka = pytest.importorskip("eip_scipy_studies.heyoka_runs", exc_type=ImportError)
