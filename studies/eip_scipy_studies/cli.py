@@ -3,40 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, NOT_PRINTED, WRONG_USAGE, nearest
+from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, WRONG_USAGE
 
 PROGRAM = "eip-scipy"
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Print an error in one line, without the usage that argparse puts before it."""
-        self.exit(WRONG_USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
-
-
-class _Version(argparse.Action):
-    """Action that reads the version only when it is requested, because reading takes time."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        from eip_scipy import __version__
-
-        print(f"eip_scipy {__version__}")
-        parser.exit()
 
 
 def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
     """Run one command with the arguments `argv` (default: those of the process), and return the exit status.
 
-    The status is 0 done, 1 a check inside the command failed or a run is not reliable, 2 wrong usage, 3 the text could
-    not be printed, though the files are written, 130 interrupted. `settings` are those of the command, in place of its
-    own defaults.
+    The status is 0 done, 1 a check inside the command failed or a run is not reliable, 2 wrong usage, 130 interrupted.
+    `settings` are those of the command, in place of its own defaults.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     longest_first = sorted(COMMANDS, key=lambda name: -name.count(" "))
@@ -50,27 +35,20 @@ def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
 
 
 def _no_command(words: list[str]) -> int:
-    """Report that the words name no command, and exit; ``--help`` and ``--version`` without a command are handled here.
+    """Show the help or the version if asked for, otherwise an error: the words name no command."""
+    if "--version" in words:
+        from eip_scipy import __version__
 
-    The first word is then missing, an option, mistyped, or only the first of the two words of a command's name.
-    """
-    groups = {name.split()[0] for name in COMMANDS if " " in name} - set(COMMANDS)
-    group = words.pop(0) if words and words[0] in groups else ""
-    known = [name for name in COMMANDS if name.startswith(group)]
-    parser = _Parser(
-        prog=f"{PROGRAM} {group}".rstrip(),
-        usage=f"{PROGRAM} {group or 'COMMAND'} {'TASK ' if group else ''}[options]",
-        description="Explicit invariants-preserving integrators for SciPy." if not group else None,
+        print(f"eip_scipy {__version__}")
+        return DONE
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM, usage=f"{PROGRAM} COMMAND [options]", epilog=_listed(list(COMMANDS)),
+        description="Explicit invariants-preserving integrators for SciPy.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=_listed(known),
-    )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    )  # fmt: skip
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
     _, rest = parser.parse_known_args(words)
-    what = "TASK" if group else "COMMAND"
-    last = list(dict.fromkeys(name.removeprefix(group).split()[0] for name in known))
-    if not rest or rest[0].startswith("-"):
-        parser.error(f"expected {what} first, one of {', '.join(last)}")
-    parser.error(f"unknown {what} {rest[0]!r}, expected one of {', '.join(last)}{nearest(rest[0], last)}")
+    parser.error(f"expected a command first, got {' '.join(rest)!r} (see {PROGRAM} --help)")
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -81,7 +59,7 @@ def _listed(names: Sequence[str]) -> str:
 def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
     module, _, kind = COMMANDS[name].where.partition(":")
     below = [other for other in COMMANDS if other.startswith(f"{name} ")]
-    parser = _Parser(
+    parser = argparse.ArgumentParser(
         prog=f"{PROGRAM} {name}",
         description=COMMANDS[name].summary,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -92,58 +70,47 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
     try:
         command = getattr(import_module(f".{module}", __package__), kind)
     except UsageError as error:  # a package is not installed that the study needs
-        parser.exit(WRONG_USAGE, f"{parser.prog}: {error}\n")
-    _add_options(parser, command)
-    parser.set_defaults(**settings)
-    args, rest = parser.parse_known_args(words)
-    if rest:
-        known = [
-            *(text for action in parser._actions for text in action.option_strings),
-            *(b.split()[1] for b in below),
-        ]
-        parser.error(f"unrecognized arguments: {' '.join(rest)}{nearest(rest[0].partition('=')[0], known)}")
-    return _conduct(name, command, args)
-
-
-def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
-    """Add the options of the command, which are its fields, and those of all commands."""
+        parser.error(str(error))
     for item in fields(command):
-        if "help" not in item.metadata:
-            continue
-        settings = {"default": item.default, **item.metadata}
-        flag = f"--{item.name.replace('_', '-')}"
-        if settings.pop("positional", False):
-            flag = item.name
-        elif item.default is False:
-            settings["action"] = "store_true"
-        parser.add_argument(flag, **settings)
+        if "help" in item.metadata:
+            _add_option(parser, item)
     parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("eip_results"),
-        metavar="DIR",
+        "--out", type=Path, default=Path("eip_results"), metavar="DIR",
         help="folder of figures and CSV files (default: ./%(default)s)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write the numbers as JSON, with versions and machine"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.set_defaults(**settings)
+    return _conduct(name, command, vars(parser.parse_args(words)))
 
 
-def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
+def _add_option(parser: argparse.ArgumentParser, item: Any) -> None:
+    """Add the option of a command that is made by a field of its class."""
+    settings, flag = {"default": item.default, **item.metadata}, f"--{item.name.replace('_', '-')}"
+    if settings.pop("positional", False):
+        flag = item.name
+    elif item.default is False:
+        settings["action"] = "store_true"
+    parser.add_argument(flag, **settings)
+
+
+def _conduct(name: str, command: Any, given: dict[str, Any]) -> int:
     from eip_scipy import ProjectionWarning
 
-    from .report import UsageError, ended_by_sigterm, listening, printing, warn
+    from .report import UsageError, listening, warn
     from .study import Session
 
-    session = Session(name, args.out, args.json, args.quiet)
-    own = {key: value for key, value in vars(args).items() if key not in ("out", "json", "quiet")}
-    with ended_by_sigterm(), listening(ProjectionWarning) as untrusted, printing() as unsaid:
+    session = Session(name, given.pop("out"), given.pop("json"), given.pop("quiet"))
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with listening(ProjectionWarning) as untrusted:
         try:
-            status = command(**own).run(session)
+            status = command(**given).run(session)
             for line in session.absent:  # at the end, where it is seen
                 warn(line)
-        except UsageError as error:
+        except (UsageError, OSError) as error:
             warn(str(error))
             status = WRONG_USAGE
         except KeyboardInterrupt:
@@ -152,8 +119,4 @@ def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
         finally:
             for message in untrusted:
                 warn(message)
-            if unsaid:
-                warn(f"cannot print to standard output: {unsaid[0]}. The files of the command are not affected.")
-    if status == DONE and untrusted:
-        return CHECK_FAILED
-    return NOT_PRINTED if status == DONE and unsaid else status
+    return CHECK_FAILED if status == DONE and untrusted else status

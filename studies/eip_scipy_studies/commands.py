@@ -5,10 +5,9 @@ This module imports no command, so that ``--help`` is quick.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
-DONE, CHECK_FAILED, WRONG_USAGE, NOT_PRINTED, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, CHECK_FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
 class Entry(NamedTuple):
@@ -86,11 +85,3 @@ COMMANDS = {
     "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
 }
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ``; did you mean ...?`` with the known name that is most like `name`, or "" if none is similar."""
-    import difflib
-
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""

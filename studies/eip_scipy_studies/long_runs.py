@@ -14,7 +14,7 @@ from typing import Any
 import eip_scipy
 from eip_scipy.solvers import EIPSolver
 
-from .report import UsageError, check_folder
+from .report import UsageError
 from .study import option
 
 METRICS = ("error", "euclidean")
@@ -30,11 +30,11 @@ class Checkpoints:
     resume: bool = option(False, "continue from the checkpoints in the folder of --checkpoint")
 
     def check_settings(self) -> None:
-        """Raise a UsageError if ``--resume`` comes without ``--checkpoint``, or the folder cannot be written to."""
+        """Raise a UsageError if ``--resume`` comes without ``--checkpoint``; make the folder."""
         if self.resume and self.checkpoint is None:
             raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
         if self.checkpoint is not None:
-            check_folder(self.checkpoint)
+            self.checkpoint.mkdir(parents=True, exist_ok=True)
 
     def checkpoint_options(self, name: str) -> dict[str, Any]:
         """Return the options with which `integrate` keeps checkpoints of the run `name` in a separate file.

@@ -7,16 +7,13 @@ import json
 import math
 import os
 import platform
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
 from typing import Any, TextIO
 
 import numpy as np
@@ -24,7 +21,6 @@ import numpy as np
 from eip_scipy import show_config
 
 _untrusted: list[str] = []  # messages about unreliable runs since `listening` began
-_unsaid: list[str] = []  # reasons why stdout took no text, since `printing` began
 
 
 class UsageError(Exception):
@@ -153,36 +149,14 @@ def _line(label: str, cells: Sequence[str], first: int, widths: Sequence[int]) -
 
 
 def say(text: str = "") -> None:
-    """Print on stdout; neither a terminal without Unicode nor a closed stdout ends the command.
-
-    If a reader such as `head` has closed the pipe, nothing more is printed. Any other failure is recorded for
-    `printing`.
-    """
-    if sys.stdout is None or sys.stdout.closed:
-        _unsaid.append("it is closed")
-        return
+    """Print on stdout, in the characters that it has."""
     encoding = sys.stdout.encoding or "utf-8"
-    try:
-        print(text.encode(encoding, "replace").decode(encoding), flush=True)
-    except OSError as error:
-        if not isinstance(error, BrokenPipeError):
-            _unsaid.append(_reason(error))
-        # Python writes the rest of its buffer when it closes stdout; the rest is discarded.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    print(text.encode(encoding, "replace").decode(encoding), flush=True)
 
 
 def warn(message: str) -> None:
-    """Print one line for the user on stderr, if stderr works."""
-    if sys.stderr is not None:
-        with suppress(OSError):
-            print(f"eip-scipy: {message}", file=sys.stderr, flush=True)
-
-
-@contextmanager
-def printing() -> Iterator[list[str]]:
-    """Collect the reasons for which `say` could not print, in the list that is yielded."""
-    _unsaid.clear()
-    yield _unsaid
+    """Print one line for the user on stderr."""
+    print(f"eip-scipy: {message}", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -214,93 +188,18 @@ def listening(kind: type[Warning]) -> Iterator[list[str]]:
         yield _untrusted
 
 
-@contextmanager
-def ended_by_sigterm() -> Iterator[None]:
-    """Make SIGTERM end the block as Ctrl-C does; afterwards the process ends by SIGTERM, as its sender expects.
-
-    A handler that the user has set is kept. A second SIGTERM does not disturb the reaction to the first one.
-    """
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    came = False
-
-    def note(number: int, frame: FrameType | None) -> None:
-        nonlocal came
-        if not came:
-            came = True
-            raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        if came:
-            if sys.stdout is not None:
-                sys.stdout.flush()
-            signal.raise_signal(signal.SIGTERM)
-
-
-def check_folder(folder: Path) -> None:
-    """Make `folder` if necessary; raise a UsageError if that fails or no file can be written there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _try_to_write(folder)
-    except OSError as error:
-        raise UsageError(f"cannot write to the folder {str(folder)!r}: {_reason(error)}") from error
-
-
-def check_target(path: Path) -> None:
-    """Raise a UsageError if no file can be written at `path`; its folder must exist."""
-    if path.is_dir():
-        raise UsageError(f"cannot write {str(path)!r}: it is a folder; give the name of a file")
-    try:
-        _try_to_write(path.parent)
-    except OSError as error:
-        raise UsageError(f"cannot write {str(path)!r}: {_reason(error)}") from error
-
-
-def check_outputs(folder: Path | None, target: Path | None) -> None:
-    """Check the folder of a command's files and the file of its JSON, as far as they are wanted, before it computes."""
-    if folder is not None:
-        check_folder(folder)
-    if target is not None:
-        check_target(target)
-
-
-def _try_to_write(folder: Path) -> None:
-    probe = folder / f".eip-scipy-{os.getpid()}.probe"
-    probe.touch()
-    probe.unlink()
-
-
-def _reason(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Yield a temporary path next to `path` that replaces it after success; an old file remains until then."""
-    temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise UsageError(f"cannot write {str(path)!r}: {_reason(error)}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def write_file(path: Path, write: Callable[[Path], Any]) -> Path:
     """Let `write` fill a temporary file that then replaces `path`, and return `path`.
 
-    ``write(temporary_path)`` gets a path with the suffix of `path`. An interruption leaves no incomplete file. If the
-    file cannot be written, a UsageError is raised.
+    ``write(temporary_path)`` gets a path with the suffix of `path`. An interruption leaves no incomplete file.
     """
-    with _whole(path) as temporary:
+    temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
     return path
 
 

@@ -17,10 +17,9 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from eip_scipy.checkpoint import CheckpointError
 
-from .commands import CHECK_FAILED, DONE, INTERRUPTED, nearest
+from .commands import CHECK_FAILED, DONE, INTERRUPTED
 from .report import (
     UsageError,
-    check_outputs,
     describe_machine,
     document,
     say,
@@ -50,16 +49,12 @@ def option(default: Any, text: str, **settings: Any) -> Any:
 
 
 def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
-    """Make the ``type`` of an option that accepts one of the `known` names, and suggests a similar one for others.
-
-    `what` is the kind of the names, for messages.
-    """
+    """Make the ``type`` of an option that accepts one of the `known` names; `what` is their kind, for messages."""
 
     def read(text: str) -> str:
         if text in known:
             return text
-        hint = nearest(text.lower(), known)
-        raise argparse.ArgumentTypeError(f"unknown {what} {text!r}, expected one of {', '.join(known)}{hint}")
+        raise argparse.ArgumentTypeError(f"unknown {what} {text!r}, expected one of {', '.join(known)}")
 
     return read
 
@@ -236,9 +231,11 @@ class Study(Command, Generic[Found]):
         """Raise a UsageError if settings are wrong or do not go together."""
 
     def run(self, session: Session) -> int:
-        """Check the settings and the files to write, and then do what `perform` does; return the exit status."""
+        """Check the settings, make the folders, and then do what `perform` does; return the exit status."""
         self.check_settings()
-        check_outputs(session.out if self.writes_files else None, session.json)
+        for folder in (session.out if self.writes_files else None, session.json and session.json.parent):
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
         return perform(self, session)[0]
 
 

@@ -145,24 +145,6 @@ def test_the_command_at_another_epoch(kernel, tmp_path, capsys, nothing_to_time)
 # --- what cannot be had ---
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--epoch", "tomorrow"), "argument --epoch: expected an epoch such as"),
-        (("--epoch", "2001-02-29"), "no such date or time: '2001-02-29'"),
-        (("--epoch", "2000-01-01", "--data", "de440"), "not allowed with argument"),
-        (("--data", "de440", "--epoch", "2000-01-01"), "argument --epoch: not allowed with argument --data"),
-        (("--kernel", "own.bsp"), "--kernel goes with --epoch"),
-        (("--epoch", "2000-01-01", "--kernel", "none.bsp"), "no kernel at none.bsp"),
-        (("--epoch", "2000-01-01", "--kernel", "."), "no kernel at ."),
-    ],
-)
-def test_wrong_usage_is_one_line(capsys, tmp_path, monkeypatch, nothing_to_time, options, message):
-    monkeypatch.chdir(tmp_path)
-    assert main(["solar-system", *SPAN, *options]) == 2
-    assert message in the_line(capsys)
-
-
 @pytest.mark.parametrize("epoch", ["3000-01-01", "1549-12-30", "2650-01-25T00:01", "0.5", "-3100015.5"])
 def test_outside_the_span(kernel, capsys, tmp_path, nothing_to_time, epoch):
     assert main(["solar-system", *SPAN, "--epoch", epoch, "--out", str(tmp_path)]) == 2

@@ -57,20 +57,6 @@ def test_a_missing_peer_is_told_at_the_end(name, two_methods, tmp_path, capsys, 
     )
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--years", "3"], "--years must be one of 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, got 3"),
-        (["--years", "1", "--data", "paper"], "unrecognized arguments: --data paper"),
-    ],
-)
-def test_a_span_or_data_without_reference_is_refused(options, message, tmp_path, capsys):
-    assert main(["solar-system", "frontier", *options, "--out", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-
-
 @pytest.mark.needs_jit
 @pytest.mark.slow
 def test_methods_of_the_frontier_run(monkeypatch):
@@ -107,13 +93,6 @@ def test_heyoka_on_our_states():
     assert np.linalg.norm((result.y - problem.reference(1.0))[:30].reshape(10, 3), axis=1).max() < 1e-12
     assert result.steps > 10
     assert result.wall_time > 0
-
-
-@pytest.mark.parametrize(("y0", "options"), [(np.zeros(11), {"t_end": 1.0}), (np.zeros(12), {"t_end": -1.0})])
-def test_heyoka_refuses(y0, options):
-    heyoka = pytest.importorskip("eip_scipy_studies.heyoka_runs", exc_type=ImportError)
-    with pytest.raises(ValueError, match=r"shape|positive"):
-        heyoka.run(np.ones(2), y0, **options)
 
 
 def test_heyoka_says_where_it_stopped():

@@ -326,28 +326,3 @@ def test_start_that_is_no_state(tmp_path, capsys):
         assert main(["gpe", "ring", "--start", str(file), "--out", str(tmp_path), "--quiet"]) == 2
         assert "cannot read a state from" in capsys.readouterr().err
     assert main(["gpe", "ring", "--start", str(tmp_path / "none.npz"), "--out", str(tmp_path), "--quiet"]) == 2
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ["gpe", "ground-states"],
-            "unknown TASK 'ground-states', expected one of ground-state, ring, vortex-lines; did",
-        ),
-        (["gpe", "--seed", "1", "ring"], "expected TASK first, one of ground-state, ring, vortex-lines"),
-        (["gpe", "ground-state", "--scene", "rings"], "did you mean 'ring'"),
-        (["gpe", "ground-state", "--starts", "0"], "expected an integer >= 1, got '0'"),
-        (["gpe"], "expected TASK first, one of ground-state, ring, vortex-lines"),
-        (["gpe", "ring", "--t-end", "0"], "expected a positive number, got '0'"),
-        (["gpe", "ring", "--resume"], "--resume needs the folder to resume from"),
-        (["gpe", "ring", "--starts", "3"], "unrecognized arguments: --starts 3; did you mean '--start'?"),
-        (["gpe", "vortex-lines", "--t-end", "3"], "unrecognized arguments: --t-end 3"),
-        (["gpe", "ground-state", "--checkpoint", "a"], "unrecognized arguments: --checkpoint a"),
-    ],
-)
-def test_wrong_usage(arguments, message, capsys):
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1

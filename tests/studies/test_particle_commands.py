@@ -122,19 +122,6 @@ def test_scenes_of_the_command(options, scenes, tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["uniform", "--orbit", "banana"], "unrecognized arguments: --orbit"),
-        (["tokomak"], "unrecognized arguments: tokomak; did you mean 'tokamak'?"),
-        (["tokamak", "--orbit", "potato"], "invalid choice"),
-    ],
-)
-def test_wrong_usage(options, words, tmp_path, capsys):
-    assert main(["charged-particle", *options, "--out", str(tmp_path)]) == 2
-    assert words in capsys.readouterr().err
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_runs")

@@ -121,25 +121,6 @@ def test_angles_and_distances():
 # --- wrong usage: one line, exit status 2 ---
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--forces", "1PN"], "'1PN', expected one of 1pn, eih, gr-potential, j2, moon-quadrupole, moon; did you mean"),
-        (["--forces", "moonn"], "did you mean 'moon'?"),
-        (["--forces", "1pn", "eih"], "'1pn' and 'eih' all describe relativity"),
-        (["--forces", "moon", "moon-quadrupole"], "'moon-quadrupole' replaces the Moon"),
-        (["--years", "1000"], "is outside the kernel's span, JD 2287184.5 to 2688976.5 TDB (1549-12-31 to 2650-01-25)"),
-        (["--years", "-1000"], "is outside the kernel's span"),
-        (["--years", "0"], "expected a positive number"),
-        (["--years", "1", "--h", "2"], "a step of 2 yr does not fit into 1 yr"),
-    ],
-)
-def test_wrong_usage(tmp_path, capsys, arguments, message):
-    assert main(["solar-system", "truth", *arguments, "--out", str(tmp_path)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
-
-
 def test_models():
     assert [model.name for model in solar_truth.models(None)][:2] == ["Newton", "Newton + 1pn"]
     assert [model.name for model in solar_truth.models(["moon"])] == ["Newton", "Newton + moon"]

@@ -34,17 +34,9 @@ def boris(
     fields : callable
         ``fields(t, x, out[, params])`` fills out[:3] with E and out[3:] with B; see `ParticleField.fill`. A function
         jitted by Numba runs compiled, any other callable interpreted.
-    t_span : tuple of float
-        Start and end; a smaller end integrates backward.
-    y0 : array_like, shape (6,)
-        Initial state (x, v).
-    h : float
-        Length of a step, positive in both directions; the last one ends on the end of the interval exactly.
+    t_span, y0, h, params, save_every
+        As for `stormer_verlet`, with y = (x, v).
     mass, charge : float, optional
-    params : array_like, shape (p,), optional
-        Passed to `fields` as a float64 array when given.
-    save_every : int, optional
-        Save every `save_every`-th state in addition to the first and the last; default: only these two.
 
     Returns
     -------

@@ -34,16 +34,8 @@ def implicit_midpoint(
     rhs : callable
         ``rhs(t, y, out[, params])`` fills out. A function jitted by Numba runs compiled, any other callable
         interpreted.
-    t_span : tuple of float
-        Start and end; a smaller end integrates backward.
-    y0 : array_like, shape (n,)
-        Initial state, real.
-    h : float
-        Length of a step, positive in both directions; the last one ends on the end of the interval exactly.
-    params : array_like, shape (p,), optional
-        Passed to `rhs` as a float64 array when given.
-    save_every : int, optional
-        Save every `save_every`-th state in addition to the first and the last; default: only these two.
+    t_span, y0, h, params, save_every
+        As for `stormer_verlet`, with any state.
 
     Returns
     -------

@@ -11,7 +11,7 @@ from ..commands import DONE, INTERRUPTED
 from ..condensates.efficiency import Efficiency
 from ..kepler.figures import KeplerFigures
 from ..particles.charged_particle import ChargedParticle
-from ..report import check_outputs, document, write_json
+from ..report import document, write_json
 from ..solar.solar_system import SolarSystem
 from ..study import Command, Session, Study, option, perform
 from .tables import TABLES, PaperTable
@@ -48,7 +48,7 @@ class Reproduce(Command):
 
         If a JSON file is wanted, it is one for all; its lists `cells` and `orders` hold the numbers of all tables.
         """
-        check_outputs(session.out, session.json)
+        session.out.mkdir(parents=True, exist_ok=True)
         wanted = list(dict.fromkeys(self.studies if "all" in self.table else self.table))
         content: dict[str, Any] = {"cells": [], "orders": []}
         status = DONE
