@@ -32,7 +32,8 @@ def jitted_call(function: LibraryFunction) -> Any:
     if function.own or function.numbers < 0 or not (function.in_place or returns):
         return function
     call, handle, rows = FUNCTION(function.call_address), function.handle, function.numbers
-    wrong = f"{function.__name__} was called with a state or params of the wrong size, or could not get memory"
+    wrong = f"{function.__name__} was called with a state or params of the wrong size"
+    no_memory = f"{function.__name__} could not get the memory that it needs"
 
     def number(t, y, params):
         state = y.ctypes.data
@@ -45,7 +46,10 @@ def jitted_call(function: LibraryFunction) -> Any:
 
     def fill(t, y, f, out, params):
         pointers = y.ctypes.data, f.ctypes.data, out.ctypes.data, params.ctypes.data
-        if call(handle, t, *pointers, y.size, params.size) != 0.0:
+        status = call(handle, t, *pointers, y.size, params.size)
+        if status > 0.0:
+            raise MemoryError(no_memory)
+        if status != 0.0:
             raise ValueError(wrong)
 
     def fill_rows(t, y, f, out, params):  # `out` may be a part of a larger array

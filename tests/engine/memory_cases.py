@@ -9,10 +9,10 @@ import json
 import sys
 
 import numpy as np
-from numba import njit
 from scipy import LowLevelCallable
 
 from eip_scipy import EIPGJ12, EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate
+from eip_scipy.core.jitted import jitted_call
 from eip_scipy.engine.native import BUILD, library
 from eip_scipy.problems import ForceConstants, kepler, nbody
 
@@ -44,11 +44,7 @@ def cases(c):
     def turning(t, y):
         return [y[1], -y[0]]
 
-    momentum = library["eih.momentum"]
-
-    @njit
-    def compiled(y, params):
-        return momentum(0.0, y, params)
+    compiled = jitted_call(library["eih.momentum"])
 
     return {
         "pointers, fixed": (lambda: pointers(method=EIPRK4, h=0.02), True),
@@ -63,7 +59,7 @@ def cases(c):
         "eih": (lambda: integrate(bodies, method=EIPRK4).y, True),
         "batches": (lambda: ensemble(problem, (0, 1), np.tile(problem.y0, (16, 1)), method=EIPRK4, h=0.05).y, True),
         "library": (lambda: np.atleast_1d(library["eih.momentum"](0.0, bodies.y0, bodies.params)), False),
-        "compiled": (lambda: compiled(bodies.y0, bodies.params), True),
+        "compiled": (lambda: compiled(0.0, bodies.y0, bodies.params), True),
         "stepped by hand": (lambda: stepped(turning, square), False),
         "complex step": (
             lambda: BUILD.gradients.complex_step(lambda t, y: y @ y, 0.0, np.array([1.0, 2.0]), (), 1e-20), False,

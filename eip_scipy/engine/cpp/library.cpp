@@ -76,7 +76,7 @@ PyObject *call(PyObject *self, PyObject *arguments, PyObject *names) noexcept {
 }
 
 // Call a function for one state from compiled code that no exception may pass through. Returns the number if `out` is null,
-// else 0; NaN if the sizes are wrong, or if the function did not get the memory that it needs.
+// else 0. NaN: the sizes are wrong, or there is no number; 1: the function did not get the memory that it needs to fill `out`.
 double call_by_handle(const void *handle, double t, const double *y, const double *f, double *out, const double *params,
                       int64_t n, int64_t p) {
     const LibraryFunction &function = *static_cast<const LibraryFunction *>(handle);
@@ -86,7 +86,7 @@ double call_by_handle(const void *handle, double t, const double *y, const doubl
         function.one(t, y, f, out ? out : &number, params, n, p);
         return number;
     } catch (const std::exception &) {
-        return NOT_A_NUMBER;
+        return out ? 1.0 : NOT_A_NUMBER;
     }
 }
 
