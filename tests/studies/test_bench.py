@@ -1,226 +1,143 @@
-"""`eip-scipy bench`: errors against closed forms, reports on failures of packages, and the report."""
+"""`eip-scipy bench`: equations against each other and closed forms, references, times at equal error, the report."""
 
 from __future__ import annotations
 
 import csv
-import json
 import math
-from dataclasses import replace
-from functools import partial
 
+import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.special import ellipj
 
-from eip_scipy_studies.bench import compare, figures, page, process, suites
-from eip_scipy_studies.bench.command import Bench
-from eip_scipy_studies.bench.compare import Row, standings
-from eip_scipy_studies.bench.equations import EQUATIONS, scene_from
-from eip_scipy_studies.bench.peers import COMPILED, PEERS, PYTHON
+from eip_scipy_studies.bench.cases import CASES, INERTIA
+from eip_scipy_studies.bench.measure import Measured, Run, everything, measure, seconds_at
+from eip_scipy_studies.bench.report import markdown
+from eip_scipy_studies.bench.solvers import SOLVERS
 from eip_scipy_studies.cli import main
-from eip_scipy_studies.report import UsageError
-from eip_scipy_studies.study import Session
 
-CIRCLE = suites._record("circle", "kepler", [1.0, 0, 0, 1], [-1.0, 0, 0, -1], math.pi, {"EIPRKN12": [20, 30]})
-
-
-def tiny(peer):
-    return suites._for(peer, [CIRCLE], (1e-5, 1e-8))
+SINGLE = [case for case in CASES.values() if not case.members]
+BY_NAME = {solver.name: solver for solver in SOLVERS}
 
 
-def bench(tmp_path, peers, **settings):
-    own = {"suites": {"kepler": suites.Suite("kepler", "Kepler", "precision", lambda: tiny, "a note")}}
-    own |= {"field_of_peers": {name: PEERS[name] for name in peers}, "limit": 20.0, "repeats": 1}
-    return Bench(**own | settings), Session("bench", tmp_path, quiet=True)
+@pytest.mark.parametrize("case", SINGLE, ids=lambda case: case.name)
+def test_invariants_are_kept_by_the_equations(case):
+    """grad I . f = 0 at the start and at the reference's end, by differences along f."""
+    for y in (case.y0, case.end):
+        f = case.plain.fun(0.0, y)
+        step = 1e-6 / max(1.0, np.abs(f).max())
+        for name, invariant in case.plain.invariants.items():
+            values = [np.asarray(invariant(0.0, y + sign * step * f)) for sign in (1, -1)]
+            assert np.abs(values[0] - values[1]).max() <= 1e-9 * (1 + np.abs(values[0]).max()), name
 
 
-def lines(path):
-    return list(csv.DictReader(path.read_text().splitlines()))
+@pytest.mark.parametrize("case", [case for case in SINGLE if case.plain.acceleration], ids=lambda case: case.name)
+def test_acceleration_is_that_of_the_equations(case):
+    half = case.y0.size // 2
+    np.testing.assert_allclose(case.plain.acceleration(0.0, case.y0[:half]), case.plain.fun(0.0, case.y0)[half:])
 
 
-def worker_of(tmp_path, monkeypatch, text):
-    """A worker in its stead, for `ask`."""
-    (tmp_path / "stand_in.py").write_text(text)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return partial(process.ask, worker="stand_in")
+@pytest.mark.parametrize("case", SINGLE, ids=lambda case: case.name)
+def test_reference_keeps_the_invariants(case):
+    for invariant in case.plain.invariants.values():
+        first, last = invariant(0.0, case.y0), invariant(0.0, case.end)
+        np.testing.assert_allclose(last, first, rtol=1e-12, atol=1e-14)
 
 
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory):
-    command, session = bench(tmp_path_factory.mktemp("bench"), ["EIPDOP853", "SciPy DOP853"])
-    assert command.run(session) == 0
-    return session.out
+def test_rigid_body_against_elliptic_functions():
+    """Jacobi's solution in 30 digits, for L = (A, 0, C) with A < C and inverse inertias 1/2, 1, 3/2."""
+    case = CASES["rigid body"]
+    assert 1 / np.array(INERTIA) == pytest.approx([0.5, 1.0, 1.5])
+    with mpmath.workdps(30):
+        A, _, C = (mpmath.mpf(value) for value in case.y0)
+        u, m = C * mpmath.mpf(case.t_end) / mpmath.sqrt(2), (A / C) ** 2
+        sn, cn, dn = (mpmath.ellipfun(name, u, m=m) for name in ("sn", "cn", "dn"))
+        exact = [float(value) for value in (A * cn, -mpmath.sqrt(2) * A * sn, C * dn)]
+    np.testing.assert_allclose(case.end, exact, atol=3e-13)
 
 
-def test_errors_are_those_of_the_closed_form(measured):
-    rows = lines(measured / "bench.csv")
-    assert [row["peer"] for row in rows] == ["EIPDOP853"] * 2 + ["SciPy DOP853"] * 2
-    fun = scene_from(CIRCLE).plain().fun
-    for row in rows[2:]:
-        tolerance = float(row["setting"])
-        y = solve_ivp(fun, (0, math.pi), CIRCLE["y0"], method=row["peer"][6:], rtol=tolerance, atol=1e-3 * tolerance).y[
-            :, -1
-        ]
-        assert float(row["error"]) == pytest.approx(np.max(np.abs(y - CIRCLE["end"])), rel=1e-12)
-        assert float(row["seconds"]) > 0
-    assert float(rows[1]["drift"]) < 1e-14 < float(rows[3]["drift"])
+@pytest.mark.parametrize("name", ["Hénon-Heiles", "double pendulum", "halo orbit", "Robertson"])
+def test_references_against_scipy(name):
+    case = CASES[name]
+    method, rtol, near = ("Radau", 1e-10, 1e-8) if case.stiff else ("DOP853", 1e-13, 3e-9)
+    found = solve_ivp(case.plain.fun, (0, case.t_end), case.y0, method=method, rtol=rtol, atol=rtol * 1e-4)
+    assert case.error(found.y[:, -1]) < near
 
 
-def test_report_holds_all_it_shows(measured):
-    html = (measured / "bench.html").read_text()
-    assert html.count("data:image/png;base64,") == 1
-    assert "http" not in html
-    assert "SciPy DOP853" in html
-    text = (measured / "bench.md").read_text()
-    assert "](bench-kepler-circle-python.png)" in text
-    assert (measured / "bench-kepler-circle-python.png").stat().st_size > 1000
-    assert len(lines(measured / "bench-equal-error.csv")) == 2
-
-
-def test_a_peer_that_is_not_installed_is_named(tmp_path, monkeypatch):
-    (tmp_path / "extensisq.py").write_text("raise ModuleNotFoundError(\"No module named 'extensisq'\")")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    command, session = bench(tmp_path, ["extensisq Pr9", "extensisq SWAG"])
-    found = command.measure(session)
-    assert found.absent == {"extensisq": "ModuleNotFoundError: No module named 'extensisq'"}
-    assert "extensisq did not run: ModuleNotFoundError: No module named 'extensisq'" in command.text(found)
-    assert not found.rows
-
-
-def test_a_crash_and_a_late_worker_keep_what_they_had(tmp_path, monkeypatch):
-    line = "import sys, time, os; sys.stdin.read(); print('{\"error\": 1}', flush=True);"
-    crash = worker_of(tmp_path, monkeypatch, f"{line} print('oh dear', file=sys.stderr, flush=True); os._exit(3)")
-    reply = crash({}, 20.0)
-    assert reply.answers == [{"error": 1}]
-    assert reply.failed == "the process ended with status 3: oh dear"
-    late = worker_of(tmp_path, monkeypatch, f"{line} time.sleep(60)")
-    reply = late({}, 2.0)
-    assert reply.answers == [{"error": 1}]
-    assert reply.failed == "not done after 2 s, and ended"
-
-
-def test_a_peer_that_fails_is_named_with_what_it_said(tmp_path):
-    wave = {**suites.asking()[0], "settings": {}}
-    suite = suites.Suite("asked", "Asked", "asked", lambda: lambda peer: suites._for(peer, [wave], (1e-6,)), "")
-    command, session = bench(tmp_path, ["SciPy LSODA"], suites={"asked": suite})
-    said = {row.peer: row.said for row in command.measure(session).rows}
-    assert said["SciPy LSODA"].startswith("ValueError: ")
-
-
-def rows_of(peer, *pairs, takes=PYTHON, scene="orbit"):
-    return [Row("kepler", scene, takes, peer, 1.0, seconds, error, 0.0) for seconds, error in pairs]
-
-
-def test_cost_at_equal_error_is_interpolated_and_divided_by_our_best():
-    rows = [
-        *rows_of("EIPDOP853", (2.0, 1e-4), (8.0, 1e-10)),
-        *rows_of("EIPRKN12", (1.0, 1e-5), (3.0, 1e-7)),
-        *rows_of("SciPy DOP853", (10.0, 1e-5), (1000.0, 1e-7)),
-    ]
-    near, far = standings(rows)
-    assert not near.bound
-    assert far.tried == 1000.0
-    assert (near.best, near.ours) == ("EIPRKN12", pytest.approx(math.sqrt(3)))
-    assert near.seconds == pytest.approx(100.0)
-    assert far.best == "EIPDOP853"
-    assert math.isnan(far.ratio)
-    assert not far.lost
-
-
-def test_other_forms_stand_beside_our_compiled_methods():
-    rows = rows_of("heyoka", (1.0, 1e-10), takes=PEERS["heyoka"].takes)
-    rows += rows_of("EIPDOP853 (jitted)", (4.0, 1e-10), takes=COMPILED)
-    (near, _) = standings(rows)
-    assert (near.peer, near.ratio) == ("heyoka", 0.25)
-
-
-def test_an_error_that_we_do_not_reach_is_a_loss():
-    rows = [*rows_of("EIPDOP853", (2.0, 1e-7)), *rows_of("SciPy DOP853", (1.0, 1e-7), (9.0, 1e-10))]
-    _, far = standings(rows)
-    assert far.lost
-    assert "SciPy DOP853 is the only one that arrives at 1e-9." in page.text(page.Found("here", "today", rows))
-
-
-def test_a_reason_is_printed_only_where_the_peer_won(monkeypatch):
-    monkeypatch.setattr(compare, "REASONS", (("kepler", "orbit", "", "SciPy", "It is clever."),))
-    ahead = [*rows_of("EIPDOP853", (2.0, 1e-10)), *rows_of("SciPy DOP853", (1.0, 1e-10))]
-    behind = [*rows_of("EIPDOP853", (1.0, 1e-10)), *rows_of("SciPy DOP853", (2.0, 1e-10))]
-    texts = [page.text(page.Found("here", "today", rows)) for rows in (ahead, behind)]
-    assert "SciPy DOP853 is ahead by 2 at 1e-6; SciPy DOP853 is ahead by 2 at 1e-9. It is clever." in texts[0]
-    assert "clever" not in texts[1]
-
-
-def test_stored_ends_of_the_rigid_body_are_elliptic_functions():
-    a, _, d = suites.kepler()[2]["y0"]
-    for t_end, end in suites.RIGID_BODY.items():
-        sn, cn, dn, _ = ellipj(d / math.sqrt(2) * t_end, (a / d) ** 2)
-        np.testing.assert_allclose(end, [a * cn, -math.sqrt(2) * a * sn, d * dn], atol=1e-11)
-
-
-@pytest.mark.parametrize("name", EQUATIONS)
-def test_gradients_and_accelerations_belong_to_the_functions(name):
-    functions = EQUATIONS[name](math.sqrt)
-    y = np.array([0.3, 0.5, 0.7, 0.2][: 3 if name == "rigid_body" else 4])
-    rate = np.array(functions.gradients(0.0, y)) @ np.array(functions.fun(0.0, y))
-    np.testing.assert_allclose(rate, 0.0, atol=1e-14)
-    if functions.acc is not None:
-        np.testing.assert_array_equal(functions.acc(0.0, y[:2]), functions.fun(0.0, y)[2:])
-
-
-def test_the_field_keeps_its_invariants():
-    scene = scene_from(suites.field()[0])
-    functions, y = scene.plain(), scene.y0
-    rate = np.real(np.conj(functions.gradients(0.0, y)) @ functions.fun(0.0, y))
-    np.testing.assert_allclose(rate, 0.0, atol=1e-12)
-    assert functions.values(0.0, scene.end) == pytest.approx(functions.values(0.0, y), rel=1e-9)
-
-
-def test_unknown_names_are_refused(capsys):
-    assert main(["bench", "--suite", "sollar"]) == 2
-    assert "unknown suite 'sollar', expected one of all, kepler, solar, " in capsys.readouterr().err
-    with pytest.raises(UsageError, match="package 'nobody' is not known; expected some of CyRK"):
-        Bench(peers=["nobody"]).check_settings()
-
-
-def test_all_suites_have_work_for_us_and_for_a_peer():
-    for suite in suites.SUITES.values():
-        make = suite.make()
-        asked = [peer for peer in PEERS.values() if make(peer)]
-        assert any(peer.ours for peer in asked)
-        assert not all(peer.ours for peer in asked)
-        json.dumps([make(peer) for peer in asked])
-
-
-def test_interrupted_keeps_what_it_had(tmp_path, monkeypatch):
-    command, session = bench(tmp_path, ["SciPy RK45", "SciPy DOP853"])
-    command = replace(command, limit=21.0)
-    asked = []
-
-    def ask(request, limit):
-        asked.append(request["peer"])
-        if len(asked) == 2:
-            raise KeyboardInterrupt
-        return process.Reply([{"scene": "circle", "seconds": 1.0, "error": 1e-7}], "1.0", 1.0, "")
-
-    monkeypatch.setattr("eip_scipy_studies.bench.command.ask", ask)
-    assert command.run(session) == 130
-    assert [row["peer"] for row in lines(tmp_path / "bench.csv")] == ["SciPy RK45"]
-
-
-def test_figures_leave_out_what_has_no_error():
-    rows = [*rows_of("EIPDOP853", (1.0, 1e-6)), Row("kepler", "orbit", PYTHON, "SciPy RK45", said="no")]
-    ((where, name, _),) = figures.drawn(rows, "here")
-    assert (where, name) == (("kepler", "orbit", PYTHON), "bench-kepler-orbit-python.png")
+@pytest.mark.parametrize("case", [case for case in SINGLE if case.ready], ids=lambda case: case.name)
+def test_ready_problems_are_the_same_equations(case):
+    problem = case.ready()
+    np.testing.assert_allclose(case.to_own(problem.y0), case.y0, rtol=1e-14, atol=1e-300)
+    np.testing.assert_allclose(
+        case.to_own(problem.fun(0.0, problem.y0)), case.plain.fun(0.0, case.y0), rtol=1e-12, atol=1e-14
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.needs_jit
-def test_metric_of_contacts(tmp_path):
-    """Beads in contact and a ball: the default metric is never worse than the better of none and euclidean."""
-    assert main(["bench", "metric", "--only", "Hertz", "--out", str(tmp_path), "--quiet"]) == 0
-    with open(tmp_path / "metric.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == 48
-    assert sum(float(row["ratio"]) > 1.5 for row in rows) < 8
-    assert np.median([float(row["default"]) / float(row["none"]) for row in rows]) < 0.2
+@pytest.mark.parametrize(
+    "name", ["EIPDOP853", "EIPRKN12", "EIPDOP853, hamiltonian", "EIPDOP853 in solve_ivp", "SciPy DOP853"]
+)
+def test_solvers_reach_the_reference(name):
+    case = CASES["Hénon-Heiles"]
+    setting = 1500 if BY_NAME[name].steps else 1e-11
+    assert case.error(BY_NAME[name].prepare(case)(setting)) < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["heyoka", "CyRK Vern8", "numbalsoda dop853", "diffrax Dopri8", "extensisq Pr9"])
+def test_other_packages_reach_the_reference(name):
+    pytest.importorskip(name.split()[0])
+    case = CASES["double pendulum"]
+    assert case.error(BY_NAME[name].prepare(case)(1e-11)) < 1e-8
+
+
+@pytest.mark.parametrize("name", ["REBOUND IAS15", "REBOUND WHFast c17", "REBOUND TRACE", "REBOUND MERCURIUS"])
+def test_rebound_follows_the_planets(name):
+    case = CASES["ten bodies, 100 years"]
+    setting = 8000 if BY_NAME[name].steps else 1e-9
+    near = {"REBOUND IAS15": 1e-9, "REBOUND WHFast c17": 1e-7}.get(name, 1e-2)
+    assert case.error(BY_NAME[name].prepare(case)(setting)) < near
+
+
+def test_seconds_at_equal_error():
+    runs = [Run("", "", 0, 1.0, 1e-4), Run("", "", 0, 4.0, 1e-8)]
+    assert seconds_at(runs, 1e-6) == (pytest.approx(2.0), False)
+    assert seconds_at(runs, 1e-3) == (1.0, True)
+    assert math.isnan(seconds_at(runs, 1e-9)[0])
+    assert seconds_at([Run("", "", 0, 1.0, math.inf), runs[1]], 1e-6) == (4.0, True)
+
+
+def test_first_come_the_losses():
+    def made(solver, *seconds, said=""):
+        runs = [Run("Hénon-Heiles", solver, 1, s, e) for s, e in zip(seconds, (2e-6, 1e-6, 1e-9), strict=False)]
+        return Measured("Hénon-Heiles", solver, "1.0", 0.5, runs, said)
+
+    page = markdown(
+        [made("EIPDOP853", 1, 1, 2), made("heyoka", 0.4, 0.5, 0.5), made("SciPy RK45", 9, 9, said="Error: why")], "here"
+    )
+    lost = page.index("error 1e-09: heyoka is 4 times faster")
+    assert lost < page.index("error 1e-06: heyoka is 2 times faster") < page.index("## Hénon-Heiles")
+    assert "- SciPy RK45: Error: why" in page
+
+
+def test_a_package_that_fails_is_a_row():
+    found = measure("Robertson", "EIPDOP853", 0.1, 0.1)
+    assert found.runs == []
+    assert found.said
+
+
+@pytest.mark.slow
+def test_command_writes_runs_and_page(tmp_path):
+    assert (
+        main(["bench", "--case", "double pendulum", "--solvers", "SciPy DOP853", "--out", str(tmp_path), "--quiet"])
+        == 0
+    )
+    rows = list(csv.DictReader((tmp_path / "bench.csv").read_text(encoding="utf-8").splitlines()))
+    errors = [float(row["error"]) for row in rows]
+    assert errors[0] > 1e-6
+    assert errors[-1] < 1e-9
+    assert "SciPy DOP853" in (tmp_path / "bench.md").read_text(encoding="utf-8")
+
+
+def test_nothing_matches():
+    assert list(everything(["Robertson"], ["no such"], 0.1, 0.1)) == []

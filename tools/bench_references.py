@@ -1,0 +1,119 @@
+#!/usr/bin/env python3
+"""Compute the reference states of the bench in 80-bit arithmetic, and write them to the studies' data.
+
+    python tools/bench_references.py [NAME ...]
+
+Extrapolation of Gragg's midpoint rule to order 20, and of the linearly implicit Euler rule for stiff systems (Hairer,
+Norsett and Wanner, Solving Ordinary Differential Equations I, II.9, and II, IV.9), with steps of fixed length. The
+result is that of the finer of two runs; their difference, which is printed, estimates the error of the coarser one.
+Ten bodies come from the stored states of `solar_system`. NumPy's longdouble must have 80 bits or more.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eip_scipy_studies.bench.cases import ATOMS, CASES, Case
+
+DATA = Path(__file__).parent.parent / "studies/eip_scipy_studies/data/bench_references.json"
+Vector = Any
+COLUMNS = 10
+STEPS = {  # of the coarser run; the finer one takes 1.5 times as many
+    "perturbed Kepler": 50_000, "Hénon-Heiles": 2500, "double pendulum": 300, "halo orbit": 4000, "rigid body": 2000,
+    "Lennard-Jones": 200, "charged particle": 60_000, "Robertson": 900,
+}  # fmt: skip
+
+
+def lennard_jones(t: Any, y: Vector) -> Vector:
+    """Return the same forces as `cases.atoms`, by whole arrays."""
+    q = y[: 3 * ATOMS].reshape(ATOMS, 3)
+    d = q[:, None] - q[None, :]
+    r2 = (d * d).sum(-1)
+    np.fill_diagonal(r2, 1)
+    s6 = r2**-3
+    w = 24 * s6 * (2 * s6 - 1) / r2
+    np.fill_diagonal(w, 0)
+    return np.concatenate([y[3 * ATOMS :], (w[..., None] * d).sum(1).ravel()])
+
+
+def gragg(f: Callable[..., Vector], y: Vector, h: Any) -> Vector:
+    """Take one step of the extrapolated midpoint rule."""
+    start, columns, counts = f(0, y), [], [2 * (k + 1) for k in range(COLUMNS)]
+    for n in counts:
+        part = h / n
+        before, now = y, y + part * start
+        for _ in range(n - 1):
+            before, now = now, before + 2 * part * f(0, now)
+        columns.append((before + now + part * f(0, now)) / 2)
+    return extrapolated(columns, [np.longdouble(n) ** 2 for n in counts])
+
+
+def implicit(f: Callable[..., Vector], y: Vector, h: Any) -> Vector:
+    """Take one step of the extrapolated linearly implicit Euler rule, with the Jacobian of Robertson's reactions."""
+    b, c = y[1:]
+    number = np.longdouble
+    J = np.array([[number("-0.04"), 1e4 * c, 1e4 * b], [number("0.04"), -1e4 * c - 6e7 * b, -1e4 * b], [0, 6e7 * b, 0]])
+    columns = []
+    for n in range(1, COLUMNS + 1):
+        inverse, now = inverted(np.eye(3) - h / n * J), y
+        for _ in range(n):
+            now = now + inverse @ (h / n * f(0, now))
+        columns.append(now)
+    return extrapolated(columns, [number(n) for n in range(1, COLUMNS + 1)])
+
+
+def inverted(A: Vector) -> Vector:
+    """Return the inverse of a 3 by 3 matrix by its cofactors, which NumPy's linear algebra lacks in 80 bits."""
+    rows = np.array([np.cross(A[1], A[2]), np.cross(A[2], A[0]), np.cross(A[0], A[1])])
+    return rows.T / (A[0] @ rows[0])
+
+
+def extrapolated(columns: list[Vector], powers: list[Any]) -> Vector:
+    """Return the limit by Neville's scheme, for errors in powers of 1 / `powers`."""
+    for k in range(1, len(columns)):
+        for j in range(len(columns) - 1, k - 1, -1):
+            columns[j] = columns[j] + (columns[j] - columns[j - 1]) / (powers[j] / powers[j - k] - 1)
+    return columns[-1]
+
+
+def end(case: Case, steps: int) -> Vector:
+    """Return the state at the end."""
+    y, t_end = case.y0.astype(np.longdouble), np.longdouble(case.t_end)
+    if case.scalar:
+        parts = case.make(np).fun
+        f = lambda t, state: np.array(parts(t, state))  # noqa: E731
+    else:
+        f = lennard_jones
+    if case.stiff:  # steps that grow from 1e-6 to the end
+        times = np.concatenate([[0], np.geomspace(np.longdouble(1e-6), t_end, steps)])
+        for h in np.diff(times):
+            y = implicit(f, y, h)
+        return y
+    for _ in range(steps):
+        y = gragg(f, y, t_end / steps)
+    return y
+
+
+def main() -> None:
+    """Compute the references that are named, or all of them."""
+    known = json.loads(DATA.read_text(encoding="utf-8")) if DATA.exists() else {}
+    for name in sys.argv[1:] or [name for name, case in CASES.items() if not case.members]:
+        case = CASES[name]
+        if case.gm is not None:
+            final = case.ready().reference(case.t_end)
+            print(f"{name}: stored states of solar_system")
+        else:
+            coarse, final = end(case, STEPS[name]), end(case, STEPS[name] * 3 // 2)
+            print(f"{name}: {float(np.abs(coarse - final).max() / np.abs(final).max()):.1e}", flush=True)
+        known[name] = [float(value) for value in final]
+        DATA.write_text(json.dumps(known, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
