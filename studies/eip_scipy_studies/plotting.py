@@ -6,7 +6,7 @@ show them in a notebook.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -47,7 +47,6 @@ __all__ = [
     "orbits_figure",
     "paper_kepler_figure",
     "particle_figure",
-    "side_by_side_figure",
     "surfaces_figure",
 ]
 
@@ -891,63 +890,3 @@ def _legend_below(figure: Figure, axis: Axes, heading: str | None = None) -> Non
         title=heading,
         title_fontsize="small",
     )
-
-
-def side_by_side_figure(
-    series: Mapping[str, Mapping[str, Any]],
-    *,
-    ours: Collection[str],
-    levels: Collection[float],
-    time: str = "wall time [s]",
-    title: str = "",
-    footnote: str = "",
-) -> Figure:
-    """Draw the trajectory's error against the run's wall time and, below, the invariants' errors, by package.
-
-    Parameters
-    ----------
-    series : mapping of str to mapping
-        For each package, arrays "seconds", "error" (of the trajectory) and "drift" (of the invariants), which may be
-        nan.
-    ours : collection of str
-        Names of the series that are drawn with heavier lines.
-    levels : collection of float
-        Errors of the trajectory at which the report compares packages, drawn as dotted lines.
-    time : str, optional
-        Label of the axis of the runs' times.
-    title, footnote : str, optional
-
-    Returns
-    -------
-    Figure
-    """
-    drifts = np.concatenate([np.asarray(values["drift"], dtype=float) for values in series.values()])
-    panels = ["error of the trajectory"] + ["change of the invariants"] * bool(np.isfinite(drifts).any())
-    height = HEIGHT if len(panels) == 2 else 0.6 * HEIGHT
-    figure = blank_figure(WIDTH, height + LINE_HEIGHT * -(-len(series) // 2), title)
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    styles = method_styles([*(name for name in series if name in ours), *(name for name in series if name not in ours)])
-    for axis, key in zip(axes, ("error", "drift"), strict=False):
-        for name in styles:
-            _curve(
-                axis, series[name]["seconds"], series[name][key], {**styles[name], **(OURS if name in ours else FAINT)}
-            )
-    for level in levels:
-        axes[0].axhline(level, color="0.6", lw=0.8, ls=":")
-    for axis, label in zip(axes, panels, strict=True):
-        log_x(axis)
-        log_errors(axis, time if axis is axes[-1] else "", label)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=2, fontsize="small", frameon=False, handlelength=3.5
-    )
-    if footnote:
-        axes[0].annotate(footnote, (1, 1.02), xycoords="axes fraction", ha="right", fontsize="xx-small", color="0.35")
-    return figure
-
-
-def _curve(axis: Axes, seconds: Any, errors: Any, style: Mapping[str, Any]) -> None:
-    """Draw a curve on log axes; errors below the spacing of floating-point numbers at 1 are drawn at that value."""
-    x, y = np.asarray(seconds, dtype=float), np.asarray(errors, dtype=float)
-    good = np.isfinite(x) & np.isfinite(y)
-    axis.plot(x[good], np.maximum(y[good], FLOOR), **style)
