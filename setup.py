@@ -73,7 +73,7 @@ def module(name: str, *flags: str) -> Extension:
     return Extension(
         f"eip_scipy.engine.{name}",
         sources=[str(path) for path in sorted(FOLDER.rglob("*.cpp"))],
-        depends=[str(path) for path in sorted(FOLDER.rglob("*.hpp"))],
+        depends=[str(path) for path in sorted(FOLDER.rglob("*.?pp"))],  # `sources` are compiled before, and taken away
         define_macros=[("EIP_MODULE", name), ("NB_DOMAIN", name), ("EIP_SOURCES", f'"{stamp()}"'), *STABLE, *FREE],
         extra_compile_args=[*FLAGS, *flags],
         extra_link_args=UNUSED,

@@ -128,11 +128,6 @@ class Work:
     def arrays(self) -> dict[str, numpy.typing.NDArray[Any]]:
         """Return all arrays by name."""
 
-    def share(self, other: Work, names: set[Any]) -> None:
-        """
-        Use the buffers of `other` with these names from now on, in place of own ones.
-        """
-
     def __getstate__(self) -> tuple[Any, ...]: ...
 
     def __setstate__(self, arg: tuple[Any, ...], /) -> None: ...
@@ -644,33 +639,6 @@ class condensates:
     def shifted(psi: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], a: float, b: float, out: numpy.typing.NDArray[numpy.inexact]) -> list[float]: ...
     @staticmethod
     def weighted_square(field: numpy.typing.NDArray[numpy.inexact], weight: numpy.typing.NDArray[numpy.float64]) -> float: ...
-
-class fields:
-    @staticmethod
-    def extrapolate(last: numpy.typing.NDArray[numpy.inexact], before: numpy.typing.NDArray[numpy.inexact], first: numpy.typing.NDArray[numpy.inexact]) -> None: ...
-    @staticmethod
-    def multiply_modes(modes: numpy.typing.NDArray[numpy.inexact], factor: numpy.typing.NDArray[numpy.inexact]) -> None: ...
-    @staticmethod
-    def right_side(start: numpy.typing.NDArray[numpy.inexact], mean: numpy.typing.NDArray[numpy.inexact], rotation: numpy.typing.NDArray[numpy.inexact], W: numpy.typing.NDArray[numpy.float64], w: float, c: float, out: numpy.typing.NDArray[numpy.inexact]) -> float: ...
-    @staticmethod
-    def other_end(mean: numpy.typing.NDArray[numpy.inexact], start: numpy.typing.NDArray[numpy.inexact]) -> None: ...
-    @staticmethod
-    def mean_density(start: numpy.typing.NDArray[numpy.inexact], mean: numpy.typing.NDArray[numpy.inexact], V: numpy.typing.NDArray[numpy.float64], beta: float, out: numpy.typing.NDArray[numpy.float64]) -> None: ...
-    @staticmethod
-    def density(psi: numpy.typing.NDArray[numpy.inexact], V: numpy.typing.NDArray[numpy.float64], beta: float, out: numpy.typing.NDArray[numpy.float64]) -> None: ...
-    @staticmethod
-    def nonlinear_force(psi: numpy.typing.NDArray[numpy.inexact], other: numpy.typing.NDArray[numpy.inexact], a: float, V: numpy.typing.NDArray[numpy.float64], beta: float, out: numpy.typing.NDArray[numpy.inexact]) -> float: ...
-    @staticmethod
-    def projections(force: numpy.typing.NDArray[numpy.inexact], modes: numpy.typing.NDArray[numpy.inexact], inverse: numpy.typing.NDArray[numpy.inexact], c: float) -> list[float]: ...
-    @staticmethod
-    def advance(modes: numpy.typing.NDArray[numpy.inexact], inverse: numpy.typing.NDArray[numpy.inexact], factor: float, new_modes: numpy.typing.NDArray[numpy.inexact], force: numpy.typing.NDArray[numpy.inexact]) -> None: ...
-
-class comparators:
-    @staticmethod
-    def take_steps(scheme: str, constant: float, functions: object, work: Work, steps: object, y: numpy.typing.NDArray[numpy.float64], rows: numpy.typing.NDArray[numpy.inexact]) -> int:
-        """
-        Make all steps from the state `y`, which is overwritten, and fill `rows` (saved, n), whose first row is the start, with the states to save. Return the number of evaluations.
-        """
 
 class gradients:
     @staticmethod

@@ -11,6 +11,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numba import njit
 from scipy.integrate import solve_ivp
 
 from eip_scipy.problems import MechanicsProblem, mechanics, mechanism
@@ -36,11 +37,30 @@ def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
     q0, u0, forces = (np.zeros(2 * ends) for _ in range(3))
     q0[0::2], q0[1::2], u0[0::2], forces[1::2] = np.arange(ends), 1.0, 1.0, -G * weights
 
+    @njit
     def lengths(t: Any, q: Any) -> np.ndarray:
-        x, y = q[0::2], q[1::2]
-        cranks = (x - np.arange(ends)) ** 2 + y**2 - 1
-        couplers = (x[1:] - x[:-1]) ** 2 + (y[1:] - y[:-1]) ** 2 - 1
-        return np.concatenate([cranks, couplers]) / 2
+        out = np.empty(2 * ends - 1)
+        for i in range(ends):
+            out[i] = ((q[2 * i] - i) ** 2 + q[2 * i + 1] ** 2 - 1) / 2
+        for i in range(ends - 1):
+            out[ends + i] = ((q[2 * i + 2] - q[2 * i]) ** 2 + (q[2 * i + 3] - q[2 * i + 1]) ** 2 - 1) / 2
+        return out
+
+    @njit
+    def gamma(t: Any, q: Any, u: Any) -> np.ndarray:  # exact, which matters next to singular positions
+        out = np.empty(2 * ends - 1)
+        for i in range(ends):
+            out[i] = u[2 * i] ** 2 + u[2 * i + 1] ** 2
+        for i in range(ends - 1):
+            out[ends + i] = (u[2 * i + 2] - u[2 * i]) ** 2 + (u[2 * i + 3] - u[2 * i + 1]) ** 2
+        return out
+
+    @njit
+    def height(t: Any, q: Any) -> Any:
+        total = 0.0
+        for i in range(ends):
+            total += G * weights[i] * q[2 * i + 1]
+        return total
 
     def reference(t: float) -> np.ndarray:
         angle, rate = _crank(n, t)
@@ -54,7 +74,8 @@ def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
         q0=q0,
         u0=u0,
         t_span=(0.0, t_end),
-        potential=lambda t, q: G * (weights @ q[1::2]),
+        potential_energy=height,
+        gamma=gamma,
         name=f"{n}-four-bar",
         reference=reference,
         source="multibody benchmark library, A02",
@@ -97,7 +118,7 @@ def andrews() -> MechanicsProblem:
         q0=START,
         u0=np.zeros(7),
         t_span=(0.0, 0.03),
-        potential=lambda t, q: STIFFNESS / 2 * (_spring(q)[0] - LENGTH) ** 2 - TORQUE * q[0],
+        potential_energy=njit(lambda t, q: STIFFNESS / 2 * (_spring(q)[0] - LENGTH) ** 2 - TORQUE * q[0]),
         coordinates="beta Theta gamma Phi delta Omega epsilon",
         name="andrews",
         source="test set for initial value problem solvers",
@@ -105,6 +126,7 @@ def andrews() -> MechanicsProblem:
     )
 
 
+@njit
 def _andrews_mass(q: Any) -> np.ndarray:
     e, f = E - EA, ZF - FA
     M = np.zeros((7, 7))
@@ -121,6 +143,7 @@ def _andrews_mass(q: Any) -> np.ndarray:
     return M
 
 
+@njit
 def _spring(q: Any) -> tuple[Any, Any, Any]:
     """Return the spring's length, and the components x and y of the vector along it."""
     x = SD * np.cos(q[2]) + SC * np.sin(q[2]) + XB - XC
@@ -128,6 +151,7 @@ def _spring(q: Any) -> tuple[Any, Any, Any]:
     return np.sqrt(x**2 + y**2), x, y
 
 
+@njit
 def _andrews_forces(t: Any, q: Any, u: Any) -> np.ndarray:
     e, f = E - EA, ZF - FA
     length, x, y = _spring(q)
@@ -145,6 +169,7 @@ def _andrews_forces(t: Any, q: Any, u: Any) -> np.ndarray:
     )
 
 
+@njit
 def _andrews_constraints(t: Any, q: Any) -> np.ndarray:
     x = RR * np.cos(q[0]) - D * np.cos(q[0] + q[1])
     y = RR * np.sin(q[0]) - D * np.sin(q[0] + q[1])
@@ -185,20 +210,25 @@ def car_axis() -> MechanicsProblem:
     )
 
 
+@njit
 def _right_wheel(t: Any) -> np.ndarray:
     """Return the position of the right wheel, at a distance of 1 from the left one."""
     height = BUMP * np.sin(BUMPS * t)
     return np.array([np.sqrt(1 - height**2), height])
 
 
+@njit
 def _car_forces(t: Any, q: Any, u: Any) -> np.ndarray:
-    pulls = []
-    for along in (q[:2], q[2:] - _right_wheel(t)):
-        length = np.sqrt(along @ along)
-        pulls += list((REST_LENGTH - length) / length * along - np.array([0, CAR_MASS]))
-    return np.array(pulls)
+    out, right = np.empty(4), q[2:] - _right_wheel(t)
+    for k in range(2):
+        x, y = (q[0], q[1]) if k == 0 else (right[0], right[1])
+        length = np.sqrt(x * x + y * y)
+        out[2 * k] = (REST_LENGTH - length) / length * x
+        out[2 * k + 1] = (REST_LENGTH - length) / length * y - CAR_MASS
+    return out
 
 
+@njit
 def _car_constraints(t: Any, q: Any) -> np.ndarray:
     """Return the residuals of the constraints.
 
@@ -228,23 +258,43 @@ def bricard(section: float = 0.1, axes: bool = True, t_end: float = 10.0, **opti
         whole[np.ix_([i, j], [i, j])] += np.array([[2, 1], [1, 2]]) / 6
         weights[[i, j]] += 0.5
 
-    def rods(q: Any) -> list[Any]:
-        P = [CORNERS[0], CORNERS[1], q[0:3], q[3:6], q[6:9], q[9:12]]
-        return [P[(k + 1) % 6] - P[k] for k in range(6)]
+    @njit
+    def rods(q: Any) -> Any:
+        r = np.empty((6, 3))
+        for j in range(3):
+            for k in range(6):
+                first = CORNERS[k, j] if k < 2 else q[3 * k - 6 + j]
+                last = CORNERS[(k + 1) % 6, j] if (k + 1) % 6 < 2 else q[3 * (k + 1) - 6 + j]
+                r[k, j] = last - first
+        return r
 
+    @njit
     def with_axes(t: Any, q: Any) -> np.ndarray:
-        r, a = rods(q), [AXES[0], AXES[1], q[12:15], q[15:18], q[18:21], q[21:24], AXES[0]]
-        found = [axis @ axis - 1 for axis in a[2:6]]
+        r, a, out = rods(q), np.empty((7, 3)), np.empty(24)
+        for j in range(3):
+            for k in range(7):
+                a[k, j] = AXES[k % 6, j] if k % 6 < 2 else q[6 + 3 * k + j]
+        for k in range(4):
+            out[k] = a[k + 2] @ a[k + 2] - 1
         for k in range(1, 6):
-            found += [r[k] @ r[k] - 1, a[k] @ r[k], a[k + 1] @ r[k], a[k] @ a[k + 1]]
-        return np.array(found)
+            out[4 * k] = r[k] @ r[k] - 1
+            out[4 * k + 1], out[4 * k + 2], out[4 * k + 3] = a[k] @ r[k], a[k + 1] @ r[k], a[k] @ a[k + 1]
+        return out
 
+    @njit
     def without(t: Any, q: Any) -> np.ndarray:
-        r = rods(q)
+        r, out = rods(q), np.empty(12)
         a2, a5 = np.cross(r[1], AXES[1]), np.cross(r[5], AXES[0])
         a3, a4 = np.cross(r[2], a2), np.cross(r[4], a5)
-        found = [rod @ rod - 1 for rod in r[1:]]
-        return np.array([*found, r[1] @ AXES[1], r[2] @ a2, r[3] @ a3, r[3] @ a4, r[4] @ a5, r[5] @ AXES[0], a3 @ a4])
+        for k in range(5):
+            out[k] = r[k + 1] @ r[k + 1] - 1
+        out[5], out[6], out[7], out[8] = r[1] @ AXES[1], r[2] @ a2, r[3] @ a3, r[3] @ a4
+        out[9], out[10], out[11] = r[4] @ a5, r[5] @ AXES[0], a3 @ a4
+        return out
+
+    @njit
+    def height(t: Any, q: Any) -> Any:
+        return G * (weights[2] * q[1] + weights[3] * q[4] + weights[4] * q[7] + weights[5] * q[10])
 
     M, forces = np.kron(whole[2:, 2:], np.eye(3)), -G * np.kron(weights[2:], [0, 1, 0])
     q0 = CORNERS[2:].ravel()
@@ -259,7 +309,7 @@ def bricard(section: float = 0.1, axes: bool = True, t_end: float = 10.0, **opti
         q0=q0,
         u0=np.zeros(q0.size),
         t_span=(0.0, t_end),
-        potential=lambda t, q: G * (weights[2:] @ q[1:12:3]),
+        potential_energy=height,
         name="bricard",
         source="multibody benchmark library, A04",
         **options,
@@ -279,11 +329,11 @@ def knife_edge(t_end: float = 10.0) -> MechanicsProblem:
     return mechanism(
         [1, 1, 1],
         [1, 0, 0],
-        velocity_constraints=lambda t, q, u: [np.sin(q[2]) * u[0] - np.cos(q[2]) * u[1]],
+        velocity_constraints=njit(lambda t, q, u: np.array([np.sin(q[2]) * u[0] - np.cos(q[2]) * u[1]])),
         q0=[0, 0, 0],
         u0=[0, 0, 1],
         t_span=(0.0, t_end),
-        potential=lambda t, q: -q[0],
+        potential_energy=njit(lambda t, q: -q[0]),
         coordinates="x y angle",
         name="knife edge",
         reference=reference,
