@@ -9,16 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 from systems import energy, pericentre
 
-from eip_scipy.problems import (
-    Grid,
-    GrossPitaevskii,
-    harmonic_trap,
-    plane_wave,
-    rotating_packet,
-    solar_system,
-    soliton,
-    tokamak,
-)
+from eip_scipy.problems import Grid, GrossPitaevskii, solar_system, tokamak
 from eip_scipy_studies.comparators import (
     boris,
     crank_nicolson,
@@ -29,6 +20,7 @@ from eip_scipy_studies.comparators import (
     stormer_verlet,
 )
 from eip_scipy_studies.comparators.stormer_verlet import FORMS
+from eip_scipy_studies.condensates.problems import harmonic_trap, plane_wave, rotating_packet, soliton
 
 SCHEMES = (crank_nicolson, linearly_implicit, sav_crank_nicolson)
 TOL = 1e-12
