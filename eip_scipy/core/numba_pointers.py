@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from itertools import count
+from types import CodeType, FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -148,10 +149,9 @@ def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
         given.append("params")
     dimensions = len(kind.shape)
     put = PUT["values" if kind.real and dimensions == 1 else dimensions] if not kind.in_place else ()
-    lines = "def call(t, y, f, out, params):", f"value = fun({', '.join(given)})", *put
-    made = {"fun": fun, "ChangedShapeError": ChangedShapeError}
-    exec("\n    ".join(lines), made)
-    return jit(made["call"])
+    text = "\n    ".join(["def call(t, y, f, out, params):", f"value = fun({', '.join(given)})", *put])
+    (code,) = (item for item in compile(text, "<call>", "exec").co_consts if isinstance(item, CodeType))
+    return jit(FunctionType(code, {"fun": fun, "ChangedShapeError": ChangedShapeError}))
 
 
 @lru_cache(maxsize=256)
