@@ -299,15 +299,9 @@ def test_a_run_that_fails_is_listed(capsys):
     assert "Did not reach the end:\n  small, EIPRKN12, h 0.10: projection failed" in text
 
 
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [("pythagoras", "; did you mean 'pythagorean'?"), ("kepler-0.9999", "; did you mean 'kepler-0.999'?"), ("x", "")],
-)
-def test_unknown_scene(name, hint, capsys):
-    assert main(["hard-scenes", "--scene", name]) == 2
-    err = capsys.readouterr().err
-    assert len(err.splitlines()) == 1
-    assert f"unknown scene {name!r}, expected one of {', '.join(SCENES)}{hint} (see" in err
+def test_unknown_scene(capsys):
+    assert main(["hard-scenes", "--scene", "pythagoras"]) == 2
+    assert f"unknown scene 'pythagoras', expected one of {', '.join(SCENES)}" in capsys.readouterr().err
 
 
 def test_invariant_errors_and_bodies_of_a_scene():

@@ -26,7 +26,7 @@ def pendulum():
         return [(q[0] ** 2 + q[1] ** 2 - 1) / 2]
 
     return mechanism(
-        [1, 1], [0, -9.81], length, q0=[1, 0], u0=[0, 0], t_span=(0, 0.4), potential=lambda t, q: 9.81 * q[1]
+        [1, 1], [0, -9.81], length, q0=[1, 0], u0=[0, 0], t_span=(0, 0.4), potential_energy=lambda t, q: 9.81 * q[1]
     )
 
 

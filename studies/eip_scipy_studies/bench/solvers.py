@@ -288,19 +288,22 @@ def rebound(integrator: str, case: Case) -> Solve:
     """Return calls of REBOUND; IAS15 and the like get a tolerance, others a number of steps."""
     package = import_module("rebound")
     q, v = case.y0.reshape(2, -1, 3)
+    name = integrator.partition(" ")[0].lower()
 
     def solve(setting: Any) -> np.ndarray:
         simulation = package.Simulation()
-        simulation.integrator = integrator.partition(" ")[0].lower()
+        simulation.integrator = name
+        # Version 4 keeps an integrator's options in simulation.ri_<name>, version 5 in simulation.integrator.
+        options = getattr(simulation, f"ri_{name}", None) or simulation.integrator
         for mass, position, velocity in zip(case.gm, q, v, strict=True):
             names = dict(zip(("x", "y", "z", "vx", "vy", "vz"), (*position, *velocity), strict=True))
             simulation.add(m=mass, **names)
         if integrator == "IAS15":
-            simulation.ri_ias15.epsilon = setting
+            options.epsilon = setting
         else:
             simulation.dt = case.t_end / setting
         if integrator == "WHFast c17":
-            simulation.ri_whfast.corrector, simulation.ri_whfast.safe_mode = 17, 0
+            options.corrector, options.safe_mode = 17, 0
         simulation.integrate(case.t_end)
         found = np.empty((2, len(case.gm), 3))
         simulation.serialize_particle_data(xyz=found[0], vxvyvz=found[1])
