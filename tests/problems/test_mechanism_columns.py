@@ -133,15 +133,16 @@ def test_columns_are_differences_of_the_flow(name):
 
 
 @pytest.mark.needs_jit
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_columns_of_compiled_mechanisms_are_those_of_plain_functions():
-    run = integrate(SYSTEMS["3, sphere"](), variations="state", **OPTIONS)
-    assert run.columns["source"] == "dual numbers"
-    plain = mechanism([1, 1, 1], [0, 0, -G], sphere.py_func, q0=[1, 0, 0], u0=[0, 0.5, 0.3], t_span=(0, 0.2))
-    other = integrate(plain, variations="state", **OPTIONS)
-    assert other.columns["source"] == "complex steps"
-    right = integrate(SYSTEMS["3, sphere"](), t_span=(0, 0.2), variations="state", **OPTIONS).stm[-1]
-    np.testing.assert_allclose(other.stm[-1], right, rtol=0, atol=1e-9 * np.abs(right).max())
+    """Along the constraints; elsewhere the flow is not defined, and depends on how gamma is computed."""
+    problem = SYSTEMS["3, sphere"]()
+    plain = mechanism([1, 1, 1], [0, 0, -G], sphere.py_func, q0=[1, 0, 0], u0=[0, 0.5, 0.3])
+    runs = [integrate(item, t_span=(0, 0.2), variations="state", **OPTIONS) for item in (problem, plain)]
+    assert [run.columns["source"] for run in runs] == ["dual numbers", "complex steps"]
+    columns = [run.stm[-1] @ along_constraints(problem) for run in runs]
+    np.testing.assert_allclose(*columns, rtol=0, atol=1e-8)
 
 
 def period_and_slope(angle, omega):

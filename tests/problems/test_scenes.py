@@ -154,17 +154,6 @@ def test_pythagorean_to_its_end():
     assert distance(problem, plain.y[:, -1], 70.0) > 5 * distance(problem, kept.y[:, -1], 70.0)
 
 
-@pytest.mark.slow
-def test_reference_file_can_be_made_anew(tmp_path):
-    pytest.importorskip("heyoka")
-    assert main(["study", "scene-reference", "--bits", "128", "--out", str(tmp_path)]) == 0
-    stored = ROOT / "eip_scipy" / "data" / "scene_references.json"
-    assert (
-        json.loads((tmp_path / "scene_references.json").read_text())["states"]
-        == json.loads(stored.read_text())["states"]
-    )
-
-
 # Fictitious time.
 
 

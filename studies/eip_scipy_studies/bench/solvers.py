@@ -183,7 +183,9 @@ def numbalsoda(method: str, case: Case) -> Solve:
         ends = np.empty_like(starts)
         for k in range(len(starts)):
             states, success = call(address, starts[k], times, params, rtol=rtol, atol=atol, mxstep=10**8)
-            ends[k] = states[-1] if success else np.nan
+            ends[k] = states[-1]
+            if not success:
+                ends[k, :] = np.nan
         return ends
 
     return lambda setting: each(np.atleast_2d(case.y0), setting, ATOL * setting).reshape(case.y0.shape)
