@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from time import process_time
 from typing import Any, NamedTuple
 
@@ -88,7 +88,11 @@ def measure(case_name: str, solver_name: str, enough: float, patience: float) ->
                     break
         except Exception as error:  # whatever a package raises is its answer
             said = _line(error)
-    return Measured(case.name, solver.name, version(solver.package), compilation, runs, said)
+    try:
+        installed = version(solver.package)
+    except PackageNotFoundError:
+        installed = ""
+    return Measured(case.name, solver.name, installed, compilation, runs, said)
 
 
 def _line(error: BaseException) -> str:

@@ -11,10 +11,13 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.integrate import solve_ivp
 
 from eip_scipy.problems import MechanicsProblem, mechanics, mechanism
+
+from ..report import needed
+
+njit = needed("numba", '"eip_scipy[numba]"').njit
 
 G = 9.81  # m/s^2
 FINEST = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
