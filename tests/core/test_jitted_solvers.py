@@ -5,8 +5,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, Invariant
-from eip_scipy.core.jitted import compiled_call
-from eip_scipy.engine.native import Call
 
 numba = pytest.importorskip("numba")
 njit = numba.njit
@@ -86,18 +84,6 @@ def test_python_is_not_called_in_the_steps(monkeypatch):
 @njit
 def of_a_list(t, y):
     return [y[1], -y[0]]
-
-
-@njit
-def maybe(t, y):
-    if y[0] > 0:
-        return y[0]
-    return None
-
-
-@pytest.mark.parametrize(("fun", "shape"), [(of_a_list, (2,)), (maybe, ()), (both, ())])
-def test_other_values_go_through_python(fun, shape):
-    assert compiled_call(Call(fun, (), shape, None), 4, np.dtype(float)).compiled is None
 
 
 def test_lists_and_integers():

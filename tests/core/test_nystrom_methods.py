@@ -2,13 +2,13 @@
 
 from fractions import Fraction
 
-import mpmath
 import numba
 import numpy as np
 import pytest
+from closed_forms import kepler_state
 from orders import observed_order
 from scipy.integrate import solve_ivp
-from systems import JIT_H, JIT_L, energy
+from systems import JIT_H, JIT_L, energy, orbit
 
 from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, eip_method, integrate
 from eip_scipy.methods import NystromTableau
@@ -29,10 +29,6 @@ def fill_acceleration(t, q, out):
     out[0], out[1] = w * q[0], w * q[1]
 
 
-def orbit(t, y):
-    return np.concatenate([y[2:], acceleration(t, y[:2])])
-
-
 INVARIANTS = [JIT_H, JIT_L]
 TAYLOR = NystromTableau("Taylor 2", [[]], ["1/2"], [1], [0], 1, reference="q + h v + h^2 a / 2, v + h a")
 KEPT = {"invariants": INVARIANTS, "blocks": 2}
@@ -40,18 +36,7 @@ KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 @pytest.fixture(scope="module")
 def exact():
-    """Return the state at t = 2, from Kepler's equation between two points of an orbit, in 40 digits."""
-    with mpmath.workdps(40):
-        q, v, t = mpmath.matrix(Y0[:2].tolist()), mpmath.matrix(Y0[2:].tolist()), 2
-        r = mpmath.norm(q)
-        a = 1 / (2 / r - mpmath.fdot(v, v))
-        n, s = a**-1.5, mpmath.fdot(q, v) / mpmath.sqrt(a)
-        u = mpmath.findroot(lambda u: u - (1 - r / a) * mpmath.sin(u) + s * (1 - mpmath.cos(u)) - n * t, n * t)
-        rest, sin = 1 - mpmath.cos(u), mpmath.sin(u)
-        q_end = (1 - a / r * rest) * q + (t - (u - sin) / n) * v
-        r_end = mpmath.norm(q_end)
-        v_end = -mpmath.sqrt(a) / (r * r_end) * sin * q + (1 - a / r_end * rest) * v
-        return np.array([float(x) for x in [*q_end, *v_end]])
+    return kepler_state(Y0, 2)
 
 
 @pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "metric": "euclidean"}])

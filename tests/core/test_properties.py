@@ -77,17 +77,6 @@ def test_powers_of_two_in_the_invariants_change_no_bit(seed, size, iterations, d
 
 @given(seeds, sizes, st.integers(1, 2))
 @few
-def test_any_factors_of_the_invariants(seed, size, iterations):
-    """The result depends on the unit by round-off only, over 24 decades."""
-    q = Quadratics(seed, *size)
-    assume(q.well_conditioned())
-    factors = 10.0 ** q.rng.uniform(-12, 12, size[1]) * q.rng.choice([-1, 1], size[1])
-    plain, scaled = (project(q.y_hat, q.invariant(f), iterations=iterations).y for f in (1.0, factors))
-    np.testing.assert_allclose(scaled, plain, rtol=0, atol=1e-13)
-
-
-@given(seeds, sizes, st.integers(1, 2))
-@few
 def test_order_of_invariants_and_components(seed, size, iterations):
     q = Quadratics(seed, *size)
     n, rows = size
@@ -147,22 +136,6 @@ def test_least_norm_in_the_metric_and_neutral_to_the_frame(seed, n, rows, k):
         assert np.abs(C @ unweighted).max() > 1e-6 * np.abs(unweighted).max()
 
 
-@given(seeds, st.integers(2, 8), st.integers(1, 3))
-@few
-def test_least_norm_by_the_kkt_system(seed, n, rows):
-    """The correction minimises |d / sigma|^2 / 2 with G d = -g, with all multipliers."""
-    assume(rows < n)
-    rng = np.random.default_rng(seed)
-    G, y_hat, sigma = rng.standard_normal((rows, n)), rng.standard_normal(n), rng.uniform(0.2, 1, n)
-    assume(np.linalg.cond(G) < 100)
-    target = G @ y_hat + rng.standard_normal(rows)
-    K = np.block([[np.diag(sigma**-2), G.T], [G, np.zeros((rows, rows))]])
-    d = np.linalg.solve(K, np.concatenate([np.zeros(n), target - G @ y_hat]))[:n]
-    result = project(y_hat, Invariant(lambda t, y: G @ y, lambda t, y: G, target=target), sigma=sigma)
-    np.testing.assert_allclose(result.correction, d, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(result.defect, 0.0, atol=1e-13)
-
-
 @given(seeds, st.integers(2, 6), st.integers(1, 3))
 @few
 def test_dependent_rows_give_the_pseudo_inverse_s_answer(seed, n, rows):
@@ -205,18 +178,6 @@ def test_size_of_the_weights_does_not_matter():
         np.testing.assert_array_equal(project(q.y_hat, q.invariant(), sigma=factor * sigma).y, plain.y)
 
 
-@given(seeds, sizes)
-@few
-def test_euclidean_projection_is_the_paper_s_formula(seed, size):
-    """y + G^T lambda, lambda = -(G G^T)^-1 g."""
-    q = Quadratics(seed, *size)
-    assume(q.well_conditioned())
-    G, g = q.grad(0.0, q.y_hat), q.value(0.0, q.y_hat) - q.target
-    result = project(q.y_hat, q.invariant())
-    np.testing.assert_allclose(result.correction, -G.T @ np.linalg.solve(G @ G.T, g), rtol=0, atol=1e-13)
-    np.testing.assert_allclose(result.defect, q.value(0.0, result.y) - q.target, rtol=0, atol=0)
-
-
 @given(seeds, sizes, st.sampled_from([1e-2, 1e-3, 1e-4]))
 @few
 def test_second_projection_moves_by_offset_times_the_first(seed, size, offset):
@@ -246,9 +207,9 @@ def test_project_with_a_gradient_by_f(f, iterations):
     assert by_f.rank == 1
 
 
-@given(seeds, sizes, st.integers(2, 4))
+@given(seeds, sizes, st.integers(1, 4))
 @few
-def test_more_iterations_are_newton_s(seed, size, iterations):
+def test_iterations_are_newton_s(seed, size, iterations):
     """On the fixed directions G(y_hat)' mu the residuals are those of Newton's method written with numpy's solver."""
     q = Quadratics(seed, *size, offset=1e-2)
     assume(q.well_conditioned())
@@ -386,9 +347,9 @@ def test_rotation_needs_blocks():
     assert np.abs(turned.y[:, -1].reshape(-1, 3) - rotated).max() > 1e-7
 
 
-def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40):
-    """Return eccentric Kepler, with a different unit for each component."""
-    problem = kepler(0.6, 0.005)
+def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40, eccentricity=0.6):
+    """Return Kepler with a different unit for each component, at and between the steps."""
+    problem = kepler(eccentricity, 0.005 if eccentricity else 0.0)
 
     def inner(item, t, z):
         y = z / unit
@@ -402,18 +363,20 @@ def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40):
         for item in problem.invariants
     ]
     options = {"metric": metric, "atol": atol, "blocks": blocks, "invariants": invariants, "method": EIPRK4, "h": 0.03}
+    options["t_eval"] = np.linspace(0, 0.03 * steps, 3 * steps + 2)
     return integrate(lambda t, z: problem.fun(t, z / unit) * unit, (0, 0.03 * steps), problem.y0 * unit, **options)
 
 
-@given(seeds, st.booleans())
-@settings(max_examples=20, deadline=None)
-def test_units_of_the_state_with_the_error_metric(seed, blocks):
-    """Steps with atol=0: any units of the components (of the blocks, where there are any), over 24 decades."""
+@given(seeds, st.booleans(), st.sampled_from([0.0, 0.6]))
+@settings(max_examples=30, deadline=None)
+def test_units_of_the_state_with_the_error_metric(seed, blocks, eccentricity):
+    """Steps with atol=0: any units of the components, or blocks, over 24 decades; also where gradients are parallel."""
     rng = np.random.default_rng(seed)
     unit = 10.0 ** (np.repeat(rng.uniform(-12, 12, 2), 2) if blocks else rng.uniform(-12, 12, 4))
-    options = {"blocks": 2} if blocks else {}
+    options = {"blocks": 2 if blocks else None, "eccentricity": eccentricity}
     plain, scaled = kepler_in_units(np.ones(4), **options), kepler_in_units(unit, **options)
-    np.testing.assert_allclose(scaled.y[:, -1] / unit, plain.y[:, -1], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(scaled.y / unit[:, None], plain.y, rtol=0, atol=1e-11)
+    assert scaled.diagnostics.n_rank_reduced == plain.diagnostics.n_rank_reduced
 
 
 @pytest.mark.parametrize("options", [{"metric": "euclidean"}, {"atol": 1e-6}])
@@ -514,13 +477,6 @@ def test_error_metric_is_its_formula(layout, method, every):
     largest = max(np.linalg.norm(move[b]) / s for b, s in zip(lists, scale, strict=True)) / r.max()
     assert run.diagnostics.max_correction == pytest.approx(largest, rel=1e-6)
     assert run.diagnostics.n_projections == 1
-
-
-def test_error_metric_without_any_error_is_euclidean():
-    """f = 0: err = 0 in each component."""
-    keep = Invariant(lambda t, y: y[0] + 3 * y[1] + t, lambda t, y: np.array([1.0, 3.0]))
-    run = integrate(lambda t, y: np.zeros(2), (0, 1), [0.0, 0.0], method=EIPRK4, h=1.0, invariants=keep, check=False)
-    np.testing.assert_allclose(run.y[:, -1], [-0.1, -0.3], rtol=4 * EPS)
 
 
 @pytest.mark.parametrize(("compensated", "move"), [(False, [0.25 / 9.25, 3 / 9.25]), (True, [0.1, 0.3])])
