@@ -5,15 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from systems import (
-    SQUARE,
-    VOLTERRA,
-    lotka_volterra,
-    oscillator,
-    pendulum,
-    pendulum_energy,
-    pendulum_gradient,
-)
+from systems import SQUARE, VOLTERRA, lotka_volterra, oscillator, pendulum, pendulum_energy, pendulum_gradient
 
 from eip_scipy import (
     EIPDOP853,

@@ -9,17 +9,7 @@ from systems import oscillator, pendulum
 from systems import pendulum_energy as energy
 from systems import pendulum_gradient as energy_gradient
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK4,
-    EIPRK45,
-    EIPRKN12,
-    Invariant,
-    ensemble,
-    integrate,
-    project,
-    recommend,
-)
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate, project, recommend
 from eip_scipy.core import invariant_checks
 from eip_scipy.core.invariants import InvariantSet, as_invariants
 from eip_scipy.core.problem import Problem

@@ -551,31 +551,6 @@ def test_spacing_by_itself_is_its_rule(h, metric):
     assert 2 < len(expected) < 20  # some asked in vain
 
 
-@pytest.mark.parametrize("uses_f", [False, True])
-@pytest.mark.parametrize("direction", ["new", "old", "midpoint"])
-@pytest.mark.parametrize("iterations", [1, 2])
-def test_directions_are_those_of_the_paper_s_remark(direction, iterations, uses_f):
-    """y + D mu with D the gradient at the new, old or middle point and Newton's mu, gradients at the iterates."""
-    y0, h = np.array([0.1, -0.2, 0.35, 0.05]), 0.4
-    times = []
-
-    def gradient(t, y, f):
-        times.append(t)
-        return np.array([-f[2], -f[3], y[2], y[3]])
-
-    keep = Invariant(swing_energy, gradient if uses_f else swing_gradient, uses_f=uses_f)
-    options = {"direction": direction, "iterations": iterations, "metric": "euclidean"}
-    run = integrate(swing, (0, h), y0, method=EIPRK4, h=h, invariants=keep, **options)
-    y_hat, _ = raw_step(EIPRK4.TABLEAU, swing, 0.0, y0, h)
-    D = swing_gradient(0, {"new": y_hat, "old": y0, "midpoint": 0.5 * (y0 + y_hat)}[direction])
-    y = y_hat
-    for _ in range(iterations):
-        y = y - D * (swing_energy(0, y) - swing_energy(0, y0)) / (swing_gradient(0, y) @ D)
-    np.testing.assert_allclose(run.y[:, -1], y, rtol=0, atol=2 * EPS)
-    if uses_f:
-        assert (0.5 * h in times) == (direction == "midpoint")
-
-
 def test_harmonic_oscillator_multiplier_of_the_paper():
     """One EIP step is y_hat + lambda omega y_hat with lambda = -(1 - |y0|^2 / |y_hat|^2) / (2 omega)."""
     problem = harmonic(omega=10.0, h=0.1, t_end=0.1)

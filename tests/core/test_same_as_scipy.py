@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import DOP853, RK23, RK45, solve_ivp
-from systems import (
-    JIT_H,
-    JIT_L,
-    jit_orbit,
-    orbit,
-    pericentre,
-)
+from systems import JIT_H, JIT_L, jit_orbit, orbit, pericentre
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, Invariant, eip_method, integrate
 

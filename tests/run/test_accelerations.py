@@ -9,17 +9,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 import eip_scipy
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-    ensemble,
-    integrate,
-    recommend,
-)
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate, recommend
 from eip_scipy.core.acceleration import AccelerationField
 from eip_scipy.core.problem import Problem
 

@@ -10,17 +10,7 @@ from systems import jit_momentum as momentum
 from systems import jit_orbit as kepler
 from systems import pericentre
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ14,
-    EIPRK4,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-    eip_method,
-    integrate,
-    solve_ivp,
-)
+from eip_scipy import EIPDOP853, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12, Invariant, eip_method, integrate, solve_ivp
 
 E = 0.6
 START = pericentre(E)
