@@ -497,6 +497,8 @@ def test_rows_grow_beyond_the_first_thousand():
     run = integrate(orbit, (0, 12), Y0, save_every=1, **options)
     np.testing.assert_array_equal(run.t, sol.t)
     np.testing.assert_array_equal(run.y, sol.y)
+    seldom = integrate(orbit, (0, 12), Y0, save_every=1000, **options)
+    np.testing.assert_array_equal(seldom.y, sol.y[:, [*range(0, len(sol.t) - 1, 1000), -1]])
 
 
 @pytest.mark.needs_jit

@@ -8,6 +8,7 @@ from eip_scipy import Invariant
 from eip_scipy.core.gradients import random_directions
 from eip_scipy.core.invariant_checks import complaints
 from eip_scipy.core.invariants import InvariantSet, with_args
+from eip_scipy.engine.data import N_FIGURES
 from eip_scipy.problems import kepler
 
 SIZES = [0.0, *10.0 ** np.arange(-13.0, 0.5, 0.5)]
@@ -74,6 +75,25 @@ def test_what_is_found_in_order_passes_the_examination(case):
     assert not any(found[:3])
     assert any(found)
     assert not np.any(np.array(in_order) & np.array(found))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_look_notes_rates_and_looks(case):
+    rng = np.random.default_rng(6)
+    for size in SIZES[::6]:
+        item, fun = case(size)
+        t, y = rng.uniform(0, 10), rng.standard_normal(2)
+        f = fun(t, y)
+        known = InvariantSet(item, t, y, f, TAU, t_bound=t - 5.0, rhs=fun)
+        G, here, directions = known.gradients(t, y, f), known.values(t, y), random_directions(2, False)
+        looked, noted = np.zeros((2, 1, N_FIGURES))
+        known.note_rates(noted, t, y, f, G, here)
+        of_run = known.target, known.scales, TAU, known.t_span, directions
+        found = known.functions.look(looked, t, y, f, *of_run)
+        assert found == known.functions.is_in_order(t, y, f, G, here, TAU, known.t_span, directions)
+        assert np.array_equal(looked, noted)
+        assert known.functions.look(looked, t, y, np.array([np.nan, 1.0]), *of_run)
+        assert np.array_equal(looked, noted)
 
 
 def with_own(item, params):

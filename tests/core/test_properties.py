@@ -207,6 +207,15 @@ def test_project_with_a_gradient_by_f(f, iterations):
     assert by_f.rank == 1
 
 
+@pytest.mark.parametrize("direction", ["new", "old", "midpoint"])
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_directions_with_a_gradient_by_f(direction, iterations):
+    """f is evaluated where the gradient is: in the middle of the step too."""
+    options = {"method": EIPRK4, "h": 0.4, "metric": "euclidean", "direction": direction, "iterations": iterations}
+    by_f, plain = (integrate(orbit, (0, 0.4), ORBIT_STATE, invariants=item, **options).y for item in (H_USES_F, H))
+    np.testing.assert_allclose(by_f, plain, rtol=0, atol=4 * EPS)
+
+
 @given(seeds, sizes, st.integers(1, 4))
 @few
 def test_iterations_are_newton_s(seed, size, iterations):
@@ -347,8 +356,8 @@ def test_rotation_needs_blocks():
     assert np.abs(turned.y[:, -1].reshape(-1, 3) - rotated).max() > 1e-7
 
 
-def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40, eccentricity=0.6):
-    """Return Kepler with a different unit for each component, at and between the steps."""
+def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40, eccentricity=0.6, time=1.0):
+    """Return Kepler with a unit for each component and for the time, at and between the steps."""
     problem = kepler(eccentricity, 0.005 if eccentricity else 0.0)
 
     def inner(item, t, z):
@@ -362,9 +371,10 @@ def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40, eccen
         Invariant(lambda t, z, item=item: item.fun(t, z / unit, *item.args), lambda t, z, item=item: inner(item, t, z))
         for item in problem.invariants
     ]
-    options = {"metric": metric, "atol": atol, "blocks": blocks, "invariants": invariants, "method": EIPRK4, "h": 0.03}
-    options["t_eval"] = np.linspace(0, 0.03 * steps, 3 * steps + 2)
-    return integrate(lambda t, z: problem.fun(t, z / unit) * unit, (0, 0.03 * steps), problem.y0 * unit, **options)
+    options = {"metric": metric, "atol": atol, "blocks": blocks, "invariants": invariants, "method": EIPRK4}
+    options |= {"h": 0.03 * time, "t_eval": time * np.linspace(0, 0.03 * steps, 3 * steps + 2)}
+    span, rate = (0, 0.03 * steps * time), unit / time
+    return integrate(lambda t, z: problem.fun(t / time, z / unit) * rate, span, problem.y0 * unit, **options)
 
 
 @given(seeds, st.booleans(), st.sampled_from([0.0, 0.6]))
@@ -374,7 +384,8 @@ def test_units_of_the_state_with_the_error_metric(seed, blocks, eccentricity):
     rng = np.random.default_rng(seed)
     unit = 10.0 ** (np.repeat(rng.uniform(-12, 12, 2), 2) if blocks else rng.uniform(-12, 12, 4))
     options = {"blocks": 2 if blocks else None, "eccentricity": eccentricity}
-    plain, scaled = kepler_in_units(np.ones(4), **options), kepler_in_units(unit, **options)
+    time = 2.0 ** rng.integers(-40, 40)
+    plain, scaled = kepler_in_units(np.ones(4), **options), kepler_in_units(unit, time=time, **options)
     np.testing.assert_allclose(scaled.y / unit[:, None], plain.y, rtol=0, atol=1e-11)
     assert scaled.diagnostics.n_rank_reduced == plain.diagnostics.n_rank_reduced
 
