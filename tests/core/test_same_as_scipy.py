@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import DOP853, RK23, RK45, solve_ivp
-from systems import JIT_H, JIT_L, jit_orbit, orbit, pericentre
+from systems import JIT_H, JIT_L, JIT_NORM, jit_orbit, jit_spin, orbit, pericentre
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, Invariant, eip_method, integrate
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, eip_method, integrate
 
 EPS = np.finfo(float).eps
 SCIPY = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853}
@@ -284,31 +284,15 @@ def test_attributes_step_by_step(name, method):
 
 
 @njit
-def jit_spin(t, y):
-    return np.array([-1j * y[0] + 0.5j * y[1], -2j * y[1] + 0.5j * y[0]])
-
-
-@njit
-def jit_norm(t, y):
-    return (y[0] * np.conj(y[0]) + y[1] * np.conj(y[1])).real
-
-
-@njit
-def jit_norm_gradient(t, y):
-    return 2 * y
-
-
-@njit
 def jit_event(t, y):
     return y[0].real - 0.3
 
 
-NORM = Invariant(jit_norm, jit_norm_gradient, name="N")
 RUNS = {
     "orbit": (jit_orbit, (0.0, 15.0), pericentre(0.6), [JIT_H, JIT_L]),
     "backward": (jit_orbit, (2.0, -10.0), pericentre(0.6), [JIT_H, JIT_L]),
-    "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), NORM),
-    "complex backward": (jit_spin, (3.0, -9.0), np.array([1.0 + 0j, 0.2j]), NORM),
+    "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), JIT_NORM),
+    "complex backward": (jit_spin, (3.0, -18.0), np.array([1.0 + 0j, 0.2j]), JIT_NORM),
 }
 # Complex states have a separate driver.
 runs = pytest.mark.parametrize(
