@@ -95,6 +95,27 @@ JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
 JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
 
 
+# Two complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
+
+
+@njit
+def jit_spin(t, y):
+    return -1j * np.array([0.3 * y[1] + abs(y[0]) ** 2 * y[0], 0.3 * y[0] + 0.7 * y[1]])
+
+
+@njit
+def jit_norm(t, y):
+    return abs(y[0]) ** 2 + abs(y[1]) ** 2
+
+
+@njit
+def twice(t, y):
+    return 2 * y
+
+
+JIT_NORM = Invariant(jit_norm, twice, name="N")
+
+
 def lotka_volterra(t, u):
     return np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)])
 

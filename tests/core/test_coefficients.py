@@ -1,7 +1,5 @@
 """Coefficients of solver classes, as in SciPy's Runge-Kutta classes, and classes made of such classes."""
 
-from fractions import Fraction
-
 import numpy as np
 import pytest
 from scipy.integrate import DOP853, LSODA, RK23, RK45, OdeSolver, solve_ivp
@@ -118,10 +116,3 @@ def changed(**members):
 def test_classes_that_are_refused(method, error, match):
     with pytest.raises(error, match=match):
         eip_method(method)
-
-
-def test_order_conditions_are_those_of_fractions():
-    """Cash and Karp's weights sum to 1 exactly; their floats do to rounding, which is what is accepted."""
-    exact = [Fraction(37, 378), Fraction(250, 621), Fraction(125, 594), Fraction(512, 1771)]
-    assert sum(exact) == 1
-    assert abs(CashKarp.B.sum() - 1) < 1e-15

@@ -5,23 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 from orders import observed_order
 from scipy.integrate import solve_ivp
-from systems import (
-    H_USES_F,
-    H,
-    L,
-    energy,
-    jit_energy,
-    jit_energy_gradient,
-    jit_momentum,
-    jit_momentum_gradient,
-    jit_orbit,
-    momentum,
-    orbit,
-    pericentre,
-)
+from systems import H_USES_F, H, L, energy, momentum, orbit, pericentre
 
 from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invariant, eip_method, integrate
 from eip_scipy.problems import solar_system
@@ -397,29 +383,16 @@ def test_an_invariant_as_an_event(method):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "compiled",
-    [pytest.param(True, marks=pytest.mark.needs_jit), pytest.param(False, marks=pytest.mark.slow_without_jit)],
-)
+@pytest.mark.slow_without_jit
 @pairs
-def test_adversarial_thresholds_of_integrate(method, compiled):
-    """The threshold comes with the parameters, so that one event is compiled for all."""
-    if compiled:
-        fun, event, invariants = jit_with_params()
-    else:
-        fun, event, invariants = lambda t, y, p: orbit(t, y), lambda t, y, p: y[0] - p[0], None
-        invariants = [
-            Invariant(lambda t, y, p: energy(t, y), lambda t, y, p: H.grad(t, y), name="H"),
-            Invariant(lambda t, y, p: momentum(t, y), lambda t, y, p: L.grad(t, y), name="L"),
-        ]
-    options = {"method": method, "rtol": 1e-4, "atol": 1e-7, "compiled": compiled, "invariants": invariants}
-    run = integrate(fun, (0.0, 8.0), Y0, params=[0.0], save_every=1, **options)
-    assert run.compiled is compiled
+def test_adversarial_thresholds_of_integrate(method):
+    options = {"method": method, "rtol": 1e-4, "atol": 1e-7, "invariants": [H, L], "save_every": 1}
+    run = integrate(orbit, (0.0, 8.0), Y0, **options)
     cases = [(i, value, k) for i, value, k in thresholds(run) if i == 0]
     assert len(cases) >= 57
     crossed = 0
     for _, value, k in cases:
-        found = integrate(fun, (0.0, 8.0), Y0, params=[value], save_every=1, events=event, **options)
+        found = integrate(orbit, (0.0, 8.0), Y0, events=passing(0, value), **options)
         np.testing.assert_array_equal(found.y, run.y)
         signs = np.sign(run.y[0] - value)
         signs = signs[signs != 0]  # a state on the threshold is one event, not one of each of its steps
@@ -432,58 +405,7 @@ def test_adversarial_thresholds_of_integrate(method, compiled):
     assert crossed >= 57
 
 
-def jit_with_params():
-    fun = njit(lambda t, y, p: jit_orbit(t, y))
-    event = njit(lambda t, y, p: y[0] - p[0])
-    value, gradient = njit(lambda t, y, p: jit_energy(t, y)), njit(lambda t, y, p: jit_energy_gradient(t, y))
-    momentum_value = njit(lambda t, y, p: jit_momentum(t, y))
-    second = Invariant(momentum_value, njit(lambda t, y, p: jit_momentum_gradient(t, y)), name="L")
-    return fun, event, [Invariant(value, gradient, name="H"), second]
-
-
 # Samples on the manifold.
-
-
-@pairs
-@pytest.mark.parametrize("rtol", [1e-4, pytest.param(1e-8, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("t_span", [(0.0, 8.0), (8.0, 0.0)], ids=["forward", "backward"])
-@pytest.mark.parametrize("driver", ["solve_ivp", "integrate"])
-def test_samples_on_the_manifold(method, rtol, t_span, driver):
-    options = {"invariants": [H, L], "rtol": rtol, "atol": rtol * 1e-3, "t_span": t_span}
-    level = defects(solve(method, **options).y).max()
-    t = np.linspace(*t_span, 301)
-    if driver == "solve_ivp":
-        y = solve(method, **options, t_eval=t).y
-    else:
-        del options["t_span"]
-        y = integrate(orbit, t_span, Y0, method=method, t_eval=t, **options).y
-    assert y.shape == (4, 301)
-    assert defects(y).max() <= (1e-7 if rtol == 1e-4 else max(level, 1e-14) * (1 + 1e-3) + 4e-15)
-
-
-@pairs
-def test_units_of_the_state(method):
-    """Lengths in metres and velocities in m/s: the same samples, in those units, to round-off."""
-    au, gm = 1.495978707e11, 1.32712440018e20
-    unit_v = math.sqrt(gm / au)
-    unit_t = au / unit_v
-    units = np.array([au, au, unit_v, unit_v])
-
-    def si(t, y):
-        return orbit(t, y / units) * units / unit_t
-
-    invariants = [
-        Invariant(lambda t, y: energy(t, y / units) * unit_v**2, lambda t, y: H.grad(t, y / units) * unit_v**2 / units),
-        Invariant(lambda t, y: momentum(t, y / units), lambda t, y: L.grad(t, y / units) / units),
-    ]
-    t = np.linspace(0, 8, 101)
-    tolerance = {"rtol": 1e-6, "atol": 1e-9}
-    one = solve(method, invariants=[H, L], t_eval=t, first_step=0.01, **tolerance).y
-    scaled = {"rtol": 1e-6, "atol": 1e-9 * units, "fun": si, "y0": Y0 * units, "t_span": (0.0, 8.0 * unit_t)}
-    scaled["first_step"] = 0.01 * unit_t
-    other = solve(method, invariants=invariants, t_eval=t * unit_t * (1 - 1e-15), **scaled).y / units[:, None]
-    np.testing.assert_allclose(other, one, rtol=0, atol=2e-6)
-    assert defects(other).max() <= 1e-10
 
 
 @pairs

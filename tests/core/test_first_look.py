@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from systems import oscillator
 
 from eip_scipy import Invariant
 from eip_scipy.core.gradients import random_directions
@@ -13,10 +14,6 @@ from eip_scipy.problems import kepler
 SIZES = [0.0, *10.0 ** np.arange(-13.0, 0.5, 0.5)]
 TAU = 0.1
 ENERGY = Invariant(lambda t, y: 0.5 * (y @ y), lambda t, y: y)
-
-
-def oscillator(t, y):
-    return np.array([y[1], -y[0]])
 
 
 def with_friction(size):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from systems import SQUARE, VOLTERRA, lotka_volterra, oscillator
+from systems import SQUARE, VOLTERRA, lotka_volterra, oscillator, pendulum, pendulum_energy, pendulum_gradient
 
 from eip_scipy import (
     EIPDOP853,
@@ -26,16 +26,7 @@ from eip_scipy.problems import kepler, solar_system
 
 EPS = np.finfo(float).eps
 METRICS = ["error", "euclidean"]
-GM_SUN, AU = 1.32712440018e20, 1.495978707e11
-
-
-def pendulum(t, y):
-    return np.array([y[1], -math.sin(y[0])])
-
-
-PENDULUM_ENERGY = Invariant(
-    lambda t, y: 0.5 * y[1] ** 2 - math.cos(y[0]), lambda t, y: np.array([math.sin(y[0]), y[1]]), name="H"
-)
+PENDULUM_ENERGY = Invariant(pendulum_energy, pendulum_gradient, name="H")
 
 
 def by_scipy(fun, t_span, y0, **options):
@@ -189,35 +180,6 @@ def test_project_with_zero_gradient(iterations):
 # Units and amplitudes.
 
 
-def kepler_si(eccentricity):
-    energy = Invariant(
-        lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - GM_SUN / math.hypot(y[0], y[1]),
-        lambda t, y: np.array([*(GM_SUN / math.hypot(y[0], y[1]) ** 3 * y[:2]), y[2], y[3]]),
-        name="H",
-    )
-    momentum = Invariant(
-        lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"
-    )
-    speed = math.sqrt(GM_SUN / AU * (1 + eccentricity) / (1 - eccentricity))
-    return (
-        lambda t, y: np.array([y[2], y[3], *(-GM_SUN / math.hypot(y[0], y[1]) ** 3 * y[:2])]),
-        [AU * (1 - eccentricity), 0.0, 0.0, speed],
-        [energy, momentum],
-        2 * np.pi * math.sqrt(AU**3 / GM_SUN),
-    )
-
-
-@pytest.mark.parametrize(("metric", "e"), [("error", 0.0), ("euclidean", 0.0), ("error", 0.1), ("error", 0.5)])
-def test_kepler_in_si_units(metric, e):
-    fun, y0, invariants, period = kepler_si(e)
-    run = by_integrate(fun, (0, period), y0, h=period / 500, invariants=invariants, metric=metric)
-    size = np.array([0.5 * y0[3] ** 2 + GM_SUN / y0[0], y0[0] * y0[3]])
-    assert run.status == 0
-    assert (run.max_defect <= 1e-14 * size).all()
-    assert np.linalg.norm(run.y[:2, -1] - y0[:2]) < 1e-7 * AU
-    assert run.diagnostics.n_rank_reduced == (run.diagnostics.n_projections if e == 0 else 0)
-
-
 def sizes_of_h_and_l(problem):
     """Sums of the absolute terms of H and of the components of L."""
     gm, (q, v) = problem.params, problem.y0.reshape(2, -1, 3)
@@ -245,46 +207,27 @@ D = np.array([1 / 3, 1 / 2, 1.0])
 
 @metrics
 @pytest.mark.parametrize("atol", [0.0, 1e-6])
-@pytest.mark.parametrize("amplitude", AMPLITUDES)
-def test_amplitudes_of_an_oscillator(metric, atol, amplitude):
-    """A quadratic energy, which is subnormal (5e-324 apart) at the smallest amplitude, and a norm, which is not."""
-    energy = Invariant(lambda t, y: 0.5 * (y @ y), lambda t, y: 1.0 * y, name="H")
-    length = Invariant(lambda t, y: math.hypot(*y), lambda t, y: y / math.hypot(*y), name="N")
-    for invariant in (energy, length):
-        options = {"invariants": invariant, "metric": metric, "atol": atol, "h": 0.1}
-        run = by_integrate(oscillator, (0, 5), [amplitude, 0.3 * amplitude], **options)
-        start = invariant.fun(0.0, run.y[:, 0])
-        assert run.status == 0
-        assert np.isfinite(run.y).all()
-        assert run.max_defect[0] <= 8 * EPS * start + 2 * 5e-324
-        plain = by_integrate(oscillator, (0, 5), [amplitude, 0.3 * amplitude], h=0.1)
-        # A subnormal energy resolves 5e-324 / H of the amplitude; the correction may move by that much.
-        assert np.abs(run.y - plain.y).max() <= (1e-5 + 5e-324 / start) * amplitude
-        assert run.diagnostics.n_rejected_projections == 0
-
-
-@metrics
 @pytest.mark.parametrize("blocks", [None, 3])
 @pytest.mark.parametrize("amplitude", AMPLITUDES)
-def test_amplitudes_of_a_nonlinear_problem(metric, blocks, amplitude):
+def test_amplitudes_of_a_nonlinear_problem(metric, blocks, amplitude, atol):
     """Euler's top is homogeneous: times an amplitude, it runs that many times faster along the same curve."""
     invariants = [
         Invariant(lambda t, y: 0.5 * (y @ (D * y)), lambda t, y: D * y, name="T"),
         Invariant(lambda t, y: 0.5 * (y @ y), lambda t, y: 1.0 * y, name="M"),
     ]
-    options = {"invariants": invariants, "metric": metric, "blocks": blocks, "atol": 0.0}
+    options = {"invariants": invariants, "metric": metric, "blocks": blocks, "atol": atol}
     direction = np.array([1.0, 0.1, 0.4])
 
     def top(t, y):
         return np.cross(y, D * y)
 
     run = by_integrate(top, (0, 5 / amplitude), amplitude * direction, h=0.1 / amplitude, **options)
-    one = by_integrate(top, (0, 5), direction, h=0.1, **options)
     start = 0.5 * amplitude**2 * np.array([direction @ (D * direction), direction @ direction])
     assert run.status == 0
     assert np.isfinite(run.y).all()
     assert (run.max_defect <= 8 * EPS * start + 2 * 5e-324).all()
     if amplitude >= 1e-150:
+        one = by_integrate(top, (0, 5), direction, h=0.1, **options | {"atol": atol / amplitude})
         np.testing.assert_allclose(run.y / amplitude, one.y, rtol=0, atol=1e-12)
 
 
@@ -529,14 +472,6 @@ def test_blow_up_ends_with_a_finite_state(driver):
     assert np.isfinite(run.y).all()
     assert 1.0 < run.t[-1] < 1.1
     assert "non-finite" in run.message or "finite" in run.message
-
-
-def test_overflow_in_one_step():
-    with np.errstate(all="ignore"):
-        run = by_integrate(lambda t, y: 1e200 * y, (0, 2), [1.0], h=0.01)
-    assert run.status == -1
-    assert run.t.tolist() == [0.0]
-    assert run.message.startswith("fun returned a non-finite value at t=0.00")
 
 
 def test_overflow_of_the_sum_alone():

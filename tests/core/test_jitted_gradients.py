@@ -5,6 +5,9 @@ import math
 import mpmath
 import numpy as np
 import pytest
+from systems import jit_energy as energy
+from systems import jit_momentum as momentum
+from systems import jit_orbit as fun
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, ensemble, integrate
 from eip_scipy.core.invariants import InvariantSet
@@ -212,22 +215,6 @@ def test_params_are_given():
     np.testing.assert_array_equal(found, [[3.0, 0.0]])
 
 
-@njit
-def fun(t, y):
-    r3 = (y[0] ** 2 + y[1] ** 2) ** 1.5
-    return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
-
-
-@njit
-def momentum(t, y):
-    return np.array([y[0] * y[3] - y[1] * y[2]])
-
-
-@njit
-def energy(t, y):
-    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1.0 / math.hypot(y[0], y[1])
-
-
 def energy_in_python(t, y):
     return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1.0 / np.sqrt(y[0] ** 2 + y[1] ** 2)
 
@@ -262,7 +249,11 @@ def test_ensembles_run_compiled_with_the_same_bits():
 
 
 def test_a_function_that_dual_numbers_cannot_take_runs_interpreted_and_says_so():
-    kept = Invariant(njit(lambda t, y: energy(t, y) * np.prod(np.ones(2) + 0 * y[:2])), name="H")
+    @njit
+    def value(t, y):
+        return (0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / math.hypot(y[0], y[1])) * np.prod(np.ones(2) + 0 * y[:2])
+
+    kept = Invariant(value, name="H")
     with pytest.warns(UserWarning, match="'H' has no grad and allows no complex step"):
         result = run([kept])
     assert not result.compiled

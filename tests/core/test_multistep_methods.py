@@ -1,15 +1,14 @@
 """Multistep methods through integrate and solve_ivp: orders, values between steps, bits, and refused arguments."""
 
-import math
 from dataclasses import replace
 
-import mpmath
 import numba
 import numpy as np
 import pytest
-from c_compiler import low_level, shared_library
+from closed_forms import kepler_state
+from scipy import LowLevelCallable
 from scipy.integrate import solve_ivp
-from systems import JIT_H, JIT_L
+from systems import JIT_H, JIT_L, orbit, pericentre
 
 from eip_scipy import (
     EIPDOP853,
@@ -26,13 +25,12 @@ from eip_scipy import (
 )
 from eip_scipy.engine.native import library
 from eip_scipy.methods import GaussJackson
-from eip_scipy.problems import Problem, figure_eight, nbody, solar_system
+from eip_scipy.problems import figure_eight, nbody, solar_system
 from eip_scipy.problems.gravity import solar_data
 from eip_scipy.run import integrate as longrun
 
 both = pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
-E = 0.2
-Y0 = np.array([1 - E, 0.0, 0.0, np.sqrt((1 + E) / (1 - E))])
+Y0 = pericentre(0.2)
 STEP = 2 * np.pi / 256
 
 
@@ -49,29 +47,13 @@ def jacobian(t, q, dq, out):
         out[k] = (along * q[k] - dq[k]) / square**1.5
 
 
-def orbit(t, y):
-    return np.concatenate([y[2:], acceleration(t, y[:2])])
-
-
 INVARIANTS = (JIT_H, JIT_L)
 KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 
 def exact(times, y0=Y0):
-    """Return states of Kepler's problem from the pericentre of this start, in 30 digits."""
-    out = []
-    with mpmath.workdps(30):
-        q, v = (mpmath.mpf(float(x)) for x in (y0[0], y0[3]))
-        axis = 1 / (2 / q - v * v)
-        e, n = 1 - q / axis, axis ** mpmath.mpf(-1.5)
-        side = mpmath.sqrt(1 - e * e)
-        for t in np.atleast_1d(times):
-            mean = n * mpmath.mpf(float(t))
-            angle = mpmath.findroot(lambda u, mean=mean: u - e * mpmath.sin(u) - mean, mean)
-            c, s = mpmath.cos(angle), mpmath.sin(angle)
-            speed = n * axis / (1 - e * c)
-            out.append([float(x) for x in (axis * (c - e), axis * side * s, -speed * s, speed * side * c)])
-    return np.array(out).T
+    """Return states of Kepler's problem from this start."""
+    return np.array([kepler_state(y0, t) for t in np.atleast_1d(times)]).T
 
 
 def run(end, y0=Y0, **options):
@@ -232,50 +214,33 @@ def test_a_problems_accelerations_are_taken_where_they_are_of_its_library():
         np.testing.assert_allclose(runs[2].y, runs[0].y, rtol=0, atol=1e-11)
 
 
-C_FUNCTIONS = """
-#include <math.h>
-
-int acceleration(double t, const double *q, double *out, const double *params) {
-    const double r = sqrt(q[0] * q[0] + q[1] * q[1]), w = params[0] / (r * r * r);
-    out[0] = -w * q[0];
-    out[1] = -w * q[1];
-    return 0;
-}
-
-int jacobian(double t, const double *q, const double *dq, double *out, const double *params) {
-    const double square = q[0] * q[0] + q[1] * q[1], w = params[0] / (square * sqrt(square));
-    const double along = 3 * (q[0] * dq[0] + q[1] * dq[1]) / square;
-    for (int k = 0; k < 2; ++k) out[k] = w * (along * q[k] - dq[k]);
-    return dq[0] > 1 ? -7 : 0;
-}
-"""
+def attraction(t, q, out, params):
+    w = params[0] / (q[0] * q[0] + q[1] * q[1]) ** 1.5
+    out[0], out[1] = -w * q[0], -w * q[1]
+    return 0
 
 
-def test_c_functions(tmp_path):
+def change_of_attraction(t, q, dq, out, params):
+    square = q[0] * q[0] + q[1] * q[1]
+    w = params[0] / square**1.5
+    along = 3 * (q[0] * dq[0] + q[1] * dq[1]) / square
+    out[0], out[1] = w * (along * q[0] - dq[0]), w * (along * q[1] - dq[1])
+    return 0
+
+
+def test_c_functions():
     """C functions by pointer, with params, give the bits of Python functions that compute the same."""
-    source = tmp_path / "functions.c"
-    source.write_text(C_FUNCTIONS)
-    library = shared_library(tmp_path / "functions.so", source)
-    acceleration, product = low_level(library, "acceleration"), low_level(library, "jacobian", 4)
-
-    def in_python(t, q, out, params):
-        r = math.sqrt(q[0] * q[0] + q[1] * q[1])
-        w = params[0] / (r * r * r)
-        out[:] = [-w * q[0], -w * q[1]]
-
-    def times(t, q, dq, out, params):
-        square = q[0] * q[0] + q[1] * q[1]
-        w = params[0] / (square * math.sqrt(square))
-        along = 3 * (q[0] * dq[0] + q[1] * dq[1]) / square
-        out[:] = [w * (along * q[k] - dq[k]) for k in range(2)]
-
-    given = {"method": EIPGJ14, "h": STEP, "params": [1.0], "in_place": True}
-    native = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=product, **given)
-    python = integrate(acceleration=in_python, t_span=(0, 20), y0=Y0, jacobian=times, **given)
+    by_pointer, in_python = [], []
+    for fun, arrays in ((attraction, 3), (change_of_attraction, 4)):
+        compiled = numba.cfunc(f"intc(f8{', CPointer(f8)' * arrays})")(fun)
+        by_pointer.append(LowLevelCallable(compiled.ctypes))
+        in_python.append(lambda *arguments, fun=fun: fun(*arguments) or None)
+    given = {"method": EIPGJ14, "h": STEP, "params": [1.0], "in_place": True, "t_span": (0, 20), "y0": Y0}
+    native, python = (integrate(acceleration=a, jacobian=j, **given) for a, j in (by_pointer, in_python))
     assert native.calls == {"acceleration": "pointer", "jacobian": "pointer"}
     assert np.array_equal(native.y, python.y)
     with pytest.raises(TypeError, match="jacobian is a C function of the signature"):
-        integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=acceleration, **given)
+        integrate(acceleration=by_pointer[0], jacobian=by_pointer[0], **given)
 
 
 def test_events():
@@ -536,10 +501,3 @@ def test_test_particles_and_many_bodies(method):
     other = integrate(problem, method=EIPRKN12, h=0.1, compensated=True)
     assert found.trusted
     assert np.abs(found.y[:, -1] - other.y[:, -1]).max() < 1e-12
-
-
-def test_a_problem_of_ones_own():
-    """Velocities in `fun` of a Problem, which has the whole derivative."""
-    problem = Problem(name="orbit", fun=orbit, y0=Y0, t_span=(0, 10), invariants=INVARIANTS, h=STEP)
-    found = integrate(problem, method=EIPGJ12)
-    assert np.abs(found.y[:, -1] - exact(10)[:, 0]).max() < 2e-14

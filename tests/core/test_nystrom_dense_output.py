@@ -104,15 +104,8 @@ def test_samples_have_the_order_of_the_steps(method):
     """Halved steps divide the error of samples as they do that of the steps, of order p."""
     errors = []
     for h in (0.2, 0.1) if method is EIPRKN8 else (0.25, 0.125):
-        run = integrate(
-            acceleration=pull,
-            t_span=(0, 2),
-            method=method,
-            h=h,
-            t_eval=np.linspace(0, 2, 101),
-            compiled=False,
-            **KEPLER,
-        )
+        given = {"method": method, "h": h, "t_eval": np.linspace(0, 2, 101), "compiled": False, **KEPLER}
+        run = integrate(acceleration=pull, t_span=(0, 2), **given)
         errors.append(largest(run.y - exact_kepler(run.t)))
     assert np.log2(errors[0] / errors[1]) > method.TABLEAU.order - 2.0
 
@@ -120,29 +113,12 @@ def test_samples_have_the_order_of_the_steps(method):
 @both
 def test_backward_and_complex(method):
     """Dense output works for the orbit run backward, and in the complex plane as one component."""
-    run = integrate(
-        acceleration=pull, t_span=(0, -9), method=method, h=0.05, t_eval=-TIMES[:90], compiled=False, **KEPLER
-    )
+    given = {"t_span": (0, -9), "method": method, "h": 0.05, "t_eval": -TIMES[:90], "compiled": False}
+    run = integrate(acceleration=pull, **given, **KEPLER)
     assert largest(run.y - exact_kepler(run.t)) < (1e-9 if method is EIPRKN8 else 1e-13)
     y0 = KEPLER["y0"][::2] + 1j * KEPLER["y0"][1::2]
-    plane = integrate(
-        acceleration=lambda t, z: -z / abs(z) ** 3,
-        t_span=(0, -9),
-        y0=y0,
-        method=method,
-        h=0.05,
-        t_eval=-TIMES[:90],
-        compiled=False,
-    )
-    real = integrate(
-        acceleration=pull,
-        t_span=(0, -9),
-        method=method,
-        h=0.05,
-        t_eval=-TIMES[:90],
-        compiled=False,
-        **KEPLER | {"invariants": ()},
-    )
+    plane = integrate(acceleration=lambda t, z: -z / abs(z) ** 3, y0=y0, **given)
+    real = integrate(acceleration=pull, y0=KEPLER["y0"], **given)
     np.testing.assert_allclose([plane.y[0].real, plane.y[0].imag], real.y[:2], rtol=0, atol=1e-13)
 
 
@@ -181,14 +157,8 @@ def test_a_short_multistep_run_whose_accelerations_depend_on_velocities():
 
 def test_methods_of_low_order_keep_the_quintic():
     """Nystrom's own method of order 4: the quintic through both ends errs about as much as the steps, for nothing."""
-    tableau = NystromTableau(
-        "Nystrom 4",
-        [[], ["1/8"], [0, "1/2"]],
-        ["1/6", "1/3", 0],
-        ["1/6", "2/3", "1/6"],
-        [0, "1/2", 1],
-        4,
-    )
+    weights = ["1/6", "1/3", 0], ["1/6", "2/3", "1/6"]
+    tableau = NystromTableau("Nystrom 4", [[], ["1/8"], [0, "1/2"]], *weights, [0, "1/2", 1], 4)
     given = {"method": eip_method(tableau), "h": 0.02, "compiled": False, **KEPLER}
     run = integrate(acceleration=pull, t_span=(0, 5), save_every=1, dense_output=True, **given)
     times = np.linspace(0, 5, 333)

@@ -2,13 +2,13 @@
 
 from fractions import Fraction
 
-import mpmath
 import numba
 import numpy as np
 import pytest
+from closed_forms import kepler_state
 from orders import observed_order
 from scipy.integrate import solve_ivp
-from systems import JIT_H, JIT_L, energy
+from systems import JIT_H, JIT_L, orbit
 
 from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, eip_method, integrate
 from eip_scipy.methods import NystromTableau
@@ -29,10 +29,6 @@ def fill_acceleration(t, q, out):
     out[0], out[1] = w * q[0], w * q[1]
 
 
-def orbit(t, y):
-    return np.concatenate([y[2:], acceleration(t, y[:2])])
-
-
 INVARIANTS = [JIT_H, JIT_L]
 TAYLOR = NystromTableau("Taylor 2", [[]], ["1/2"], [1], [0], 1, reference="q + h v + h^2 a / 2, v + h a")
 KEPT = {"invariants": INVARIANTS, "blocks": 2}
@@ -40,18 +36,7 @@ KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 @pytest.fixture(scope="module")
 def exact():
-    """Return the state at t = 2, from Kepler's equation between two points of an orbit, in 40 digits."""
-    with mpmath.workdps(40):
-        q, v, t = mpmath.matrix(Y0[:2].tolist()), mpmath.matrix(Y0[2:].tolist()), 2
-        r = mpmath.norm(q)
-        a = 1 / (2 / r - mpmath.fdot(v, v))
-        n, s = a**-1.5, mpmath.fdot(q, v) / mpmath.sqrt(a)
-        u = mpmath.findroot(lambda u: u - (1 - r / a) * mpmath.sin(u) + s * (1 - mpmath.cos(u)) - n * t, n * t)
-        rest, sin = 1 - mpmath.cos(u), mpmath.sin(u)
-        q_end = (1 - a / r * rest) * q + (t - (u - sin) / n) * v
-        r_end = mpmath.norm(q_end)
-        v_end = -mpmath.sqrt(a) / (r * r_end) * sin * q + (1 - a / r_end * rest) * v
-        return np.array([float(x) for x in [*q_end, *v_end]])
+    return kepler_state(Y0, 2)
 
 
 @pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "metric": "euclidean"}])
@@ -70,25 +55,6 @@ def test_order(method, n, options, exact):
     (order,) = observed_order([e.max() for e in errors], [1 / k for k in n])
     assert errors[1].max() > 3e-14
     assert order > method.TABLEAU.order - 1.0
-
-
-def accelerations(tableau, h):
-    """Return the accelerations of the stages of the first step, by the definition."""
-    q, v, k = Y0[:2], Y0[2:], []
-    for i in range(tableau.n_stages):
-        k.append(acceleration(0, q + tableau.c[i] * h * v + h * h * sum(tableau.A[i, j] * k[j] for j in range(i))))
-    return np.array(k)
-
-
-@both
-def test_one_step_is_the_tableau(method):
-    """The step agrees with one written from the definition, in fractions' own floats."""
-    tableau, h = method.TABLEAU, 0.1
-    q, v, k = Y0[:2], Y0[2:], accelerations(tableau, h)
-    expected = np.concatenate([q + h * v + h * h * tableau.b @ k, v + h * tableau.b_prime @ k])
-    for compensated in (False, True):
-        run = integrate(acceleration=acceleration, t_span=(0, h), y0=Y0, method=method, h=h, compensated=compensated)
-        np.testing.assert_allclose(run.y[:, -1], expected, rtol=4e-16, atol=4e-16)
 
 
 @both
@@ -134,23 +100,6 @@ def test_all_ways_give_the_same_bits(method, options):
     np.testing.assert_allclose(runs[0].y[:, -1], end, rtol=0, atol=1e-13)
 
 
-@numba.njit
-def string(t, u, params):
-    """Complex: u'' = -params[0]^2 u."""
-    return -(params[0] ** 2) * u
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@both
-def test_complex_states_and_params(method):
-    q, v = np.array([1.0 + 0.5j, -0.3j]), np.array([0.2j, 1.0 + 0j])
-    run = integrate(acceleration=string, t_span=(0, 2), y0=np.concatenate([q, v]), method=method, h=0.02, params=[1.5])
-    expected = q * np.cos(3.0) + v / 1.5 * np.sin(3.0)
-    assert run.compiled != numba.config.DISABLE_JIT
-    np.testing.assert_allclose(run.y[:2, -1], expected, rtol=0, atol=1e-13)
-
-
 @both
 @pytest.mark.parametrize("backward", [False, True])
 def test_adaptive(method, backward, exact):
@@ -164,25 +113,6 @@ def test_adaptive(method, backward, exact):
     run = integrate(acceleration=acceleration, t_span=span, y0=start, method=method, rtol=1e-9, atol=1e-11, **KEPT)
     assert run.compiled != numba.config.DISABLE_JIT
     np.testing.assert_allclose(run.y[:, -1], sol.y[:, -1], rtol=0, atol=1e-12)
-
-
-@both
-@pytest.mark.parametrize("options", [{"invariants": ()}, KEPT])
-def test_dense_output(method, options):
-    """As accurate as the steps, exact at the nodes and on the manifold between them."""
-    times = np.linspace(0, 2, 101)
-    fine = integrate(
-        acceleration=acceleration, t_span=(0, 2), y0=Y0, method=EIPRKN12, h=0.02, t_eval=times, compiled=False
-    ).y
-    for h in (0.2, 0.1):
-        sol = solve_ivp(orbit, (0, 2), Y0, method=method, h=h, dense_output=True, **options)
-        np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
-        between, at = sol.sol(times), sol.sol(np.linspace(0, 2, 11))
-        error = max(np.abs(at - fine[:, ::10]).max(), 1e-14)
-        assert np.abs(between - fine).max() < 3 * error
-        if options is KEPT:
-            drift = [[item.fun(0, y) - item.fun(0, Y0) for y in between.T] for item in INVARIANTS]
-            assert np.abs(drift).max() < 1e-11
 
 
 @both
@@ -200,22 +130,6 @@ def test_what_is_no_second_order_system(method):
             call()
     with pytest.raises(ValueError, match=r"acceleration returned shape \(4,\), expected \(2,\)"):
         integrate(acceleration=lambda t, q: np.zeros(4), t_span=(0, 1), y0=Y0, method=method, h=0.1)
-
-
-def test_events_and_samples():
-    """The pericentre is found by an event on the radial velocity, through both drivers."""
-
-    def radial(t, y):
-        return y[0] * y[2] + y[1] * y[3]
-
-    options = {"method": EIPRKN12, "h": 0.05, "events": radial, "t_eval": np.linspace(0, 20, 41), **KEPT}
-    sol = solve_ivp(orbit, (0, 20), Y0, **options)
-    run = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, **options)
-    a = -0.5 / energy(0, Y0)
-    period = 2 * np.pi * a**1.5
-    for found in (sol, run):
-        np.testing.assert_allclose(np.diff(found.t_events[0][::2]), period, rtol=1e-7)
-        assert np.abs([energy(0, y) - energy(0, Y0) for y in found.y.T]).max() < 1e-11
 
 
 @pytest.mark.slow
@@ -301,12 +215,6 @@ def test_a_tableau_of_ones_own():
 def test_every_is_a_number_or_auto(value):
     with pytest.raises(ValueError, match="every must be an integer >= 1"):
         integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0, method=EIPRKN12, h=0.1, **{**KEPT, "every": value})
-
-
-def test_auto_needs_an_estimate():
-    method = eip_method(TAYLOR)
-    with pytest.raises(ValueError, match="every='auto' needs an error estimate, and Taylor 2 has none"):
-        integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0, method=method, h=0.1, every="auto", **KEPT)
 
 
 def test_auto_projects_where_it_pays():

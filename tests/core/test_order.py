@@ -84,19 +84,6 @@ def test_order_of_the_solution_without_blocks(method, end):
     assert order == pytest.approx(method.TABLEAU.order, abs=TOLERANCE)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_order_through_solve_ivp(method, end):
-    n = STEPS[method.TABLEAU.order]
-    errors = []
-    for k in n:
-        sol = solve_ivp(
-            PROBLEM.fun, (0, 1), PROBLEM.y0, method=method, h=1 / k, invariants=PROBLEM.invariants, blocks=BLOCKS
-        )
-        errors.append(np.abs(sol.y[:, -1] - end).max())
-    (order,) = observed_order(errors, [1 / k for k in n])
-    assert order == pytest.approx(method.TABLEAU.order, abs=TOLERANCE)
-
-
 # The local part: single steps from states on the manifold around an orbit of eccentricity 0.2.
 ORBIT = kepler(eccentricity=0.2)
 STATES = integrate(ORBIT, (0, 6.2), method=EIPRK5, h=0.002, t_eval=np.linspace(0.1, 6.1, 24), compiled=False).y.T

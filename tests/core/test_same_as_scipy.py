@@ -1,22 +1,14 @@
 """Without invariants the adaptive pairs take the steps of SciPy's classes; `integrate` takes those of the classes."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import DOP853, RK23, RK45, solve_ivp
-from systems import (
-    JIT_H,
-    JIT_L,
-    jit_orbit,
-    orbit,
-    pericentre,
-)
+from systems import JIT_H, JIT_L, JIT_NORM, jit_orbit, jit_spin, orbit, pericentre
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, Invariant, eip_method, integrate
-from eip_scipy.problems import kepler
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, eip_method, integrate
 
 EPS = np.finfo(float).eps
 SCIPY = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853}
@@ -292,41 +284,15 @@ def test_attributes_step_by_step(name, method):
 
 
 @njit
-def jit_spin(t, y):
-    return np.array([-1j * y[0] + 0.5j * y[1], -2j * y[1] + 0.5j * y[0]])
-
-
-@njit
-def jit_norm(t, y):
-    return (y[0] * np.conj(y[0]) + y[1] * np.conj(y[1])).real
-
-
-@njit
-def jit_norm_gradient(t, y):
-    return 2 * y
-
-
-@njit
 def jit_event(t, y):
     return y[0].real - 0.3
 
 
-@njit
-def jit_time_event(t, y):
-    return t - 4.0
-
-
-@njit
-def jit_lower_event(t, y):
-    return y[1].real + 0.1
-
-
-NORM = Invariant(jit_norm, jit_norm_gradient, name="N")
 RUNS = {
     "orbit": (jit_orbit, (0.0, 15.0), pericentre(0.6), [JIT_H, JIT_L]),
     "backward": (jit_orbit, (2.0, -10.0), pericentre(0.6), [JIT_H, JIT_L]),
-    "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), NORM),
-    "complex backward": (jit_spin, (3.0, -9.0), np.array([1.0 + 0j, 0.2j]), NORM),
+    "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), JIT_NORM),
+    "complex backward": (jit_spin, (3.0, -18.0), np.array([1.0 + 0j, 0.2j]), JIT_NORM),
 }
 # Complex states have a separate driver.
 runs = pytest.mark.parametrize(
@@ -368,69 +334,6 @@ def test_integrate_takes_the_steps_of_the_class(case, method, projected, compile
 
 
 @drivers
-@pytest.mark.parametrize("method", OURS.values(), ids=OURS)
-@runs
-def test_the_named_classes_too(case, method, compiled):
-    """Projected bit for bit; plain, where the classes may leave the steps to SciPy, to round-off."""
-    fun, t_span, y0, invariants = RUNS[case]
-    options = {"method": method, "invariants": invariants}
-    compare(
-        integrate(fun, t_span, y0, save_every=1, compiled=compiled, **options), solve_ivp(fun, t_span, y0, **options)
-    )
-    options["invariants"] = ()
-    run = integrate(fun, t_span, y0, save_every=1, compiled=compiled, **options)
-    sol = solve_ivp(fun, t_span, y0, **options)
-    assert (len(run.t), run.nfev) == (len(sol.t), sol.nfev)
-    rtol = OWN_LEVEL[method.TABLEAU.name]
-    assert_close(run.t, sol.t, rtol)
-    assert_close(run.y, sol.y, rtol)
-
-
-@drivers
-@projected
-@pytest.mark.parametrize("method", [OWN["RK45"], EIPRK4], ids=lambda m: m.__name__)
-@pytest.mark.parametrize("save_every", [7, 1000])
-def test_save_every(method, projected, compiled, save_every):
-    fun, t_span, y0, invariants = RUNS["orbit"]
-    options = {"method": method, "invariants": invariants if projected else ()}
-    sol = solve_ivp(fun, t_span, y0, **options)
-    run = integrate(fun, t_span, y0, save_every=save_every, compiled=compiled, **options)
-    last = len(sol.t) - 1
-    keep = [*range(0, last, save_every), last]
-    np.testing.assert_array_equal(run.t, sol.t[keep])
-    np.testing.assert_array_equal(run.y, sol.y[:, keep])
-    only_ends = integrate(fun, t_span, y0, compiled=compiled, **options)
-    np.testing.assert_array_equal(only_ends.y, sol.y[:, [0, -1]])
-
-
-@drivers
-@own
-@runs
-@pytest.mark.parametrize("terminal", [False, 2])
-def test_events_of_integrate(case, method, compiled, terminal):
-    """Without invariants; with them in tests/run/test_samples.py, states at given times too."""
-    fun, t_span, y0, _ = RUNS[case]
-    # Twice within one step is found by `integrate` only: no step is so long here.
-    options = {"method": method, "max_step": 0.5 if "complex" in case else np.inf}
-    jit_event.terminal = terminal
-    events = [jit_event, jit_time_event, jit_lower_event]
-    try:
-        sol = solve_ivp(fun, t_span, y0, events=events, **options)
-        run = integrate(fun, t_span, y0, events=events, save_every=1, compiled=compiled, **options)
-    finally:
-        jit_event.terminal = False
-    assert run.compiled is compiled
-    assert sol.status == (1 if terminal else 0)
-    if not terminal:
-        compare(run, sol, counts=False)
-    for name in ("t", "y"):
-        assert_close(run[name], sol[name], ROOTS)
-    for kind in ("t_events", "y_events"):
-        for mine, other in zip(run[kind], sol[kind], strict=True):
-            assert_close(mine.T, other.T, ROOTS)
-
-
-@drivers
 @pytest.mark.parametrize("method", [OWN["RK45"], EIPRK4], ids=lambda m: m.__name__)
 def test_terminal_event_and_t_eval(method, compiled):
     """SciPy drops the samples after the event and does not add its state."""
@@ -448,19 +351,3 @@ def test_terminal_event_and_t_eval(method, compiled):
     assert_close(run.y, sol.y, 8 * EPS)
     for kind in ("t_events", "y_events"):
         assert_close(run[kind][0].T, sol[kind][0].T, ROOTS)
-
-
-@drivers
-def test_adaptive_problem(compiled):
-    """A problem with a default step runs adaptively once h is removed from it or first_step given."""
-    problem = kepler(0.6, 0.0)
-    bare = dataclasses.replace(problem, h=None)
-    run = integrate(bare, (0, 10), method=EIPRK45, save_every=1, compiled=compiled)
-    assert run.h is None
-    options = {"invariants": problem.invariants, "blocks": problem.blocks, "metric": problem.metric}
-    sol = solve_ivp(problem.fun, (0, 10), problem.y0, method=EIPRK45, **options)
-    assert len(run.t) == len(sol.t)
-    np.testing.assert_allclose(run.y, sol.y, rtol=0, atol=1e-11)
-    run = integrate(problem, (0, 10), method=EIPRK45, first_step=0.01, rtol=1e-8, compiled=compiled)
-    assert run.h is None
-    assert (run.max_defect < 1e-12).all()

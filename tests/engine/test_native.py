@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from systems import H, orbit, pericentre
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, Invariant
 from eip_scipy.core.dense import Interpolants
@@ -20,23 +21,12 @@ from eip_scipy.engine.data import CUBIC, POLYNOMIAL, Work
 from eip_scipy.engine.native import BUILD, Engine
 from eip_scipy.run.prepare import Request, prepared
 
-Y0 = np.array([0.4, 0.0, 0.0, 2.0])
-
-
-def pull(t, y):
-    return np.append(y[2:], -y[:2] / np.hypot(y[0], y[1]) ** 3)
-
-
-H = Invariant(
-    lambda t, y: 0.5 * (y[2:] @ y[2:]) - 1 / np.hypot(y[0], y[1]),
-    lambda t, y: np.append(y[:2] / np.hypot(y[0], y[1]) ** 3, y[2:]),
-    name="H",
-)
+Y0 = pericentre(0.6)
 
 
 def parts(method=EIPRK4, **options):
     """Return arguments of an engine that is ready to step."""
-    fun, y0 = pull, Y0
+    fun, y0 = orbit, Y0
     if options.pop("dtype", None):
         fun, y0 = lambda t, y: -1j * y, np.ones(3, complex)
     ready = prepared(Request.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
@@ -180,7 +170,7 @@ def test_buffers_outlive_their_owner_and_are_copied(dtype):
 def dense_parts(**case):
     """Return an engine, and the data of its dense output."""
     engine, method = Engine(**parts(**case)), case.pop("method", EIPRK4)
-    ready = prepared(Request.of(fun=pull, t_span=(0, 1), y0=Y0, method=method, **case))
+    ready = prepared(Request.of(fun=orbit, t_span=(0, 1), y0=Y0, method=method, **case))
     return engine, Interpolants(ready.run, engine).record
 
 
@@ -306,7 +296,7 @@ def test_a_run_is_not_stepped_from_its_own_functions():
     def fun(t, y):
         if engines:
             engines[0].step(0, 0.0, y, y)
-        return pull(t, y)
+        return orbit(t, y)
 
     given = parts(h=0.1, invariants=H)
     functions = given["functions"]

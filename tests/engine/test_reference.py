@@ -4,19 +4,7 @@ import numpy as np
 import pytest
 from reference_step import Step
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK1,
-    EIPRK2,
-    EIPRK3,
-    EIPRK4,
-    EIPRK5,
-    EIPRK23,
-    EIPRK45,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-)
+from eip_scipy import EIPDOP853, EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, Invariant
 
 CLASSES = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
 Y0 = np.array([0.7, 0.1, -0.3, 1.2, -0.2, 0.4])

@@ -181,13 +181,6 @@ def test_b_low_makes_the_moments_exact(tableau):
     assert np.abs(tableau.b_low).max() < 3 * EPS * np.abs(tableau.b).max()
 
 
-def test_b_low_is_needed():
-    """Without low parts the rounded weights of Fehlberg's method miss the moments by round-off."""
-    nodes, weights = [Fraction(x) for x in RK5.c], [Fraction(x) for x in RK5.b]
-    missed = [sum(w * x**k for w, x in zip(weights, nodes, strict=True)) - Fraction(1, k + 1) for k in range(5)]
-    assert max(map(abs, missed)) > Fraction(1, 10**18)
-
-
 def test_low_parts_of_a_float_tableau():
     floats = Tableau("floats", RK5.A.tolist(), RK5.b.tolist(), order=5)
     assert max(moment_residuals(floats)) <= 1

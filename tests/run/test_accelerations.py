@@ -5,22 +5,11 @@ import pickle
 
 import numpy as np
 import pytest
-from c_compiler import low_level, shared_library
 from numba import njit
 from scipy.integrate import solve_ivp
 
 import eip_scipy
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-    ensemble,
-    integrate,
-    recommend,
-)
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate, recommend
 from eip_scipy.core.acceleration import AccelerationField
 from eip_scipy.core.problem import Problem
 
@@ -30,12 +19,6 @@ SECOND_ORDER |= {EIPGJ12: {"h": 0.02}}
 ENERGY = Invariant(
     lambda t, y, p: 0.5 * (p[0] * y[:2] @ y[:2] + y[2:] @ y[2:]), lambda t, y, p: np.append(p[0] * y[:2], y[2:])
 )
-C_SOURCE = """
-int acceleration(double t, const double *q, double *out, const double *p) {
-    for (int k = 0; k < 2; ++k) out[k] = -p[0] * q[k];
-    return 0;
-}
-"""
 
 
 def spring(t, q):
@@ -68,12 +51,6 @@ def exact(t):
     return np.append(q * np.cos(2 * t) + v / 2 * np.sin(2 * t), v * np.cos(2 * t) - 2 * q * np.sin(2 * t))
 
 
-def pointer(folder):
-    source = folder / "spring.c"
-    source.write_text(C_SOURCE)
-    return low_level(shared_library(folder / "spring.so", source), "acceleration")
-
-
 @pytest.mark.parametrize("method", SECOND_ORDER)
 @pytest.mark.parametrize("how", ["python", "jitted", "in place", "jitted in place", "field", "jitted field", "params"])
 def test_accelerations_and_fields_of_second_order_methods(method, how):
@@ -93,14 +70,10 @@ def test_accelerations_and_fields_of_second_order_methods(method, how):
     np.testing.assert_allclose(longer.y[:, -1], exact(4), rtol=0, atol=4e-10)
 
 
-def test_every_method_takes_accelerations(tmp_path):
-    """Runge-Kutta methods have the bits of the field derived from accelerations; C functions work by their address."""
+def test_every_method_takes_accelerations():
+    """Runge-Kutta methods have the bits of the field derived from accelerations."""
     run = integrate(acceleration=spring, t_span=(0, 3), y0=Y0, method=EIPRK4, h=0.01)
     np.testing.assert_array_equal(run.y, integrate(field, (0, 3), Y0, method=EIPRK4, h=0.01).y)
-    given = {"t_span": (0, 3), "y0": Y0, "method": EIPRKN12, "rtol": 1e-10}
-    in_c = integrate(acceleration=pointer(tmp_path), params=[4.0], **given)
-    assert in_c.calls == {"acceleration": "pointer"}
-    np.testing.assert_array_equal(in_c.y, integrate(acceleration=spring, **given).y)
 
 
 def test_ensembles_recommendations_and_checkpoints(tmp_path):

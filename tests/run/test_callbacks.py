@@ -16,29 +16,13 @@ MANY = 1200
 
 
 @njit
-def jit_oscillator(t, y):
-    return np.array([y[1], -y[0]])
-
-
-@njit
-def jit_square(t, y):
-    return y[0] * y[0] + y[1] * y[1]
-
-
-@njit
-def jit_square_gradient(t, y):
-    return 2 * y
-
-
-@njit
 def passage(t, y):
     return y[0]
 
 
-JIT_SQUARE = Invariant(jit_square, jit_square_gradient, name="S")
 FUNCTIONS = {
     "interpreted": {"fun": oscillator, "invariants": SQUARE},
-    "compiled": {"fun": jit_oscillator, "invariants": JIT_SQUARE},
+    "compiled": {"fun": njit(oscillator), "invariants": Invariant(njit(SQUARE.fun), njit(SQUARE.grad), name="S")},
 }
 STEPS = {
     "fixed": {"method": EIPRK4, "h": 0.01},

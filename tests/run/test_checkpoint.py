@@ -22,17 +22,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from numba import njit
 from numpy.lib import format as npy
-from systems import (
-    H_USES_F,
-    JIT_H,
-    JIT_L,
-    H,
-    L,
-    jit_orbit,
-    orbit,
-    pericentre,
-    same,
-)
+from systems import H_USES_F, JIT_H, JIT_L, H, L, jit_orbit, orbit, pericentre, same
 
 from eip_scipy import (
     EIPDOP853,
@@ -404,7 +394,6 @@ def test_no_file_yet(tmp_path):
         ({"resume": "yes", "checkpoint": "a"}, ValueError, "resume must be True or False, got 'yes'"),
         ({"checkpoint": 3}, TypeError, "checkpoint must be the path of a file, got 3"),
         ({"checkpoint": "a", "checkpoint_every": 0}, ValueError, "checkpoint_every must be a number of seconds > 0"),
-        ({"checkpoint": "a", "checkpoint_every": np.nan}, ValueError, "checkpoint_every .* got nan"),
         ({"checkpoint": "a", "checkpoint_every": "1 min"}, ValueError, "checkpoint_every .* got '1 min'"),
         ({"checkpoints": "a"}, TypeError, "did you mean 'checkpoint'"),
         ({"checkpoint": "no/such/folder/a"}, CheckpointError, "cannot write .*folder.+a'.* (no such file|path not)"),

@@ -7,16 +7,7 @@ import pytest
 from numba import njit
 from systems import Verlet, oscillator
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK4,
-    EIPRK45,
-    EIPRKN12,
-    Invariant,
-    eip_method,
-    ensemble,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPRKN12, Invariant, eip_method, ensemble, integrate
 from eip_scipy.problems import kepler
 
 PHASE = 0.3

@@ -243,18 +243,20 @@ def adding(t, y, out):
 
 
 NOT_FILLING = [
-    (returning, TypeError, r"fun returned array\(.*in_place=True it must fill its argument out"),
-    (half, ValueError, "fun does not fill all of its argument out, in component 1, at t=0"),
-    (nothing, ValueError, "fun does not fill all of its argument out, in component 0, at t=0"),
-    (adding, ValueError, "fun reads its argument out, whose content is arbitrary, before filling it, in component 0"),
+    (returning, TypeError, r"returned array\(.*must fill its argument out"),
+    (half, ValueError, "does not fill all of its argument out, in component 1"),
+    (nothing, ValueError, "does not fill all of its argument out, in component 0"),
+    (adding, ValueError, "reads its argument out, whose content is arbitrary, before filling it, in component 0"),
 ]
 
 
 @both
 @pytest.mark.parametrize(("fun", "error", "match"), NOT_FILLING)
 def test_functions_that_do_not_fill(how, fun, error, match):
-    with pytest.raises(error, match=match):
+    with pytest.raises(error, match=f"^fun {match}"):
         how(fun, in_place=True)
+    with pytest.raises(error, match=f"gradient of invariant 'S' {match}"):
+        how(invariants=Invariant(square, fun, name="S", in_place=True))
 
 
 @both
@@ -282,20 +284,6 @@ def test_functions_that_stop_filling(how):
     assert run.status == -1
     assert run.message.startswith("fun returned a non-finite value at t=0.5 (component 1 is NaN; with in_place=True")
     np.testing.assert_array_equal(run.y, interpreted().y[:, : run.t.size])
-
-
-@both
-@pytest.mark.parametrize(
-    ("grad", "error", "match"),
-    [
-        (returning, TypeError, "gradient of invariant 'S' returned array"),
-        (half, ValueError, "gradient of invariant 'S' does not fill all of its argument out, in component 1"),
-        (adding, ValueError, "gradient of invariant 'S' reads its argument out"),
-    ],
-)
-def test_gradients_that_do_not_fill(how, grad, error, match):
-    with pytest.raises(error, match=match):
-        how(invariants=Invariant(square, grad, name="S", in_place=True))
 
 
 @both

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
-from systems import H, L, orbit, pericentre
+from systems import H, L, orbit, pendulum, pendulum_energy, pendulum_gradient, pericentre
 
 from eip_scipy import EIPGJ14, EIPRadau, Invariant, ProjectionWarning, integrate, recommend
 from eip_scipy.problems import kepler, satellite, solar_system
@@ -26,15 +26,11 @@ def assert_near(found, wanted):
     assert wanted / FACTOR <= found <= wanted * FACTOR, f"{found:.1e} where {wanted:.0e} was wanted"
 
 
-def pendulum(t, y):
-    return np.array([y[1], -math.sin(y[0])])
-
-
 def damped(t, y):
     return np.array([y[1], -math.sin(y[0]) - 0.2 * y[1]])
 
 
-ENERGY = Invariant(lambda t, y: 0.5 * y[1] ** 2 - np.cos(y[0]), lambda t, y: np.array([np.sin(y[0]), y[1]]), name="E")
+ENERGY = Invariant(pendulum_energy, pendulum_gradient, name="E")
 
 
 @pytest.mark.parametrize("wanted", [1e-4, 1e-9])

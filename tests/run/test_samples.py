@@ -8,7 +8,7 @@ import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
-from systems import same
+from systems import JIT_NORM, jit_spin, same
 
 from eip_scipy import (
     EIPDOP853,
@@ -69,21 +69,6 @@ def acceleration(t, q, params):
 
 
 @njit
-def spin(t, y):
-    return -1j * np.array([0.3 * y[1] + abs(y[0]) ** 2 * y[0], 0.3 * y[0] + 0.7 * y[1]])
-
-
-@njit
-def spin_norm(t, y):
-    return abs(y[0]) ** 2 + abs(y[1]) ** 2
-
-
-@njit
-def spin_gradient(t, y):
-    return 2 * y
-
-
-@njit
 def upright(t, y):
     return y[0].real
 
@@ -111,13 +96,12 @@ def test_roots_and_samples_of_compiled_and_interpreted_runs(method, steps, span)
 
 
 def test_roots_of_a_complex_state():
-    norm = Invariant(spin_norm, spin_gradient, name="N")
-    options = {"method": EIPRK4, "h": 0.1, "invariants": norm, "events": upright, "t_eval": np.linspace(0, 40, 333)}
+    options = {"method": EIPRK4, "h": 0.1, "invariants": JIT_NORM, "events": upright, "t_eval": np.linspace(0, 40, 333)}
     y0 = np.array([0.8, 0.6j])
-    compiled = integrate(spin, (0.0, 40.0), y0, **options)
+    compiled = integrate(jit_spin, (0.0, 40.0), y0, **options)
     assert compiled.compiled
     assert len(compiled.t_events[0]) > 4
-    same(compiled, integrate(spin, (0.0, 40.0), y0, compiled=False, **options))
+    same(compiled, integrate(jit_spin, (0.0, 40.0), y0, compiled=False, **options))
 
 
 @pytest.mark.parametrize(("method", "steps"), [STEPS["RK4"], STEPS["RK45"], STEPS["DOP853"]])

@@ -3,29 +3,18 @@
 import mpmath
 import numpy as np
 import pytest
+from closed_forms import kepler_flow
 from numba import njit
+from systems import jit_energy as energy
+from systems import jit_momentum as momentum
+from systems import jit_orbit as kepler
+from systems import pericentre
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ14,
-    EIPRK4,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-    eip_method,
-    integrate,
-    solve_ivp,
-)
+from eip_scipy import EIPDOP853, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12, Invariant, eip_method, integrate, solve_ivp
 
 E = 0.6
-START = np.array([1 - E, 0.0, 0.0, np.sqrt((1 + E) / (1 - E))])
+START = pericentre(E)
 END = 10 * np.pi  # five revolutions
-
-
-@njit
-def kepler(t, y):
-    r3 = (y[0] ** 2 + y[1] ** 2) ** 1.5
-    return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
 
 
 @njit
@@ -33,32 +22,7 @@ def acceleration(t, q):
     return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
 
 
-@njit
-def energy(t, y):
-    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
-
-
-@njit
-def momentum(t, y):
-    return y[0] * y[3] - y[1] * y[2]
-
-
 KEPT = [Invariant(energy, name="H"), Invariant(momentum, name="L")]
-
-
-def flow(start, t):
-    """Return the state after a time t, by Lagrange's coefficients and Kepler's equation (Battin 1987, 4.41)."""
-    x, y, u, v = start
-    r0 = mpmath.hypot(x, y)
-    a = 1 / (2 / r0 - u * u - v * v)
-    mean = a ** mpmath.mpf(-1.5)
-    c0, s0 = 1 - r0 / a, (x * u + y * v) / mpmath.sqrt(a)
-    angle = mpmath.findroot(lambda d: d - c0 * mpmath.sin(d) + s0 * (1 - mpmath.cos(d)) - mean * t, mean * t)
-    sin, cos = mpmath.sin(angle), mpmath.cos(angle)
-    r = a * (1 - c0 * cos + s0 * sin)
-    f, g = 1 - a / r0 * (1 - cos), t - (angle - sin) / mean
-    f_dot, g_dot = -mpmath.sqrt(a) / (r * r0) * sin, 1 - a / r * (1 - cos)
-    return [f * x + g * u, f * y + g * v, f_dot * x + g_dot * u, f_dot * y + g_dot * v]
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +31,7 @@ def matrix():
         start, t, shift = [mpmath.mpf(float(x)) for x in START], mpmath.mpf(END), mpmath.mpf(10) ** -15
         columns = []
         for k in range(4):
-            ends = [flow([x + sign * shift * (i == k) for i, x in enumerate(start)], t) for sign in (1, -1)]
+            ends = [kepler_flow([x + sign * shift * (i == k) for i, x in enumerate(start)], t) for sign in (1, -1)]
             columns.append([float((a - b) / (2 * shift)) for a, b in zip(*ends, strict=True)])
     return np.array(columns).T
 

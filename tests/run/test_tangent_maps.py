@@ -7,6 +7,7 @@ import pytest
 import sympy
 from c_compiler import low_level, shared_library
 from numba import njit
+from systems import pericentre
 
 from eip_scipy import EIPDOP853, EIPRK4, equations, hamiltonian, integrate
 from eip_scipy.problems import ForceConstants, harmonic, nbody
@@ -16,8 +17,7 @@ from eip_scipy.tangent_maps import lyapunov_spectrum, megno
 pytestmark = pytest.mark.needs_jit
 
 PERIOD = 2 * np.pi
-E = 0.6
-PERICENTRE = np.array([1 - E, 0.0, 0.0, np.sqrt((1 + E) / (1 - E))])
+PERICENTRE = pericentre(0.6)
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +66,6 @@ def test_matrix_of_kepler(kepler, method, steps, revolutions, bound):
 
 SYSTEMS = {
     "pendulum": ({"q": "p", "p": "-k*sin(q)"}, {"k": 1.3}, ["p**2/2 - k*cos(q)"], [1.0, 0.3]),
-    "oscillators": (
-        {"x": "v", "y": "w", "v": "-a*x", "w": "-b*y"},
-        {"a": 1.0, "b": 2.5},
-        ["v**2 + a*x**2", "w**2 + b*y**2"],
-        [1.0, 0.2, 0.1, 0.7],
-    ),
     "Kepler": (
         {"x": "u", "y": "v", "u": "-m*x/(x*x + y*y)**1.5", "v": "-m*y/(x*x + y*y)**1.5"},
         {"m": 1.1},
@@ -96,7 +90,6 @@ SYSTEMS = {
         [],
         [1.0, 1.0, 20.0],
     ),
-    "van der Pol": ({"x": "v", "v": "m*(1 - x*x)*v - x"}, {"m": 0.7}, [], [1.0, 0.5]),
     "forced Duffing": ({"x": "v", "v": "x - x**3 - c*v + F*cos(w*t)"}, {"c": 0.2, "F": 0.3, "w": 1.1}, [], [0.5, 0.1]),
     "Henon-Heiles": (
         {"x": "u", "y": "v", "u": "-x - 2*l*x*y", "v": "-y - l*(x*x - y*y)"},
@@ -109,48 +102,6 @@ SYSTEMS = {
         {"k": 0.7},
         ["(u*u + v*v)/2 + k*exp(a - b)", "u + v"],
         [0.3, 0.1, 0.2, -0.4],
-    ),
-    "SIR": (
-        {"S": "-b*S*I", "I": "b*S*I - g*I", "R": "g*I"},
-        {"b": 1.2, "g": 0.4},
-        ["S + I + R"],
-        [0.99, 0.01, 0.0],
-    ),
-    "Brusselator": (
-        {"x": "a + x*x*y - (b + 1)*x", "y": "b*x - x*x*y"},
-        {"a": 1.0, "b": 2.2},
-        [],
-        [1.1, 1.9],
-    ),
-    "FitzHugh-Nagumo": (
-        {"v": "v - v**3/3 - w + J", "w": "e*(v + a - b*w)"},
-        {"J": 0.5, "e": 0.08, "a": 0.7, "b": 0.8},
-        [],
-        [-1.0, 1.0],
-    ),
-    "Rossler": (
-        {"x": "-y - z", "y": "x + a*y", "z": "b + z*(x - c)"},
-        {"a": 0.2, "b": 0.2, "c": 5.7},
-        [],
-        [1.0, 1.0, 0.5],
-    ),
-    "quartic": (
-        {"x": "u", "y": "v", "u": "-4*x**3 - 2*e*x*y*y", "v": "-4*y**3 - 2*e*x*x*y"},
-        {"e": 0.6},
-        ["(u*u + v*v)/2 + x**4 + y**4 + e*x*x*y*y"],
-        [0.5, 0.4, 0.3, -0.2],
-    ),
-    "magnetic field": (
-        {"x": "u", "y": "v", "u": "B*(1 + x)*v", "v": "-B*(1 + x)*u"},
-        {"B": 1.4},
-        ["u*u + v*v"],
-        [0.1, 0.2, 0.5, 0.3],
-    ),
-    "Volterra of three": (
-        {"x": "k*x*(y - z)", "y": "k*y*(z - x)", "z": "k*z*(x - y)"},
-        {"k": 0.8},
-        ["x + y + z", "log(x) + log(y) + log(z)"],
-        [0.5, 0.8, 1.1],
     ),
     "logistic": ({"x": "r*x*(1 - x/K)"}, {"r": 1.1, "K": 2.0}, [], [0.3]),
     "swinging spring": (
@@ -460,33 +411,6 @@ def test_figures():
 # Two planets, against REBOUND.
 
 
-@njit
-def planets(t, y, out, m):
-    n = m.size
-    for i in range(3 * n):
-        out[i], out[3 * n + i] = y[3 * n + i], 0.0
-    for i in range(n):
-        for j in range(i):
-            dx, dy, dz = y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]
-            r2 = dx * dx + dy * dy + dz * dz
-            s = 1.0 / (r2 * np.sqrt(r2))
-            for k, d in enumerate((dx, dy, dz)):
-                out[3 * (n + i) + k] += m[j] * s * d
-                out[3 * (n + j) + k] -= m[i] * s * d
-
-
-@njit
-def planets_energy(t, y, m):
-    n, e = m.size, 0.0
-    for i in range(n):
-        v = 3 * (n + i)
-        e += 0.5 * m[i] * (y[v] ** 2 + y[v + 1] ** 2 + y[v + 2] ** 2)
-        for j in range(i):
-            dx, dy, dz = y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]
-            e -= m[i] * m[j] / np.sqrt(dx * dx + dy * dy + dz * dz)
-    return e
-
-
 def two_planets(a, e_outer):
     """Return masses and the state of two planets at their pericentres, on opposite sides."""
     m, q, v = np.array([1.0, 1e-3, 1e-3]), np.zeros((3, 3)), np.zeros((3, 3))
@@ -497,20 +421,6 @@ def two_planets(a, e_outer):
 
 def as_problem(m, y0, **options):
     return nbody(m, y0[:9].reshape(3, 3), y0[9:].reshape(3, 3), t_span=(0, 1), **options)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize(("a", "e"), [(1.8, 0.02), (1.45, 0.05), (1.7, 0.1)])
-def test_a_few_points_of_a_map_are_those_of_rebound(a, e):
-    pytest.importorskip("rebound")
-    from eip_scipy.integrations import rebound
-
-    m, y0 = two_planets(a, e)
-    theirs, _, deviation = rebound.megno(m, y0, t_end=100 * PERIOD, dt=PERIOD / 100)
-    run = megno(as_problem(m, y0), (0, 100 * PERIOD), deviation=deviation, method=EIPDOP853, h=PERIOD / 40)
-    assert run.trusted
-    assert run.megno == pytest.approx(theirs, abs=0.02)
 
 
 @pytest.mark.parametrize("force", [pytest.param("gr-potential", marks=[pytest.mark.nightly, pytest.mark.slow]), "1pn"])
@@ -539,8 +449,7 @@ def test_megno_of_planets_is_that_of_rebound(a, regular):
     m, y0 = two_planets(a, 0.02 if regular else 0.1)
     t_end = 2000 * PERIOD
     theirs, slope, deviation = rebound.megno(m, y0, t_end=t_end, dt=PERIOD / 60, seed=3)
-    run = megno(planets, (0, t_end), y0, deviation=deviation, params=m, in_place=True, method=EIPDOP853,
-                h=PERIOD / 40, invariants=planets_energy)  # fmt: skip
+    run = megno(as_problem(m, y0), (0, t_end), deviation=deviation, method=EIPDOP853, h=PERIOD / 40)
     assert run.trusted
     if regular:
         assert theirs == pytest.approx(2.0, abs=0.01)

@@ -6,36 +6,21 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
+from systems import JIT_H as H
+from systems import JIT_L as L
+from systems import jit_energy as energy
+from systems import jit_energy_gradient as energy_gradient
 from systems import jit_momentum as momentum
 from systems import jit_momentum_gradient as momentum_gradient
+from systems import jit_orbit as fun
+from systems import pericentre
 
 from eip_scipy import EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate
 from eip_scipy.problems import nbody
 
 pytestmark = pytest.mark.needs_jit
 
-# Kepler with a relativistic term: plain, with params, and in place.
-
-
-@njit
-def fun(t, y):
-    r2 = y[0] * y[0] + y[1] * y[1]
-    w = 1.0 / (r2 * sqrt(r2))
-    w += 0.0075 * w / r2
-    return np.array([y[2], y[3], -w * y[0], -w * y[1]])
-
-
-@njit
-def energy(t, y):
-    r2 = y[0] * y[0] + y[1] * y[1]
-    r = sqrt(r2)
-    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / r - 0.0025 / (r * r2)
-
-
-@njit
-def energy_gradient(t, y):
-    f = fun(t, y)
-    return np.array([-f[2], -f[3], y[2], y[3]])
+# Kepler: plain, with params, and in place.
 
 
 @njit
@@ -106,8 +91,7 @@ def clock_gradient(t, y):
     return np.array([0.0, 0.0, 1.0])
 
 
-Y0 = np.array([0.4, 0.0, 0.0, 2.0])
-H, L = Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")
+Y0 = pericentre(0.6)
 H_OF_F = Invariant(energy, energy_gradient_of_f, uses_f=True, name="H")
 HL = Invariant(both, both_gradients, name="HL")
 WITH_PARAMS = [
