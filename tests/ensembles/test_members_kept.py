@@ -162,7 +162,9 @@ ADAPTIVE = {"method": EIPDOP853, "rtol": 1e-8}
 
 
 @pytest.mark.parametrize("rows", [{}, {"save_every": 40}, {"t_eval": np.linspace(1.0, 7.0, 5)}], ids=str)
-@pytest.mark.parametrize("more", [STEPS, ADAPTIVE, STEPS | {"compiled": False}, STEPS | {"events": EVENTS}], ids=range(4))
+@pytest.mark.parametrize(
+    "more", [STEPS, ADAPTIVE, STEPS | {"compiled": False}, STEPS | {"events": EVENTS}], ids=range(4)
+)
 def test_reduce_gets_the_results_of_single_runs(rows, more):
     options = rows | more
     if options.keys() >= {"save_every", "rtol"}:

@@ -132,18 +132,6 @@ def test_columns_are_differences_of_the_flow(name):
     np.testing.assert_allclose(run.stm[-1] @ directions, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
 
 
-@pytest.mark.needs_jit
-@pytest.mark.slow
-def test_columns_of_compiled_mechanisms_are_those_of_plain_functions():
-    run = integrate(SYSTEMS["3, sphere"](), variations="state", **OPTIONS)
-    assert run.columns["source"] == "dual numbers"
-    plain = mechanism([1, 1, 1], [0, 0, -G], sphere.py_func, q0=[1, 0, 0], u0=[0, 0.5, 0.3], t_span=(0, 0.2))
-    other = integrate(plain, variations="state", **OPTIONS)
-    assert other.columns["source"] == "complex steps"
-    right = integrate(SYSTEMS["3, sphere"](), t_span=(0, 0.2), variations="state", **OPTIONS).stm[-1]
-    np.testing.assert_allclose(other.stm[-1], right, rtol=0, atol=1e-9 * np.abs(right).max())
-
-
 def period_and_slope(angle, omega):
     """Return the period of a pendulum that is released at `angle`, and its derivative by the angle."""
     m, K = np.sin(angle / 2) ** 2, ellipk(np.sin(angle / 2) ** 2)
