@@ -408,12 +408,6 @@ def test_processes():
     np.testing.assert_array_equal(here.trajectories, there.trajectories)
 
 
-def test_threads_of_the_user():
-    with ThreadPoolExecutor(2) as executor:
-        run = ensemble(oscillator, (0, 1), np.ones((9, 2)), h=0.1, executor=executor, chunk=2)
-    same(run, ensemble(oscillator, (0, 1), np.ones((9, 2)), h=0.1))
-
-
 def ends_its_process(t, y):
     if y[0] > 100.0:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -77,20 +77,10 @@ def mechanical(name: str, V: Callable[[Array], float], dV: Callable[[Array], Arr
     return Quantity(name, value, gradient, by_f)
 
 
-def positive_matrix(rng: np.random.Generator, n: int, low: float, high: float) -> Array:
-    """A symmetric matrix with eigenvalues from `low` to `high`."""
-    Q, _ = np.linalg.qr(rng.standard_normal((n, n)))
-    return (Q * rng.uniform(low, high, n)) @ Q.T
-
-
-def skew(rng: np.random.Generator, n: int) -> Array:
-    a = rng.standard_normal((n, n))
-    return (a - a.T) / math.sqrt(n)
-
-
 def bowl(rng: np.random.Generator, n: int) -> tuple[Callable[[Array], float], Callable[[Array], Array]]:
     """A polynomial of degree 4 that grows in all directions, and its gradient."""
-    A, B = positive_matrix(rng, n, 0.3, 3.0), rng.uniform(0.0, 0.5, (n, n))
+    Q, _ = np.linalg.qr(rng.standard_normal((n, n)))
+    A, B = (Q * rng.uniform(0.3, 3.0, n)) @ Q.T, rng.uniform(0.0, 0.5, (n, n))
     B = B + B.T
 
     def value(x: Array) -> float:
@@ -159,10 +149,10 @@ def poisson(rng: np.random.Generator) -> System:
     """y' = S(y) grad H(y) with a skew matrix S that is linear in y."""
     n = int(rng.integers(2, 8))
     H, dH = bowl(rng, n)
-    S0, S1 = skew(rng, n), np.array([0.3 * skew(rng, n) for _ in range(n)])
+    S0, *S1 = (scale * (a - a.T) for scale in [1.0, *[0.3] * n] for a in [rng.standard_normal((n, n)) / math.sqrt(n)])
 
     def fun(t: float, y: Array) -> Array:
-        return (S0 + np.tensordot(y, S1, 1)) @ dH(y)
+        return (S0 + np.tensordot(y, np.array(S1), 1)) @ dH(y)
 
     return System("poisson", fun, 0.7 * rng.standard_normal(n), (Quantity("H", lambda t, y: H(y), lambda t, y: dH(y)),))
 
@@ -175,11 +165,6 @@ def rigid_body(rng: np.random.Generator) -> System:
         Quantity("L2", lambda t, w: (inertia * w) @ (inertia * w), lambda t, w: 2 * inertia**2 * w),
     )
     return System("rigid body", lambda t, w: np.cross(inertia * w, w) / inertia, rng.standard_normal(3), kept)
-
-
-def _total(name: str, n: int) -> Quantity:
-    row = np.array([*np.zeros(n), *np.ones(n)])
-    return Quantity(name, lambda t, y: float(y[n:].sum()), lambda t, y: row.copy())
 
 
 def toda(rng: np.random.Generator) -> System:
@@ -206,7 +191,7 @@ def toda(rng: np.random.Generator) -> System:
     C = np.kron(np.eye(2), np.ones((1, n)))  # the sums of positions and of velocities
     kept = (
         mechanical("H", lambda q: float(pull(q).sum()), dV),
-        _total("P", n),
+        Quantity("P", lambda t, y: float(y[n:].sum()), lambda t, y: np.array([*np.zeros(n), *np.ones(n)])),
         Quantity("third", third, third_gradient),
     )
     return second_order("toda", lambda t, x: -dV(x), q, v, kept, frame=(C, C.T.copy()))
