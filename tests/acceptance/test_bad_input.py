@@ -8,10 +8,12 @@ import re
 import time
 import warnings
 
+import numba
 import numpy as np
 import pytest
+from numba import njit
 from scipy.integrate import RK45, solve_ivp
-from systems import orbit, oscillator
+from systems import SQUARE, orbit, oscillator
 
 from eip_scipy import (
     EIPRK1,
@@ -19,7 +21,6 @@ from eip_scipy import (
     EIPRK4,
     EIPRK45,
     Invariant,
-    ProjectionWarning,
     check_gradient,
     ensemble,
     integrate,
@@ -29,18 +30,12 @@ from eip_scipy import (
 from eip_scipy.solvers import EIPSolver
 
 EPS = np.finfo(float).eps
+NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+jit_oscillator = njit(oscillator)
 Y0 = [1.0, 2.0]
 
 
-def square(t, y):
-    return y @ y
-
-
-def square_gradient(t, y):
-    return 2 * y
-
-
-SQUARE = Invariant(square, square_gradient, name="S")
+square, square_gradient = SQUARE.fun, SQUARE.grad
 
 
 def by_scipy(fun=oscillator, t_span=(0, 1), y0=Y0, **options):
@@ -94,6 +89,26 @@ def test_bad_inputs(driver, name):
         driver(**options)
 
 
+def event(terminal=None, direction=0):
+    def passing(t, y):
+        return y[0]
+
+    passing.terminal, passing.direction = terminal, direction
+    return passing
+
+
+def takes_more(t, y, m):
+    return m * (y @ y)
+
+
+def takes_more_gradient(t, y, m):
+    return 2 * m * y
+
+
+NAMED = r".*Invariant\(\.\.\., args=\(\.\.\.,\)\)"
+TERMINAL = "`terminal` attribute of each event must be a boolean or positive integer"
+DIRECTION = "`direction` attribute of each event must be a number"
+TIME = "'M' is called with \\({0}\\): .* The first argument is always the time: .* lambda {0}: "
 WRONG_OPTIONS = [
     ("metric", "errors", "metric must be 'error', 'euclidean' or an array"),
     ("metric", [1.0, 2.0, 3.0], r"metric: weights have shape \(3,\), the state has 2"),
@@ -148,6 +163,66 @@ WRONG = [
     (kept(grad=lambda t, y: 2.002 * y), ValueError, "gradient of invariant 'H' is wrong"),
     (kept(target=math.nan), ValueError, "invariant 'H': target must be finite"),
     (kept(target=[1.0, 2.0]), ValueError, r"invariant 'H': target has shape \(2,\)"),
+    # Options of runs.
+    *(({name: 1}, ValueError, f"{name} must be True or False") for name in ("in_place", "progress", "compensated")),
+    ({"resume": "yes"}, ValueError, "resume must be True or False, got"),
+    ({"compiled": "a"}, ValueError, "compiled must be True, False or None .compile if possible., got"),
+    *(({"max_bytes": v}, ValueError, "max_bytes must be a number of bytes >= 0") for v in ("a", math.nan, -1, True)),
+    *(({"save_every": v}, ValueError, "save_every must be an integer >= 1") for v in (0, 1.5, "1", True)),
+    ({"save_every": 10**30}, ValueError, "save_every must be at most 9223372036854775807, got 1000"),
+    ({"callback": 1}, TypeError, "callback must be a function callback"),
+    ({"events": 1}, TypeError, "events must be callable, or a sequence of callables, got 1"),
+    ({"events": [None]}, TypeError, "events must be callable, got None"),
+    *(({"events": event(v)}, ValueError, TERMINAL) for v in (math.nan, "a", -1, 1.5, [1])),
+    *(({"events": event(True, v)}, ValueError, DIRECTION) for v in (None, math.nan, "a")),
+    ({"checkpoint_every": 10**400}, ValueError, "checkpoint_every must be a number of seconds > 0, got 1000"),
+    *(({"params": v}, TypeError, "params must be an array of numbers, got")
+      for v in ([10**400], [None], 1j, [[1], [2, 3]])),
+    ({"params": {"k": 1.0}}, TypeError,
+     r"got {'k': 1.0}\. Give the values .* params=\[1.0, 2.0\], .* args=\(mapping,\)"),
+    *(({"t_eval": v}, ValueError, "t_eval must be an array of numbers") for v in ([1j], "ab", [None], [10**400])),
+    *(({"t_eval": v}, ValueError, "t_eval must be finite") for v in ([0.2, math.nan], [0.2, math.inf])),
+    *(({"t_eval": v}, ValueError, "`t_eval` are not within `t_span`") for v in ([0.5, 1.1], [-0.1, 0.5])),
+    *(({"t_eval": v}, ValueError, "`t_eval` are not properly sorted") for v in ([0.5, 0.2], [0.5, 0.5])),
+    ({"t_eval": [0.2, 0.5], "t_span": (1, 0)}, ValueError, "`t_eval` are not properly sorted"),
+    *(({"t_eval": v}, ValueError, "`t_eval` must be 1-dimensional") for v in ([[0.5]], 0.5)),
+    ({"t_eval": []}, ValueError, "`t_eval` must be 1-dimensional and not empty"),
+    ({"t_eval": [0.5], "save_every": 1}, ValueError, "save_every or t_eval, not both"),
+    *(({"h": None, "method": EIPRK45, "first_step": v}, ValueError, "`first_step` exceeds bounds")
+      for v in (11.0, math.inf)),
+    # Functions of other arguments.
+    *(({"invariants": Invariant(value, grad, name="M", **more)}, TypeError, match + NAMED)
+      for value, grad, more, match in (
+          (takes_more, takes_more_gradient, {}, r"invariant 'M' is called with \(t, y\): .*'m'"),
+          (takes_more, None, {}, r"invariant 'M' is called with \(t, y\): .*'m'"),
+          (square, takes_more_gradient, {}, r"gradient of invariant 'M' is called with \(t, y\): .*'m'"),
+          (square, square_gradient, {"args": (1.0,)}, r"invariant 'M' is called with \(t, y, args\[0\]\): too many"),
+          (square, square_gradient, {"uses_f": True}, r"gradient of invariant 'M' .* \(t, y, f\): too many"),
+      )),
+    *(({"invariants": Invariant(value, grad, name="M")}, TypeError, TIME.format("t, y"))
+      for value, grad in ((lambda y: y @ y, None), (lambda y: y @ y, square_gradient), (square, lambda y: 2 * y))),
+    ({"invariants": Invariant(lambda y, m: m * (y @ y), name="M", args=(2.0,))}, TypeError,
+     TIME.format(r"t, y, args\[0\]")),
+    ({"invariants": Invariant(lambda t, y: y @ y + takes_more(t, y), square_gradient)}, TypeError,
+     r"takes_more\(\) missing 1 required positional argument: 'm'$"),  # from within: unchanged
+    ({"fun": lambda t, y, p: y}, TypeError, r"fun is called with \(t, y\): missing .* 'p'.*params=\.\.\."),
+    ({"params": [1.0]}, TypeError, r"fun is called with \(t, y, params\): too many"),
+    ({"in_place": True}, TypeError, r"fun is called with \(t, y, out\): too many"),
+    ({"in_place": True, "params": 1.0}, TypeError, r"fun is called with \(t, y, out, params\): too many"),
+    ({"events": event(True), "params": 1.0, "fun": lambda t, y, p: y}, TypeError,
+     r"event 0 is called with \(t, y, params\)"),
+    # Methods and invariants.
+    *(({"method": m}, TypeError, "method must be an EIP class such as EIPRK4") for m in (EIPSolver, 4)),
+    *(({"method": m}, TypeError, rf"Give the class: from eip_scipy import {name}\.$")
+      for m, name in (("EIPRK4", "EIPRK4"), ("rk45", "EIPRK45"), (RK45, "EIPRK45"), ("Radau", "EIPRadau"))),
+    ({"method": "LSODA"}, TypeError, r"got 'LSODA'\.$"),
+    ({"method": None}, TypeError, "method"),
+    ({"y0": None}, TypeError, "y0 is missing"),
+    ({"fun": 3}, TypeError, "fun must be callable or a Problem, got 3"),
+    *(({"invariants": v}, TypeError, r"invariants: got .*; expected an Invariant, a function f\(t, y\)")
+      for v in (Invariant, None)),  # the class itself is not an invariant either
+    *(({"invariants": [SQUARE, v]}, TypeError, r"the sequence contains .*; expected Invariant objects or functions")
+      for v in (Invariant, None)),
 ]  # fmt: skip
 
 
@@ -164,16 +239,11 @@ def test_wrong_arguments(options, error, match):
 
 
 @both
-def test_y0_masked(driver):
+def test_y0_without_masked_values_and_unchanged(driver):
     plain, unmasked = driver(), driver(y0=np.ma.array(Y0, mask=[False, False]))
     np.testing.assert_array_equal(np.asarray(unmasked.y), plain.y)
-
-
-@both
-def test_y0_is_not_changed(driver):
     y0 = np.array(Y0)
-    target = Invariant(square, square_gradient, target=5.1)
-    driver(y0=y0, invariants=target, project_initial=True)
+    driver(y0=y0, invariants=Invariant(square, square_gradient, target=5.1), project_initial=True)
     np.testing.assert_array_equal(y0, Y0)
 
 
@@ -182,36 +252,27 @@ def test_y0_is_not_changed(driver):
 
 @both
 @pytest.mark.parametrize("invariants", [(), SQUARE])
-def test_fun_that_returns_its_buffer(driver, invariants):
-    buffer = np.zeros(2)
+def test_fun_that_keeps_overwrites_or_reuses_arrays(driver, invariants):
+    """Each call of fun gets fresh arrays, as in SciPy, and what it returns is copied."""
+    kept, buffer = [], np.zeros(2)
 
     def reusing(t, y):
         buffer[:] = y[1], -y[0]
         return buffer
 
-    np.testing.assert_array_equal(driver(reusing, invariants=invariants).y, driver(invariants=invariants).y)
-
-
-@both
-@pytest.mark.parametrize("invariants", [(), SQUARE])
-def test_fun_that_keeps_or_overwrites_its_argument(driver, invariants):
-    """Each call returns fresh arrays, as SciPy does."""
-    kept = []
-
     def careless(t, y):
-        f = np.array([y[1], -y[0]])
         kept.append((y, y.copy()))
-        return f
+        return oscillator(t, y)
 
     def destructive(t, y):
-        f = np.array([y[1], -y[0]])
+        f = oscillator(t, y)
         y[:] = 1e9
         return f
 
     good = driver(invariants=invariants).y
-    np.testing.assert_array_equal(driver(careless, invariants=invariants).y, good)
+    for fun in (reusing, careless, destructive):
+        np.testing.assert_array_equal(driver(fun, invariants=invariants).y, good)
     assert all((now == then).all() for now, then in kept)
-    np.testing.assert_array_equal(driver(destructive, invariants=invariants).y, good)
 
 
 class MineError(Exception):
@@ -268,72 +329,58 @@ def test_partial_whoever_raises(part, error):
     assert partial.y.shape == (2, len(partial.t))
 
 
+@njit
+def late(t, fails):
+    if fails and t > 0.5:
+        raise ValueError("from compiled code")
+
+
 @pytest.mark.needs_jit
-class TestCompiledExceptions:
-    @staticmethod
-    def functions(where):
-        from numba import njit
+@pytest.mark.parametrize("where", ["fun", *(pytest.param(k, marks=NIGHTLY) for k in ("grad", "in place", "value"))])
+def test_exceptions_of_compiled_functions_propagate(where):
+    of_fun, of_in_place, of_value, of_grad = (where == name for name in ("fun", "in place", "value", "grad"))
 
-        number = ["fun", "in place", "value", "grad"].index(where)
+    @njit
+    def fun(t, y):
+        late(t, of_fun)
+        return np.array([y[1], -y[0]])
 
-        @njit
-        def fun(t, y):
-            if number == 0 and t > 0.5:
-                raise ValueError("from compiled code")
-            return np.array([y[1], -y[0]])
+    @njit
+    def in_place(t, y, out):
+        late(t, of_in_place)
+        out[0], out[1] = y[1], -y[0]
 
-        @njit
-        def in_place(t, y, out):
-            if number == 1 and t > 0.5:
-                raise ValueError("from compiled code")
-            out[0], out[1] = y[1], -y[0]
+    @njit
+    def value(t, y):
+        late(t, of_value)
+        return y[0] * y[0] + y[1] * y[1]
 
-        @njit
-        def value(t, y):
-            if number == 2 and t > 0.5:
-                raise ValueError("from compiled code")
-            return y[0] * y[0] + y[1] * y[1]
+    @njit
+    def grad(t, y):
+        late(t, of_grad)
+        return 2 * y
 
-        @njit
-        def grad(t, y):
-            if number == 3 and t > 0.5:
-                raise ValueError("from compiled code")
-            return 2 * y
-
-        return (in_place if where == "in place" else fun), Invariant(value, grad, name="S")
-
-    @pytest.mark.parametrize(
-        "where",
-        [
-            "fun",
-            *(
-                pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow])
-                for name in ("grad", "in place", "value")
-            ),
-        ],
-    )
-    def test_propagate(self, where):
-        fun, kept = self.functions(where)
-        options = {"in_place": where == "in place", "invariants": kept, "compiled": True, "save_every": 10}
-        with pytest.raises(ValueError, match="from compiled code") as info:
-            integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.01, **options)
-        check_partial(info.value.partial)
+    options = {"in_place": of_in_place, "invariants": Invariant(value, grad, name="S"), "compiled": True}
+    with pytest.raises(ValueError, match="from compiled code") as info:
+        integrate(in_place if of_in_place else fun, (0, 1), Y0, method=EIPRK4, h=0.01, save_every=10, **options)
+    check_partial(info.value.partial)
 
 
 # The interval and the step.
 
 
-@pytest.mark.parametrize("span", [(-math.inf, 0), (math.inf, math.inf), (math.nan, 1), (0, math.nan)])
-def test_start_of_t_span_finite_through_the_solver_class(span):
+@pytest.mark.parametrize(
+    ("span", "match"),
+    [
+        *((s, "be finite, got .*; only its end may be infinite")
+          for s in ((-math.inf, 0), (math.inf, math.inf), (math.nan, 1), (0, math.nan))),
+        *((s, "hold two numbers, got") for s in ((0j, 1.0), (None, 1.0), (0.0, 10**400))),
+    ],
+)  # fmt: skip
+def test_times_of_the_solver_class(span, match):
     """A run from an infinite start never arrives; the end may be infinite, because a terminal event may end the run."""
-    with pytest.raises(ValueError, match=r"t_span must be finite, got .*; only its end may be infinite"):
-        by_scipy(t_span=span)
-
-
-@pytest.mark.parametrize("ends", [(0j, 1.0), (None, 1.0), (0.0, 10**400)])
-def test_times_of_the_solver_class_are_real(ends):
-    with pytest.raises(ValueError, match="t_span must hold two numbers, got"):
-        EIPRK4(oscillator, ends[0], Y0, ends[1], h=0.1)
+    with pytest.raises(ValueError, match=f"t_span must {match}"):
+        EIPRK4(oscillator, span[0], Y0, span[1], h=0.1)
 
 
 def test_unbounded_interval_through_the_solver_class():
@@ -471,49 +518,9 @@ def test_options_of_other_solvers_warn_as_scipy_s(names):
         by_scipy(**options, invarients=3)
 
 
-@pytest.mark.parametrize("method", [EIPSolver, 4])
-def test_wrong_method(method):
-    with pytest.raises(TypeError, match="method must be an EIP class such as EIPRK4"):
-        by_integrate(method=method)
-    if method is EIPSolver:
-        with pytest.raises(TypeError, match="eip_method"):
-            by_scipy(method=method)
-
-
-def test_missing_arguments():
-    with pytest.raises(TypeError, match="method"):
-        integrate(oscillator, (0, 1), Y0, h=0.1)
-    with pytest.raises(TypeError, match="y0 is missing"):
-        integrate(oscillator, (0, 1), method=EIPRK4, h=0.1)
-    with pytest.raises(TypeError, match="fun must be callable or a Problem, got 3"):
-        by_integrate(3)
-
-
-WRONG_OF_RUNS = [
-    *((name, 1, ValueError, f"{name} must be True or False, got") for name in ("in_place", "progress", "compensated")),
-    ("resume", "yes", ValueError, "resume must be True or False, got"),
-    ("compiled", "a", ValueError, "compiled must be True, False or None .compile if possible., got"),
-    *(("max_bytes", v, ValueError, "max_bytes must be a number of bytes >= 0, got") for v in ("a", math.nan, -1, True)),
-    *(("save_every", v, ValueError, "save_every must be an integer >= 1") for v in (0, 1.5, "1", True)),
-    ("save_every", 10**30, ValueError, "save_every must be at most 9223372036854775807, got 1000"),
-    ("callback", 1, TypeError, "callback must be a function callback"),
-    ("events", 1, TypeError, "events must be callable, or a sequence of callables, got 1"),
-    ("events", [None], TypeError, "events must be callable, got None"),
-    ("checkpoint_every", 10**400, ValueError, "checkpoint_every must be a number of seconds > 0, got 1000"),
-    *(
-        ("params", v, TypeError, "params must be an array of numbers, got")
-        for v in ([10**400], [None], 1j, [[1], [2, 3]])
-    ),
-    ("params", {"k": 1.0}, TypeError, r"got {'k': 1.0}\. Give the values .* params=\[1.0, 2.0\], .* args=\(mapping,\)"),
-    *(("t_eval", v, ValueError, "t_eval must be an array of numbers, got") for v in ([1j], "ab", [None], [10**400])),
-]
-
-
-@pytest.mark.parametrize(("name", "value", "error", "match"), WRONG_OF_RUNS, ids=lambda v: str(v)[:12])
-def test_wrong_arguments_of_runs(name, value, error, match):
-    with pytest.raises(error, match=match) as info:
-        by_integrate(**{name: value})
-    assert len(str(info.value)) < 400
+def test_the_base_class_as_a_method():
+    with pytest.raises(TypeError, match="eip_method"):
+        by_scipy(method=EIPSolver)
 
 
 @pytest.mark.parametrize("name", ["first_step", "max_step"])
@@ -525,29 +532,9 @@ def test_wrong_bounds_of_steps(driver, name, value):
         driver(h=None, method=EIPRK45, **{name: value})
 
 
-def test_bounds_of_steps_that_do_not_fit():
-    for value in (11.0, math.inf):
-        with pytest.raises(ValueError, match="`first_step` exceeds bounds"):
-            by_integrate(t_span=(0, 10), h=None, method=EIPRK45, first_step=value)
-
-
 def test_state_without_components():
     """SciPy's own suite asks for it of solve_ivp."""
     assert by_scipy(lambda t, y: y, y0=[]).y.shape[0] == 0
-
-
-def event(terminal=None, direction=0):
-    def passing(t, y):
-        return y[0]
-
-    passing.terminal, passing.direction = terminal, direction
-    return passing
-
-
-@pytest.mark.parametrize("value", [math.nan, "a", -1, 1.5, [1]])
-def test_wrong_terminal(value):
-    with pytest.raises(ValueError, match="`terminal` attribute of each event must be a boolean or positive integer"):
-        by_integrate(events=event(terminal=value))
 
 
 @pytest.mark.parametrize("value", [None, False, 0, True, 1, 2, 1.0, np.int64(3), np.True_])
@@ -555,90 +542,6 @@ def test_terminal_as_scipy_takes_it(value):
     run, sol = (driver(events=event(value), t_span=(0, 20)) for driver in (by_integrate, by_scipy))
     assert run.status == sol.status
     np.testing.assert_allclose(run.t_events[0], sol.t_events[0], atol=1e-10)
-
-
-@pytest.mark.parametrize("value", [None, math.nan, "a"])
-def test_wrong_direction(value):
-    with pytest.raises(ValueError, match="`direction` attribute of each event must be a number"):
-        by_integrate(events=event(terminal=True, direction=value))
-
-
-def takes_more(t, y, m):
-    return m * (y @ y)
-
-
-def takes_more_gradient(t, y, m):
-    return 2 * m * y
-
-
-FORGOTTEN = [
-    (Invariant(takes_more, takes_more_gradient, name="M"), r"invariant 'M' is called with \(t, y\): .*'m'.*"),
-    (Invariant(takes_more, name="M"), r"invariant 'M' is called with \(t, y\): .*'m'.*"),
-    (Invariant(square, takes_more_gradient, name="M"), r"gradient of invariant 'M' is called with \(t, y\): .*'m'.*"),
-    (
-        Invariant(square, lambda t, y: 2 * y, name="M", args=(1.0,)),
-        r"invariant 'M' is called with \(t, y, args\[0\]\): too many.*",
-    ),
-    (
-        Invariant(square, lambda t, y: 2 * y, name="M", uses_f=True),
-        r"gradient of invariant 'M' is called with \(t, y, f\): too many.*",
-    ),
-]
-
-
-@pytest.mark.parametrize(("invariants", "match"), FORGOTTEN)
-def test_forgotten_args_of_an_invariant(invariants, match):
-    with pytest.raises(TypeError, match=match + r"Invariant\(\.\.\., args=\(\.\.\.,\)\)"):
-        by_integrate(invariants=invariants)
-
-
-TIME_LEFT_OUT = [
-    Invariant(lambda y: y @ y, name="M"),
-    Invariant(lambda y: y @ y, square_gradient, name="M"),
-    Invariant(square, lambda y: 2 * y, name="M"),
-    Invariant(lambda y, m: m * (y @ y), name="M", args=(2.0,)),
-]
-
-
-@pytest.mark.parametrize("invariants", TIME_LEFT_OUT)
-def test_invariants_without_the_time(invariants):
-    names = "t, y, args\\[0\\]" if invariants.args else "t, y"
-    with pytest.raises(
-        TypeError,
-        match=rf"'M' is called with \({names}\): .* The first argument is always the time: .* lambda {names}: ",
-    ):
-        by_integrate(invariants=invariants)
-
-
-def test_a_method_by_its_name():
-    for method, name in (("EIPRK4", "EIPRK4"), ("rk45", "EIPRK45"), (RK45, "EIPRK45"), ("Radau", "EIPRadau")):
-        with pytest.raises(TypeError, match=rf"Give the class: from eip_scipy import {name}\.$"):
-            by_integrate(method=method)
-    with pytest.raises(TypeError, match=r"got 'LSODA'\.$"):
-        by_integrate(method="LSODA")
-
-
-def test_type_errors_within_an_invariant_pass_unchanged():
-    def broken(t, y):
-        return y @ y + takes_more(t, y)
-
-    with pytest.raises(TypeError, match=r"takes_more\(\) missing 1 required positional argument: 'm'$"):
-        by_integrate(invariants=Invariant(broken, square_gradient))
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        ({"fun": lambda t, y, p: y}, r"fun is called with \(t, y\): missing .* 'p'.*params=\.\.\."),
-        ({"params": [1.0]}, r"fun is called with \(t, y, params\): too many"),
-        ({"in_place": True}, r"fun is called with \(t, y, out\): too many"),
-        ({"in_place": True, "params": 1.0}, r"fun is called with \(t, y, out, params\): too many"),
-        ({"events": event(True), "params": 1.0, "fun": lambda t, y, p: y}, r"event 0 is called with \(t, y, params\)"),
-    ],
-)
-def test_functions_that_take_other_arguments(options, match):
-    with pytest.raises(TypeError, match=match):
-        by_integrate(**options)
 
 
 # Times of dense output.
@@ -659,32 +562,6 @@ def test_times_of_dense_output_are_real(t):
 # Saving.
 
 
-@pytest.mark.parametrize(
-    ("t_eval", "match"),
-    [
-        ([0.2, math.nan], "t_eval must be finite"),
-        ([0.2, math.inf], "t_eval must be finite"),
-        ([0.5, 1.1], "`t_eval` are not within `t_span`"),
-        ([-0.1, 0.5], "`t_eval` are not within `t_span`"),
-        ([0.5, 0.2], "`t_eval` are not properly sorted"),
-        ([0.5, 0.5], "`t_eval` are not properly sorted"),
-        ([[0.5]], "`t_eval` must be 1-dimensional"),
-        (0.5, "`t_eval` must be 1-dimensional"),
-        ([], "`t_eval` must be 1-dimensional and not empty"),
-    ],
-)
-def test_wrong_t_eval(t_eval, match):
-    with pytest.raises(ValueError, match=match):
-        by_integrate(t_eval=t_eval)
-
-
-def test_t_eval_in_the_direction_of_the_run():
-    with pytest.raises(ValueError, match="`t_eval` are not properly sorted"):
-        by_integrate(t_span=(1, 0), t_eval=[0.2, 0.5])
-    with pytest.raises(ValueError, match="save_every or t_eval, not both"):
-        by_integrate(t_eval=[0.5], save_every=1)
-
-
 def test_memory_is_estimated_before_the_run():
     begin = time.perf_counter()
     with pytest.raises(MemoryError, match=r"needs 2\.4e\+04 GB, .*save_every"):
@@ -699,14 +576,6 @@ def test_memory_is_estimated_before_the_run():
 
 
 # Invariants.
-
-
-def test_invariants_of_wrong_kind():
-    for wrong in (Invariant, None):  # the class itself is not an invariant either
-        with pytest.raises(TypeError, match=r"invariants: got .*; expected an Invariant, a function f\(t, y\)"):
-            by_integrate(invariants=wrong)
-        with pytest.raises(TypeError, match=r"the sequence contains .*; expected Invariant objects or functions"):
-            by_integrate(invariants=[SQUARE, wrong])
 
 
 @pytest.mark.parametrize(
@@ -775,18 +644,6 @@ def test_gradients_vanish_at_an_extremum(angle):
         integrate(orbit, (0.0, 0.01), circle, method=EIPRK4, h=0.01, invariants=wrong)
 
 
-@both
-def test_no_invariant_warns(driver):
-    first = Invariant(lambda t, y: y[0], lambda t, y: np.array([1.0, 0.0]), name="first")
-    with warnings.catch_warnings(record=True) as record:
-        warnings.simplefilter("always")
-        driver(invariants=first)
-    assert [item.category for item in record] == [UserWarning, ProjectionWarning]
-    for item in record:
-        assert "'first' is not an invariant of this system: at t=0 it changes at the rate 2" in str(item.message)
-        assert item.filename == __file__
-
-
 @pytest.mark.parametrize(
     ("call", "size"),
     [
@@ -824,21 +681,25 @@ def test_start_off_the_target():
     ("options", "match"),
     [
         ({}, "invariant 'S' has no target"),
-        ({"target": [1.0, 2.0]}, "target must be 1 finite numbers"),
+        *(({"target": v}, "target must be 1 finite numbers") for v in ([1.0, 2.0], math.nan, 1j, [[1.0]])),
+        *(({"target": 1.0, "t": v}, "t must be a finite number, got") for v in (None, math.nan, 1j)),
         ({"target": 1.0, "sigma": [1.0]}, r"sigma: weights have shape \(1,\)"),
         ({"target": 1.0, "sigma": [0.0, 0.0]}, "sigma: weights must be finite"),
-        ({"target": 1.0, "iterations": 0}, "iterations must be an integer >= 1"),
-        ({"target": 1.0, "frame": 3}, "frame must be a pair"),
-        *(({"target": v}, "target must be 1 finite numbers, got") for v in (math.nan, 1j, [[1.0]])),
-        *(({"target": 1.0, "t": v}, "t must be a finite number, got") for v in (None, math.nan, 1j)),
         ({"target": 1.0, "sigma": "a"}, "sigma must be an array of numbers, got"),
+        ({"target": 1.0, "iterations": 0}, "iterations must be an integer >= 1"),
         ({"target": 1.0, "iterations": 2**70}, "iterations must be at most 1000"),
+        ({"target": 1.0, "frame": 3}, "frame must be a pair"),
         ({"target": 1.0, "f": [1.0]}, r"f has shape \(1,\), expected \(2,\)"),
+        ({"target": 1.0, "y": [1.0, math.nan]}, "must be finite"),
+        ({"target": 1.0, "y": [Y0]}, "1-dimensional"),
+        ({"target": 1.0, "t": 3.0, "invariants": Invariant(square, lambda t, y: -2 * y, name="W"), "y": [0.6, 0.81]},
+         r"projection failed at t=3: invariant 'W', residual .*, rank 1 of 1"),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments_of_project(options, match):
+    options = {"y": Y0, "invariants": SQUARE} | options
     with pytest.raises(ValueError, match=match):
-        project(Y0, SQUARE, **options)
+        project(options.pop("y"), options.pop("invariants"), **options)
 
 
 def test_project_needs_f_where_a_gradient_uses_it():
@@ -852,93 +713,51 @@ def test_project_needs_f_where_a_gradient_uses_it():
         check_gradient(kept, 0.0, Y0)
 
 
-def test_project_state():
-    with pytest.raises(ValueError, match="must be finite"):
-        project([1.0, math.nan], SQUARE, target=1.0)
-    with pytest.raises(ValueError, match="1-dimensional"):
-        project([Y0], SQUARE, target=1.0)
-
-
-def test_project_that_fails():
-    wrong = Invariant(square, lambda t, y: -2 * y, target=1.0, name="W")
-    with pytest.raises(ValueError, match=r"projection failed at t=3: invariant 'W', residual .*, rank 1 of 1"):
-        project([0.6, 0.81], wrong, t=3.0)
-
-
 # Compilation.
 
 
+jit_value, jit_grad = njit(lambda t, y: y[0] * y[0] + y[1] * y[1]), njit(lambda t, y: 2 * y)
+NOT_COMPILABLE = {
+    "plain fun": ((square, square_gradient, ()), "fun is not a Numba function"),
+    "plain grad": ((jit_value, square_gradient, ()), "gradient of invariant 'V' is not"),
+    "args": ((lambda t, y, a: y @ y, lambda t, y, a: 2 * y, (1,)), "'V' has args"),
+    "plain value": ((square, jit_grad, ()), "invariant 'V' is not a Numba function"),
+    "no grad": ((njit(lambda t, y: 2 * np.mean(y * y)), None, ()),
+                "invariant 'V' has no grad, and it does not compile for dual numbers"),
+}  # fmt: skip
+
+
 @pytest.mark.needs_jit
-class TestNotCompilable:
-    @staticmethod
-    def jitted():
-        from numba import njit
+@pytest.mark.filterwarnings("ignore:invariant 'V' has no grad")
+@pytest.mark.parametrize(
+    "case", ["plain fun", "plain grad", "args", *(pytest.param(k, marks=NIGHTLY) for k in ("plain value", "no grad"))]
+)
+def test_what_does_not_compile_is_named(case):
+    (value, grad, args), reason = NOT_COMPILABLE[case]
+    fun = oscillator if case == "plain fun" else jit_oscillator
+    invariants = () if case == "plain fun" else Invariant(value, grad, args=args, name="V")
+    with pytest.raises(TypeError, match=reason):
+        by_integrate(fun, invariants=invariants, compiled=True)
+    run = by_integrate(fun, invariants=invariants)
+    assert (run.status, run.compiled) == (0, False)
+    assert "interpreted: " in run.message
+    assert reason.lstrip("'") in run.message
 
-        return (
-            njit(lambda t, y: np.array([y[1], -y[0]])),
-            njit(lambda t, y: y[0] * y[0] + y[1] * y[1]),
-            njit(lambda t, y: 2 * y),
-        )
 
-    def cases(self):
-        from numba import njit
-
-        fun, value, grad = self.jitted()
-        two_arguments = njit(lambda t, y, p: y)
-        return {
-            "plain fun": (oscillator, (), "fun is not a Numba function"),
-            "plain value": (fun, Invariant(square, grad, name="V"), "invariant 'V' is not a Numba function"),
-            "plain grad": (fun, Invariant(value, square_gradient, name="V"), "gradient of invariant 'V' is not"),
-            "no grad": (
-                fun,
-                Invariant(njit(lambda t, y: 2 * np.mean(y * y)), name="V"),
-                "invariant 'V' has no grad, and it does not compile for dual numbers",
-            ),
-            "args": (fun, Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,), name="V"), "'V' has args"),
-            "arguments": (fun, Invariant(value, two_arguments, name="V"), None),
-        }
-
-    @pytest.mark.filterwarnings("ignore:invariant 'V' has no grad")
-    @pytest.mark.parametrize(
-        "case",
-        [
-            "plain fun",
-            "plain grad",
-            "args",
-            *(pytest.param(k, marks=[pytest.mark.nightly, pytest.mark.slow]) for k in ("plain value", "no grad")),
-        ],
-    )
-    def test_says_which_and_why(self, case):
-        fun, invariants, reason = self.cases()[case]
-        with pytest.raises(TypeError, match=reason):
-            by_integrate(fun, invariants=invariants, compiled=True)
-        run = by_integrate(fun, invariants=invariants)
-        assert run.status == 0
-        assert not run.compiled
-        assert "interpreted: " in run.message
-        assert reason.lstrip("'") in run.message
-
-    def test_wrong_number_of_arguments(self):
-        fun, invariants, _ = self.cases()["arguments"]
-        with pytest.raises(TypeError, match=r"argument|V"):
-            by_integrate(fun, invariants=invariants, compiled=True)
-
-    def test_compiled_false_says_so(self):
-        run = by_integrate(self.jitted()[0], compiled=False)
-        assert not run.compiled
-        assert "compiled=False" in run.message
-
-    def test_compiled_run_says_so(self):
-        run = by_integrate(self.jitted()[0])
-        assert run.compiled
-        assert "interpreted" not in run.message
+@pytest.mark.needs_jit
+def test_runs_say_whether_they_are_compiled():
+    with pytest.raises(TypeError, match=r"argument|V"):
+        by_integrate(jit_oscillator, invariants=Invariant(jit_value, njit(lambda t, y, p: y), name="V"), compiled=True)
+    for compiled, says in ((False, "compiled=False"), (None, "")):
+        run = by_integrate(jit_oscillator, compiled=compiled)
+        assert run.compiled == (compiled is None)
+        assert says in run.message
+        assert ("interpreted" in run.message) == (not run.compiled)
 
 
 @pytest.mark.needs_jit
 def test_jit_disabled_is_a_reason(monkeypatch):
-    import numba
-
-    fun = numba.njit(lambda t, y: np.array([y[1], -y[0]]))
+    fun = njit(oscillator)
     monkeypatch.setattr(numba.config, "DISABLE_JIT", True)
     run = by_integrate(fun)
     assert not run.compiled

@@ -200,14 +200,23 @@ def with_an_array(t, y):
     return np.array([y[1], -y[0]])
 
 
-@pytest.mark.slow
-@pytest.mark.needs_jit
-@pytest.mark.parametrize(("fun", "in_place"), [(with_a_branch, True), (with_an_array, False)])
-def test_what_does_not_go_into_a_vector_runs_one_by_one(fun, in_place):
-    starts = spread_starts(np.array([1.0, 0.5]), 9)
-    run = check_bits(fun, (0, 4), starts, method=EIPRK4, h=0.05, in_place=in_place, invariants=())
+JITTED = [pytest.mark.slow, pytest.mark.needs_jit]
+TWO = np.array([1.0, 0.5])
+PLAIN = {"method": EIPRK4, "h": 0.05, "invariants": ()}
+ONE_BY_ONE = [
+    pytest.param(with_a_branch, TWO, 4, PLAIN | {"in_place": True}, "fun does not compile", marks=JITTED),
+    pytest.param(with_an_array, TWO, 4, PLAIN | {"in_place": False}, "fun does not compile", marks=JITTED),
+    (harmonic(), harmonic().y0, 1, {"method": EIPRK45, "first_step": 0.1}, "steps are adaptive"),
+    (kepler(), kepler().y0, 0.2, {"method": EIPGJ14, "h": 0.02},
+     "the run has fewer steps than the history of the method"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fun", "y0", "end", "options", "why"), ONE_BY_ONE)
+def test_what_runs_one_by_one(fun, y0, end, options, why):
+    run = check_bits(fun, (0, end), spread_starts(y0, 9), **options)
     assert not run.side_by_side.any()
-    assert run.one_by_one.startswith("fun does not compile")
+    assert run.one_by_one.startswith(why)
 
 
 @njit
@@ -286,13 +295,6 @@ def test_any_number_of_bodies(n):
     assert run.side_by_side.all()
 
 
-def test_adaptive_members_run_one_by_one():
-    starts = spread_starts(harmonic().y0, 9)
-    run = check_bits(harmonic(), (0, 1), starts, method=EIPRK45, first_step=0.1)
-    assert not run.side_by_side.any()
-    assert run.one_by_one == "steps are adaptive"
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -303,6 +305,8 @@ def test_adaptive_members_run_one_by_one():
         {"every": 7},
         {"invariants": ()},
         {"metric": "euclidean"},
+        {"kept": [0]},
+        {"kept": [1]},
     ],
     ids=lambda options: "-".join(options) or "defaults",
 )
@@ -310,6 +314,9 @@ def test_adaptive_members_run_one_by_one():
 def test_members_of_multistep_methods(method, options):
     problem = solar_system(years=100.0)
     starts = spread_starts(problem.y0, 11, size=1e-7)
+    options = dict(options)
+    if "kept" in options:
+        options["invariants"] = [problem.invariants[k] for k in options.pop("kept")]
     run = check_bits(problem, (0, 3), starts, method=method, h=1 / 620, members=[0, 4, 7, 8, 10], **options)
     assert run.side_by_side.all()
     assert run.one_by_one == ""
@@ -319,15 +326,6 @@ def test_multistep_members_backward_and_on_two_dimensions():
     run = check_bits(kepler(), (1.0, -40.3), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02, save_every=100)
     assert run.side_by_side.all()
     assert np.all(run.nlu > 0)
-
-
-@pytest.mark.parametrize("kept", [(0,), (1,), (0, 1)], ids=["H", "L", "both"])
-def test_multistep_members_keep_any_number_of_invariants(kept):
-    problem = solar_system(years=100.0)
-    starts = spread_starts(problem.y0, 8, size=1e-7)
-    invariants = [problem.invariants[k] for k in kept]
-    run = check_bits(problem, (0, 2), starts, method=EIPGJ14, h=1 / 412, invariants=invariants, members=[0, 7])
-    assert run.side_by_side.all()
 
 
 def test_multistep_members_with_bodies_of_their_own():
@@ -377,12 +375,6 @@ def test_evaluations_of_multistep_members_do_not_depend_on_how_fast_the_machine_
         monkeypatch.setattr(tasks, "why_one_by_one", lambda *_: "a test")
     run = check_bits(kepler(), (0, 3.01), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02)
     assert run.side_by_side.all() == together
-
-
-def test_multistep_members_without_a_history_run_one_by_one():
-    run = check_bits(kepler(), (0, 0.2), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02)
-    assert not run.side_by_side.any()
-    assert run.one_by_one == "the run has fewer steps than the history of the method"
 
 
 @njit

@@ -74,11 +74,6 @@ class Case:
         """Return whether all functions are Numba functions."""
         return self.system.name == jitted.NAME
 
-    @property
-    def terminal(self) -> bool:
-        """Return whether an event may end the run."""
-        return any(event.terminal for event in self.events)  # type: ignore[attr-defined]
-
     def error(self, y: Array) -> float:
         """Return the largest error of the states (n, SAMPLES), in units of the components' sizes."""
         return float(np.max(np.abs(y - self.truth) / self.size[:, None]))
@@ -206,24 +201,15 @@ def random_case(seed: int) -> Case:
     truth, growth = _truth(rng, system, times)
     size = np.abs(np.column_stack([system.y0, truth])).max(axis=1)
     size = np.maximum(size, 1e-3 * np.max(size * system.unit) / system.unit)
-    return Case(
-        seed=seed,
-        system=system,
-        invariants=invariants,
-        sick=sick,
-        method=name,
-        t_span=t_span,
-        steps=_steps(rng, system, min(h, length), length, least_rtol, size),
-        projection=_projection(rng, system, size, name != "EIPRK1"),
-        compensated=bool(rng.random() < 0.15),
-        params=params,
-        in_place=in_place,
-        events=() if system.name == jitted.NAME else _events(rng, size),
-        times=times,
-        truth=truth,
-        size=size,
-        growth=growth,
-    )
+    options = {
+        "steps": _steps(rng, system, min(h, length), length, least_rtol, size),
+        "projection": _projection(rng, system, size, name != "EIPRK1"),
+        "compensated": bool(rng.random() < 0.15),
+        "events": () if system.name == jitted.NAME else _events(rng, size),
+    }
+    known = {"times": times, "truth": truth, "size": size, "growth": growth}
+    given = {"invariants": invariants, "sick": sick, "params": params, "in_place": in_place}
+    return Case(seed=seed, system=system, method=name, t_span=t_span, **given, **options, **known)
 
 
 # Preserved quantities.
@@ -355,17 +341,11 @@ def _projection(rng: np.random.Generator, system: System, size: Array, has_estim
         found["frame"] = system.frame
     if rng.random() < 0.3:
         found["direction"] = str(rng.choice(["old", "midpoint"]))
-    if rng.random() < 0.2:
-        found["iterations"] = int(rng.integers(2, 4))
-    if rng.random() < 0.4:
-        every = [2, 3, 10, "auto" if has_estimate else 5]
-        found["every"] = every[rng.integers(4)]
-    if rng.random() < 0.2:
-        found["reuse_f"] = False
-    if rng.random() < 0.05:
-        found["project_initial"] = True
-    if rng.random() < 0.05:
-        found["check"] = False
+    every = [2, 3, 10, "auto" if has_estimate else 5]
+    others: dict[str, Any] = {"iterations": int(rng.integers(2, 4)), "every": every[rng.integers(4)]}
+    others |= {"reuse_f": False, "project_initial": True, "check": False}
+    shares = {"iterations": 0.2, "every": 0.4, "reuse_f": 0.2, "project_initial": 0.05, "check": 0.05}
+    found |= {name: others[name] for name, share in shares.items() if rng.random() < share}
     return found
 
 

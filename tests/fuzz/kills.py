@@ -76,7 +76,9 @@ def chain(seed: int, folder: Path, context: Any, most: int, killed: Counter[str]
             yield f"{kind}: {number.name} did not end it within {PATIENCE:g} s"
             return
         ended = process.exitcode == 0
-        if process.exitcode not in ((0, 1) if number == signal.SIGINT else (0, -number)):
+        # SIGTERM raises KeyboardInterrupt where a checkpoint is written, and ends the process elsewhere.
+        statuses = {signal.SIGINT: (0, 1), signal.SIGTERM: (0, 1, -number), signal.SIGKILL: (0, -number)}
+        if process.exitcode not in statuses[number]:
             yield f"{kind}: exit status {process.exitcode} after {number.name}"
         killed["ended before"] += ended
         killed[number.name] += not ended

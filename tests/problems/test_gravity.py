@@ -1,7 +1,6 @@
 """The sums over pairs of N point masses: accuracy, symmetry, and the same bits by all ways to call them."""
 
 import os
-import pickle
 import subprocess
 import sys
 from itertools import combinations
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from eip_scipy import EIPGJ12, EIPGJ14, EIPRKN12, integrate
-from eip_scipy.core.jitted import jitted_call
 from eip_scipy.engine.native import library
 from eip_scipy.problems import nbody
 from eip_scipy.problems.gravity import orbits
@@ -186,25 +184,6 @@ def test_bodies_at_one_place_are_not_finite(n, pair):
     assert not np.isfinite(energy(0.0, y, gm))
 
 
-@pytest.mark.needs_jit
-def test_the_same_bits_from_the_package_s_own_jitted_functions():
-    """They call the library with contiguous arrays, or fill a part of a larger array with rows."""
-    gm, y = bodies(5)
-    f, of_energy, of_momentum, expected = np.empty(30), np.empty(30), np.empty((3, 31)), np.empty((3, 30))
-    rhs(0.0, y, f, gm)
-    jitted_call(energy_gradient)(0.0, y, f, of_energy, gm)
-    jitted_call(momentum_gradient)(0.0, y, of_momentum[:, :-1], gm)
-    energy_gradient(0.0, y, f, again := np.empty(30), gm)
-    momentum_gradient(0.0, y, expected, gm)
-    np.testing.assert_array_equal(of_energy, again)
-    np.testing.assert_array_equal(of_momentum[:, :-1], expected)
-    assert jitted_call(energy)(0.0, y, gm) == energy(0.0, y, gm)
-    np.testing.assert_array_equal(jitted_call(momentum)(0.0, y, gm), momentum(0.0, y, gm))
-    assert jitted_call(acc) is acc
-    with pytest.raises(ValueError, match=r"gravity\.rhs was called with a state or params of the wrong size"):
-        jitted_call(rhs)(0.0, y[:-1], np.empty(29), gm)
-
-
 PRINT = """
 import numpy as np
 from eip_scipy.engine.native import library
@@ -248,10 +227,6 @@ def test_arguments_are_converted_or_refused():
         rhs(0.0, y, gm)
     with pytest.raises(TypeError, match="takes no keywords"):
         rhs(0.0, y, out, params=gm)
-
-
-def test_pickled_by_name():
-    assert pickle.loads(pickle.dumps(rhs)) is rhs
 
 
 def test_frequencies_of_orbits_and_of_a_moon():

@@ -14,7 +14,6 @@ from sympy.physics import mechanics as me
 from eip_scipy import EIPDOP853, EIPRadau, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import mechanics, mechanism
-from eip_scipy.problems.symbolic.models import _solution
 from eip_scipy_studies.mechanisms import examples
 
 G = 9.81
@@ -171,25 +170,6 @@ def test_functions_may_change_their_arguments_and_return_the_same_array():
     np.testing.assert_allclose(found.fun(0.0, state), exact.fun(0.0, state), atol=1e-8)
     assert found.outputs(0.0, state)["x"] == 0.1
     np.testing.assert_array_equal(state, found.y0)
-
-
-@pytest.mark.parametrize("wrapped", [lambda f: f, pytest.param(njit, marks=pytest.mark.needs_jit)])
-def test_constraints_may_depend_on_time(wrapped):
-    # A bead on a rod that turns at the rate w: r'' = w^2 r.
-    w = 2.0
-    problem = mechanism(
-        [1, 1],
-        [0, 0],
-        wrapped(lambda t, q: np.array([q[0] * np.sin(w * t) - q[1] * np.cos(w * t)])),
-        q0=[1, 0],
-        u0=[0, w],
-    )
-    last = integrate(
-        lambda t, y: problem.motion_at(t, y), (0, 1), problem.y0, method=EIPDOP853, rtol=1e-9, atol=1e-9
-    ).y[:, -1]
-    r, speed = np.cosh(w), w * np.sinh(w)
-    along, across = np.array([np.cos(w), np.sin(w)]), np.array([-np.sin(w), np.cos(w)])
-    np.testing.assert_allclose(last, np.append(r * along, speed * along + w * r * across), atol=1e-6)
 
 
 @pytest.mark.parametrize("t_span", [None, (0, 10)])
@@ -673,16 +653,6 @@ def test_euler_angles_of_a_body_with_body_rates(order, attitude):
             mechanics(model, {}, [0, 0, 0], w)
 
 
-def test_kinematical_equations_are_solved_by_blocks():
-    a, b, c = sympy.symbols("a b c")
-    A = sympy.Matrix([[0, 0, a, b, 0], [1, 0, 0, 0, 0], [0, 0, -b, a, c], [a, 2, b, 0, 0], [0, 0, 0, 0, c]])
-    B = sympy.Matrix([[1, a], [0, b], [c, 0], [1, 1], [a, c]])
-    X = _solution(A, B)
-    assert (A * X - B).applyfunc(sympy.simplify).is_zero_matrix
-    assert X.has(1 / (a**2 + b**2))
-    assert _solution(sympy.Matrix([[1, 0], [a, 0]]), B[:2, :]) is None
-
-
 def test_inputs_are_expressions_of_time_and_state():
     x, u, push = me.dynamicsymbols("x u push")
     N, P = me.ReferenceFrame("N"), me.Point("P")
@@ -693,13 +663,6 @@ def test_inputs_are_expressions_of_time_and_state():
         mechanics(kane, {}, [0], [1])
     problem = mechanics(kane, {}, [0], [1], inputs={"push": sympy.sin(me.dynamicsymbols._t) - 3 * x})
     np.testing.assert_allclose(problem.motion_at(0.5, np.array([0.2, 1.0])), [1.0, (np.sin(0.5) - 0.6) / 2], rtol=1e-15)
-
-
-def test_compiled_motion_is_that_of_python(four_bar):
-    rng = np.random.default_rng(2)
-    for _ in range(5):
-        y = four_bar.y0 + 0.1 * rng.normal(size=6)
-        np.testing.assert_allclose(four_bar.fun(0.3, y), four_bar.motion_at(0.3, y), rtol=1e-13, atol=1e-13)
 
 
 def test_a_pole_of_dependent_speeds_is_none_of_the_motion():

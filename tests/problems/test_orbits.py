@@ -1,6 +1,5 @@
 """Orbits in systems of N bodies: their balances against mpmath, the choice of centres, and wrong input."""
 
-import copy
 import pickle
 
 import mpmath
@@ -265,18 +264,14 @@ GM, Y = system(5)
         ((GM, Y, "enrgy"), "unknown quantity 'enrgy'.*did you mean 'energy'"),
         ((GM, Y, None), "unknown quantity None"),
         ((GM, Y, ["energy", 3]), "unknown quantity 3"),
+        ((GM, Y, {"bodies": ["a", "b"]}), "bodies has 2 names, but gm has 5 masses"),
+        ((GM, Y, {"newton": 1}), "newton must be True or False"),
     ],
 )
 def test_wrong_input(arguments, message):
+    options = arguments[-1] if isinstance(arguments[-1], dict) else {}
     with pytest.raises(ValueError, match=message):
-        orbital_balances(*arguments)
-
-
-def test_wrong_names_and_flags():
-    with pytest.raises(ValueError, match="bodies has 2 names, but gm has 5 masses"):
-        orbital_balances(GM, Y, bodies=["a", "b"])
-    with pytest.raises(ValueError, match="newton must be True or False"):
-        orbital_balances(GM, Y, newton=1)
+        orbital_balances(*arguments[: 2 if options else None], **options)
 
 
 ORBIT = [0.0, 2.0, 0.0, -1.0, 1.0, 1.0]
@@ -339,28 +334,6 @@ def test_sizes_that_do_not_fit_are_refused(name):
             function.bound(np.ones(20))(0.0, np.zeros(12), np.zeros(11))
 
 
-def test_bound_functions():
-    (balance,) = orbital_balances(GM, Y)
-    function, unbound = balance.fun, library["orbits.energy"]
-    params, y = np.array(function.own), 1.001 * Y
-    assert np.array_equal(params[:5], GM)
-    assert unbound.own == []
-    value = unbound(0.0, y, params)
-    again = pickle.loads(pickle.dumps(function))
-    for same in (function, copy.copy(function), copy.deepcopy(function), again, function.bound(params)):
-        assert same.own == function.own
-        assert np.array_equal(same(0.0, y), value)
-        assert np.array_equal(same(0.0, y, np.ones(3)), value)  # parameters of a run are left aside
-    assert pickle.loads(pickle.dumps(unbound)) is unbound
-    params[:] = np.nan  # the function has copied them
-    assert np.array_equal(again(0.0, y), value)
-    assert np.array_equal(function(0.0, y), value)
-    with pytest.raises(ValueError, match="one parameter at least"):
-        unbound.bound([])
-    with pytest.raises(ValueError, match="too small depth"):
-        unbound.bound("x")
-
-
 def test_balances_are_pickled():
     for balance in orbital_balances(GM, Y, QUANTITIES):
         again = pickle.loads(pickle.dumps(balance))
@@ -369,12 +342,6 @@ def test_balances_are_pickled():
         for (components, weights), (found, found_weights) in zip(balance.subspaces, again.subspaces, strict=True):
             assert np.array_equal(components, found)
             assert np.array_equal(weights, found_weights)
-
-
-def test_bound_functions_have_none_for_eight_members():
-    whole = library["gravity.rhs"]
-    assert whole.octet_address
-    assert not whole.bound(np.ones(4)).octet_address
 
 
 def test_ten_bodies_over_a_century():

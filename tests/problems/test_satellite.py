@@ -35,9 +35,7 @@ def dot(a, b):
 
 def formulas():
     """Return the acceleration and the rates of Kepler's energy, angular momentum and Laplace's vector, by mpmath."""
-    mu, radius, j2, drag, height, scale, spin = (
-        mpmath.mpf(x) for x in (*EARTH.values(), *AIR.values())
-    )  # fmt: skip
+    mu, radius, j2, drag, height, scale, spin = (mpmath.mpf(x) for x in (*EARTH.values(), *AIR.values()))
     x, v, pole = vector(START[0]), vector(START[1]), vector(POLE)
     pole /= mpmath.sqrt(dot(pole, pole))
 
@@ -48,9 +46,7 @@ def formulas():
         return -mu / mpmath.sqrt(r2) * j2 * radius**2 / r2 * (1 - 3 * sine2) / 2
 
     r, u = mpmath.sqrt(dot(x, x)), v - spin * cross(pole, x)
-    gradient = mpmath.matrix(
-        [mpmath.diff(potential, tuple(x), tuple(int(i == k) for i in range(3))) for k in range(3)]
-    )  # fmt: skip
+    gradient = mpmath.matrix([mpmath.diff(potential, tuple(x), tuple(np.eye(3, dtype=int)[k])) for k in range(3)])
     air = drag * mpmath.exp((radius + height - r) / scale) * mpmath.sqrt(dot(u, u))
     P = -gradient - air * u
     h = cross(x, v)

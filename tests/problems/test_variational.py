@@ -1,7 +1,5 @@
 """Variational equations of problems: against differences of order 8 of their right-hand sides, at random states."""
 
-import pickle
-
 import numpy as np
 import pytest
 from numba import njit
@@ -102,18 +100,6 @@ def test_expressions_without_numba(monkeypatch, name):
     assert_variational(problem, rng.uniform(0.3, 1.3, len(problem.system.components)), rng, (0,), columns=1)
     for cached in caches:
         cached.cache_clear()
-
-
-@pytest.mark.needs_jit
-def test_expressions_are_written_when_they_are_asked_for(monkeypatch):
-    problem = SYMBOLIC["lorenz"]()
-    system._with_columns.cache_clear()
-    monkeypatch.setattr(system, "variational_function", None)
-    again = pickle.loads(pickle.dumps(problem))
-    with pytest.raises(TypeError):
-        again.variational(())
-    monkeypatch.undo()
-    assert again.variational((2, 0)) is problem.variational((2, 0))
 
 
 def test_expressions_that_have_no_derivative():

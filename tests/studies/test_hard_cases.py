@@ -220,16 +220,6 @@ def test_wrong_rtol(rtol, capsys):
     assert "expected a number from 1e-13 to 0.1" in capsys.readouterr().err
 
 
-def test_interrupt(tmp_path, monkeypatch, capsys):
-    def stop(*args):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(command, "solve", stop)
-    assert main(["hard-cases", "--out", str(tmp_path), "--quiet"]) == 130
-    assert list(tmp_path.iterdir()) == []
-    assert "interrupted" in capsys.readouterr().err
-
-
 # --- the paper's figures, work and precision ---
 
 

@@ -233,11 +233,6 @@ def test_command_prints_and_writes(tmp_path, capsys):
     assert float(lines[0]["ours"]) == pytest.approx(6.3506e-3, rel=1e-4)
 
 
-def test_quiet_prints_nothing(tmp_path, capsys):
-    assert main(["reproduce", "table1", "--quiet", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out == ""
-
-
 def test_a_wrong_number_fails_the_command(tmp_path, monkeypatch, capsys):
     """The status is 1 and the line is marked when the step is not the paper's."""
     monkeypatch.setitem(tables.METHODS, "RK3", tables.EIPRK2)
@@ -245,8 +240,3 @@ def test_a_wrong_number_fails_the_command(tmp_path, monkeypatch, capsys):
     text = capsys.readouterr().out
     assert "7 marked ! DIFFER" in text
     assert "0/5!" in text
-
-
-def test_unknown_table_is_wrong_usage(capsys):
-    assert main(["reproduce", "table6"]) == 2
-    assert "invalid choice: 'table6'" in capsys.readouterr().err
