@@ -575,9 +575,9 @@ class Options(NamedTuple):
     compensated: bool
     adaptive: bool
     per_band: float
-    watched: bool = ...
-    limit: float = ...
-    distant: float = ...
+    watched: bool
+    limit: float
+    distant: float
     joint: Any = ...
 
 class Members(NamedTuple):
@@ -670,11 +670,6 @@ class gravity:
         """
 
 class multibody:
-    @staticmethod
-    def solve(matrices: numpy.typing.NDArray[numpy.float64], tolerance: float, acceleration: numpy.typing.NDArray[numpy.float64], multipliers: numpy.typing.NDArray[numpy.float64]) -> int:
-        """
-        Fill `acceleration` with u' (n,) and `multipliers` with lambda (m,), the solution of M u' + G^T lambda = F, G u' = -gamma. `matrices` holds M, F, G and gamma, one after the other. Return the rank of G, or MASS_IS_SINGULAR or NOT_FINITE.
-        """
     @staticmethod
     def solve_address() -> int:
         """Return the address of `solve` in multibody.cpp, for compiled code."""

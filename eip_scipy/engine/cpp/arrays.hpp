@@ -148,7 +148,6 @@ struct PointsOf {
 
 using Field = PointsOf<double, true>;
 using ConstField = PointsOf<const double, true>;
-using Reals = PointsOf<double, false>;
 using ConstReals = PointsOf<const double, false>;
 
 template <class First, class... Others>

@@ -126,12 +126,7 @@ template <class AnyRun>
     const auto &w = run.work;
     const Columns &columns = o.columns;
     const int64_t n = columns.size;
-    if (o.uses_f) {
-        run.system.rhs(w, step.t_new, step.y_new, w.f_point);
-        ++w.counters[NFEV];
-    }
-    run.system.grad(w, step.t_new, step.y_new, w.f_point, w.G);
-    ++w.counters[NJEV];
+    evaluate_gradients(run, step.t_new, step.y_new, w.f_point);
     const bool in_halves = columns.half > 0;
     double *M = in_halves ? w.err : step.y_new + n, *scratch = w.err_low;
     for (int64_t c = 0; in_halves && c < columns.count; ++c) take_column(columns, c, step.y_new, M + c * n);

@@ -6,18 +6,25 @@
 
 namespace eip {
 
-// (y_hat, carry_hat) = y + carry + h sum_j (b + b_low)[j] K[j], rounded once to two floats.
+// y + carry + h sum_j (b + b_low)[j] rate(j), rounded once to two floats.
+template <class Rate>
+[[gnu::always_inline]] inline Pair compensated_sum(double y, double carry, double h, const Method &m,
+                                                   const Rate &rate) {
+    double main = 0.0, low = 0.0;
+    for (int64_t j = 0; j < m.stages; ++j) {
+        const double f = rate(j);
+        main += m.b[j] * f;
+        low += m.b_low[j] * f;
+    }
+    const Pair increment = two_product(h, main), s = two_sum(y, increment.value);
+    return two_sum(s.value, s.rest + (increment.rest + h * low + carry));
+}
+
+// (y_hat, carry_hat), the end of a step from y.
 template <class W>
 inline void compensated_step(const double *y, double h, const Method &m, const W &w) {
     for (int64_t i = 0; i < w.m; ++i) {
-        double main = 0.0, low = 0.0;
-        for (int64_t j = 0; j < m.stages; ++j) {
-            const double f = w.row(j)[i];
-            main += m.b[j] * f;
-            low += m.b_low[j] * f;
-        }
-        const Pair increment = two_product(h, main), s = two_sum(y[i], increment.value);
-        const Pair sum = two_sum(s.value, s.rest + (increment.rest + h * low + w.carry[i]));
+        const Pair sum = compensated_sum(y[i], w.carry[i], h, m, [&](int64_t j) { return w.row(j)[i]; });
         w.y_hat[i] = sum.value;
         w.carry_hat[i] = sum.rest;
     }
@@ -27,14 +34,8 @@ inline void compensated_step(const double *y, double h, const Method &m, const W
 template <class W>
 inline void compensated_levels(double h, const Method &m, const Balances &balances, const W &w) {
     for (int64_t b = 0; b < w.balances; ++b) {
-        double main = 0.0, low = 0.0;
-        for (int64_t j = 0; j < m.stages; ++j) {
-            if (!balances.rated[j]) continue;
-            main += m.b[j] * w.rate(j)[b];
-            low += m.b_low[j] * w.rate(j)[b];
-        }
-        const Pair increment = two_product(h, main), s = two_sum(w.level[b], increment.value);
-        const Pair sum = two_sum(s.value, s.rest + (increment.rest + h * low + w.level_carry[b]));
+        const auto rate = [&](int64_t j) { return balances.rated[j] ? w.rate(j)[b] : 0.0; };
+        const Pair sum = compensated_sum(w.level[b], w.level_carry[b], h, m, rate);
         w.target[balances.place[b]] = sum.value;
         w.level_carry_new[b] = sum.rest;
     }

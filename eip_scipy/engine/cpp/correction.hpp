@@ -105,7 +105,7 @@ inline int64_t solve_part(const Matrix &B, const double *defects, const W &w) {
 template <int SIZE, class W>
 [[gnu::noinline]] inline int64_t move_groups(const Options &o, const W &w, double *out) {
     const Groups &groups = o.balance_groups;
-    double *total = o.frame.rows > 0 ? w.stage : w.move, *defects = w.inner.g;
+    double *total = o.frame.rows > 0 ? w.stage : w.move, *defects = w.inner_g;
     int64_t rank = 0;
     fill(total, 0.0, w.m);
     for (int64_t k = 0; k < groups.count; ++k) {
@@ -184,19 +184,26 @@ template <class W>
     return factored_move(o, w, out);
 }
 
+// Computes the gradients w.G at the state y, and f there if they take it.
+template <class AnyRun>
+inline void evaluate_gradients(const AnyRun &run, double t, const double *y, double *f) {
+    if (run.options.uses_f) evaluate_f(run, t, y, f);
+    run.system.grad(run.work, t, y, f, run.work.G);
+    ++run.work.counters[NJEV];
+}
+
 // Add to w.mu the Newton step of (B . Q) step = -g, on the rows that the first factorisation chose.
 inline void newton_matrix_solve(int64_t rank, const Work &w) {
-    const Inner &inner = w.inner;
-    const Matrix matrix = corner(inner.matrix, rank, w), R = corner(inner.R, w.l, w);
+    const Matrix matrix = corner(w.inner_matrix, rank, w), R = corner(w.inner_R, w.l, w);
     for (int64_t k = 0; k < rank; ++k) {
         for (int64_t q = 0; q < rank; ++q) matrix(k, q) = dot(w.B + w.pivots[k] * w.m, w.Q + w.pivots[q] * w.m, w.m);
-        inner.g[k] = w.g[w.pivots[k]];
+        w.inner_g[k] = w.g[w.pivots[k]];
     }
-    const int64_t inner_rank = factor(matrix, inner.inverse_norms, R, inner.pivots);
+    const int64_t inner_rank = factor(matrix, w.inner_inverse_norms, R, w.inner_pivots);
     if (inner_rank < 0) fill(w.mu, NOT_A_NUMBER, w.l);
-    least_norm(inner.g, inner.inverse_norms, R, inner.pivots, inner_rank, inner.mu);
+    least_norm(w.inner_g, w.inner_inverse_norms, R, w.inner_pivots, inner_rank, w.inner_mu);
     for (int64_t k = 0; k < rank; ++k)
-        for (int64_t q = 0; q < rank; ++q) w.mu[w.pivots[q]] += inner.mu[k] * matrix(k, q);
+        for (int64_t q = 0; q < rank; ++q) w.mu[w.pivots[q]] += w.inner_mu[k] * matrix(k, q);
     ++w.counters[NLU];
 }
 
@@ -207,16 +214,11 @@ inline void newton_matrix_solve(int64_t rank, const Work &w) {
     weigh_rows(o.frame, w, w.B);
     if (o.direction == OLD) {
         run.system.grad(w, step.t, step.y, w.row(0), w.G);
+        ++w.counters[NJEV];
     } else {
         midpoint(step.y, w.y_hat, w.stage, w.m);
-        const double t = 0.5 * (step.t + step.t_new);
-        if (o.uses_f) {
-            run.system.rhs(w, t, w.stage, w.f_point);
-            ++w.counters[NFEV];
-        }
-        run.system.grad(w, t, w.stage, w.f_point, w.G);
+        evaluate_gradients(run, 0.5 * (step.t + step.t_new), w.stage, w.f_point);
     }
-    ++w.counters[NJEV];
     weigh_rows(o.frame, w, w.Q);
     const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, corner(w.R, w.l, w), w.pivots);
     if (rank >= 0) {
@@ -247,12 +249,7 @@ inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1
     const Options &o = run.options;
     const auto &w = run.work;
     run.system.inv(w, step.t_new, step.y_new, w.values);
-    if (o.uses_f) {
-        run.system.rhs(w, step.t_new, step.y_new, w.f_point);
-        ++w.counters[NFEV];
-    }
-    run.system.grad(w, step.t_new, step.y_new, w.f_point, w.G);
-    ++w.counters[NJEV];
+    evaluate_gradients(run, step.t_new, step.y_new, w.f_point);
     if (!defects<double>(nullptr, step.y_new, o, w, w.defect)) return false;
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);

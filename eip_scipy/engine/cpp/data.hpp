@@ -320,18 +320,9 @@ void fields(Options &o, Visit &visit) {
     visit.record("kinds", "Grouping", o.kinds);
     each(visit, "kappa", o.kappa, "metric", o.metric, "direction", o.direction, "iterations", o.iterations, "every",
          o.every, "reuse_f", o.reuse_f, "uses_f", o.uses_f, "compensated", o.compensated, "adaptive", o.adaptive,
-         "per_band", o.per_band);
-    visit.by_default("watched", o.watched, false);
-    visit.by_default("limit", o.limit, ENDLESS);
-    visit.by_default("distant", o.distant, DISTANT);
+         "per_band", o.per_band, "watched", o.watched, "limit", o.limit, "distant", o.distant);
     visit.in_python("joint", "typing.Any", true);
 }
-
-// Scratch of the small Newton systems.
-struct Inner {
-    double *matrix, *g, *inverse_norms, *R, *mu;
-    int64_t *pivots;
-};
 
 // Buffers of a run of m values (floats, or those of eight members), l invariants, some of which are balances, and
 // `stages` + 1 rows of K. For each balance: rows of rates at the stages, its value at the current state and what rounding
@@ -350,7 +341,8 @@ struct WorkOf {
         *target, *products;  // the last two: the invariants' targets; scratch of the frame
     double *norm, *suspect;
     int64_t *pivots, *counters;
-    Inner inner;
+    double *inner_matrix, *inner_g, *inner_inverse_norms, *inner_R, *inner_mu;  // scratch of the small Newton systems
+    int64_t *inner_pivots;
     int64_t behind = 0;  // of a part of a state: floats of the whole one that are behind its m
 
     int64_t whole() const { return m + behind; }
@@ -390,9 +382,9 @@ void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
     visit("suspect", w.suspect, {w.suspect_size()});
     visit("pivots", w.pivots, {l});
     visit("counters", w.counters, {N_COUNTERS});
-    each(visit, {l, l}, "inner_matrix", w.inner.matrix, "inner_R", w.inner.R);
-    each(visit, {l}, "inner_g", w.inner.g, "inner_inverse_norms", w.inner.inverse_norms, "inner_mu", w.inner.mu,
-         "inner_pivots", w.inner.pivots);
+    each(visit, {l, l}, "inner_matrix", w.inner_matrix, "inner_R", w.inner_R);
+    each(visit, {l}, "inner_g", w.inner_g, "inner_inverse_norms", w.inner_inverse_norms, "inner_mu", w.inner_mu,
+         "inner_pivots", w.inner_pivots);
 }
 
 using Work = WorkOf<double>;

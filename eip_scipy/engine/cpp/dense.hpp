@@ -346,11 +346,7 @@ inline bool project_sample(const Run &run, double t, double *out) {
     const Options &o = run.options;
     const Work &w = run.work;
     for (int64_t k = 0; k < o.iterations; ++k) {
-        if (o.uses_f) {
-            run.system.rhs(w, t, w.y_hat, w.last());
-            ++w.counters[NFEV];
-        }
-        run.system.grad(w, t, w.y_hat, w.last(), w.G);
+        evaluate_gradients(run, t, w.y_hat, w.last());
         evaluate_invariants(run, t, w.y_hat);
         if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) {
             copy(w.y_hat, out, w.m);

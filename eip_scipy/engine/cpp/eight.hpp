@@ -28,48 +28,32 @@ struct OctetSystem {
 
     template <class W>
     void rhs_of_scratch(const W &w, double t, const double *y, double *out) {
-        const int64_t half = w.m / 2, floats = second_order ? half : w.m;
-        if (second_order) {
-            copy(y + half, out, half);
-            out += half;
-        }
-        if (rhs_pointer.library)
-            return rhs_pointer.library(t, octets_of(y), nullptr, octets_of(out), params.data(), floats / LANES, p());
-        fill(out, NOT_A_NUMBER, floats);
-        require(rhs_pointer.pointer(t, y, out, floats_of(params.data())));
+        const int64_t half = w.m / 2;
+        if (second_order) copy(y + half, out, half);
+        call(rhs_pointer, t, y, nullptr, second_order ? out + half : out, rhs_pointer.floats);
     }
 
     // Computes the accelerations like `System::acceleration`.
     template <class W>
     void acceleration(const W &w, double t, const double *y, double *f, double *a) {
-        const int64_t half = w.m / 2;
-        if (second_order && rhs_pointer.library)
-            return rhs_pointer.library(t, octets_of(y), nullptr, octets_of(a), params.data(), half / LANES, p());
+        if (second_order) return call(rhs_pointer, t, y, nullptr, a, rhs_pointer.floats);
         rhs_of_scratch(w, t, y, f);
-        copy(f + half, a, half);
+        copy(f + w.m / 2, a, w.m / 2);
     }
 
     template <class W>
-    void jacobian(const W &w, double t, const double *q, const double *dq, double *out, int64_t count) {
-        const auto &[pointer, library, octets] = jacobian_pointer;
-        if (library) return library(t, octets_of(q), octets_of(dq), octets_of(out), params.data(), count / LANES, p());
-        fill(out, NOT_A_NUMBER, w.m / 2);
-        require(pointer(t, q, dq, out, floats_of(params.data())));
+    void jacobian(const W &, double t, const double *q, const double *dq, double *out, int64_t count) {
+        call(jacobian_pointer, t, q, dq, out, count / LANES);
     }
 
     template <class W>
     void inv(const W &, double t, const Octet *y, Octet *values) {
-        call_each(inv_pointers, t, y, nullptr, values, [&](auto pointer, double *out) {
-            return pointer(t, copied(floats_of(y), scratch), out, floats_of(params.data()));
-        });
+        call_each(inv_pointers, t, y, nullptr, values);
     }
 
     template <class W>
     void grad(const W &, double t, const Octet *y, const Octet *f, Octet *G) {
-        call_each(grad_pointers, t, y, f, G, [&](auto pointer, double *out) {
-            const double *state = copied(floats_of(y), scratch), *slope = copied(floats_of(f), scratch_f);
-            return pointer(t, state, slope, out, floats_of(params.data()));
-        });
+        call_each(grad_pointers, t, y, f, G);
     }
 
     static Octet *octets_of(double *a) { return reinterpret_cast<Octet *>(a); }
@@ -84,20 +68,27 @@ struct OctetSystem {
         copy(a, floats_of(own.data()), LANES * static_cast<int64_t>(own.size()));
         return floats_of(own.data());
     }
-    static void require(int status) {
+    // Calls a function at a state of n vectors; f is null if the function does not take it.
+    template <class Pointer>
+    void call(const Native<Pointer, Octet> &function, double t, const double *y, const double *f, double *out,
+              int64_t n) {
+        const auto &[pointer, library, octets] = function;
+        if (library) return library(t, octets_of(y), octets_of(f), octets_of(out), params.data(), n, p());
+        fill(octets_of(out), NOT_A_NUMBER, octets);
+        int status;
+        if constexpr (std::is_same_v<Pointer, ValuePointer>)
+            status = pointer(t, y, out, floats_of(params.data()));
+        else
+            status = pointer(t, y, f, out, floats_of(params.data()));
         if (status) throw GaveUp{};
     }
-    template <class Calls, class ByPointer>
-    void call_each(const Calls &functions, double t, const Octet *y, const Octet *f, Octet *out,
-                   const ByPointer &by_pointer) {
-        for (const auto &[pointer, library, octets] : functions) {
-            if (library) {
-                library(t, y, f, out, params.data(), n(), p());
-            } else {
-                fill(out, NOT_A_NUMBER, octets);
-                require(by_pointer(pointer, floats_of(out)));
-            }
-            out += octets;
+    template <class Calls>
+    void call_each(const Calls &functions, double t, const Octet *y, const Octet *f, Octet *out) {
+        for (const auto &function : functions) {
+            const double *state = floats_of(y), *slope = floats_of(f);
+            if (!function.library) state = copied(state, scratch), slope = f ? copied(slope, scratch_f) : slope;
+            call(function, t, state, slope, floats_of(out), n());
+            out += function.floats;
         }
     }
 };
@@ -137,20 +128,8 @@ struct Eight {
         const int64_t half = ms ? ms->half : 0, nodes_kept = ms ? ms->rows : 0;
         Places places;
         each_buffer(work, blocks, places);
-        for (const auto &[place, count] :
-             std::initializer_list<std::pair<Octet **, int64_t>>{{&work.target, l},
-                                                                 {&work.products, products},
-                                                                 {&y, n},
-                                                                 {&y_new, n},
-                                                                 {&projections, 1},
-                                                                 {&skips, 1},
-                                                                 {&reduced, 1},
-                                                                 {&levels, 3 * l},
-                                                                 {&nodes, nodes_kept * half},
-                                                                 {&sums, 4 * half},
-                                                                 {&predicted, 3 * half},
-                                                                 {&change, half}})
-            places.add(*place, count);
+        places.add(work.target, l, work.products, products, y, n, y_new, n, projections, 1, skips, 1, reduced, 1,
+                   levels, 3 * l, nodes, nodes_kept * half, sums, 4 * half, predicted, 3 * half, change, half);
         memory.resize(places.total, Octet(0.0));
         Octet *next = memory.data();
         for (const auto &[place, count] : places.of) {
@@ -190,9 +169,11 @@ struct Eight {
         std::vector<std::pair<Octet **, int64_t>> of;
         int64_t total = 0;
 
-        void add(Octet *&place, int64_t count) {
+        template <class... Others>
+        void add(Octet *&place, int64_t count, Others &&...others) {
             of.emplace_back(&place, count);
             total += count;
+            if constexpr (sizeof...(others) > 0) add(others...);
         }
         void operator()(const char *, Octet *&place, std::initializer_list<int64_t> shape) {
             add(place, std::accumulate(shape.begin(), shape.end(), int64_t{1}, std::multiplies()));
@@ -206,23 +187,20 @@ struct Eight {
 
     Options flat_options_{};
 
+    template <class... Others>
+    static void see(double *&place, Octet *octets, Others &&...others) {
+        place = OctetSystem::floats_of(octets);
+        if constexpr (sizeof...(others) > 0) see(others...);
+    }
+
     // Sets up `flat`: the same buffers seen as those of one state of 8 n floats, as far as the raw step needs them.
     void flatten(const Work &w) {
         flat.n = flat.m = LANES * w.n;
         flat.l = w.l;
         flat.stages = w.stages;
-        for (const auto &[place, octets] :
-             std::initializer_list<std::pair<double **, Octet *>>{{&flat.K, work.K},
-                                                                  {&flat.stage, work.stage},
-                                                                  {&flat.y_hat, work.y_hat},
-                                                                  {&flat.err, work.err},
-                                                                  {&flat.err_low, work.err_low},
-                                                                  {&flat.err_sum, work.err_sum},
-                                                                  {&flat.carry, work.carry},
-                                                                  {&flat.carry_hat, work.carry_hat},
-                                                                  {&flat.f_point, work.f_point},
-                                                                  {&flat.move, work.move}})
-            *place = OctetSystem::floats_of(octets);
+        see(flat.K, work.K, flat.stage, work.stage, flat.y_hat, work.y_hat, flat.err, work.err, flat.err_low,
+            work.err_low, flat.err_sum, work.err_sum, flat.carry, work.carry, flat.carry_hat, work.carry_hat,
+            flat.f_point, work.f_point, flat.move, work.move);
         flat.norm = no_norm.data();
         flat.counters = counters;
         flat_options_ = options;

@@ -36,11 +36,6 @@ Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Me
     return by_length(run, [&](const auto &sized) { return sweep(sized, samples, s, members, steps, y, y_new); });
 }
 
-Code sweep_eights(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
-                  double *y, double *y_new) {
-    return sweep_octets(run, octets, s, members, steps, y, y_new);
-}
-
 Code step_once(const Run &run, const Schedule &s, int64_t k, const double *y, double *y_new) {
     return next_step(run, s.span, s.clock, k, y, y_new);
 }

@@ -6,20 +6,15 @@
 
 namespace eip {
 
-// These functions call `advance` (loop.hpp), `sweep` (members.hpp) and `sweep_octets` (side_by_side.hpp); comments
-// there explain the codes that are returned.
+// The first two call `advance` (loop.hpp) and `sweep` (members.hpp), the third one is in side_by_side.hpp; comments there
+// explain the codes that are returned.
 Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
                  const Saved &saved);
 Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,
                    double *y, double *y_new);
 
-// Data for sweeping batches of members.
-struct Octets {
-    Eight &eight;
-    Samples *samples;
-};
-Code sweep_eights(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
-                  double *y, double *y_new);
+Code sweep_octets(const Run &run, Eight &eight, Samples *samples, const Schedule &s, const Members &members,
+                  int64_t steps, double *y, double *y_new);
 
 // Step k of a run, and parts of a step: its projection, and what follows it.
 Code step_once(const Run &run, const Schedule &s, int64_t k, const double *y, double *y_new);

@@ -184,8 +184,8 @@ class Engine {
                 "engine: `sweep_octets` needs functions for eight members, fixed steps without events, a row for each "
                 "saved state, and dense output and kept rows for t_eval");
         if (samples_) samples_->interpolants.capacity = 0;
-        const Octets octets{*eight_, samples()};
-        return stepped([&](const Run &run) { return sweep_eights(run, octets, s, all, steps, from, to); });
+        return stepped(
+            [&](const Run &run) { return eip::sweep_octets(run, *eight_, samples(), s, all, steps, from, to); });
     }
 
     void sample(nb::object dense) {

@@ -294,8 +294,7 @@ inline void start_step(const AnyRun &run, double t, double h, const double *y) {
         if (k > 0) {
             copy(w.y_hat, w.move, w.m);
             copy(w.carry_hat, w.carry, w.m);
-            run.system.rhs(w, here, w.move, w.row(0));
-            ++w.counters[NFEV];
+            evaluate_f(run, here, w.move, w.row(0));
         }
         const Step step{here, here + part, part, k > 0 ? w.move : y, w.y_hat, false, false};
         if (run.method.nystrom)
@@ -347,8 +346,7 @@ inline Code begin_history(const AnyRun &run, double *y) {
             start_step(run, ms.t0 + static_cast<double>(k - 1) * ms.h, ms.h, y);
             copy(w.y_hat, y, w.m);
             copy(w.carry_hat, w.carry, w.m);
-            run.system.rhs(w, ms.t0 + static_cast<double>(k) * ms.h, y, w.row(0));
-            ++w.counters[NFEV];
+            evaluate_f(run, ms.t0 + static_cast<double>(k) * ms.h, y, w.row(0));
         }
         if (run.system.MEMBERS == 1 && !all_finite(w.row(0), w.m)) return NOT_FINITE;
         copy(w.row(0) + ms.half, next_row(ms), ms.half);
@@ -644,8 +642,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     defects_of_values(ms, w);
     const Code status = project_softly(run, step);
     if (status != OK || run.options.reuse_f) return status;
-    run.system.rhs(w, step.t_new, step.y_new, w.last());
-    ++w.counters[NFEV];
+    evaluate_f(run, step.t_new, step.y_new, w.last());
     return OK;
 }
 
@@ -664,8 +661,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     }
     start_step(run, from, step.h, step.y_new);
     if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
-    run.system.rhs(w, step.t_new, w.y_hat, w.last());
-    ++w.counters[NFEV];
+    evaluate_f(run, step.t_new, w.y_hat, w.last());
     Code status = OK;
     copy(w.y_hat, step.y_new, w.m);
     if (step.last && ms.balances > 0)

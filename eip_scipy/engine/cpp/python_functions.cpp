@@ -55,29 +55,12 @@ PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb:
         require(dimensions_[k] >= 0, "engine: shape contains a negative length");
         floats_ *= dimensions_[k];
     }
-    take_library();
     const nb::handle compiled = kept_attribute(description, "compiled", kept);
     if (compiled.is_none()) return;
     require(args_.empty() && !takes_f_ && !in_place_, "engine: compiled code must be that of fun(t, y)");
     pointer_ = reinterpret_cast<ValuePointer>(nb::cast<uintptr_t>(compiled.attr("address")));
     require(pointer_, "engine: compiled code needs an address");
     state_.resize(components_ * width_of(type_));
-}
-
-// Numbers of the library and their gradients are computed without a detour through Python. Other arguments than they
-// take are refused where Python calls them.
-void PythonCall::take_library() {
-    const LibraryFunction *found;
-    if (type_ != NPY_DOUBLE || !nb::try_cast(fun_, found) || !(found->is_numbers() || found->is_gradient())) return;
-    params_ = found->own.data();
-    n_params_ = std::ssize(found->own);
-    if (found->own.empty()) {
-        if (args_.size() != 1 || !is_plain(args_[0].ptr(), NPY_DOUBLE, 1)) return;
-        params_ = nb::borrow<Array>(args_[0]).floats();
-        n_params_ = nb::borrow<Array>(args_[0]).size();
-    }
-    const bool same = takes_f_ == found->takes_f() && in_place_ != found->returns();
-    if (same && found->fits(components_, n_params_) && found->filled(components_) == floats_) library_ = found;
 }
 
 // Call the compiled function; false if it raised an exception, or its value has another shape.
@@ -87,10 +70,6 @@ bool PythonCall::by_pointer(double t, const double *y, double *out) const {
 }
 
 void PythonCall::operator()(double t, const double *y, const double *f, double *out, nb::handle owner) const {
-    if (library_) {
-        library_->one(t, y, f, out, params_, components_, n_params_);
-        return Ending::leave_if_begun();
-    }
     if (pointer_ && by_pointer(t, y, out)) return;
     PyObject *arguments[5 + MOST_ARGUMENTS];  // t, y, f and out before them, and the place of the callee
     const nb::object time_object = time(t), y_object = copied(y, components_, type_);
@@ -247,12 +226,8 @@ int PythonHooks::raw_step(const Step &step) {
     if (!drives) one_step_(time(step.t), copied(step.y, w.n, type_), time(step.h));
     if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
     if (step.project && o.uses_f) {
-        if (o.direction == OLD) {
-            run_.system.rhs(w, step.t, step.y, w.row(0));
-            ++w.counters[NFEV];
-        }
-        run_.system.rhs(w, step.t_new, w.y_hat, w.last());
-        ++w.counters[NFEV];
+        if (o.direction == OLD) evaluate_f(run_, step.t, step.y, w.row(0));
+        evaluate_f(run_, step.t_new, w.y_hat, w.last());
     }
     w.counters[HAVE_F] = 1;  // as far as anyone asks for it: the next step does not
     w.counters[HAVE_ERROR] = estimates_;

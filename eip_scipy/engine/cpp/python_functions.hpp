@@ -26,15 +26,11 @@ class PythonCall {
     int64_t floats() const { return floats_; }
 
   private:
-    void take_library();
     bool by_pointer(double t, const double *y, double *out) const;
     bool take_list(PyObject *value, double *out) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
     nb::handle fun_, convert_;
-    const LibraryFunction *library_ = nullptr;
-    const double *params_ = nullptr;
-    int64_t n_params_ = 0;
     ValuePointer pointer_ = nullptr;
     mutable std::vector<double> state_;  // a copy for `pointer_`, because the function may overwrite it
     std::vector<nb::handle> args_;

@@ -94,10 +94,6 @@ class Reader {
         fields(place, reader);
     }
 
-    template <class Value>
-    void by_default(const char *name, Value &place, Value) {
-        (*this)(name, place);
-    }
     void in_python(const char *, const char *, bool) { ++place_; }
 
     const Sizes sizes;
@@ -156,11 +152,6 @@ class Names {
     template <class Record>
     void record(const char *name, const char *type, Record &) {
         add(name, type);
-    }
-    template <class Value>
-    void by_default(const char *name, Value &place, Value value) {
-        (*this)(name, place);
-        defaults.append(value);
     }
     void in_python(const char *name, const char *type, bool may_be_missing) {
         add(name, type);

@@ -261,9 +261,8 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
 }
 
 // The next states of all eight by a multistep method, at most `steps` further; the step that they belong to.
-[[gnu::noinline]] inline int64_t next_octet_states(const Run &run, const Octets &octets, const Schedule &s,
+[[gnu::noinline]] inline int64_t next_octet_states(const Run &run, Samples *samples, Eight &eight, const Schedule &s,
                                                    const Members &members, int64_t steps, double *y, double *y_new) {
-    const auto &[eight, samples] = octets;
     s.place[ROW] = eight.row;
     const int64_t k = eight.step, stop = next_stop(run.method, samples, s, k, last_of(run.method, s.span, k, steps));
     double *from = OctetSystem::floats_of(eight.y), *to = OctetSystem::floats_of(eight.y_new);
@@ -345,9 +344,8 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
 
 // Runs batches of members from where[0] on, up to the given number of steps. Returns OK if no member is left or if more
 // calls are needed. A member whose status is not set afterwards must be run alone.
-inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
-                         double *y, double *y_new) {
-    const auto &[eight, samples] = octets;
+Code sweep_octets(const Run &run, Eight &eight, Samples *samples, const Schedule &s, const Members &members,
+                  int64_t steps, double *y, double *y_new) {
     int64_t &first = members.where[0], &begun = members.where[1];
     for (; first < members.count; first += LANES, begun = 0) {
         try {
@@ -359,7 +357,7 @@ inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s
             while (eight.step < s.span.n_steps && any(alive_of(eight))) {
                 if (steps <= 0) return OK;
                 const int64_t made = eight.method.multistep
-                                         ? next_octet_states(run, octets, s, members, steps, y, y_new)
+                                         ? next_octet_states(run, samples, eight, s, members, steps, y, y_new)
                                          : step_octet(run, samples, eight, s, members, y, y_new);
                 steps -= made - eight.step;
                 eight.step = made;

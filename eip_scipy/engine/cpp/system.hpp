@@ -170,7 +170,7 @@ struct System {
             if (k == energy_item)
                 values[0] = energy;
             else
-                call_for_values(w, inv_pointers, "inv", k, t, y, values);
+                call_kept(w, inv_pointers[k], "inv", k, t, y, nullptr, values);
             values += inv_pointers[k].floats;
         }
     }
@@ -210,7 +210,7 @@ struct System {
             else if (!by_pointer)
                 python->one(RATES, b, t, y, f, out);
             else
-                call_with_f(w, balance.rate, "rate", b, t, y, f, out);
+                call_kept(w, balance.rate, "rate", b, t, y, f, out);
             out += balance.floats;
         }
     }
@@ -300,12 +300,7 @@ struct System {
     template <class W>
     void jacobian(const W &w, double t, const double *q, const double *dq, double *out, int64_t count) {
         if (!by_pointer) return python->jacobian(t, q, dq, out);
-        const auto &[pointer, library, floats] = jacobian_pointer;
-        if (library) return library(t, q, dq, out, params, count, n_params);
-        fill(out, NOT_A_NUMBER, floats);
-        const int status = pointer(t, q, dq, out, params);
-        if (status) [[unlikely]]
-            gave_up(status, {"jacobian", 0, t, {q, q + w.m / 2}, {dq, dq + w.m / 2}}, out, floats);
+        call<false>(jacobian_pointer, "jacobian", 0, w.m / 2, count, w.m / 2, t, q, dq, out);
     }
 
   private:
@@ -371,7 +366,7 @@ struct System {
     template <class W>
     void inv_of(const W &w, int64_t k, double t, const double *y, double *values) {
         if (!by_pointer) return python->one(VALUES, k, t, y, nullptr, values);
-        call_for_values(w, inv_pointers, "inv", k, t, y, values);
+        call_kept(w, inv_pointers[k], "inv", k, t, y, nullptr, values);
     }
 
     template <class W>
@@ -379,18 +374,30 @@ struct System {
                                                 double *G) {
         const Native<GradientPointer> &grad = grad_pointers[k];
         if (!grad.pointer && !grad.library) return grad_by_differences(w, k, t, y, G);
-        call_with_f(w, grad, "grad", k, t, y, f, G);
+        call_kept(w, grad, "grad", k, t, y, f, G);
     }
 
-    template <class W>
-    [[gnu::always_inline]] void call_with_f(const W &w, const Native<GradientPointer> &function, const char *name,
-                                            int64_t k, double t, const double *y, const double *f, double *out) {
-        const auto &[pointer, library, floats] = function;
-        if (library) return library(t, y, f, out, params, w.m, n_params);
+    // Calls a function at y and f, of m numbers each; f is null if the function does not take it. A function of the library
+    // gets n as their length, another one copies of those that are KEPT.
+    template <bool KEPT, class Pointer>
+    [[gnu::always_inline]] void call(const Native<Pointer> &function, const char *name, int64_t k, int64_t m, int64_t n,
+                                     int64_t floats, double t, const double *y, const double *f, double *out) {
+        if (function.library) return function.library(t, y, f, out, params, n, n_params);
         fill(out, NOT_A_NUMBER, floats);  // shows where a function leaves a part of it as it was
-        const int status = pointer(t, copied(y, scratch, w.m), copied(f, scratch_f, w.m), out, params);
+        const double *state = KEPT ? copied(y, scratch, m) : y;
+        int status;
+        if constexpr (std::is_same_v<Pointer, ValuePointer>)
+            status = function.pointer(t, state, out, params);
+        else
+            status = function.pointer(t, state, KEPT ? copied(f, scratch_f, m) : f, out, params);
         if (status) [[unlikely]]
-            gave_up(status, {name, k, t, {y, y + w.m}, {f, f + w.m}}, out, floats);
+            gave_up(status, name, k, t, y, f, m, out, floats);
+    }
+
+    template <class W, class Pointer>
+    [[gnu::always_inline]] void call_kept(const W &w, const Native<Pointer> &function, const char *name, int64_t k,
+                                          double t, const double *y, const double *f, double *out) {
+        call<true>(function, name, k, w.m, w.m, function.floats, t, y, f, out);
     }
 
     static const double *copied(const double *y, std::vector<double> &own, int64_t m) {
@@ -407,50 +414,31 @@ struct System {
 
     template <class W>
     [[gnu::always_inline]] void call_rhs_pointer(const W &w, double t, const double *y, double *out, int64_t floats) {
-        if (rhs_pointer.library) return rhs_pointer.library(t, y, nullptr, out, params, floats, n_params);
-        fill(out, NOT_A_NUMBER, floats);
-        const int status = rhs_pointer.pointer(t, y, out, params);
-        if (status) [[unlikely]]
-            gave_up(status, {"rhs", 0, t, {y, y + w.m}, {}}, out, floats);
+        call<false>(rhs_pointer, "rhs", 0, w.m, floats, floats, t, y, nullptr, out);
     }
 
     template <class W>
     void call_each(const W &w, const std::vector<Native<ValuePointer>> &functions, const char *name, double t,
                    const double *y, double *values) {
         for (int64_t k = 0; k < std::ssize(functions); ++k) {
-            call_for_values(w, functions, name, k, t, y, values);
+            call_kept(w, functions[k], name, k, t, y, nullptr, values);
             values += functions[k].floats;
         }
-    }
-
-    template <class W>
-    [[gnu::always_inline]] void call_for_values(const W &w, const std::vector<Native<ValuePointer>> &functions,
-                                                const char *name, int64_t k, double t, const double *y,
-                                                double *values) {
-        const auto &[pointer, library, floats] = functions[k];
-        if (library) return library(t, y, nullptr, values, params, w.m, n_params);
-        fill(values, NOT_A_NUMBER, floats);  // shows where a function leaves a value as it was
-        const int status = pointer(t, copied(y, scratch, w.m), values, params);
-        if (status) [[unlikely]]
-            gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
     }
 
     template <class W>
     [[gnu::cold, gnu::noinline]] void grad_by_differences(const W &w, int64_t k, double t, const double *y, double *G) {
         const Native<ValuePointer> &inv = inv_pointers[k];
         const auto values_at = [&](double *state, double *out) {
-            fill(out, NOT_A_NUMBER, inv.floats);
-            const int status = inv.pointer(t, state, out, params);
-            if (status) [[unlikely]]
-                gave_up(status, {"inv", k, t, {state, state + w.m}, {}}, out, inv.floats);
+            call<false>(inv, "inv", k, w.m, w.m, inv.floats, t, state, nullptr, out);
         };
         difference_gradient(values_at, y, inv.floats, shifts, G);
     }
 
-    [[gnu::cold, gnu::noinline]] void gave_up(int status, FailedCall call, double *out, int64_t floats) {
+    [[gnu::cold, gnu::noinline]] void gave_up(int status, const char *name, int64_t k, double t, const double *y,
+                                              const double *f, int64_t m, double *out, int64_t floats) {
         if (status > 0) return fill(out, NOT_A_NUMBER, floats);
-        failed = std::move(call);
-        failed.status = status;
+        failed = {name, k, t, {y, y + m}, {f, f ? f + m : f}, status};
         throw Broken{};
     }
 };
@@ -466,6 +454,13 @@ struct RunOf {
 };
 
 using Run = RunOf<Work>;
+
+// Computes f at the state y, and counts the evaluation.
+template <class AnyRun>
+inline void evaluate_f(const AnyRun &run, double t, const double *y, double *f) {
+    run.system.rhs(run.work, t, y, f);
+    ++run.work.counters[NFEV];
+}
 
 // Uses the code for states of any length.
 template <class W, class Called>

@@ -6,7 +6,7 @@
 
 #include <nanobind/stl/array.h>
 
-#include "../pairs.hpp"
+#include "../sums.hpp"
 
 namespace eip {
 namespace {
@@ -15,11 +15,17 @@ constexpr npy_intp BLOCK = 512;  // floats
 
 // Pointwise terms.
 
-// Times real factors, as many or, one for each row, (rows, 1).
+// True if a real factor stands for each row, (rows, 1), false for one of each point.
+bool is_by_rows(ConstField field, ConstReals factor, const char *otherwise) {
+    const bool by_rows = factor.columns == 1 && factor.points * field.columns == field.points;
+    require(by_rows || factor.points == field.points, otherwise);
+    return by_rows;
+}
+
+// Times real factors.
 void multiply(Field field, ConstReals factor) {
     const npy_intp columns = field.columns;
-    const bool by_rows = factor.columns == 1 && factor.points * columns == field.points;
-    require(by_rows || factor.points == field.points, "multiply: expected a factor for each point, or for each row");
+    const bool by_rows = is_by_rows(field, factor, "multiply: expected a factor for each point, or row");
     const Released released(field.points);
     double *z = field.data;
     if (!by_rows) {
@@ -69,15 +75,34 @@ void turn(ConstField f, double factor, Field out) {
     }
 }
 
-// Sums.
+// Sums. Complex numbers in vectors are pairs of floats.
+//
+// Products are written so because GCC 12 and later fuse the two halves of a loop over a c - b d and a d + b c into one
+// operation (vfmaddsub) in spite of -ffp-contract=off: other bits where the processor has it.
+
+// With their parts exchanged.
+inline Vector swapped(Vector z) {
+    Vector w{};
+    for (int k = 0; k < WIDTH; ++k) w[k] = z[k ^ 1];
+    return w;
+}
+
+// (-s, s, -s, s): i s z is this times z with its parts exchanged.
+inline Vector turning(double s) {
+    Vector v;
+    for (int k = 0; k < WIDTH; ++k) v[k] = k % 2 ? s : -s;
+    return v;
+}
 
 // Version for one block or more.
-template <class Term, std::size_t N>
-void sum_blocks(npy_intp floats, std::array<double, N> &total, Term part) {
+template <class Part>
+auto sum_blocks(npy_intp floats, Part part) {
+    decltype(part(0, 0)) total{};
     for (npy_intp begin = 0; begin < floats; begin += BLOCK) {
-        const std::array<double, N> sums = part(begin, std::min(begin + BLOCK, floats));
-        for (std::size_t k = 0; k < N; ++k) total[k] += sums[k];
+        const auto sums = part(begin, std::min(begin + BLOCK, floats));
+        for (std::size_t k = 0; k < sums.size(); ++k) total[k] += sums[k];
     }
+    return total;
 }
 
 // The sum over the imaginary parts, the odd lanes, less that over the real ones.
@@ -97,8 +122,7 @@ struct Tail {
 // receives the position of these floats and how many of them are valid: fewer than eight at the end.
 template <class Sums, class... Fields>
 auto lane_sums(npy_intp floats, Sums begin, Fields... fields) {
-    decltype(begin.sums()) total{};
-    sum_blocks(floats, total, [&](npy_intp first, npy_intp end) {
+    return sum_blocks(floats, [&](npy_intp first, npy_intp end) {
         Sums block = begin;
         npy_intp i = first;
         for (; i + LANES <= end; i += LANES) block.add(i, LANES, fields + i...);
@@ -108,7 +132,6 @@ auto lane_sums(npy_intp floats, Sums begin, Fields... fields) {
         }
         return block.sums();
     });
-    return total;
 }
 
 struct MomentSums {
@@ -143,11 +166,10 @@ std::array<double, 5> moments(ConstField psi, ConstField f) {
 // The sum of |psi|^2.
 double total_mass(ConstField psi) {
     const Released released(psi.points);
-    std::array<double, 1> total{};
-    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
+    const auto part = [&](npy_intp begin, npy_intp end) {
         return std::array{dot(psi.data + begin, psi.data + begin, end - begin)};
-    });
-    return total[0];
+    };
+    return sum_blocks(2 * psi.points, part)[0];
 }
 
 struct ExpansionSums {
@@ -201,8 +223,7 @@ std::array<double, 3> shifted(ConstField psi, ConstField f, double a, double b, 
 // Sum of weight |field|^2; a weight for each point or, (rows, 1), for each row.
 double weighted_square(ConstField field, ConstReals weight) {
     const npy_intp columns = field.columns;
-    const bool by_rows = weight.columns == 1 && weight.points * columns == field.points;
-    require(by_rows || weight.points == field.points, "weighted_square: expected a weight for each point, or row");
+    const bool by_rows = is_by_rows(field, weight, "weighted_square: expected a weight for each point, or row");
     const Released released(field.points);
     const double *z = field.data, *w = weight.data;
     if (by_rows) {
@@ -211,8 +232,7 @@ double weighted_square(ConstField field, ConstReals weight) {
         return total;
     }
     const auto term = [=](npy_intp i) { return w[i] * (z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1]); };
-    std::array<double, 1> total{};
-    sum_blocks(field.points, total, [&](npy_intp begin, npy_intp end) {
+    const auto part = [&](npy_intp begin, npy_intp end) {
         double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
         npy_intp i = begin;
         for (; i + 4 <= end; i += 4) {
@@ -223,8 +243,8 @@ double weighted_square(ConstField field, ConstReals weight) {
         }
         for (; i < end; ++i) a += term(i);
         return std::array{(a + b) + (c + d)};
-    });
-    return total[0];
+    };
+    return sum_blocks(field.points, part)[0];
 }
 
 }  // namespace

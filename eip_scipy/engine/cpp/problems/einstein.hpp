@@ -93,8 +93,8 @@ struct Einstein {
             for (int64_t j = i + 1; j < n; ++j) {
                 const Three x = body(q, i) - body(q, j);
                 const double u = 1.0 / std::sqrt(dot(x, x));
-                add_pull(out, i, j, x, u, phi, newton);
-                add_pull(out, j, i, -x, u, phi, newton);
+                Pull(*this, i, j, x, u, phi, newton.data()).add(out);
+                Pull(*this, j, i, -x, u, phi, newton.data()).add(out);
             }
     }
 
@@ -119,7 +119,8 @@ struct Einstein {
         for (int64_t i = 0; i < n; ++i)
             for (int64_t j = 0; j < n; ++j) {
                 if (j == i) continue;
-                const PullSlope pull(*this, i, j, phi, newton);
+                const Three x = body(q, i) - body(q, j);
+                const Pull pull(*this, i, j, x, 1.0 / std::sqrt(dot(x, x)), phi, newton);
                 for (int64_t k = 0; k < count; ++k) {
                     const double *slopes = by_phi.data() + n * k, *accelerations = by_newton.data() + half * k;
                     pull.add(columns + size * k, 4.0 * slopes[i] + slopes[j], accelerations, out + size * k + half);
@@ -208,40 +209,35 @@ struct Einstein {
     ThreeColumns by_position(double *out, int64_t i) const { return {out + 3 * i, 6 * n}; }
     ThreeColumns by_velocity(double *out, int64_t i) const { return {out + 3 * (n + i), 6 * n}; }
 
-    // Body j's pull on body i; x from j to i, u = 1/r.
-    void add_pull(double *out, int64_t i, int64_t j, const Three &x, double u, const std::vector<double> &phi,
-                  const std::vector<double> &newton) const {
-        const Three vi = body(v, i), vj = body(v, j), aj = body(newton.data(), j);
-        const double w = over_c2 * gm[j], radial = dot(x, vj) * u;
-        double along = 4.0 * phi[i] + phi[j] - dot(vi, vi) - 2.0 * dot(vj, vj) + 4.0 * dot(vi, vj);
-        along += 1.5 * radial * radial + 0.5 * dot(x, aj);
-        const double w3 = w * u * u * u;
-        add(out, i, w3 * along, x);
-        add(out, i, w3 * (4.0 * dot(x, vi) - 3.0 * dot(x, vj)), vi - vj);
-        add(out, i, 3.5 * w * u, aj);
-    }
-
-    // The derivative of add_pull, with what does not depend on the direction.
-    struct PullSlope {
+    // Body j's pull on body i, and what its derivative takes that does not depend on the direction; x from j to i, u = 1/r.
+    struct Pull {
         int64_t i, j, n;
         Three x, vi, vj, aj;
-        double u, radial, along, across, w, w3;
+        double u, radial, along, across, mass, w, w3;
 
-        PullSlope(const Einstein &all, int64_t i, int64_t j, const std::vector<double> &phi, const double *newton)
+        Pull(const Einstein &all, int64_t i, int64_t j, const Three &x, double u, const std::vector<double> &phi,
+             const double *newton)
             : i(i),
               j(j),
               n(all.n),
-              x(body(all.q, i) - body(all.q, j)),
+              x(x),
               vi(body(all.v, i)),
               vj(body(all.v, j)),
-              aj(body(newton, j)) {
-            u = 1.0 / std::sqrt(dot(x, x));
+              aj(body(newton, j)),
+              u(u) {
             radial = dot(x, vj) * u;
             along = 4.0 * phi[i] + phi[j] - dot(vi, vi) - 2.0 * dot(vj, vj) + 4.0 * dot(vi, vj);
             along += 1.5 * radial * radial + 0.5 * dot(x, aj);
             across = 4.0 * dot(x, vi) - 3.0 * dot(x, vj);
-            w = all.over_c2 * all.gm[j] * u;
+            mass = all.over_c2 * all.gm[j];
+            w = mass * u;
             w3 = w * u * u;
+        }
+
+        void add(double *out) const {
+            eip::add(out, i, w3 * along, x);
+            eip::add(out, i, w3 * across, vi - vj);
+            eip::add(out, i, 3.5 * mass * u, aj);
         }
 
         // Change along a column (dq, dv): what it adds to 4 phi_i + phi_j, and what it adds to Newton's accelerations.

@@ -47,34 +47,42 @@ void kepler_acc(const Given<T> &g) {
     g.out[1] = -w * g.y[1];
 }
 
-// The accelerations' derivative along dq, which stands in f.
+// The derivative of the accelerations at q.
+template <class T>
+struct PullSlope {
+    const T *q;
+    T r2 = q[0] * q[0] + q[1] * q[1], inverse = 1.0 / r2, w = inverse / sqrt(r2), pull, radial;
+
+    PullSlope(const T *q, const T &eps) : q(q) {
+        const T over = 1.5 * eps * inverse;
+        pull = w + w * over;
+        radial = (3.0 * w + 5.0 * w * over) * inverse;
+    }
+    void along(const T *d, T *out) const {
+        const T along = radial * (q[0] * d[0] + q[1] * d[1]);
+        out[0] = along * q[0] - pull * d[0];
+        out[1] = along * q[1] - pull * d[1];
+    }
+};
+
+// Along dq, which stands in f.
 template <class T>
 void kepler_jacobian(const Given<T> &g) {
-    const T *q = g.y, *d = g.f;
-    const T r2 = q[0] * q[0] + q[1] * q[1], inverse = 1.0 / r2, w = inverse / sqrt(r2);
-    const T over = 1.5 * g.params[0] * inverse, pull = w + w * over;
-    const T along = (3.0 * w + 5.0 * w * over) * inverse * (q[0] * d[0] + q[1] * d[1]);
-    g.out[0] = along * q[0] - pull * d[0];
-    g.out[1] = along * q[1] - pull * d[1];
+    PullSlope(g.y, g.params[0]).along(g.f, g.out);
 }
 
 // The derivative of a state with columns behind it. The last column may be that by the relativistic coefficient.
 template <bool BY_PARAMETER>
 void kepler_variational(const Given<double> &g) {
     kepler_rhs(g);
-    const double *q = g.y, r2 = q[0] * q[0] + q[1] * q[1], inverse = 1.0 / r2, w = inverse / sqrt(r2);
-    const double over = 1.5 * g.params[0] * inverse, pull = w + w * over;
-    const double radial = (3.0 * w + 5.0 * w * over) * inverse;
+    const PullSlope slope(g.y, g.params[0]);
     for (int64_t k = 4; k < g.n; k += 4) {
-        const double *d = g.y + k, along = radial * (q[0] * d[0] + q[1] * d[1]);
-        double *out = g.out + k;
-        out[0] = d[2];
-        out[1] = d[3];
-        out[2] = along * q[0] - pull * d[0];
-        out[3] = along * q[1] - pull * d[1];
+        g.out[k] = g.y[k + 2];
+        g.out[k + 1] = g.y[k + 3];
+        slope.along(g.y + k, g.out + k + 2);
     }
     if constexpr (BY_PARAMETER)
-        for (int c = 0; c < 2; ++c) g.out[g.n - 2 + c] -= 1.5 * w * inverse * q[c];
+        for (int c = 0; c < 2; ++c) g.out[g.n - 2 + c] -= 1.5 * slope.w * slope.inverse * g.y[c];
 }
 
 template <class T>

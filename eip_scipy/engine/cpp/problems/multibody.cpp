@@ -60,21 +60,8 @@ class Motion {
         room.resize(m * n + m * m + 2 * n * n + 2 * m + 5 * n);
         places.resize(m + n);
         reflections.resize(2 * std::min(m, n));
-        double *next = room.data();
-        for (const auto &[part, size] : {std::pair{&A_, m * n},
-                                         {&rest_, m * m},
-                                         {&null_, n * n},
-                                         {&B_, n * n},
-                                         {&scale_, m},
-                                         {&lambda_, m},
-                                         {&x_, n},
-                                         {&y_, n},
-                                         {&b_, n},
-                                         {&row_scale_, n},
-                                         {&column_scale_, n}}) {
-            *part = next;
-            next += size;
-        }
+        divide(room.data(), A_, m * n, rest_, m * m, null_, n * n, B_, n * n, scale_, m, lambda_, m, x_, n, y_, n, b_,
+               n, row_scale_, n, column_scale_, n);
         pivot_ = places.data();
         order_ = pivot_ + m;
         left_ = reflections.data();
@@ -96,6 +83,12 @@ class Motion {
     }
 
   private:
+    template <class... Others>
+    static void divide(double *next, double *&part, int64_t size, Others &&...others) {
+        part = next;
+        if constexpr (sizeof...(others) > 0) divide(next + size, others...);
+    }
+
     double *column(int64_t k) const { return A_ + pivot_[k] * n_; }
 
     // A P = Q R, where A has the scaled gradients as columns. A column holds those of R, its diagonal included, and below a
@@ -242,7 +235,7 @@ class Motion {
     Reflection *left_, *right_;
 };
 
-// For compiled code: fills u' and, unless null, the multipliers. Returns the rank, or below 0 why there is none.
+// For compiled code: fills u' and, unless null, the multipliers; `matrices` holds M, F, G and gamma, one after the other. Returns the rank, or below 0 why there is none.
 int64_t solve(const double *matrices, int64_t n, int64_t m, double tolerance, double *acceleration,
               double *multipliers) {
     try {
@@ -256,21 +249,9 @@ int64_t solve(const double *matrices, int64_t n, int64_t m, double tolerance, do
     }
 }
 
-int64_t solve_checked(ArrayOf<const double, 1> matrices, double tolerance, ArrayOf<double, 1> acceleration,
-                      ArrayOf<double, 1> multipliers) {
-    const int64_t n = acceleration.shape[0], m = multipliers.shape[0];
-    require(matrices.shape[0] == n * n + n + m * n + m,
-            "motion: expected n n + n + m n + m numbers: M, F, G and gamma of n speeds and m constraints");
-    return solve(matrices.data, n, m, tolerance, acceleration.data, multipliers.data);
-}
-
 }  // namespace
 
 void add_multibody(nb::module_ module) {
-    module.def("solve", solve_checked, "matrices"_a, "tolerance"_a, "acceleration"_a, "multipliers"_a,
-               "Fill `acceleration` with u' (n,) and `multipliers` with lambda (m,), the solution of M u' + G^T lambda "
-               "= F, G u' = -gamma. `matrices` holds M, F, G and gamma, one after the other. Return the rank of G, or "
-               "MASS_IS_SINGULAR or NOT_FINITE.");
     module.def(
         "solve_address", [] { return reinterpret_cast<uintptr_t>(solve); },
         "Return the address of `solve` in multibody.cpp, for compiled code.");
