@@ -22,7 +22,7 @@ from building.targets import target
 
 FOLDER = Path("eip_scipy/engine/cpp")
 # Called once a run, or by Python: these are compiled in half the time without the passes that make loops fast.
-COLD = ["complex_step.cpp", "examination.cpp", "frequencies.cpp", "library.cpp", "module.cpp", "python_functions.cpp"]
+COLD = ["complex_step.cpp", "examination.cpp", "library.cpp", "module.cpp", "python_functions.cpp"]
 COLD += ["records.cpp"]
 # These files do not include Python's headers, so that zig, which keeps what it has compiled, compiles them once.
 NUMBERS = ["engine.cpp", "forces.cpp", "gravity.cpp", "kepler.cpp", "orbits.cpp", "planets.cpp", "threads.cpp"]

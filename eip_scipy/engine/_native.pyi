@@ -5,6 +5,15 @@ from typing import Any, NamedTuple
 import numpy
 import numpy.typing
 
+def work_alone(alone: bool) -> bool:
+    """
+    If `alone` is True, keep the calling thread from sharing sums over many bodies with other threads; if False, let it share them. Return the previous setting.
+    """
+
+def end_threads() -> None:
+    """
+    End the threads that share sums over many bodies. They are not started again.
+    """
 OK: int = 0
 NOT_FINITE: int = 1
 FAILED_PROJECTION: int = 2
@@ -650,23 +659,6 @@ class gradients:
     def checked_complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float, direction: numpy.typing.NDArray[numpy.float64], floors: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray | None:
         """
         Return the value of `complex_step`, or None if it disagrees with differences of ``fun`` along ``direction * (abs(y) + floors)``, as it does if ``fun`` is not analytic.
-        """
-
-class gravity:
-    @staticmethod
-    def frequencies(gm: numpy.typing.NDArray[numpy.float64], y: numpy.typing.NDArray[numpy.float64], duration: float) -> tuple[numpy.ndarray, float]:
-        """
-        Return the largest angular frequency of each body on its orbit about the heaviest one, and that of all other pairs.
-        """
-    @staticmethod
-    def work_alone(alone: bool) -> bool:
-        """
-        If `alone` is True, keep the calling thread from sharing sums over many bodies with other threads; if False, let it share them. Return the previous setting.
-        """
-    @staticmethod
-    def end_threads() -> None:
-        """
-        End the threads that share sums over many bodies. They are not started again.
         """
 
 class multibody:

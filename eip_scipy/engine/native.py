@@ -188,17 +188,17 @@ else:
     BUILD = _best()
     _require_current(BUILD)
 if _is_worker() and "OMP_NUM_THREADS" not in os.environ:
-    BUILD.gravity.end_threads()
+    BUILD.end_threads()
 
 
 @contextmanager
 def working_alone() -> Iterator[None]:
     """Return a context in which the calling thread computes sums over many bodies alone, without other threads."""
-    before = BUILD.gravity.work_alone(True)
+    before = BUILD.work_alone(True)
     try:
         yield
     finally:
-        BUILD.gravity.work_alone(before)
+        BUILD.work_alone(before)
 
 
 Engine = BUILD.Engine

@@ -135,7 +135,7 @@ class Pool:
 def thread_pool(plan: Plan, workers: int) -> Pool:
     """Return a pool of threads of this process; compiled members run in parallel."""
     stop = threading.Event()
-    alone = partial(BUILD.gravity.work_alone, workers > 1)
+    alone = partial(BUILD.work_alone, workers > 1)
     threads = ThreadPoolExecutor(workers, thread_name_prefix="eip-ensemble", initializer=alone)
 
     def end() -> None:

@@ -156,7 +156,7 @@ expected, before = end(200), threads()
 
 def check(own):
     good = end(200) == expected and threads() in (0, own)
-    BUILD.gravity.end_threads()
+    BUILD.end_threads()
     os._exit(0 if good and end(200) == expected else 1)
 
 for own in (before, 1):
@@ -216,7 +216,7 @@ def test_interrupted_runs():
 
 
 ALONE = """
-assert BUILD.gravity.work_alone(True) is False
+assert BUILD.work_alone(True) is False
 first = threads()
 expected = end(200)
 assert threads() == first
@@ -228,7 +228,7 @@ for executor in (2, ThreadPoolExecutor(1)):
     assert all(y.tobytes() == expected for y in runs.y)
 before = threads()
 assert before <= first + 3  # the executors' own
-assert BUILD.gravity.work_alone(False) is True
+assert BUILD.work_alone(False) is True
 assert end(200) == expected
 assert threads() in (0, before + 4)
 """

@@ -14,6 +14,7 @@
 
 #include "calls.hpp"
 #include "python_functions.hpp"
+#include "threads.hpp"
 
 #if defined(__clang__)
 #define EIP_COMPILER __VERSION__  // begins with its name
@@ -430,7 +431,15 @@ NB_MODULE(EIP_MODULE, m) {
         PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError",
                                   "Error for a user's function, called by its address, that failed.", nullptr, nullptr);
     m.attr("FailedCallError") = eip::owned(eip::failed_call_error);
-    nanobind::module_::import_("atexit").attr("register")(nanobind::cpp_function(eip::Ending::begin));
+    m.def(
+        "work_alone", eip::work_alone, nanobind::arg("alone"),
+        "If `alone` is True, keep the calling thread from sharing sums over many bodies with other threads; if False, "
+        "let it share them. Return the previous setting.");
+    m.def("end_threads", eip::end_threads,
+          "End the threads that share sums over many bodies. They are not started again.");
+    const auto at_exit = nanobind::module_::import_("atexit").attr("register");
+    at_exit(nanobind::cpp_function(eip::Ending::begin));
+    at_exit(m.attr("end_threads"));
     eip::add_constants(m);
     eip::add_records(m);
     eip::add_engine(m);
@@ -438,6 +447,5 @@ NB_MODULE(EIP_MODULE, m) {
     eip::add_examination(m);
     eip::add_condensates(m.def_submodule("condensates"));
     eip::add_gradients(m.def_submodule("gradients"));
-    eip::add_gravity(m.def_submodule("gravity"));
     eip::add_multibody(m.def_submodule("multibody"));
 }

@@ -10,7 +10,7 @@ import numpy as np
 from ...core.balances import Balance
 from ...core.inputs import flag, real_array, shown
 from ...core.names import nearest
-from ...engine.native import BUILD, library
+from ...engine.native import library
 
 __all__ = [
     "QUANTITIES",
@@ -23,6 +23,10 @@ __all__ = [
 
 Array = np.ndarray
 QUANTITIES = ("energy", "momentum", "laplace")
+# Least pericentre, in units of a pair's present distance: nearer, a radial orbit ends in a collision or is perturbed.
+LEAST_PERICENTRE = 1e-3
+# Least eccentricity of a pair whose time to the pericentre is considered, and halvings that solve Kepler's equation.
+LEAST_ECCENTRICITY, HALVINGS = 0.5, 30
 # Place of the energy at the start among the entries of an orbit, see engine/cpp/problems/orbits.cpp.
 ENERGY = 0
 
@@ -237,5 +241,55 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf)
     frequency is that of its attraction at the present distance. Therefore the frequency of a pair without angular
     momentum is finite.
     """
-    bodies, others = BUILD.gravity.frequencies(gm, y, duration)
-    return bodies, others
+    n, centre = len(gm), int(np.argmax(gm))
+    pulls = np.empty_like(y)
+    library["gravity.rhs"](0.0, y, pulls, gm)
+    q, v, a = y[: 3 * n].reshape(n, 3), y[3 * n :].reshape(n, 3), pulls[3 * n :].reshape(n, 3)
+    with np.errstate(all="ignore"):  # of a body and itself, and of massless pairs
+        about = _pair_frequencies(gm + gm[centre], q - q[centre], v - v[centre], a - a[centre], duration)
+        others = 0.0
+        to_centre = (gm + gm[centre]) / np.linalg.norm(q - q[centre], axis=1) ** 3
+        for i in range(n):
+            near = (gm + gm[i]) / np.linalg.norm(q - q[i], axis=1) ** 3 > to_centre
+            near[[i, centre]] = False
+            if i != centre and near.any():
+                pairs = (each[near] - each[i] for each in (q, v, a))
+                others = max(others, _pair_frequencies(gm[near] + gm[i], *pairs, duration).max())
+    about[centre] = 0.0
+    return about, float(others)
+
+
+def _pair_frequencies(mass: Array, r: Array, u: Array, pull: Array, duration: float) -> Array:
+    """Return the frequencies (k,) of pairs of this `mass`, at relative positions and velocities r, u and pulls (k, 3)."""
+    distance, along = np.linalg.norm(r, axis=1), np.sum(r * u, axis=1)
+    own = mass / distance**3
+    inverse_axis = 2.0 / distance - np.sum(u * u, axis=1) / mass
+    momentum = np.sum(np.cross(r, u) ** 2, axis=1) / mass
+    eccentricity = np.sqrt(np.maximum(0.0, 1.0 - momentum * inverse_axis))
+    pericentre = np.maximum(momentum / (1.0 + eccentricity), LEAST_PERICENTRE * distance)
+    approaches = along * np.copysign(1.0, duration) < 0.0
+    least = _nearest(mass, distance, inverse_axis, eccentricity, approaches, abs(duration))
+    fastest = np.sqrt(mass / np.maximum(pericentre, least) ** 3)
+    mean = np.sqrt(mass * np.maximum(inverse_axis, 0.0) ** 3)
+    alone = np.linalg.norm(pull + own[:, None] * r, axis=1) < mass / distance**2
+    bound = inverse_axis > 0.0
+    of_orbit = np.where(bound, np.sqrt(mean * fastest), fastest)
+    found = np.where(alone & (bound | ~(along > 0.0)), of_orbit, np.sqrt(own))
+    return np.where((mass > 0.0) & ~np.isnan(found), found, 0.0)
+
+
+def _nearest(mass: Array, distance: Array, inverse_axis: Array, e: Array, approaches: Array, duration: float) -> Array:
+    """Return the least distances (k,) within the run of bound pairs whose pericentre comes after its end, 0 for others."""
+    a = 1.0 / inverse_axis
+    anomaly = np.arccos(np.clip((1.0 - distance / a) / e, -1.0, 1.0))
+    until = anomaly - e * np.sin(anomaly)  # the mean anomaly left
+    left = np.where(approaches, until, 2 * np.pi - until) - duration * np.sqrt(mass / a**3)
+    wanted = np.minimum(left, 2 * np.pi - left)  # the same distance before and after the apocentre
+    low, high = np.zeros_like(a), np.full_like(a, np.pi)
+    for _ in range(HALVINGS):  # of Kepler's equation
+        middle = 0.5 * (low + high)
+        below = middle - e * np.sin(middle) < wanted
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    # Circles have no pericentre to wait for.
+    later = (inverse_axis > 0.0) & (e > LEAST_ECCENTRICITY) & (left > 0.0)
+    return np.where(later, np.minimum(distance, a * (1.0 - e * np.cos(low))), 0.0)
