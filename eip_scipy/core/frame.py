@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 
 from ..engine.data import FrameRows
-from ..engine.native import BUILD
 from .blocks import INDEX
 from .inputs import numbers
 
@@ -60,7 +59,12 @@ def _rows(given_C: tuple[bytes, str], given_S: tuple[bytes, str], n: int, width:
 
 def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
     """Return a mask (l,) of gradients, rows of G, that combine rows of C: the frame removes corrections along them."""
-    return np.array(BUILD.spanned(frame, G, SPANNED), bool)
+    left = G.copy()
+    for (begin, end), (first, last) in zip(*(pairwise(rows.tolist()) for rows in frame.start), strict=True):
+        products = G[:, frame.place[first:last]] @ frame.value[first:last]
+        left[:, frame.place[begin:end]] -= products[:, None] * frame.value[begin:end]
+    sizes, rest = (np.abs(rows).max(axis=1, initial=0.0) for rows in (G, left))
+    return (sizes > 0.0) & (rest <= SPANNED * sizes)
 
 
 def _frame_matrices(C: np.ndarray, S: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

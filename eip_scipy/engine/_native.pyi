@@ -122,11 +122,6 @@ SOURCES: str = ...
 COMPILER: str
 HAS_V3: bool
 
-def spanned(frame: object, G: numpy.typing.NDArray[numpy.float64], share: float) -> list:
-    """
-    Return a list of bool: True for each row of `G` of which the frame removes all but at most the fraction `share`.
-    """
-
 class Work:
     """
     Buffers of a run in the engine's memory; each attribute is an array that shows one buffer.
@@ -410,16 +405,6 @@ LIBRARY: dict[Any, Any] = ...
 
 def are_finite(numbers: numpy.typing.NDArray[numpy.float64]) -> bool:
     """Return True if no number is NaN or infinite."""
-
-def are_calm(figures: numpy.typing.NDArray[numpy.float64], beyond_doubt: float, together: float) -> bool:
-    """
-    Return True if no row of `figures` (..., N_FIGURES) may belong to a faulty run.
-    """
-
-def note_errors(largest: numpy.typing.NDArray[numpy.float64], t: numpy.typing.NDArray[numpy.float64], values: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], t0: float) -> None:
-    """
-    Update the largest errors (l,) with those of the `values` (m, l) at the times `t` other than `t0`. An error that is NaN does not count.
-    """
 
 class InvariantFunctions:
     """The invariants of a run and their gradients, each as a `Call`."""

@@ -16,7 +16,7 @@ from ..core.native_functions import raise_again
 from ..core.runs import Run
 from ..core.stepping import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
-from ..engine.native import BUILD, FailedCallError, NativeFunctions, PythonFunctions
+from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from .events import Events
 from .memory import most_bytes
 
@@ -249,8 +249,9 @@ class Driver:
 
     def note(self, values: np.ndarray, target: np.ndarray) -> None:
         """Update the largest errors (l,) with the `values` (l, m) at the saved states except the start."""
-        rows = np.ascontiguousarray(values.T)
-        BUILD.note_errors(self.run.work.max_defect, self.t[: self.rows], rows, target, self.schedule.span.t0)
+        errors = np.abs(values[:, self.t[: self.rows] != self.schedule.span.t0].T - target)
+        largest = self.run.work.max_defect
+        np.fmax(largest, np.fmax.reduce(errors, axis=0, initial=0.0), out=largest)  # NaN does not count
 
     def values(self) -> np.ndarray:
         """Return the invariants of the saved states, (l, m)."""

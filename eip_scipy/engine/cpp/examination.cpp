@@ -278,39 +278,12 @@ class InvariantFunctions {
     std::vector<PythonCall> inv_, grad_;
 };
 
-// Raises `largest` (l,) by the errors of the values (m, l) at times after t0; an error that is NaN does not count.
-void note_errors(ArrayOf<double, 1> largest, Numbers t, ArrayOf<const double, 2> values, Numbers target, double t0) {
-    const int64_t m = t.shape[0], l = largest.shape[0];
-    require(values.shape[0] == m && values.shape[1] == l && target.shape[0] == l,
-            "trust: expected values (m, l) for m times and l targets");
-    for (int64_t k = 0; k < m; ++k) {
-        if (t.data[k] == t0) continue;
-        for (int64_t i = 0; i < l; ++i)
-            largest.data[i] = std::fmax(largest.data[i], std::abs(values.data[k * l + i] - target.data[i]));
-    }
-}
-
 bool are_finite(PointsOf<const double, false> numbers) { return all_finite(numbers.data, numbers.points); }
-
-// True if no row of figures has one that may be that of a faulty run, which is the usual case.
-bool are_calm(PointsOf<const double, false> figures, double beyond_doubt, double together) {
-    require(figures.columns == N_FIGURES, "trust: the rows of figures must have N_FIGURES numbers");
-    for (const double *row = figures.data; row < figures.data + figures.points; row += N_FIGURES) {
-        const bool none = row[SHARE] == 0.0 && row[RAW] == 0.0 && row[RAW_MANY] == 0.0 && row[MANY] == 0.0;
-        if (!none || row[NU] > beyond_doubt || row[SUM] > together * row[EXPECTED]) return false;
-    }
-    return true;
-}
 
 }  // namespace
 
 void add_examination(nb::module_ &module) {
     module.def("are_finite", &are_finite, "numbers"_a, "Return True if no number is NaN or infinite.");
-    module.def("are_calm", &are_calm, "figures"_a, "beyond_doubt"_a, "together"_a,
-               "Return True if no row of `figures` (..., N_FIGURES) may belong to a faulty run.");
-    module.def("note_errors", &note_errors, "largest"_a, "t"_a, "values"_a, "target"_a, "t0"_a,
-               "Update the largest errors (l,) with those of the `values` (m, l) at the times `t` other than `t0`. An "
-               "error that is NaN does not count.");
     using Functions = InvariantFunctions;
     nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
                           "The invariants of a run and their gradients, each as a `Call`.")

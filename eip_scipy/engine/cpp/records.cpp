@@ -284,22 +284,6 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
     return o;
 }
 
-// For each row of G, whether the frame removes all but this share of it.
-static nb::list spanned(nb::handle record, ArrayOf<const double, 2> G, double share) {
-    Frame frame{};
-    nb::list kept, found;
-    const int64_t m = G.shape[1];
-    read(frame, record, NPY_DOUBLE, {}, kept);
-    check_places(frame.start, 2 * frame.starts, frame.place, frame.values, m, "frame");
-    for (const double *row = G.data; row < G.data + G.shape[0] * m; row += m) {
-        std::vector<double> left(row, row + m);
-        remove_sparse(frame, 1, frame.products, left.data());
-        const double size = largest_abs(row, m);
-        found.append(size > 0.0 && all_finite(left.data(), m) && largest_abs(left.data(), m) <= share * size);
-    }
-    return found;
-}
-
 Schedule schedule_of(nb::handle schedule, nb::list &kept) {
     Schedule s{};
     read(s, schedule, NPY_DOUBLE, {}, kept);
@@ -621,9 +605,6 @@ void add_records(nb::module_ &module) {
     add_record<Options>(module, "Options");
     add_record<Members>(module, "Members");
     add_record<Samples>(module, "Dense");
-    module.def("spanned", &spanned, "frame"_a, "G"_a, "share"_a,
-               "Return a list of bool: True for each row of `G` of which the frame removes all but at most the "
-               "fraction `share`.");
     nb::class_<Buffers> type(
         module, "Work", "Buffers of a run in the engine's memory; each attribute is an array that shows one buffer.");
     type.def(nb::init<int64_t, nb::handle, int64_t, int64_t, int64_t, int64_t>(), "n"_a, "dtype"_a, "stages"_a,

@@ -5,8 +5,6 @@
 
 #include "arrays.hpp"
 
-#include <memory>
-
 #include "engine.hpp"
 
 namespace eip {

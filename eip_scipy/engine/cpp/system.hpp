@@ -1,9 +1,7 @@
 // The user's functions as the step calls them, and what a step knows of its run.
 #pragma once
 
-#include <cstring>
 #include <type_traits>
-#include <utility>
 #include <vector>
 
 #include "data.hpp"
