@@ -260,7 +260,7 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf)
 
 
 def _pair_frequencies(mass: Array, r: Array, u: Array, pull: Array, duration: float) -> Array:
-    """Return the frequencies (k,) of pairs of this `mass`, at relative positions and velocities r, u and pulls (k, 3)."""
+    """Return the frequencies (k,) of pairs of this `mass`, with relative positions, velocities and pulls (k, 3)."""
     distance, along = np.linalg.norm(r, axis=1), np.sum(r * u, axis=1)
     own = mass / distance**3
     inverse_axis = 2.0 / distance - np.sum(u * u, axis=1) / mass
@@ -279,7 +279,7 @@ def _pair_frequencies(mass: Array, r: Array, u: Array, pull: Array, duration: fl
 
 
 def _nearest(mass: Array, distance: Array, inverse_axis: Array, e: Array, approaches: Array, duration: float) -> Array:
-    """Return the least distances (k,) within the run of bound pairs whose pericentre comes after its end, 0 for others."""
+    """Return the least distances (k,) in the run of bound pairs whose pericentre comes after its end, 0 for others."""
     a = 1.0 / inverse_axis
     anomaly = np.arccos(np.clip((1.0 - distance / a) / e, -1.0, 1.0))
     until = anomaly - e * np.sin(anomaly)  # the mean anomaly left

@@ -343,7 +343,7 @@ def _made() -> tuple[Case, ...]:
     turn = 2 * math.pi
     return (
         Case(
-            "perturbed Kepler", "e = 0.6, 1000 periods", kepler, np.array([0.4, 0.0, 0.0, 2.0]), 1000 * turn,
+            "perturbed Kepler", "1000 periods, e = 0.6", kepler, np.array([0.4, 0.0, 0.0, 2.0]), 1000 * turn,
             steps={"EIPRKN12": 25_000, "EIPGJ14": 400_000},
             hamiltonian=("(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2) - 0.0025/sqrt(x**2 + y**2)**3", "x y", "px py"),
             ready=lambda: problems.kepler(0.6, DELTA, 1000 * turn),
@@ -361,7 +361,7 @@ def _made() -> tuple[Case, ...]:
             ),
         ),
         Case(
-            "halo orbit", "near-rectilinear, Earth and Moon, 3 periods", halo,
+            "halo orbit", "Near-rectilinear, Earth and Moon, 3 periods", halo,
             np.array([1.0218881345465263, 0.0, -0.18209648779851, 0.0, -0.10325634106279, 0.0]), 3 * 1.511261560928471,
         ),
         Case("rigid body", "t = 1000", rigid_body, np.array([0.6, 0.0, 0.8]), 1000.0),
@@ -376,10 +376,10 @@ def _made() -> tuple[Case, ...]:
             steps={"EIPRKN12": 250},
         ),
         Case(
-            "charged particle", "the paper's, 270 000 steps of pi/10", particle, np.array([0.0, -1.0, 0.1, 0.01]),
+            "charged particle", "The paper's, 270 000 steps of pi/10", particle, np.array([0.0, -1.0, 0.1, 0.01]),
             27_000 * math.pi, ready=lambda: problems.uniform_field(form="velocity"), to_own=_planar,
         ),
-        Case("Robertson", "stiff kinetics to t = 1e5", robertson, np.array([1.0, 0.0, 0.0]), 1e5, stiff=True),
+        Case("Robertson", "Stiff kinetics to t = 1e5", robertson, np.array([1.0, 0.0, 0.0]), 1e5, stiff=True),
     )  # fmt: skip
 
 

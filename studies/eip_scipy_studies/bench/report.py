@@ -65,14 +65,15 @@ def losses(found: list[Measured]) -> Iterator[tuple[float, str]]:
 
 def markdown(found: list[Measured], machine: str) -> str:
     """Return the page."""
-    versions = {solver.package: each.version for each in found for solver in SOLVERS if solver.name == each.solver}
-    packages = ", ".join(f"{name} {number}" for name, number in versions.items() if number)
+    package = {solver.name: solver.package for solver in SOLVERS}
+    versions = {package[each.solver]: each.version for each in found if each.version}
+    packages = ", ".join(f"{name} {number}" for name, number in versions.items())
     lines = [f"{machine}. {packages}.", "", HOW, "", "## Where another package is faster", ""]
     lost = sorted(losses(found), key=lambda item: -item[0] if item[0] > 0 else -math.inf)
     lines += [f"- {sentence}." for _, sentence in lost] or ["- Nowhere in this table."]
     for case in dict.fromkeys(each.case for each in found):
         table = rows(found, case)
-        lines += ["", f"## {case}", "", f"{CASES[case].title[:1].upper()}{CASES[case].title[1:]}.", ""]
+        lines += ["", f"## {case}", "", f"{CASES[case].title}.", ""]
         heads = [cell for level in LEVELS for cell in (f"error {level:.0e}", "ratio")]
         lines += [f"| | functions | {' | '.join(heads)} | compilation |", f"|---|---|{'---|' * len(heads)}---|"]
         for row in table:
