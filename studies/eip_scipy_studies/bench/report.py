@@ -10,7 +10,7 @@ from .cases import CASES
 from .measure import LEVELS, Measured, seconds_at
 from .solvers import OTHER, READY, SOLVERS, USER
 
-KINDS = {solver.name: solver.kind for solver in SOLVERS}
+BY_NAME = {solver.name: solver for solver in SOLVERS}
 HOW = (
     "Each time is the least processor time of a whole call, from the start to the state at the end, on one core; each "
     "solver runs in a process of its own. It is interpolated to an error of 1e-6 or 1e-9 of the state at the end, the "
@@ -39,7 +39,7 @@ def rows(found: list[Measured], case: str) -> list[Row]:
         if each.case == case:
             at = [seconds_at(each.runs, level) for level in LEVELS]
             times, bounds = tuple(time for time, _ in at), tuple(bound for _, bound in at)
-            made.append(Row(each.solver, KINDS[each.solver], times, bounds, each.compilation, each.said))
+            made.append(Row(each.solver, BY_NAME[each.solver].kind, times, bounds, each.compilation, each.said))
     kinds = (USER, READY, OTHER)
     return sorted(made, key=lambda row: (kinds.index(row.kind), [math.isnan(t) or t for t in row.seconds[::-1]]))
 
@@ -65,8 +65,7 @@ def losses(found: list[Measured]) -> Iterator[tuple[float, str]]:
 
 def markdown(found: list[Measured], machine: str) -> str:
     """Return the page."""
-    package = {solver.name: solver.package for solver in SOLVERS}
-    versions = {package[each.solver]: each.version for each in found if each.version}
+    versions = {BY_NAME[each.solver].package: each.version for each in found if each.version}
     packages = ", ".join(f"{name} {number}" for name, number in versions.items())
     lines = [f"{machine}. {packages}.", "", HOW, "", "## Where another package is faster", ""]
     lost = sorted(losses(found), key=lambda item: -item[0] if item[0] > 0 else -math.inf)
