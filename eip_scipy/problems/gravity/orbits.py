@@ -253,7 +253,7 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf)
             near = (gm + gm[i]) / np.linalg.norm(q - q[i], axis=1) ** 3 > to_centre
             near[[i, centre]] = False
             if i != centre and near.any():
-                pairs = (each[near] - each[i] for each in (q, v, a))
+                pairs = q[near] - q[i], v[near] - v[i], a[near] - a[i]
                 others = max(others, _pair_frequencies(gm[near] + gm[i], *pairs, duration).max())
     about[centre] = 0.0
     return about, float(others)
