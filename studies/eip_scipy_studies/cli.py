@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import fields
 from importlib import import_module
@@ -98,14 +96,13 @@ def _add_option(parser: argparse.ArgumentParser, item: Any) -> None:
 
 def _conduct(name: str, command: Any, given: dict[str, Any]) -> int:
     from eip_scipy import ProjectionWarning
+    from eip_scipy.checkpoint.signals import sigterm_as_ctrl_c
 
     from .report import UsageError, listening, warn
     from .study import Session
 
     session = Session(name, given.pop("out"), given.pop("json"), given.pop("quiet"))
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with listening(ProjectionWarning) as untrusted:
+    with sigterm_as_ctrl_c(), listening(ProjectionWarning) as untrusted:
         try:
             status = command(**given).run(session)
             for line in session.absent:  # at the end, where it is seen
