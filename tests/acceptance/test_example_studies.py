@@ -41,6 +41,8 @@ def test_low_orbit(tmp_path):
     assert (tmp_path / "low-orbit.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_balances(tmp_path):
     found = {line.split(":")[0]: numbers(line.partition("ratio")[2]) for line in printed("balances", tmp_path)}

@@ -132,19 +132,6 @@ def test_columns_are_differences_of_the_flow(name):
     np.testing.assert_allclose(run.stm[-1] @ directions, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
 
 
-@pytest.mark.needs_jit
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_columns_of_compiled_mechanisms_are_those_of_plain_functions():
-    """Along the constraints; elsewhere the flow is not defined, and depends on how gamma is computed."""
-    problem = SYSTEMS["3, sphere"]()
-    plain = mechanism([1, 1, 1], [0, 0, -G], sphere.py_func, q0=[1, 0, 0], u0=[0, 0.5, 0.3])
-    runs = [integrate(item, t_span=(0, 0.2), variations="state", **OPTIONS) for item in (problem, plain)]
-    assert [run.columns["source"] for run in runs] == ["dual numbers", "complex steps"]
-    columns = [run.stm[-1] @ along_constraints(problem) for run in runs]
-    np.testing.assert_allclose(*columns, rtol=0, atol=1e-8)
-
-
 def period_and_slope(angle, omega):
     """Return the period of a pendulum that is released at `angle`, and its derivative by the angle."""
     m, K = np.sin(angle / 2) ** 2, ellipk(np.sin(angle / 2) ** 2)
@@ -184,6 +171,8 @@ def equation(t, y):
     return np.array([y[1], -G * np.sin(y[0])])
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 def test_tangent_maps_are_those_of_the_equation():
     problem, start = pendulum(), [1.0, 0.0]
@@ -195,6 +184,8 @@ def test_tangent_maps_are_those_of_the_equation():
     assert one == pytest.approx(two, rel=1e-6)
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_plain_functions_give_columns_too():
     found, right = (integrate(pendulum(jit), variations="state", **TIGHT) for jit in (lambda f: f, njit))
     assert found.columns["source"] == "complex steps"
@@ -202,6 +193,8 @@ def test_plain_functions_give_columns_too():
     np.testing.assert_allclose(found.stm[-1], right.stm[-1], atol=1e-10)
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_members_have_the_columns_of_their_runs():
     problem = SYSTEMS["2, circle"]()
     starts = np.array([[1.0, 0, 0, 0], [0.6, -0.8, 0, 0]])

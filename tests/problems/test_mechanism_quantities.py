@@ -215,6 +215,7 @@ def test_a_pendulum_hangs_on_a_point_that_moves():
     np.testing.assert_allclose(found, expected - rate**2 * np.array([np.sin(a), -np.cos(a)]), rtol=1e-14)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_run_keeps_constraints_that_depend_on_time():
     rod = numba.njit(lambda t, q: np.array([q[0] * np.sin(2 * t) - q[1] * np.cos(2 * t)]))

@@ -192,6 +192,7 @@ def test_constraints_that_depend_on_time_are_met_nearly_at_rest(t_span):
             np.testing.assert_allclose(found.motion_at(0.0, state), exact.motion_at(0.0, state), atol=1e-11)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_skate_does_not_slip():
     problem = examples.knife_edge()
@@ -280,6 +281,7 @@ def test_given_derivatives_are_compared_and_taken(jit):
 # Mechanisms with known motions.
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_n_four_bar_mechanism_passes_its_singular_positions():
     problem = examples.n_four_bar(1)
