@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from importlib import import_module
+from inspect import isfunction
 from pathlib import Path
 from typing import Any
 
@@ -63,12 +64,15 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=_listed(below) if below else None,
     )
+    from .output import run
     from .report import UsageError
 
     try:
         command = getattr(import_module(f".{module}", __package__), kind)
     except UsageError as error:  # a package is not installed that the study needs
         parser.error(str(error))
+    if isfunction(command):
+        return run(name, command, words)
     for item in fields(command):
         if "help" in item.metadata:
             _add_option(parser, item)

@@ -18,7 +18,7 @@ class Entry(NamedTuple):
 
 
 COMMANDS = {
-    "doctor": Entry("doctor:Doctor", "list what is installed, and test in seconds whether it works"),
+    "doctor": Entry("doctor:doctor", "list what is installed, and test in seconds whether it works"),
     "solar-system": Entry(
         "solar.solar_system:SolarSystem",
         "run the solar system and compare with other methods (the paper's Experiment II)",
@@ -53,9 +53,9 @@ COMMANDS = {
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
     "bench": Entry(
-        "bench.command:Bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
+        "bench.command:bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
-    "bench metric": Entry("bench.metric:Metric", "the default metric against none and euclidean, case by case"),
+    "bench metric": Entry("bench.metric:metric", "the default metric against none and euclidean, case by case"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(

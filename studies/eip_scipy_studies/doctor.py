@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -16,8 +15,8 @@ from scipy.integrate import solve_ivp
 from eip_scipy import EIPRK4, EIPRKN12, ensemble, integrate, show_config
 from eip_scipy.problems import kepler, solar_system
 
+from .output import Output
 from .report import compact, describe_machine, table, warn
-from .study import Check, Session, Study
 
 DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
@@ -98,47 +97,19 @@ CHECKS = (
 )
 
 
-class Examined(NamedTuple):
-    """Results of the command: what is installed, and the trials."""
-
-    installed: dict[str, Any]
-    trials: list[Trial]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Doctor(Study[Examined]):
-    """Command ``eip-scipy doctor``.
-
-    `trials` has for each trial its name, the largest acceptable error, and the function that returns the error.
-    """
-
-    trials: tuple[tuple[str, float, Callable[[], float]], ...] = CHECKS
-    writes_files = False
-
-    def measure(self, session: Session) -> Examined:
-        """List what is installed, and run each trial."""
-        found = Examined(show_config("dicts") or {}, [_timed(*trial) for trial in self.trials])
-        if failed := [trial.name for trial in found.trials if not trial.passed]:
-            names = ", ".join(failed)
-            warn(
-                f"failed: {names}. This installation computes wrong results; reinstall eip_scipy and its dependencies."
-            )
-        return found
-
-    def text(self, found: Examined) -> str:
-        return _text(found.trials)
-
-    def numbers(self, found: Examined) -> dict[str, Any]:
-        trials = [{**trial._asdict(), "passed": trial.passed} for trial in found.trials]
-        return {"installation": found.installed, "checks": trials}
-
-    def checks(self, found: Examined) -> list[Check]:
-        return [Check(trial.name, trial.passed) for trial in found.trials]
-
-
-def _text(trials: Sequence[Trial]) -> str:
+def doctor(out: Output) -> None:
+    """List what is installed, and test in seconds whether it works."""
     installation = io.StringIO()
     with redirect_stdout(installation):
         show_config()
-    rows = table((("found",), ("at most",), ("s",), ("",)), [(trial.name, trial.cells()) for trial in trials])
-    return "\n\n".join((installation.getvalue().rstrip(), f"machine: {describe_machine()}", rows))
+    out.text(f"{installation.getvalue().rstrip()}\n\nmachine: {describe_machine()}\n")
+    trials = [_timed(*trial) for trial in CHECKS]
+    out.text(table((("found",), ("at most",), ("s",), ("",)), [(trial.name, trial.cells()) for trial in trials]))
+    out.passed = all(trial.passed for trial in trials)
+    out.numbers |= {
+        "installation": show_config("dicts"),
+        "checks": [{**trial._asdict(), "passed": trial.passed} for trial in trials],
+    }
+    if failed := [trial.name for trial in trials if not trial.passed]:
+        names = ", ".join(failed)
+        warn(f"failed: {names}. This installation computes wrong results; reinstall eip_scipy and its dependencies.")

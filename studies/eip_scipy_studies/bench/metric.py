@@ -23,8 +23,8 @@ from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, Invariant, integrate
 from eip_scipy.problems import nbody, solar_system
 
 from ..mechanisms.examples import EXAMPLES
+from ..output import Output
 from ..report import compact, needed, table
-from ..study import Rows, Session, Study, option
 from ..work_precision import known_end
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
@@ -264,39 +264,37 @@ def cases() -> Iterator[Case]:
         yield planets(turned, f"axes {k}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Metric(Study[list[dict[str, Any]]]):
-    """Command ``eip-scipy bench metric``."""
+def metric(out: Output, *, only: str = "") -> None:
+    """Compare the default metric with none and euclidean, case by case.
 
-    only: str = option("", "run only cases whose group or name contains TEXT", metavar="TEXT")
+    Parameters
+    ----------
+    only : str
+        run only cases whose group or name contains this text
+    """
+    chosen, rows = [case for case in cases() if only in f"{case.group} {case.name}"], []
+    with out.keep(), warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for case in out.bar(chosen, "metric", unit="case"):
+            for method in case.methods:
+                for step in case.steps:
+                    row = {"group": case.group, "case": case.name, "method": method.__name__, "step": step}
+                    errors = {name: case.run(method, step, metric) for name, metric in METRICS.items()}
+                    best = max(min(errors["none"], errors["euclidean"]), TOLERANCE)
+                    rows.append(row | errors | {"ratio": max(errors["default"], TOLERANCE) / best})
+    out.numbers["runs"] = rows
+    out.rows("metric.csv", rows)
+    out.text(summary(rows))
 
-    def measure(self, session: Session) -> list[dict[str, Any]]:
-        chosen, rows = [case for case in cases() if self.only in f"{case.group} {case.name}"], []
-        with session.bar(len(chosen), "metric", "case") as bar, warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            for case in chosen:
-                for method in case.methods:
-                    for step in case.steps:
-                        row = {"group": case.group, "case": case.name, "method": method.__name__, "step": step}
-                        errors = {name: case.run(method, step, metric) for name, metric in METRICS.items()}
-                        best = max(min(errors["none"], errors["euclidean"]), TOLERANCE)
-                        rows.append(row | errors | {"ratio": max(errors["default"], TOLERANCE) / best})
-                bar.update()
-        return rows
 
-    def text(self, found: list[dict[str, Any]]) -> str:
-        heads, body = [["runs"], *([name] for name in METRICS), ["worst", "ratio"], ["worse"]], []
-        for key in ("case", "group"):
-            for group, name in dict.fromkeys((row["group"], row[key]) for row in found):
-                own = [row for row in found if (row["group"], row[key]) == (group, name)]
-                means = [compact(float(np.exp(np.mean(np.log([row[m] + 1e-16 for row in own]))))) for m in METRICS]
-                worst, worse = max(row["ratio"] for row in own), sum(row["ratio"] > LARGEST_RATIO for row in own)
-                label = f"{group}: {name}" if key == "case" else f"all {group}"
-                body.append((label, [str(len(own)), *means, f"{worst:.3g}", str(worse)]))
-        return table(heads, body)
-
-    def numbers(self, found: list[dict[str, Any]]) -> dict[str, Any]:
-        return {"runs": found}
-
-    def tables(self, found: list[dict[str, Any]]) -> Mapping[str, Rows]:
-        return {"metric.csv": found}
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Return the table of cases and groups."""
+    heads, body = [["runs"], *([name] for name in METRICS), ["worst", "ratio"], ["worse"]], []
+    for key in ("case", "group"):
+        for group, name in dict.fromkeys((row["group"], row[key]) for row in rows):
+            own = [row for row in rows if (row["group"], row[key]) == (group, name)]
+            means = [compact(float(np.exp(np.mean(np.log([row[m] + 1e-16 for row in own]))))) for m in METRICS]
+            worst, worse = max(row["ratio"] for row in own), sum(row["ratio"] > LARGEST_RATIO for row in own)
+            label = f"{group}: {name}" if key == "case" else f"all {group}"
+            body.append((label, [str(len(own)), *means, f"{worst:.3g}", str(worse)]))
+    return table(heads, body)
