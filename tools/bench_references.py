@@ -6,7 +6,8 @@
 Extrapolation of Gragg's midpoint rule to order 20, and of the linearly implicit Euler rule for stiff systems (Hairer,
 Norsett and Wanner, Solving Ordinary Differential Equations I, II.9, and II, IV.9), with steps of fixed length. The
 result is that of the finer of two runs; their difference, which is printed, estimates the error of the coarser one.
-Ten bodies come from the stored states of `solar_system`. NumPy's longdouble must have 80 bits or more.
+Ten bodies come from the stored states of `solar_system`, mechanisms from publications or from other coordinates.
+NumPy's longdouble must have 80 bits or more.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from eip_scipy_studies.bench import mechanisms
 from eip_scipy_studies.bench.cases import ATOMS, CASES, Case
 
 DATA = Path(__file__).parent.parent / "studies/eip_scipy_studies/data/bench_references.json"
@@ -26,7 +29,7 @@ Vector = Any
 COLUMNS = 10
 STEPS = {  # of the coarser run; the finer one takes 1.5 times as many
     "perturbed Kepler": 50_000, "Hénon-Heiles": 2500, "double pendulum": 300, "halo orbit": 4000, "rigid body": 2000,
-    "Lennard-Jones": 200, "charged particle": 60_000, "Robertson": 900,
+    "Lennard-Jones": 200, "charged particle": 60_000, "Robertson": 900, "magnet": 8000,
 }  # fmt: skip
 
 
@@ -54,18 +57,20 @@ def gragg(f: Callable[..., Vector], y: Vector, h: Any) -> Vector:
     return extrapolated(columns, [np.longdouble(n) ** 2 for n in counts])
 
 
-def implicit(f: Callable[..., Vector], y: Vector, h: Any) -> Vector:
-    """Take one step of the extrapolated linearly implicit Euler rule, with the Jacobian of Robertson's reactions."""
-    b, c = y[1:]
-    number = np.longdouble
-    J = np.array([[number("-0.04"), 1e4 * c, 1e4 * b], [number("0.04"), -1e4 * c - 6e7 * b, -1e4 * b], [0, 6e7 * b, 0]])
-    columns = []
-    for n in range(1, COLUMNS + 1):
-        inverse, now = inverted(np.eye(3) - h / n * J), y
+def implicit(f: Callable[..., Vector], t: Any, y: Vector, h: Any) -> Vector:
+    """Take one step of the extrapolated linearly implicit Euler rule; the Jacobian is that by complex steps."""
+    state, tiny = np.append(y, t).astype(np.clongdouble), np.longdouble("1e-2000")
+    rates = lambda y: np.append(f(y[3], y[:3]), 1)  # noqa: E731
+    J = np.array([rates(state + 1j * tiny * row).imag / tiny for row in np.eye(4)]).T
+    columns, counts = [], range(1, COLUMNS + 1)
+    for n in counts:
+        now, part = state.real, h / n
+        inverse = inverted(np.eye(3) - part * J[:3, :3])
         for _ in range(n):
-            now = now + inverse @ (h / n * f(0, now))
+            slope = rates(now).real
+            now = now + part * np.append(inverse @ (slope[:3] + part * J[:3, 3]), 1)
         columns.append(now)
-    return extrapolated(columns, [number(n) for n in range(1, COLUMNS + 1)])
+    return extrapolated(columns, [np.longdouble(n) for n in counts])[:3]
 
 
 def inverted(A: Vector) -> Vector:
@@ -92,12 +97,39 @@ def end(case: Case, steps: int) -> Vector:
         f = lennard_jones
     if case.stiff:  # steps that grow from 1e-6 to the end
         times = np.concatenate([[0], np.geomspace(np.longdouble(1e-6), t_end, steps)])
-        for h in np.diff(times):
-            y = implicit(f, y, h)
+        for t, h in zip(times, np.diff(times), strict=False):
+            y = implicit(f, t, y, h)
         return y
     for _ in range(steps):
         y = gragg(f, y, t_end / steps)
     return y
+
+
+def four_bar(steps: int) -> Vector:
+    """Return the positions of the four-bar linkage at the end, by its equations without projection."""
+    matrices, y = mechanisms.four_bar_matrices(0.0), mechanisms.four_bar().y0.astype(np.longdouble)
+
+    def f(t: Any, y: Vector) -> Vector:
+        M, forces = matrices(y)
+        return np.append(y[3:], inverted(M) @ forces.ravel())
+
+    h = np.longdouble(CASES["four-bar"].t_end) / steps
+    for _ in range(steps):
+        y = gragg(f, y, h)
+    return y[:3]
+
+
+def disc(digits: int) -> Vector:
+    """Return the positions of the disc at the end, by its reference in coordinates that need no constraints."""
+    problem = mechanisms.disc(True)
+    return problem.reference(problem.t_span[1])[: len(problem.names.coordinates)]
+
+
+MECHANISMS: dict[str, tuple[Callable[[int], Vector], int, int]] = {
+    "four-bar": (four_bar, 6000, 9000),
+    "andrews": (lambda _: np.array(mechanisms.END), 0, 0),  # as published
+    "wobbling disc": (disc, 0, 0),
+}
 
 
 def main() -> None:
@@ -109,7 +141,8 @@ def main() -> None:
             final = case.ready().reference(case.t_end)
             print(f"{name}: stored states of solar_system")
         else:
-            coarse, final = end(case, STEPS[name]), end(case, STEPS[name] * 3 // 2)
+            compute, few, more = MECHANISMS.get(name) or (partial(end, case), STEPS[name], STEPS[name] * 3 // 2)
+            coarse, final = compute(few), compute(more)
             print(f"{name}: {float(np.abs(coarse - final).max() / np.abs(final).max()):.1e}", flush=True)
         known[name] = [float(value) for value in final]
         DATA.write_text(json.dumps(known, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")

@@ -45,10 +45,6 @@ COMMANDS = {
     "gpe vortex-lines": Entry(
         "condensates.lines:VortexLines", "run the paper's condensate in 3D after its rotation is made faster"
     ),
-    "mechanisms": Entry(
-        "mechanisms.study:Mechanisms",
-        "error against cost on mechanisms with constraints, compared with IDA, LSODA and Radau",
-    ),
     "work-precision": Entry(
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
@@ -60,9 +56,6 @@ COMMANDS = {
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
-    ),
-    "study ensembles": Entry(
-        "measurements.ensembles:Ensembles", "ensembles: cost of a member, gain from threads and workers, memory"
     ),
     "study exoplanets": Entry(
         "measurements.exoplanets:Exoplanets", "three systems of exoplanets compared with WHFast and IAS15"
@@ -81,7 +74,5 @@ COMMANDS = {
     "study solar-cloud": Entry(
         "measurements.solar_cloud:SolarCloud", "an ensemble of solar systems compared with REBOUND"
     ),
-    "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
-    "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
 }

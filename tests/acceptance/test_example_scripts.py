@@ -12,6 +12,8 @@ ROOT = Path(__file__).parents[2]
 SCRIPTS = {
     "periodic_orbit.py": (r"open by (\S+)\npublished: period off by (\S+), start by (\S+)\n", (1e-11, 1e-10, 1e-10)),
     "trajectory_fit.py": (r"mass .* off by (\S+) errors\n6 runs, mean square of the residuals (\S+)\n", (3.0, 1.2)),
+    "linkage.py": (r"ends 1.4e\+00 m from its pivot\n.* kept: the last link ends (\S+) m", (1e-10,)),
+    "stiff_systems.py": (r"magnet +\S+ +(\S+) .*\nchain +\S+ +(\S+) ", (5e-9, 1e-6)),
 }
 
 

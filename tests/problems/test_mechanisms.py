@@ -15,7 +15,7 @@ from eip_scipy import EIPDOP853, EIPRadau, Invariant, ProjectionWarning, ensembl
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import mechanics, mechanism
 from eip_scipy.problems.multibody import motion
-from eip_scipy_studies.mechanisms import examples
+from eip_scipy_studies.bench import mechanisms as examples
 
 G = 9.81
 

@@ -23,7 +23,6 @@ RUNS = [
     ("bench metric", "--only gear", ()),
     ("study bodies", "--periods 2 --bodies 10", REBOUND),
     ("study charged-particle", "--quick", ()),
-    ("study ensembles", "--members 10 --steps 100 --repeats 1 --largest 10", ()),
     ("study exoplanets", "--share 0.002", REBOUNDX),
     ("study gpe-efficiency", "--points 16 --repeats 1", ()),
     ("study long-orbits", "--years 1", ()),
@@ -32,8 +31,6 @@ RUNS = [
     ("study recommend", "--cases pendulum", ()),
     ("study relativity", "--years 1", REBOUNDX),
     ("study solar-cloud", "--members 16 --years 1 --sample 2", REBOUND),
-    ("study speed", "--quick", ()),
-    ("study stiff", "--quick", ()),
     ("study trust", "--only pendulum", ()),
 ]
 

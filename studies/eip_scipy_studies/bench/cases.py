@@ -19,6 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eip_scipy import problems
+from eip_scipy.problems import MechanicsProblem
+
+from .mechanisms import EXAMPLES
 
 DELTA, MU, GRAVITY = 0.005, 1.215058560962404e-2, 1.0
 INERTIA = (2.0, 1.0, 2.0 / 3.0)
@@ -167,6 +170,24 @@ def robertson(m: Any) -> Functions:
     return Functions(fun, None, {"mass": mass})
 
 
+def magnet(m: Any) -> Functions:
+    """Return a magnetic moment in a rotating field, with strong damping (Landau and Lifshitz)."""
+
+    def fun(t, y):  # type: ignore[no-untyped-def]
+        a, b, c = 1e3 * m.cos(t), 1e3 * m.sin(t), 500.0 + 1e3 * y[2]
+        u, v, w = y[1] * c - y[2] * b, y[2] * a - y[0] * c, y[0] * b - y[1] * a
+        return (
+            -u - 5.0 * (y[1] * w - y[2] * v),
+            -v - 5.0 * (y[2] * u - y[0] * w),
+            -w - 5.0 * (y[0] * v - y[1] * u),
+        )
+
+    def length(t, y):  # type: ignore[no-untyped-def]
+        return y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
+
+    return Functions(fun, None, {"length": length})
+
+
 def bodies(m: Any, gm: Any) -> Functions:
     """Return N bodies with G times their masses `gm`, by loops over pairs; they fill arrays."""
     gm, n = np.array(gm), len(gm)
@@ -252,7 +273,8 @@ class Case:
     `make(m)` returns its `Functions`; they return tuples if `scalar`, arrays otherwise. `y0` is (n,), or (members, n)
     for many members. `steps` are the numbers of steps with which methods of fixed steps begin, by method. `hamiltonian`
     is H as text with its variables; `ready()` the library's own problem with its `to_own`, which takes a state of that
-    problem to one of ours. `gm` is given for bodies, `stiff` for stiff systems.
+    problem to one of ours. `gm` is given for bodies, `stiff` for stiff systems. A `mechanism` makes its own functions;
+    its reference has positions only.
     """
 
     name: str
@@ -267,6 +289,7 @@ class Case:
     to_own: Callable[[np.ndarray], np.ndarray] = np.asarray
     gm: Any = None
     stiff: bool = False
+    mechanism: Callable[[], MechanicsProblem] | None = None
 
     @property
     def members(self) -> bool:
@@ -289,8 +312,9 @@ class Case:
         return _arrays(self.make(math), self, import_module("numba").njit)
 
     def error(self, y: Any) -> float:
-        """Return the largest error of a component at the end, relative to the largest component."""
-        return float(np.max(np.abs(np.asarray(y) - self.end)) / np.max(np.abs(self.end)))
+        """Return the largest error of a component of the reference, relative to its largest component."""
+        difference = np.asarray(y)[: len(self.end)] - self.end
+        return float(np.max(np.abs(difference)) / np.max(np.abs(self.end)))
 
 
 def _arrays(functions: Functions, case: Case, jit: Callable[..., Any]) -> Functions:
@@ -337,6 +361,10 @@ def _planar(y: np.ndarray) -> np.ndarray:
     return y[[0, 1, 3, 4]]
 
 
+def _of_its_own(m: Any) -> Functions:
+    raise TypeError("a mechanism has functions of its own")
+
+
 def _made() -> tuple[Case, ...]:
     e = np.linspace(0.0, 0.6, MEMBERS)
     circle = np.array([1 - e, 0 * e, 0 * e, np.sqrt((1 + e) / (1 - e))]).T
@@ -380,6 +408,15 @@ def _made() -> tuple[Case, ...]:
             27_000 * math.pi, ready=lambda: problems.uniform_field(form="velocity"), to_own=_planar,
         ),
         Case("Robertson", "Stiff kinetics to t = 1e5", robertson, np.array([1.0, 0.0, 0.0]), 1e5, stiff=True),
+        Case("magnet", "Stiff, damped, to t = 5", magnet, np.array([0.6, 0.0, 0.8]), 5.0, stiff=True),
+        *(
+            Case(name, title, _of_its_own, np.empty(0), t_end, scalar=False, mechanism=EXAMPLES[name])
+            for name, title, t_end in (
+                ("four-bar", "Linkage by SymPy's KanesMethod, 30 s", 30.0),
+                ("andrews", "Squeezing mechanism of the test set for initial value problem solvers", 0.03),
+                ("wobbling disc", "A disc that rolls, 5 s", 5.0),
+            )
+        ),
     )  # fmt: skip
 
 

@@ -22,10 +22,10 @@ from scipy.spatial.transform import Rotation
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, Invariant, integrate
 from eip_scipy.problems import nbody, solar_system
 
-from ..mechanisms.examples import EXAMPLES
 from ..output import Output
 from ..report import compact, needed, table
 from ..work_precision import known_end
+from .mechanisms import EXAMPLES
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
 METRICS: dict[str, dict[str, Any]] = {"none": {"invariants": ()}, "euclidean": {"metric": "euclidean"}, "default": {}}

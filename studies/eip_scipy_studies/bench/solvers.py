@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .cases import Case
+from .mechanisms import with_baumgarte
 
 USER, READY, OTHER = "a user's functions", "the library's problem", "other packages"
 ATOL = 1e-3
@@ -51,13 +52,18 @@ def checked(result: Any) -> np.ndarray:
 
 
 def plain(case: Case) -> bool:
-    """Return True for one start that is not stiff."""
-    return not case.members and not case.stiff
+    """Return True for one start that is not stiff, and no mechanism."""
+    return not (case.members or case.stiff or case.mechanism)
 
 
 def small(case: Case) -> bool:
     """Return True if the equations are expressions of components."""
     return plain(case) and case.scalar
+
+
+def moving(case: Case) -> bool:
+    """Return True for a mechanism."""
+    return case.mechanism is not None
 
 
 # This package.
@@ -130,6 +136,62 @@ def ready(method: str, case: Case) -> Solve:
             eip.integrate(problem, (0.0, case.t_end), method=getattr(eip, method), **control(method, case, setting))
         )
     )
+
+
+# Mechanisms: all packages get the right-hand side that `mechanism` or `mechanics` makes.
+
+
+def ours_mechanism(method: str, kept: str, case: Case) -> Solve:
+    """Return whole calls of `integrate` with the invariants in the problem's attribute `kept`."""
+    eip, problem = import_module("eip_scipy"), _problem(case)
+    options = {"method": getattr(eip, method), "invariants": getattr(problem, kept)}
+    return lambda setting: checked(eip.integrate(problem, **options, **control(method, case, setting)))
+
+
+def scipy_mechanism(method: str, factor: float, case: Case) -> Solve:
+    """Return calls of SciPy's solve_ivp, with Baumgarte's terms if `factor` is not 0."""
+    solve_ivp, problem = import_module("scipy.integrate").solve_ivp, _problem(case)
+    fun = with_baumgarte(problem, factor) if factor else problem.fun
+    return lambda setting: checked(
+        solve_ivp(fun, problem.t_span, problem.y0, method=method, rtol=setting, atol=ATOL * setting)
+    )
+
+
+def ida(case: Case) -> Solve:
+    """Return calls of SUNDIALS' IDA, with the constraints on positions and velocities as equations.
+
+    The multipliers move q' and u' along the gradients of the constraints (Gear, Gupta and Leimkuhler 1985); they are 0
+    in the exact motion, since the accelerations satisfy the constraints already.
+    """
+    solver, problem = import_module("sksundae.ida").IDA, _problem(case)
+    (item,) = problem.constraints
+    n, nq, m = problem.y0.size, len(problem.names.coordinates), item.size
+    on_positions, gradient = len(problem.names.positions), np.empty((m, n))
+
+    def residual(t: float, y: np.ndarray, rates: np.ndarray, out: np.ndarray) -> None:
+        state = y[:n].copy()  # IDA's own array is read-only, for which functions would be compiled again
+        item.gradient(t, state, gradient, *item.args)
+        out[:n] = rates[:n] - problem.fun(t, state)
+        out[:nq] -= gradient[:on_positions, :nq].T @ y[n : n + on_positions]
+        out[nq:n] -= gradient[on_positions:, nq:].T @ y[n + on_positions :]
+        out[n:] = item.function(t, state, *item.args)
+
+    options = {"algebraic_idx": list(range(n, n + m)), "max_num_steps": 10**6}
+    start = np.append(problem.y0, np.zeros(m)), np.append(problem.fun(problem.t_span[0], problem.y0), np.zeros(m))
+
+    def solve(setting: float) -> np.ndarray:
+        atol = np.append(np.full(n, ATOL * setting), np.full(m, 1e10))  # multipliers are not part of the motion
+        found = solver(residual, rtol=setting, atol=atol, **options).solve(np.array(problem.t_span), *start)
+        if not found.success:
+            raise RuntimeError(found.message)
+        return found.y[-1, :n]
+
+    return solve
+
+
+def _problem(case: Case) -> Any:
+    assert case.mechanism is not None
+    return case.mechanism()
 
 
 # Packages with SciPy's call.
@@ -330,12 +392,14 @@ def _ours() -> Iterator[Solver]:
     for method in ("EIPRadau", "EIPBDF"):
         yield Solver(method, "eip_scipy", USER, partial(ours, method), lambda case: case.stiff)
     members = lambda case: case.members  # noqa: E731
+    for kept in ("invariants", "constraints"):
+        yield Solver(f"EIPDOP853, {kept}", "eip_scipy", USER, partial(ours_mechanism, "EIPDOP853", kept), moving)
     yield Solver("ensemble, EIPDOP853", "eip_scipy", USER, partial(our_members, "EIPDOP853"), members)
     yield Solver("ensemble, EIPRKN12", "eip_scipy", USER, partial(our_members, "EIPRKN12"), members, "EIPRKN12")
 
 
 def _others() -> Iterator[Solver]:
-    anything, stiff = lambda case: not case.stiff, lambda case: case.stiff
+    anything, stiff = lambda case: not (case.stiff or case.mechanism), lambda case: case.stiff
     scipy = partial(by_solve_ivp, "scipy.integrate")
     for method in ("RK45", "DOP853"):
         yield Solver(f"SciPy {method}", "scipy", OTHER, partial(scipy, method), plain)
@@ -346,13 +410,19 @@ def _others() -> Iterator[Solver]:
         yield Solver(f"extensisq {method}", "extensisq", OTHER, partial(scipy, extensisq(method)), plain)
     for method in ("DOP853", "Vern8"):
         yield Solver(f"CyRK {method}", "CyRK", OTHER, partial(cyrk, method), plain)
+    single = lambda case: not (case.members or case.mechanism)  # noqa: E731
     yield Solver("numbalsoda dop853", "numbalsoda", OTHER, partial(numbalsoda, "dop853"), anything)
-    yield Solver("numbalsoda lsoda", "numbalsoda", OTHER, partial(numbalsoda, "lsoda"), lambda case: not case.members)
+    yield Solver("numbalsoda lsoda", "numbalsoda", OTHER, partial(numbalsoda, "lsoda"), single)
     yield Solver("CVODE (scikit-SUNDAE)", "scikit-sundae", OTHER, sundae, lambda case: small(case) or case.stiff)
     taylor = lambda case: (case.scalar or case.gm is not None) and not case.stiff  # noqa: E731
     yield Solver("heyoka", "heyoka", OTHER, heyoka, taylor, warm=True)
     yield Solver("diffrax Dopri8", "diffrax", OTHER, partial(diffrax, "Dopri8"), anything)
     yield Solver("diffrax Kvaerno5", "diffrax", OTHER, partial(diffrax, "Kvaerno5"), stiff)
+    for method in ("DOP853", "LSODA", "Radau"):
+        yield Solver(f"SciPy {method}, mechanism", "scipy", OTHER, partial(scipy_mechanism, method, 0.0), moving)
+    baumgarte = partial(scipy_mechanism, "DOP853", 5.0)
+    yield Solver("SciPy DOP853, Baumgarte 5", "scipy", OTHER, baumgarte, lambda case: case.name == "four-bar")
+    yield Solver("IDA (scikit-SUNDAE)", "scikit-sundae", OTHER, ida, moving)
     planets = lambda case: case.gm is not None  # noqa: E731
     yield Solver("REBOUND IAS15", "rebound", OTHER, partial(rebound, "IAS15"), planets)
     for method in ("WHFast c17", "TRACE", "MERCURIUS"):

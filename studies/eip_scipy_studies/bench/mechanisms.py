@@ -1,4 +1,4 @@
-"""Mechanisms with known motions: from functions of arrays, and from models of SymPy.
+"""Mechanisms of the bench, with known motions: from functions of arrays, and from models of SymPy.
 
 Sources: the multibody benchmark library of IFToMM (A02 N-four-bar, A04 Bricard), the test set for initial value problem
 solvers (Andrews' squeezing mechanism, car axis).
@@ -382,6 +382,36 @@ def four_bar_model() -> tuple[Any, dict[Any, float]]:
     return kane, {la: 0.8, lb: 2.0, lc: 1.0, ln: 2.0, m: 1.0, g: G}
 
 
+def with_baumgarte(problem: MechanicsProblem, factor: float) -> Callable[[float, Any], Any]:
+    """Return the right-hand side of the four-bar linkage as users write it: lambdify and numpy.linalg.solve.
+
+    Baumgarte's terms, -2 `factor` g' - `factor`^2 g for the constraints g = 0, are added to the constraints on the
+    accelerations.
+    """
+    matrices = four_bar_matrices(factor)
+
+    def fun(t: float, y: Any) -> Any:
+        M, forces = matrices(y)
+        return np.append(y[3:], np.linalg.solve(M, forces.ravel()))
+
+    return fun
+
+
+def four_bar_matrices(factor: float) -> Callable[[Any], Any]:
+    """Return the function of a state that returns the matrix and the right-hand side of the linkage's accelerations."""
+    import sympy
+
+    model, constants = four_bar_model()
+    state = [*model.q, *model.u]
+    rates = model._k_nh * sympy.Matrix(model.u) + model._f_nh
+    rows = sympy.zeros(1, 1).col_join(-2 * factor * rates - factor**2 * model._f_h)
+    plain = [sympy.Dummy() for _ in state]
+    known = {sympy.Symbol(k.name): v for k, v in constants.items()} | dict(zip(state, plain, strict=True))
+    return sympy.lambdify(
+        [plain], [item.xreplace(known) for item in (model.mass_matrix, model.forcing + rows)], cse=True
+    )
+
+
 def four_bar(t_end: float = 30.0) -> MechanicsProblem:
     """Return the four-bar linkage, at rest with its first link at 10 degrees."""
     model, constants = four_bar_model()
@@ -492,4 +522,3 @@ EXAMPLES: dict[str, Callable[[], MechanicsProblem]] = {
     "steady disc": lambda: disc(False),
     "knife edge": knife_edge,
 }
-PUBLISHED = ("andrews", "car axis")  # the last state, to 13 digits at least

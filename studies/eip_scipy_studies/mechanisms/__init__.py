@@ -1,1 +1,0 @@
-"""Mechanisms with known motions, and a study of them."""

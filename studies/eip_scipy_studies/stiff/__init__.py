@@ -1,1 +1,0 @@
-"""Stiff systems by SciPy's implicit methods, with and without projection."""
