@@ -48,13 +48,22 @@ def no_plotting(monkeypatch: pytest.MonkeyPatch) -> None:
 SLOW, FAST = 1.0, 0.03
 
 
+def leaves_slow_out(config: pytest.Config) -> bool:
+    """Return True unless the command names tests or marks: the whole suite without its slow tests is the default."""
+    return not config.option.markexpr and not any("::" in name for name in config.invocation_params.args)
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    if config.option.markexpr == "not slow":
+    if leaves_slow_out(config):
         terminalreporter.write_line("slow tests were left out; to run them: python -m pytest -m slow")
 
 
 @pytest.hookimpl(trylast=True)  # of the tests that were chosen
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if leaves_slow_out(config):
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if not item.get_closest_marker("slow")]
     # A file that starts last keeps one process busy alone: those that take long go first.
     seconds: Counter[Path] = Counter()
     for item in items:
