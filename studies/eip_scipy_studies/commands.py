@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "charged-particle uniform": Entry("particles.charged_particle:Uniform", "the uniform field alone"),
     "charged-particle tokamak": Entry("particles.charged_particle:Tokamak", "the tokamak alone, or one orbit of it"),
-    "hard-cases": Entry("hard.cases:HardCases", "run 35 hard cases with and without projection"),
+    "hard-cases": Entry("hard.command:hard_cases", "run 35 hard cases with and without projection"),
     "hard-scenes": Entry(
         "hard.scenes:HardScenes",
         "error against cost on high eccentricities, chaos and close encounters, compared with IAS15",
@@ -49,14 +49,11 @@ COMMANDS = {
         "mechanisms.study:Mechanisms",
         "error against cost on mechanisms with constraints, compared with IDA, LSODA and Radau",
     ),
-    "work-precision": Entry(
-        "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
-    ),
     "bench": Entry(
         "bench.command:bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
     "bench metric": Entry("bench.metric:metric", "the default metric against none and euclidean, case by case"),
-    "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
+    "reproduce": Entry("paper.reproduce:reproduce", "recompute the paper's tables and figures"),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
@@ -74,7 +71,6 @@ COMMANDS = {
     "study multistep": Entry(
         "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
     ),
-    "study recommend": Entry("measurements.recommend:Recommended", "true errors of recommended runs on the hard cases"),
     "study relativity": Entry(
         "measurements.relativity:Relativity", "ten bodies with relativity compared with WHFast and IAS15"
     ),
