@@ -54,6 +54,7 @@ COMMANDS = {
     ),
     "bench metric": Entry("bench.metric:metric", "the default metric against none and euclidean, case by case"),
     "reproduce": Entry("paper.reproduce:reproduce", "recompute the paper's tables and figures"),
+    "trust": Entry("trust.command:trust", "whether faulty runs are reported, and correct ones are not"),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
@@ -79,5 +80,4 @@ COMMANDS = {
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
     "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
-    "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
 }

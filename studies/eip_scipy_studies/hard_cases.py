@@ -225,12 +225,15 @@ def boris_2d(t, y, charge):
 
 
 @_equations
-def n_body(t, y, masses, G, dimension):
-    """N bodies, y = (positions of all, velocities of all); invariants: energy, momentum, angular momentum."""
+def n_body(t, y, masses, G, dimension, softening=0.0):
+    """N bodies, y = (positions of all, velocities of all); invariants: energy, momentum, angular momentum.
+
+    `softening` is added to squared distances.
+    """
     m = np.array(masses)
     q, v = y.reshape(2, m.size, dimension)
     d = q[:, None] - q[None, :]
-    r2 = (d * d).sum(axis=-1)
+    r2 = (d * d).sum(axis=-1) + softening
     np.fill_diagonal(r2, 1.0)
     w = G / (r2 * np.sqrt(r2))
     a = -np.einsum("ij,j,ijk->ik", w, m, d)
@@ -238,7 +241,7 @@ def n_body(t, y, masses, G, dimension):
     first, second = np.triu_indices(m.size, 1)
     d = q[first] - q[second]
     kinetic = (m[:, None] * v * v).sum() / 2
-    potential = (G * m[first] * m[second] / np.sqrt((d * d).sum(axis=-1))).sum()
+    potential = (G * m[first] * m[second] / np.sqrt((d * d).sum(axis=-1) + softening)).sum()
     yield kinetic - potential, np.concatenate([(-m[:, None] * a).ravel(), (m[:, None] * v).ravel()])
     for k, momentum in enumerate(m @ v):
         row = np.zeros((2, m.size, dimension))

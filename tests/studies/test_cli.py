@@ -33,7 +33,6 @@ RUNS = [
     ("study solar-cloud", "--members 16 --years 1 --sample 2", REBOUND),
     ("study speed", "--quick", ()),
     ("study stiff", "--quick", ()),
-    ("study trust", "--only pendulum", ()),
 ]
 
 
