@@ -40,6 +40,8 @@ class HardCase:
         Factor by which a small relative perturbation of the start has grown at the end.
     note : str
         Why the case is hard.
+    cause : str
+        Why projection does not reduce the error; "" if that is not known, or if it does.
     """
 
     name: str
@@ -50,6 +52,7 @@ class HardCase:
     weak: tuple[str, ...]
     growth: float
     note: str
+    cause: str
 
     def error(self, y: np.ndarray) -> float:
         """Return the error of a final state: largest component of `y` - `end`, relative to the largest one of `end`."""
@@ -98,7 +101,7 @@ def hard_cases(names: Sequence[str] | None = None) -> tuple[HardCase, ...]:
 
 
 def _case(record: dict[str, Any]) -> HardCase:
-    equations = CaseEquations(record["equations"], (), record["params"])
+    equations = CaseEquations(record["equations"], tuple(record["params"].values()))
     y0, end = (np.array(record[key], dtype=float) for key in ("y0", "reference"))
     if record["complex"]:
         y0, end = y0.view(complex), end.view(complex)
@@ -112,8 +115,9 @@ def _case(record: dict[str, Any]) -> HardCase:
         reference=partial(_at_end, t_end, end),
         source=record["source"],
     )
-    names, weak = tuple(record["invariants"]), tuple(record["weak"])
-    return HardCase(record["name"], record["title"], problem, end, names, weak, record["growth"], record["note"])
+    names, weak, cause = tuple(record["invariants"]), tuple(record["weak"]), record.get("cause", "")
+    about = problem, end, names, weak, record["growth"], record["note"], cause
+    return HardCase(record["name"], record["title"], *about)
 
 
 def _at_end(t_end: float, end: np.ndarray, t: float) -> np.ndarray | None:
@@ -122,14 +126,14 @@ def _at_end(t_end: float, end: np.ndarray, t: float) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class CaseEquations:
-    """Equations of a case, with the invariants in the order in which the function below names them.
+    """Equations of a case: the function of `EQUATIONS` with this name and these parameters in its order.
 
-    `name` is a key of `EQUATIONS`; the arguments of the function found there are t, y, and then `args` and `params`.
+    It is a generator function of t, y and the parameters. It yields the right-hand side, and then pairs of an invariant
+    and its gradient in the order in which its docstring names them.
     """
 
     name: str
-    args: tuple[Any, ...]
-    params: dict[str, Any]
+    params: tuple[Any, ...] = ()
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the right-hand side (n,)."""
@@ -146,25 +150,12 @@ class CaseEquations:
         return np.array([gradient for _, gradient in invariants])
 
     def _parts(self, t: float, y: np.ndarray) -> Iterator[Any]:
-        return EQUATIONS[self.name](t, y, *self.args, **self.params)
-
-
-EQUATIONS: dict[str, Callable[..., Iterator[Any]]] = {}
-
-
-def _equations(system: Callable[..., Iterator[Any]]) -> Callable[..., CaseEquations]:
-    """Make a function of the parameters that returns `CaseEquations` of a generator function of t, y and parameters.
-
-    It yields the right-hand side, and then pairs of an invariant and its gradient.
-    """
-    EQUATIONS[system.__name__] = system
-    return lambda *args, **params: CaseEquations(system.__name__, args, params)
+        return EQUATIONS[self.name](t, y, *self.params)
 
 
 # --- planar motion, y = (x, z, u, v) with velocity (u, v) ---
 
 
-@_equations
 def kepler(t, y, mu):
     """Kepler problem with GM = `mu`; invariants: energy, angular momentum."""
     x, z, u, v = y
@@ -175,7 +166,6 @@ def kepler(t, y, mu):
     yield x * v - z * u, [v, -u, -z, x]
 
 
-@_equations
 def perturbed_kepler(t, y, delta):
     """Motion in the potential -1 / r - delta / (2 r^3); invariants: energy, angular momentum."""
     x, z, u, v = y
@@ -187,7 +177,6 @@ def perturbed_kepler(t, y, delta):
     yield x * v - z * u, [v, -u, -z, x]
 
 
-@_equations
 def arenstorf(t, y, mu):
     """Restricted three-body problem with masses 1 - mu and mu in the rotating frame; invariant: Jacobi's integral."""
     x, z, u, v = y
@@ -200,7 +189,6 @@ def arenstorf(t, y, mu):
     yield jacobi, [2 * (x - a * (x + mu) - b * (x - rest)), 2 * (z - (a + b) * z), -2 * u, -2 * v]
 
 
-@_equations
 def henon_heiles(t, y):
     """System of Hénon and Heiles; invariant: energy."""
     x, z, u, v = y
@@ -209,7 +197,6 @@ def henon_heiles(t, y):
     yield energy, [x + 2 * x * z, z + x * x - z * z, u, v]
 
 
-@_equations
 def boris_2d(t, y, charge):
     """Charged particle in B = r e_z and the potential charge / r; invariants: energy, canonical angular momentum."""
     x, z, u, v = y
@@ -224,7 +211,6 @@ def boris_2d(t, y, charge):
 # --- bodies, pendulums, particles ---
 
 
-@_equations
 def n_body(t, y, masses, G, dimension, softening=0.0):
     """N bodies, y = (positions of all, velocities of all); invariants: energy, momentum, angular momentum.
 
@@ -254,7 +240,6 @@ def n_body(t, y, masses, G, dimension, softening=0.0):
         yield (m * (q[:, i] * v[:, j] - q[:, j] * v[:, i])).sum(), row.ravel()
 
 
-@_equations
 def pendulum(t, y):
     """Mathematical pendulum, y = (angle, angular velocity); invariant: energy."""
     q, p = y
@@ -262,7 +247,6 @@ def pendulum(t, y):
     yield p * p / 2 - np.cos(q), [np.sin(q), p]
 
 
-@_equations
 def duffing(t, y):
     """Equation x'' = x - x^3, y = (x, x'); invariant: energy."""
     q, p = y
@@ -270,7 +254,6 @@ def duffing(t, y):
     yield p * p / 2 - q * q / 2 + q * q * q * q / 4, [q * q * q - q, p]
 
 
-@_equations
 def oscillator(t, y):
     """Harmonic oscillator; invariant: energy."""
     q, p = y
@@ -278,7 +261,6 @@ def oscillator(t, y):
     yield (p * p + q * q) / 2, [q, p]
 
 
-@_equations
 def double_pendulum(t, y, g):
     """Double pendulum of equal masses and lengths, y = (angles, momenta); invariant: energy."""
     a, b, p, q = y
@@ -292,7 +274,6 @@ def double_pendulum(t, y, g):
     yield kinetic - 2 * g * np.cos(a) - g * np.cos(b), [-f[2], -f[3], f[0], f[1]]
 
 
-@_equations
 def spherical_pendulum(t, y, g):
     """Pendulum in space, y = (q, v) in Cartesian coordinates.
 
@@ -307,7 +288,6 @@ def spherical_pendulum(t, y, g):
     yield a * w - b * u, [w, -u, 0, -b, a, 0]
 
 
-@_equations
 def fput(t, y, omega):
     """Chain of Fermi, Pasta, Ulam and Tsingou with stiff springs of frequency `omega`; invariant: energy."""
     x, z, p = y[:3], y[3:6], y[6:]
@@ -319,7 +299,6 @@ def fput(t, y, omega):
     yield energy, np.concatenate([-force, p])
 
 
-@_equations
 def vortices(t, y, strengths):
     """Point vortices, y = (x, y) vortex by vortex; invariants: energy, two momenta, angular impulse."""
     k, z = np.array(strengths), y.reshape(-1, 2)
@@ -338,7 +317,6 @@ def vortices(t, y, strengths):
     yield (k[:, None] * z * z).sum(), (2 * k[:, None] * z).ravel()
 
 
-@_equations
 def tokamak(t, y):
     """Charged particle in an axisymmetric field, R0 = B0 = 1, q = 2; invariants: energy, toroidal momentum."""
     x, w, z, a, b, c = y
@@ -351,7 +329,6 @@ def tokamak(t, y):
     yield x * b - w * a + ((R - 1) * (R - 1) + z * z) / 4, [b + k * x, -a + k * w, z / 2, -w, x, 0]
 
 
-@_equations
 def schwarzschild(t, y):
     """Geodesics of Schwarzschild's metric, M = 1, y = (t, r, phi, E, p_r, L).
 
@@ -369,7 +346,6 @@ def schwarzschild(t, y):
 # --- tops, spins, attitude ---
 
 
-@_equations
 def rigid_body(t, y, i1, i2, i3):
     """Euler's top with these moments of inertia, y = the angular momentum; invariants: Casimir function, energy."""
     a, b, c = y
@@ -378,7 +354,6 @@ def rigid_body(t, y, i1, i2, i3):
     yield (a * a / i1 + b * b / i2 + c * c / i3) / 2, [a / i1, b / i2, c / i3]
 
 
-@_equations
 def euler_detest(t, y, k2):
     """Problem B5 of DETEST, whose solutions are Jacobi's elliptic functions of modulus k; two quadratic invariants."""
     a, b, c = y
@@ -387,7 +362,6 @@ def euler_detest(t, y, k2):
     yield k2 * a * a + c * c, [2 * k2 * a, 0, 2 * c]
 
 
-@_equations
 def quaternion(t, y, w3):
     """Attitude, a quaternion y, under the angular velocity (sin t, cos 2t, w3); invariant: ``y @ y``."""
     s, a, b, c = y
@@ -397,7 +371,6 @@ def quaternion(t, y, w3):
     yield y @ y, 2 * y
 
 
-@_equations
 def heisenberg(t, y, anisotropy):
     """Ring of spins (Landau and Lifshitz); invariants: squared length of each, energy, total spin along z."""
     S, axis = y.reshape(-1, 3), np.array([0.0, 0.0, anisotropy])
@@ -412,7 +385,6 @@ def heisenberg(t, y, anisotropy):
 # --- populations, lattices, fields ---
 
 
-@_equations
 def lotka_volterra(t, y):
     """Predator and prey, y = (u, v); invariant: ln u - u + 2 ln v - v."""
     u, v = y
@@ -420,7 +392,6 @@ def lotka_volterra(t, y):
     yield np.log(u) - u + 2 * np.log(v) - v, [1 / u - 1, 2 / v - 1]
 
 
-@_equations
 def sir(t, y, infection, recovery):
     """Epidemic of Kermack and McKendrick, y = (S, I, R).
 
@@ -433,7 +404,6 @@ def sir(t, y, infection, recovery):
     yield i + s - ratio * np.log(s), [1 - ratio / s, 1, 0]
 
 
-@_equations
 def volterra_lattice(t, y):
     """Kac and van Moerbeke's lattice; invariants: sum, a quadratic one, logarithm of the product."""
     after, before = np.roll(y, -1), np.roll(y, 1)
@@ -443,7 +413,6 @@ def volterra_lattice(t, y):
     yield np.log(y).sum(), 1 / y
 
 
-@_equations
 def zabusky_kruskal(t, y, c1, c2):
     """Korteweg and de Vries's equation in Zabusky and Kruskal's scheme; invariants: sum of u, sum of u^2.
 
@@ -456,7 +425,6 @@ def zabusky_kruskal(t, y, c1, c2):
     yield y @ y, 2 * y
 
 
-@_equations
 def sine_gordon(t, y, coupling):
     """Periodic chain of Frenkel and Kontorova, y = (u, v); invariant: energy."""
     u, v = np.split(y, 2)
@@ -466,7 +434,6 @@ def sine_gordon(t, y, coupling):
     yield (v * v / 2 + coupling * d * d / 2 + 1 - np.cos(u)).sum(), np.concatenate([-force, v])
 
 
-@_equations
 def three_wave(t, y):
     """Resonant interaction of three complex waves; invariants: two Manley-Rowe relations, energy."""
     a, b, c = y
@@ -478,7 +445,6 @@ def three_wave(t, y):
     yield 2 * (a * b * np.conj(c)).real, 2 * pairs
 
 
-@_equations
 def ablowitz_ladik(t, y):
     """Ablowitz and Ladik's periodic complex lattice; invariants: mass, and the complex correlation of neighbours."""
     right, left, square = np.roll(y, -1), np.roll(y, 1), (y * np.conj(y)).real
@@ -489,7 +455,6 @@ def ablowitz_ladik(t, y):
     yield correlation.imag, 1j * (right - left)
 
 
-@_equations
 def brockett(t, y):
     """Double-bracket flow L' = [L, [L, diag(1, 2, 3)]], y = (diagonal, off-diagonals) of L.
 
@@ -503,3 +468,14 @@ def brockett(t, y):
     powers = np.eye(3), L, L @ L, L @ L @ L
     for k in (1, 2, 3):
         yield np.trace(powers[k]), k * counted * powers[k - 1][components]
+
+
+EQUATIONS: dict[str, Callable[..., Iterator[Any]]] = {
+    system.__name__: system
+    for system in (
+        *(kepler, perturbed_kepler, arenstorf, henon_heiles, boris_2d, n_body, pendulum, duffing, oscillator),
+        *(double_pendulum, spherical_pendulum, fput, vortices, tokamak, schwarzschild, rigid_body, euler_detest),
+        *(quaternion, heisenberg, lotka_volterra, sir, volterra_lattice, zabusky_kruskal, sine_gordon, three_wave),
+        *(ablowitz_ladik, brockett),
+    )
+}

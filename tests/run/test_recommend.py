@@ -68,22 +68,6 @@ def test_hard_cases(name, wanted):
     assert 0.5 * choice.error < found < 2 * choice.error
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize(("wanted", "near"), [(1e-4, 31), (1e-6, 33), (1e-8, 35)])
-def test_all_hard_cases(wanted, near):
-    """The table of the page on `recommend`."""
-    found, expected = [], []
-    for case in hard_cases():
-        choice = recommend(case.problem, error=wanted)
-        found.append(case.error(choice.run().y[:, -1]) / wanted)
-        expected.append(found[-1] * wanted / choice.error)
-    assert len(found) == 35
-    assert max(found) <= 1.0
-    assert abs(sum(ratio >= 1 / FACTOR for ratio in found) - near) <= 1
-    assert all(1 / FACTOR <= ratio <= FACTOR for ratio in expected)
-
-
 def test_it_finds_the_multistep_method_for_planets():
     problem = solar_system()
     choice = recommend(problem, (0, 10), error=1e-8)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import Invariant, check_gradient
+from eip_scipy import Invariant, check_gradient, recommend
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.hard import command
 from eip_scipy_studies.hard_cases import EQUATIONS, hard_cases
@@ -116,7 +116,7 @@ def test_a_run_that_raises_is_an_outcome_and_a_wrong_invariant_a_loss():
 
 
 def test_a_case_without_known_cause_is_judged_by_its_neighbours():
-    case = next(case for case in CASES if case.name not in command.CAUSES)
+    case = next(case for case in CASES if not case.cause)
     worse = command.Comparison(case, command.Outcome(1e-6), command.Outcome(2e-6), nearby=(1.5, 1.5, 0.1))
     assert "scatter" in command.cause(worse)  # 0.5 * 1.5 * 1.5 > 1; the third is the euclidean metric's
     assert "not known" in command.cause(worse._replace(nearby=(1.5, 1.2, 9.0)))
@@ -163,8 +163,22 @@ def test_gains_on_the_pages(method, mean, worst, losses, tmp_path):
     assert found["summary"]["worst_gain"] > 0.95 / worst
     worse = {row["case"]: row for row in found["cases"] if row["gain"] < 1}
     assert len(worse) <= losses + 1
-    assert {name for name, row in worse.items() if row["gain"] < 0.5} <= set(command.CAUSES)
+    assert {name for name, row in worse.items() if row["gain"] < 0.5} <= {case.name for case in CASES if case.cause}
     if method == "EIPDOP853":
         assert worse["kepler_e00"]["projected_error"] == pytest.approx(2.2e-8, rel=0.2)
         assert worse["kepler_e00"]["plain_error"] == pytest.approx(7e-10, rel=0.2)
         assert worse["euler_top_tennis"]["projected_error"] < 1e-8
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize(("wanted", "near"), [(1e-4, 31), (1e-6, 33), (1e-8, 35)])
+def test_errors_on_the_page_on_recommend(wanted, near):
+    found, expected = [], []
+    for case in CASES:
+        choice = recommend(case.problem, error=wanted)
+        found.append(case.error(choice.run().y[:, -1]) / wanted)
+        expected.append(found[-1] * wanted / choice.error)
+    assert max(found) <= 1
+    assert abs(sum(ratio >= 0.1 for ratio in found) - near) <= 1
+    assert 0.1 <= min(expected) <= max(expected) <= 10

@@ -26,23 +26,6 @@ SMALL_DRIFT, MAY_EXCEED, MEDIAN_DRIFT = 1e-9, 2, 1e-12
 LEAST_GAIN = {"EIPRK45": 20.0, "EIPDOP853": 15.0}
 MOST_WORSE, LARGEST_ERROR = 3.0, 1e-7  # of EIPRK45, of EIPDOP853
 
-# Reasons why projection does not help. Each was found from errors at five tolerances, with all metrics and directions.
-CAUSES = {
-    "kepler_e00": "the plain method is lucky: its phase lag, which grows as t, and the lead from its loss of energy, "
-    "which grows as t^2, cancel near the end of this run. Projection takes away the second; the lag stays, with every "
-    "metric and direction. In a run three times as long the projected error is half the plain one",
-    "euler_top_tennis": "the plain method's error lies along the axis, its unstable components stay at 1e-14. At the "
-    "saddle the two gradients are parallel to 1e-8, and a correction magnifies the round-off in H - C/i2 by 1e8",
-    "arenstorf": "perturbations grow 2e6-fold, and the one invariant sees little of those at close encounters: which "
-    "is smaller changes from one tolerance to the next",
-    "oscillator": "the error is one of phase, along the orbit, where the invariant cannot see it; weighted corrections "
-    "are not normal to the orbit and add to it",
-    "vortices": "chaotic, and errors of equal size: which is smaller changes from one tolerance to the next",
-    "fput": "the error is the phase of the stiff springs' oscillations, which the energy cannot see; weighted "
-    "corrections restore the amplitudes but shift the phases, euclidean ones less",
-    "kdv_zk": "mass and momentum see 3 % of the error",
-}
-
 
 class Outcome(NamedTuple):
     """Result of one run: `error` and `drift` are those of `HardCase`, and `failure` says why it did not reach its end.
@@ -249,8 +232,8 @@ def why(result: Comparison) -> str:
 
 def cause(result: Comparison) -> str:
     """Return why projection makes a case worse; if unknown, whether it does so at neighbouring tolerances, too."""
-    if result.case.name in CAUSES:
-        return CAUSES[result.case.name]
+    if result.case.cause:
+        return result.case.cause
     if geometric_mean([result.gain, *result.nearby[:2]]) >= 1:
         return "scatter: over neighbouring tolerances projection gains"
     return "not known; it is worse at neighbouring tolerances, too"

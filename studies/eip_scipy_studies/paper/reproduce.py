@@ -49,6 +49,7 @@ def reproduce(out: Output, what: tuple[Name, ...]) -> None:
             PARTS[name](part)
             part.end()
             out.numbers[name], out.passed = part.numbers, out.passed and part.passed
+            out.interrupted |= part.interrupted
         else:
             PARTS[name](out)
     out.numbers["passed"] = out.passed

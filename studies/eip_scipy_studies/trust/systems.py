@@ -13,8 +13,8 @@ import eip_scipy.problems
 from eip_scipy import Invariant, eip_method
 from eip_scipy.problems import Grid, GrossPitaevskii, Problem, centre_time, kepler, solar_system, time_transformed
 
-from .. import hard_cases
 from ..condensates import problems as condensates
+from ..hard_cases import CaseEquations, hard_cases
 from ..report import needed
 
 njit = partial(needed("numba", '"eip_scipy[numba]"').njit, cache=True)
@@ -198,7 +198,7 @@ def laplace() -> Invariant:
 
 def shell() -> Invariant:
     """Return the mass shell of Schwarzschild's metric at 1.1 times the radius as an invariant."""
-    right, scale = hard_cases.schwarzschild(), np.array([1, 1.1, 1, 1, 1, 1])
+    right, scale = CaseEquations("schwarzschild"), np.array([1, 1.1, 1, 1, 1, 1])
     return Invariant(
         lambda t, y: right.values(t, y * scale)[0], lambda t, y: scale * right.gradients(t, y * scale)[0], name="shell"
     )
@@ -234,7 +234,7 @@ def case(
     `kept` is "I" for all invariants of the same system with the parameters `claim` (default: its own), "energy" for the
     first of them, or one of the `CLAIMS`.
     """
-    system, of = (getattr(hard_cases, name)(*given) for given in (params, claim or params))
+    system, of = (CaseEquations(name, tuple(given)) for given in (params, claim or params))
     known = {**CLAIMS, "I": Invariant(of.values, of.gradients, name="I")}
     known["energy"] = Invariant(
         lambda t, y, *_: of.values(t, y)[0], lambda t, y, *_: of.gradients(t, y)[0], name="energy"
@@ -244,7 +244,7 @@ def case(
 
 def hard_case(name: str) -> Problem:
     """Return one of the hard cases."""
-    return hard_cases.hard_cases([name])[0].problem
+    return hard_cases([name])[0].problem
 
 
 def epidemic(infection: float, recovery: float, infected: float) -> Problem:
@@ -371,20 +371,17 @@ def spoilt(on: str, factor: float = 1.0, at: Any = slice(None), way: str = "none
 # --- compiled: jitted equations and energies, written to `out` ---
 
 
+_spring_acc = njit(lambda t, q, params: -params[0] * q + params[2] * np.sin(params[3] * t))
+_spring_energy = njit(lambda t, y, params: 0.5 * (y[1] * y[1] + params[0] * y[0] * y[0]))
+_pendulum_energy = njit(lambda t, y, params: 0.5 * y[1] * y[1] - np.cos(y[0]))
+_trap_acc = njit(lambda t, q, params: np.array([-q[0], -params[0] * q[1]]))
+_turning = njit(lambda t, y, params: y[0] * y[3] - y[1] * y[2])
+
+
 @njit
 def _spring(t, y, out, params):  # params: square of the frequency, friction, strength of a force, its frequency
     out[0] = y[1]
     out[1] = -params[0] * y[0] - params[1] * y[1] + params[2] * np.sin(params[3] * t)
-
-
-@njit
-def _spring_acc(t, q, params):
-    return -params[0] * q + params[2] * np.sin(params[3] * t)
-
-
-@njit
-def _spring_energy(t, y, params):
-    return 0.5 * (y[1] * y[1] + params[0] * y[0] * y[0])
 
 
 @njit
@@ -403,11 +400,6 @@ def _pendulum(t, y, out, params):
 
 
 @njit
-def _pendulum_energy(t, y, params):
-    return 0.5 * y[1] * y[1] - np.cos(y[0])
-
-
-@njit
 def _pendulum_slope(t, y, out, params):
     out[0], out[1] = np.sin(y[0]), y[1]
 
@@ -415,16 +407,6 @@ def _pendulum_slope(t, y, out, params):
 @njit
 def _trap(t, y, out, params):
     out[0], out[1], out[2], out[3] = y[2], y[3], -y[0], -params[0] * y[1]
-
-
-@njit
-def _trap_acc(t, q, params):
-    return np.array([-q[0], -params[0] * q[1]])
-
-
-@njit
-def _turning(t, y, params):
-    return y[0] * y[3] - y[1] * y[2]
 
 
 @njit
