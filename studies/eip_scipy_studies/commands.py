@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "charged-particle uniform": Entry("particles.charged_particle:Uniform", "the uniform field alone"),
     "charged-particle tokamak": Entry("particles.charged_particle:Tokamak", "the tokamak alone, or one orbit of it"),
-    "hard-cases": Entry("hard.cases:HardCases", "run 35 hard cases with and without projection"),
+    "hard-cases": Entry("hard.command:hard_cases", "run 35 hard cases with and without projection"),
     "hard-scenes": Entry(
         "hard.scenes:HardScenes",
         "error against cost on high eccentricities, chaos and close encounters, compared with IAS15",
@@ -45,14 +45,12 @@ COMMANDS = {
     "gpe vortex-lines": Entry(
         "condensates.lines:VortexLines", "run the paper's condensate in 3D after its rotation is made faster"
     ),
-    "work-precision": Entry(
-        "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
-    ),
     "bench": Entry(
         "bench.command:bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
     ),
     "bench metric": Entry("bench.metric:metric", "the default metric against none and euclidean, case by case"),
-    "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
+    "reproduce": Entry("paper.reproduce:reproduce", "recompute the paper's tables and figures"),
+    "trust": Entry("trust.command:trust", "whether faulty runs are reported, and correct ones are not"),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
@@ -67,12 +65,10 @@ COMMANDS = {
     "study multistep": Entry(
         "measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 against WHFast, IAS15 and heyoka"
     ),
-    "study recommend": Entry("measurements.recommend:Recommended", "true errors of recommended runs on the hard cases"),
     "study relativity": Entry(
         "measurements.relativity:Relativity", "ten bodies with relativity compared with WHFast and IAS15"
     ),
     "study solar-cloud": Entry(
         "measurements.solar_cloud:SolarCloud", "an ensemble of solar systems compared with REBOUND"
     ),
-    "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
 }

@@ -134,10 +134,7 @@ def test_a_package_that_fails_is_a_row():
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_command_writes_runs_and_page(tmp_path):
-    assert (
-        main(["bench", "double pendulum", "--solvers", "SciPy DOP853", "--out", str(tmp_path), "--quiet"])
-        == 0
-    )
+    assert main(["bench", "double pendulum", "--solvers", "SciPy DOP853", "--out", str(tmp_path), "--quiet"]) == 0
     rows = list(csv.DictReader((tmp_path / "bench.csv").read_text(encoding="utf-8").splitlines()))
     errors = [float(row["error"]) for row in rows]
     assert errors[0] > 1e-6

@@ -28,10 +28,8 @@ RUNS = [
     ("study long-orbits", "--years 1", ()),
     ("study multistep", "--quick --parts 1 2 4", REBOUND),
     ("study multistep", "--quick --parts 3", HEYOKA),
-    ("study recommend", "--cases pendulum", ()),
     ("study relativity", "--years 1", REBOUNDX),
     ("study solar-cloud", "--members 16 --years 1 --sample 2", REBOUND),
-    ("study trust", "--only pendulum", ()),
 ]
 
 

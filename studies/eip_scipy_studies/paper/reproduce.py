@@ -2,72 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
-from ..commands import DONE, INTERRUPTED
 from ..condensates.efficiency import Efficiency
-from ..kepler.figures import KeplerFigures
+from ..output import Output
 from ..particles.charged_particle import ChargedParticle
-from ..report import document, write_json
 from ..solar.solar_system import SolarSystem
-from ..study import Command, Session, Study, option, perform
-from .tables import TABLES, PaperTable
+from ..study import Session, perform
+from .figures import kepler_figures
+from .tables import table
 
-Make = Callable[[], Study[Any]]
-STUDIES: dict[str, Make] = {
-    **{name: partial(PaperTable, name=name) for name in TABLES},
-    "fig-kepler": KeplerFigures,
-    "fig-solar": SolarSystem,
-    "fig-particle": partial(ChargedParticle, scenes=("uniform",), paper_only=True, stem="fig-particle"),
-    "fig-tokamak": partial(
-        ChargedParticle, scenes=("tokamak-banana", "tokamak-transit"), paper_only=True, stem="fig-tokamak"
-    ),
-    "fig-efficiency": Efficiency,
+Name = Literal[
+    "table1", "table2", "table3", "table4", "table5",
+    "fig-kepler", "fig-solar", "fig-particle", "fig-tokamak", "fig-efficiency", "all",
+]  # fmt: skip
+FIGURES: dict[str, Callable[[Output], None]] = {
+    "fig-kepler": kepler_figures,
+    "fig-solar": lambda out: _class(out, "solar-system", SolarSystem()),
+    "fig-particle": lambda out: _particle(out, "fig-particle", "uniform"),
+    "fig-tokamak": lambda out: _particle(out, "fig-tokamak", "tokamak-banana", "tokamak-transit"),
+    "fig-efficiency": lambda out: _class(out, "fig-efficiency", Efficiency()),
+}
+PARTS: dict[str, Callable[[Output], None]] = {
+    **{f"table{number}": partial(table, number=number) for number in range(1, 6)},
+    **FIGURES,
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reproduce(Command):
-    """Command ``eip-scipy reproduce``."""
+def reproduce(out: Output, what: tuple[Name, ...]) -> None:
+    """Recompute the paper's tables and figures, and compare with the printed numbers.
 
-    table: Sequence[str] = option(
-        (),
-        f"{', '.join(STUDIES)} or all; several may be given",
-        positional=True,
-        nargs="+",
-        choices=(*STUDIES, "all"),
-        metavar="WHAT",
-    )
-    studies: Mapping[str, Make] = field(default_factory=lambda: STUDIES)
+    The lists "cells" and "orders" of the JSON file have the numbers of all tables.
 
-    def run(self, session: Session) -> int:
-        """Run the studies of the chosen tables and figures in turn, and return the exit status.
+    Parameters
+    ----------
+    what : tuple of str
+        table1 to table5, fig-kepler, fig-solar, fig-particle, fig-tokamak, fig-efficiency, or all
+    """
+    for k, name in enumerate(PARTS if "all" in what else dict.fromkeys(what)):
+        if k:
+            out.text()
+        if name in FIGURES:
+            part = Output(out.folder, quiet=out.quiet)
+            PARTS[name](part)
+            part.end()
+            out.numbers[name], out.passed = part.numbers, out.passed and part.passed
+            out.interrupted |= part.interrupted
+        else:
+            PARTS[name](out)
+    out.numbers["passed"] = out.passed
 
-        If a JSON file is wanted, it is one for all; its lists `cells` and `orders` hold the numbers of all tables.
-        """
-        session.out.mkdir(parents=True, exist_ok=True)
-        wanted = list(dict.fromkeys(self.studies if "all" in self.table else self.table))
-        content: dict[str, Any] = {"cells": [], "orders": []}
-        status = DONE
-        for k, name in enumerate(wanted):
-            if k > 0:
-                session.say()
-            own = Session(name, session.out, None, session.quiet, session.absent)
-            if name == "fig-solar":  # a separate command, which leaves its numbers
-                own.name, own.json = "solar-system", session.out / "solar-system.json"
-            judged, numbers = perform(self.studies[name](), own)
-            if judged == INTERRUPTED:
-                return INTERRUPTED
-            status = max(status, judged)
-            if name in TABLES:
-                content = {**content, **{kind: content[kind] + numbers[kind] for kind in ("cells", "orders")}}
-            else:
-                content[name] = numbers
-        content["passed"] = status == DONE
-        if session.json is not None:
-            session.wrote(write_json(session.json, document(session.name, {"table": wanted}, **content)))
-            session.name_files()
-        return status
+
+def _particle(out: Output, stem: str, *scenes: str) -> None:
+    _class(out, stem, ChargedParticle(scenes=scenes, paper_only=True, stem=stem))
+
+
+def _class(out: Output, name: str, study: Any) -> None:
+    status, out.numbers = perform(study, Session(name, out.folder, None, out.quiet))
+    out.passed = status == 0

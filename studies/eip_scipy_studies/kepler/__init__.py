@@ -1,1 +1,0 @@
-"""The commands ``eip-scipy work-precision`` and ``reproduce fig-kepler``: Kepler's problem."""

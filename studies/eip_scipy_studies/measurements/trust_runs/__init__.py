@@ -1,1 +1,0 @@
-"""Runs of the study `trust`: systems, faulty runs, correct runs."""

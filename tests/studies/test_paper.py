@@ -1,0 +1,213 @@
+"""``eip-scipy reproduce``: the paper's tables against its numbers and 50 digits, and figures 1 and 2."""
+
+import csv
+import json
+
+import mpmath_tables
+import numpy as np
+import pytest
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, integrate
+from eip_scipy.problems import kepler
+from eip_scipy_studies.cli import main
+from eip_scipy_studies.output import Output
+from eip_scipy_studies.paper import figures, tables
+
+EPS = np.finfo(float).eps
+SERIES = tables.DATA["series"]
+EXACT = [series for series in SERIES if "mpmath" in series]
+# Numbers that do not agree to the printed digits, as (column, row) by table and quantity: round-off.
+RK2 = {(f"EIP-{kept}", f"RK2 0.03/{d}") for kept in ("H", "L", "HL") for d in (2, 3, 4)}
+APART = {
+    (1, "error"): {("RK4", "0.1/8")},
+    (1, "order"): {("RK3", "0.1/8"), ("RK4", "0.1/8")},
+    (3, "order"): {("EIP-HL", "0.02/16")},
+    (4, "error"): RK2 - {("EIP-H", "RK2 0.03/3"), ("EIP-H", "RK2 0.03/4")}
+    | {("EIP-HL", "RK1 0.03/3"), ("EIP-H", "RK2 0.03/1")},
+    (4, "order"): RK2 - {("EIP-H", "RK2 0.03/4")},
+}
+ROUNDINGS = {1: EPS / 10, 2: 1.5e-15, 3: 1e-14, 4: 3e-16}  # of the invariants; step by step of y in table 3
+
+
+def named(series):
+    return f"table{series['table']}-{series['method']}-{series['name']}"
+
+
+def read(file):
+    with open(file, newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture(scope="module")
+def cells():
+    return [row for s in EXACT for row in tables.rows_of(s, tables.errors(s))]
+
+
+def test_numbers_agree_to_the_printed_digits_except_where_listed(cells):
+    assert len(cells) == 76 + 57
+    found = {}
+    for cell in cells:
+        if cell["status"] != "matched":
+            found.setdefault((cell["table"], cell["quantity"]), set()).add((cell["column"], cell["row"]))
+            assert cell["status"] == "round-off"
+    assert found == APART
+
+
+def test_errors_are_those_in_50_digits_up_to_round_off(cells):
+    for cell in cells:
+        if cell["quantity"] == "error":
+            allowed = 1e-11 * cell["mpmath"] + ROUNDINGS[cell["table"]]
+            assert abs(cell["ours"] - cell["mpmath"]) <= allowed, cell
+            half_unit = 0.5 * 10.0 ** (np.floor(np.log10(float(cell["paper"]))) - 4)
+            from_paper = abs(cell["ours"] - float(cell["paper"])) - half_unit
+            assert min(from_paper, abs(cell["ours"] - cell["mpmath"])) <= EPS, cell
+
+
+LONG = [pytest.mark.nightly, pytest.mark.slow]
+IN_50_DIGITS = [pytest.param(s, marks=LONG if (s["table"], s["method"]) == (3, "RK4") else ()) for s in EXACT]
+
+
+@pytest.mark.parametrize("series", IN_50_DIGITS, ids=named)
+def test_stored_50_digit_values(series):
+    computed = [float(x) for x in mpmath_tables.evaluate(series)]
+    np.testing.assert_allclose([float(x) for x in series["mpmath"]], computed, rtol=6e-12)
+
+
+def printed_order_misses(series, errors):
+    """Return how much the printed orders miss those of the printed errors, over what the rounding of the two allows."""
+    e = np.array([float(x) for x in errors])
+    relative = 0.5e-4 / np.array([float(f"{x:.4e}".split("e")[0]) for x in e])  # five digits are printed
+    refinement = np.diff(np.log(series["divisors"]))
+    allowed = (relative[:-1] + relative[1:]) / refinement + 1e-4
+    return np.abs(-np.diff(np.log(e)) / refinement - [float(x) for x in series["orders"]]) / allowed
+
+
+@pytest.mark.parametrize("series", SERIES, ids=named)
+def test_transcription_and_errata(series):
+    """Printed orders follow from the printed errors; with the misprint they would not."""
+    assert (printed_order_misses(series, series["errors"]) < 1).all()
+    for k, misprint in series.get("errata", {}).items():
+        printed = [misprint["printed"] if i == int(k) else x for i, x in enumerate(series["errors"])]
+        assert (printed_order_misses(series, printed) > 100).any()
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize("series", [s for s in SERIES if s["table"] == 5], ids=named)
+def test_table_5(series):
+    """As the page on condensates says: all but two errors, of 3.5e-13, agree to three digits or more."""
+    rows = list(tables.rows_of(series, tables.errors(series)))
+    errors, orders = ([row for row in rows if row["quantity"] == kind] for kind in ("error", "order"))
+    assert (len(errors), len(orders)) == (3, 2)
+    assert all(row["status"] != "differs" for row in rows)
+    assert all(row["digits"] >= (3 if row["ours"] > 4e-13 else 2) for row in errors)
+    assert all(3.998 < row["ours"] < 4.001 for row in orders)
+
+
+def test_runs_of_table_5_are_shared_and_judged_by_the_papers_numbers(monkeypatch, tmp_path, capsys):
+    """The runs with most steps come first; an error that is off by a thousandth is found without 50 digits."""
+    submitted = []
+
+    class Pool:
+        def submit(self, function, series, h):
+            submitted.append(h)
+            k = next((k for k, length in enumerate(tables.lengths(series)) if length == h), -1)
+            end = -sum(float(x) for x in series["errors"][: k + 1]) * (1 + 1e-3 * (series["Omega"] == 0.9))
+            return type("Future", (), {"result": lambda self: np.array([end, 0.0])})()
+
+    monkeypatch.setattr(tables, "processes", lambda count: tables.nullcontext(Pool()))
+    out = Output(tmp_path)
+    tables.table(out, 5)
+    assert len(submitted) == 9 * 4
+    assert submitted == sorted(submitted)
+    assert not out.passed
+    assert (len(out.numbers["cells"]), len(out.numbers["orders"])) == (27, 18)
+    assert {row["column"][:11] for row in out.numbers["cells"] if row["status"] == "differs"} == {"Omega = 0.9"}
+    text = capsys.readouterr().out
+    assert "mpmath" not in text
+    assert "nan" not in text
+
+
+@pytest.mark.parametrize(
+    ("paper", "ours", "exact", "digits", "status"),
+    [
+        ("6.3506e-03", 6.35056e-3, np.nan, 5, "matched"),
+        ("6.3506e-03", 6.35066e-3, np.nan, 4, "differs"),
+        ("9.8071e-10", 9.807151e-10, np.nan, 4, "round-off"),
+        ("31.922", 3.19224, np.nan, 0, "differs"),
+        ("1.0000e-03", 9.9994e-4, np.nan, 4, "differs"),
+        ("1.0000e-03", np.nan, np.nan, 0, "differs"),
+        ("6.8501e-12", 6.8425e-12, 6.8425e-12, 1, "round-off"),  # the paper's own
+        ("6.8501e-12", 6.8430e-12, 6.8425e-12, 1, "differs"),
+    ],
+)
+def test_compared(paper, ours, exact, digits, status):
+    found = tables.compared(paper, ours, exact, EPS, "cause")
+    assert (found["digits"], found["status"]) == (digits, status)
+
+
+def test_command_prints_and_writes(tmp_path, capsys):
+    file = tmp_path / "tables.json"
+    assert main(["reproduce", "table2", "table1", "--out", str(tmp_path / "new"), "--json", str(file)]) == 0
+    text = capsys.readouterr().out
+    assert "15 of 16 errors and 10 of 12 orders agree" in text
+    assert "misprinted as 3.1922" in text
+    assert max(map(len, text.splitlines())) <= 130
+    written = json.loads(file.read_text())
+    assert (written["passed"], len(written["cells"]), len(written["orders"])) == (True, 40, 30)
+    (misprint,) = (cell for cell in written["cells"] if cell["misprinted_as"] is not None)
+    assert (misprint["row"], misprint["column"], misprint["paper"]) == ("RK2 iter#1", "h0/1", 31.922)
+    lines = read(tmp_path / "new" / "table1.csv")
+    assert len(lines) == 28
+    assert float(lines[0]["ours"]) == pytest.approx(6.3506e-3, rel=1e-4)
+
+
+def test_a_wrong_number_fails_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(tables.METHODS, "RK3", tables.EIPRK2)
+    assert main(["reproduce", "table1", "--out", str(tmp_path)]) == 1
+    assert "7 marked ! DIFFER" in capsys.readouterr().out
+
+
+def test_short_runs_of_figures_1_and_2(tmp_path, monkeypatch):
+    """Each run keeps what it is named after; known values are those at t = 2000, and most are not met."""
+    monkeypatch.setattr(figures, "T_END", 1.5)
+    out = Output(tmp_path, quiet=True)
+    figures.kepler_figures(out)
+    assert {path.name for path in tmp_path.iterdir()} == {"fig-kepler.csv", *figures.FIGURES}
+    assert [check["passed"] for check in out.numbers["checks"]] == [False, False, False, True]
+    last = {row["method"]: row for row in read(tmp_path / "fig-kepler.csv")}
+    energy, momentum, position = (
+        {name: float(row[f"{kind}_error"]) for name, row in last.items()} for kind in ("energy", "momentum", "position")
+    )
+    assert energy["EIP-H"] < 1e-12 < 1e-7 < momentum["EIP-H"]
+    assert momentum["EIP-L"] < 1e-12 < 1e-7 < energy["EIP-L"]
+    assert max(energy["EIP-HL"], momentum["EIP-HL"]) < 1e-10
+    assert 1e-7 < position["EIP-HL, RK5"] < position["EIP-HL"] < 1e-3 < position["EIP-HL, RK2"] < 1e-1
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_figures_1_and_2(tmp_path):
+    """Kept invariants prove nothing about the orbit: RK2's is lost, RK5's is not."""
+    assert main(["reproduce", "fig-kepler", "--out", str(tmp_path)]) == 0
+    last = {row["method"]: float(row["position_error"]) for row in read(tmp_path / "fig-kepler.csv")}
+    assert last["EIP-HL, RK5"] < 1e-3 < 0.5 < last["EIP-HL, RK2"]
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "setting", "evaluations"),
+    [
+        (EIPRK4, {"h": 200 / 27_500}, 110_000),
+        (EIPRK5, {"h": 200 / 10_300}, 62_000),
+        (EIPRK45, {"rtol": 2e-8, "atol": 2e-11, "h": None}, 21_000),
+        (EIPDOP853, {"rtol": 2e-8, "atol": 2e-11, "h": None}, 14_000),
+    ],
+)
+def test_evaluations_on_the_page_on_choosing(method, setting, evaluations):
+    problem = kepler(t_end=200.0)
+    exact = integrate(problem, method=EIPDOP853, h=200 / 40_000, compensated=True).y[:2, -1]
+    run = integrate(problem, method=method, **setting)
+    assert run.nfev == pytest.approx(evaluations, rel=0.1)
+    assert 0.4e-6 < np.hypot(*(run.y[:2, -1] - exact)) < 2.5e-6
