@@ -407,7 +407,8 @@ def interpreted(problem):
     (kept,) = problem.constraints
     target = np.zeros(kept.size)
     options = {"target": target, "size": target.size, "in_place": True, "name": "constraints"}
-    return problem.motion_at, Invariant(kept.function.py_func, kept.gradient.py_func, **options)
+    functions = [getattr(item, "py_func", item) for item in (kept.function, kept.gradient)]
+    return problem.motion_at, Invariant(*functions, **options)
 
 
 def test_no_step_ends_next_to_a_singular_position():
