@@ -85,19 +85,6 @@ def test_vortex_of_the_harmonic_trap(shape, gamma, Omega):
     assert gpe.angular_momentum(psi) / gpe.mass(psi) == pytest.approx(1, rel=tolerance)
 
 
-def test_three_dimensions_are_two_where_nothing_depends_on_z():
-    flat, full = Grid((8, 12), -2, 3), Grid((8, 12, 6), (-2, -2, 0), (3, 3, 1))
-    psi = noise(flat)
-    options = {"Omega": 0.4, "beta": 2.0}
-    two = GrossPitaevskii(flat, harmonic_trap(1, 2), **options)
-    three = GrossPitaevskii(full, harmonic_trap(1, 2, 0), **options)
-    lifted = np.repeat(psi[..., None], 6, axis=2)
-    expected = hamiltonian(two, psi)
-    np.testing.assert_allclose(hamiltonian(three, lifted), np.repeat(expected[..., None], 6, axis=2), atol=1e-12)
-    assert three.energy(lifted) == pytest.approx(two.energy(psi), rel=1e-13)
-    assert three.angular_momentum(lifted) == pytest.approx(two.angular_momentum(psi), rel=1e-12)
-
-
 def test_odd_numbers_of_points_and_one_dimension():
     """exp(i k x) has the energy k^2 / 2 per mass, and the derivative of the highest mode of an odd grid has a sign."""
     grid = Grid(9, 0, 2 * np.pi)

@@ -129,15 +129,6 @@ def test_a_system_of_pydy_brings_constants_and_start():
     np.testing.assert_allclose(lighter.motion_at(0.0, lighter.y0)[2], -(4 * 0.25 + 2) / 5, rtol=1e-13)
 
 
-def test_a_system_of_pydy_moves_as_pydy_says():
-    pydy = pytest.importorskip("pydy.system", reason="needs PyDy: python -m pip install pydy")
-    model = on_a_parabola(True)
-    start = dict(zip([*model.q, *model.u], (1.0, 1.0, 0.5, 1.0), strict=True))
-    system = pydy.System(model, constants=WEIGHT, initial_conditions=start, times=np.linspace(0, 1, 5))
-    problem = mechanics(system)
-    np.testing.assert_allclose(problem.motion_at(0.0, problem.y0), system.evaluate_ode(), rtol=1e-13)
-
-
 def test_a_model_moves_as_its_own_equations_say():
     (model, constants), problem = examples.four_bar_model(), examples.four_bar()
     gradient, state = np.empty((4, 6)), problem.y0.copy()
@@ -147,29 +138,6 @@ def test_a_model_moves_as_its_own_equations_say():
     M, f = (np.array(item.xreplace(known), float) for item in (model.mass_matrix, model.forcing))
     np.testing.assert_allclose(problem.motion_at(0.0, state)[3:], np.linalg.solve(M, f)[:, 0], rtol=1e-9)
     assert "q2 0.1 to" in repr(problem)
-
-
-def test_joints_of_a_system_of_sympy():
-    """The model has two rods on pins; the end of the second one slides along the line of x through the first pin."""
-    ground, rods = me.RigidBody("ground"), [me.RigidBody(f"rod{n}", mass=m) for n in range(2)]
-    for rod in rods:
-        rod.central_inertia = me.inertia(rod.frame, 0, m / 12, m / 12)
-    system = me.System.from_newtonian(ground)
-    for n, (parent, place) in enumerate(((ground, None), (rods[0], rods[0].x / 2))):
-        places = {"joint_axis": parent.z, "parent_point": place, "child_point": -rods[n].x / 2}
-        system.add_joints(me.PinJoint(f"pin{n}", parent, rods[n], **places))
-    (first, second), (one, two) = system.q, system.u
-    system.q_ind, system.q_dep, system.u_ind, system.u_dep = [first], [second], [one], [two]
-    end = rods[1].masscenter.locatenew("end", rods[1].x / 2)
-    system.add_holonomic_constraints(end.pos_from(system.fixed_point).dot(ground.y))
-    system.apply_uniform_gravity(-g * ground.x)
-    angle, rate = 0.7, 0.3
-    problem = mechanics(system, {m: 2.0, g: G}, {first: angle, second: -1.3}, {one: rate})
-    np.testing.assert_allclose(problem.y0, [angle, -2 * angle, rate, -2 * rate], rtol=1e-13)
-    # Rods of 1 m at the angles q and -q from the direction of x: T = (1/3 + sin^2 q) m q'^2, V = 2 m g cos q.
-    sin, cos = np.sin(angle), np.cos(angle)
-    expected = (G - cos * rate**2) * sin / (1 / 3 + sin**2)
-    np.testing.assert_allclose(problem.motion_at(0.0, problem.y0)[2:], [expected, -2 * expected], rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -374,18 +374,6 @@ def test_rates_of_the_same_pass_and_of_a_pass_of_their_own_have_the_same_bits(n)
             np.testing.assert_array_equal(fused.invariants, apart.invariants)
 
 
-def test_other_masses_than_those_of_the_balances():
-    """The rates are those of the balances' own masses, from which no pull on the way is taken then."""
-    gm, q, v = planets(10)
-    y0, others, rhs = np.concatenate([q, v], axis=None), gm * np.r_[1.0, 1.001 * np.ones(9)], library["gravity.rhs"]
-    items = orbital_balances(gm, y0, newton=True)
-    options = {"t_span": (0.0, 0.4), "h": 0.02, "y0": y0, "method": EIPRK4, "check": False, "in_place": True}
-    native = integrate(fun=rhs, params=others, invariants=items, **options)
-    items = [in_python(item) for item in items]
-    python = integrate(fun=lambda t, y, out: rhs(t, y, out, others), invariants=items, **options)
-    np.testing.assert_array_equal(native.y, python.y)
-
-
 # Runs.
 
 

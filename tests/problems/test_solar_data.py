@@ -180,19 +180,6 @@ def test_mars_misprint(planets):
     assert_allclose(printed[:2], corrected[:2], rtol=1e-14)
 
 
-def test_mercury_against_astropy(kernel):
-    pytest.importorskip("astropy")
-    from astropy import units as u
-    from astropy.coordinates import ICRS, HeliocentricEclipticIAU76, get_body_barycentric, solar_system_ephemeris
-    from astropy.time import Time
-
-    time = Time(*PAPER_EPOCH, format="jd", scale="tdb")
-    with solar_system_ephemeris.set(str(kernel)):
-        mercury = ICRS(get_body_barycentric("mercury", time)).transform_to(HeliocentricEclipticIAU76(obstime=time))
-    q, _ = heliocentric_km(solar_data.load("paper"), "Mercury")
-    assert np.linalg.norm(q - mercury.cartesian.xyz.to_value(u.km)) < 0.2
-
-
 # The kernel.
 
 
