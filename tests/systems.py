@@ -141,3 +141,17 @@ def same(one, *others):
         for key in ("last_defect", "max_defect", "max_correction"):
             np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)
         assert one.message.split(" (")[0] == other.message.split(" (")[0]
+
+
+# Systems as text, for `hamiltonian` and `equations`: names of the state, and parameters.
+
+HENON_HEILES = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"
+RELATIVISTIC_KEPLER = "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2) - eps/(2*(x**2 + y**2)**1.5)"
+RIGID_BODY = "(m1**2/I1 + m2**2/I2 + m3**2/I3)/2"
+SO3 = [[0, "-m3", "m2"], ["m3", 0, "-m1"], ["-m2", "m1", 0]]
+INERTIA = {"I1": 1.0, "I2": 2.0, "I3": 3.0}
+DOUBLE_PENDULUM = (
+    "(m2*l2**2*p1**2 + (m1 + m2)*l1**2*p2**2 - 2*m2*l1*l2*p1*p2*cos(th1 - th2))"
+    " / (2*m2*l1**2*l2**2*(m1 + m2*sin(th1 - th2)**2)) - (m1 + m2)*g*l1*cos(th1) - m2*g*l2*cos(th2)"
+)
+TWO_RODS = {"m1": 1.0, "m2": 0.5, "l1": 1.0, "l2": 0.7, "g": 9.81}

@@ -12,9 +12,13 @@ from eip_scipy.problems import mechanics, mechanism
 from eip_scipy.tangent_maps import lyapunov_spectrum, megno
 
 G = 9.81
-SPAN = (0.0, 1.0)
 OPTIONS = {"method": EIPDOP853, "h": 0.02}
 TIGHT = {"method": EIPDOP853, "rtol": 1e-12, "atol": 1e-12}
+LATER = (pytest.mark.nightly, pytest.mark.slow)  # each jitted system takes many seconds to compile
+
+
+def plain(function):
+    return function
 
 
 def torque(t, q, u):
@@ -25,70 +29,61 @@ def potential(t, q):
     return -G * np.cos(q[0])
 
 
-def pendulum(jit=njit, **options):
-    return mechanism([1.0], jit(torque), q0=[1.0], u0=[0], t_span=SPAN, potential_energy=jit(potential), **options)
+def mass_of_two(q):
+    return np.array([[2.0, np.cos(q[0] - q[1])], [np.cos(q[0] - q[1]), 1.0]])
 
 
-def double_pendulum():
-    @njit
-    def mass(q):
-        return np.array([[2.0, np.cos(q[0] - q[1])], [np.cos(q[0] - q[1]), 1.0]])
-
-    @njit
-    def forces(t, q, u):
-        sine = np.sin(q[0] - q[1])
-        return np.array([-(u[1] ** 2) * sine - 2 * G * np.sin(q[0]), u[0] ** 2 * sine - G * np.sin(q[1])])
-
-    return mechanism(mass, forces, q0=[1, 0.5], u0=[0, 0.2], t_span=SPAN)
+def forces_on_two(t, q, u):
+    sine = np.sin(q[0] - q[1])
+    return np.array([-(u[1] ** 2) * sine - 2 * G * np.sin(q[0]), u[0] ** 2 * sine - G * np.sin(q[1])])
 
 
-def driven():
-    @njit
-    def forces(t, q, u):
-        last = -(q[2] ** 3) + np.sin(t) * q[0]
-        return np.array([-q[0] - 0.1 * q[1] ** 2, -q[1] - 0.2 * q[0] * q[1] - 0.1 * u[1], last])
-
-    return mechanism([1, 2, 3], forces, q0=[1, 0.5, 0.3], u0=[0, 0.1, 0], t_span=SPAN)
+def driven(t, q, u):
+    last = -(q[2] ** 3) + np.sin(t) * q[0]
+    return np.array([-q[0] - 0.1 * q[1] ** 2, -q[1] - 0.2 * q[0] * q[1] - 0.1 * u[1], last])
 
 
-@njit
 def circle(t, q):
     return np.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2])
 
 
-@njit
 def twice(t, q):
     return np.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2, np.sqrt(q[0] ** 2 + q[1] ** 2) - 1])
 
 
-@njit
 def moving(t, q):
     return np.array([((q[0] - np.sin(t)) ** 2 + q[1] ** 2 - 1) / 2])
 
 
-@njit
 def sphere(t, q):
     return np.array([(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 - 1) / 2])
 
 
-def skate():
-    return mechanism(
-        [1, 1, 0.5], [0, G * 0.1, 0], q0=[0, 0, 0.3], u0=[np.cos(0.3), np.sin(0.3), 0.7], t_span=SPAN,
-        velocity_constraints=njit(lambda t, q, u: np.array([u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])])),
-    )  # fmt: skip
+def skate(t, q, u):
+    return np.array([u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])])
 
 
+PENDULUM = {"mass": [1.0], "forces": torque, "q0": [1.0], "u0": [0], "potential_energy": potential}
+FALLING = {"mass": [1, 1], "forces": [0, -G], "q0": [1, 0], "u0": [0, 0.5]}
 SYSTEMS = {
-    "1, free": pendulum,
-    "1, other speed": lambda: pendulum(kinematics=njit(lambda t, q, u: u * (1 + q[0] ** 2))),
-    "2, free": double_pendulum,
-    "2, circle": lambda: mechanism([1, 1], [0, -G], circle, q0=[1, 0], u0=[0, 0.5], t_span=SPAN),
-    "2, circle twice": lambda: mechanism([1, 1], [0, -G], twice, q0=[1, 0], u0=[0, 0.5], t_span=SPAN),
-    "2, moving circle": lambda: mechanism([1, 1], [0, -G], moving, q0=[1, 0], u0=[1, 0], t_span=SPAN),
-    "3, free": driven,
-    "3, sphere": lambda: mechanism([1, 1, 1], [0, 0, -G], sphere, q0=[1, 0, 0], u0=[0, 0.5, 0.3], t_span=SPAN),
-    "3, skate": skate,
-}
+    "1, free": PENDULUM,
+    "1, other speed": PENDULUM | {"kinematics": lambda t, q, u: u * (1 + q[0] ** 2)},
+    "2, free": {"mass": mass_of_two, "forces": forces_on_two, "q0": [1, 0.5], "u0": [0, 0.2]},
+    "2, circle": FALLING | {"constraints": circle},
+    "2, circle twice": FALLING | {"constraints": twice},
+    "2, moving circle": FALLING | {"constraints": moving, "u0": [1, 0]},
+    "3, free": {"mass": [1, 2, 3], "forces": driven, "q0": [1, 0.5, 0.3], "u0": [0, 0.1, 0]},
+    "3, sphere": {"mass": [1, 1, 1], "forces": [0, 0, -G], "constraints": sphere, "q0": [1, 0, 0], "u0": [0, 0.5, 0.3]},
+    "3, skate": {
+        "mass": [1, 1, 0.5], "forces": [0, G * 0.1, 0], "velocity_constraints": skate,
+        "q0": [0, 0, 0.3], "u0": [np.cos(0.3), np.sin(0.3), 0.7],
+    },
+}  # fmt: skip
+
+
+def system(name, jit=njit):
+    given = {key: jit(item) if callable(item) else item for key, item in SYSTEMS[name].items()}
+    return mechanism(**given, t_span=(0.0, 1.0))
 
 
 def along_constraints(problem):
@@ -98,7 +93,7 @@ def along_constraints(problem):
         return np.eye(n)
     (item,) = problem.constraints
     gradient = np.zeros((item.size, n))
-    getattr(item.gradient, "py_func", item.gradient)(0.0, y, gradient, *item.args)
+    item.gradient(0.0, y, gradient, *item.args)
     _, sizes, rows = np.linalg.svd(gradient)
     return rows[np.sum(sizes > 1e-9) :].T
 
@@ -116,17 +111,17 @@ def flow_differences(problem, directions, step=1e-4):
     return np.array(found).T
 
 
-FAST = ("2, circle twice",)  # each takes many seconds to compile
-LATER = [pytest.mark.nightly, pytest.mark.slow]
+GATE = ("2, circle twice",)
 
 
-@pytest.mark.parametrize("name", [name if name in FAST else pytest.param(name, marks=LATER) for name in SYSTEMS])
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("name", [name if name in GATE else pytest.param(name, marks=LATER) for name in SYSTEMS])
 def test_columns_are_differences_of_the_flow(name):
-    problem = SYSTEMS[name]()
-    run, plain = integrate(problem, variations="state", **OPTIONS), integrate(problem, **OPTIONS)
+    """The flow is that of functions that are not jitted, whose compilation would take as long again."""
+    problem = system(name, plain)
+    run, bare = integrate(system(name), variations="state", **OPTIONS), integrate(problem, **OPTIONS)
     assert run.trusted
-    assert plain.trusted
-    np.testing.assert_array_equal(run.y, plain.y)
+    np.testing.assert_allclose(run.y, bare.y, rtol=0, atol=1e-13)
     directions = along_constraints(problem)
     expected = flow_differences(problem, directions)
     np.testing.assert_allclose(run.stm[-1] @ directions, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
@@ -139,9 +134,11 @@ def period_and_slope(angle, omega):
     return 4 * K / omega, 4 * slope / omega
 
 
-def test_matrix_of_a_pendulum_after_its_period():
+@pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[*LATER, pytest.mark.needs_jit])])
+def test_matrix_of_a_pendulum_after_its_period(jit):
     period, slope = period_and_slope(1.0, np.sqrt(G))
-    run = integrate(pendulum(), t_span=(0, period), variations="state", **TIGHT)
+    run = integrate(system("1, free", jit), t_span=(0, period), variations="state", **TIGHT)
+    assert (run.columns["source"] == "complex steps") is (jit is plain)
     assert run.trusted
     np.testing.assert_allclose(run.y[:, -1], [1, 0], atol=1e-10)
     # A change of the angle changes the phase after the period by that of the period. The other column is the flow.
@@ -156,7 +153,7 @@ def test_derivatives_by_parameters_of_a_model():
     P.set_vel(N, v * N.x)
     model = me.KanesMethod(N, [x], [v], kd_eqs=[x.diff() - v])
     model.kanes_equations([me.Particle("A", P, m)], [(P, -k * sympy.sin(x) * N.x)])
-    problem = mechanics(model, {m: 2, k: 3}, {x: 1}, {v: 0}, t_span=SPAN)
+    problem = mechanics(model, {m: 2, k: 3}, {x: 1}, {v: 0})
     period = period_and_slope(1.0, np.sqrt(1.5))[0]
     run = integrate(problem, t_span=(0, period), variations=["state", "k", "m"], **TIGHT)
     assert run.trusted
@@ -175,8 +172,8 @@ def equation(t, y):
 @pytest.mark.slow
 @pytest.mark.slow_without_jit
 def test_tangent_maps_are_those_of_the_equation():
-    problem, start = pendulum(), [1.0, 0.0]
-    both = [(problem, ()), (equation, (start,))]
+    problem = system("1, free")
+    both = [(problem, ()), (equation, ([1.0, 0.0],))]
     kept = {"invariants": problem.invariants}
     one, two = (lyapunov_spectrum(fun, (0, 20), *y0, **OPTIONS, **kept).exponents for fun, y0 in both)
     np.testing.assert_allclose(one, two, rtol=1e-6)
@@ -186,18 +183,11 @@ def test_tangent_maps_are_those_of_the_equation():
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_plain_functions_give_columns_too():
-    found, right = (integrate(pendulum(jit), variations="state", **TIGHT) for jit in (lambda f: f, njit))
-    assert found.columns["source"] == "complex steps"
-    assert found.trusted
-    np.testing.assert_allclose(found.stm[-1], right.stm[-1], atol=1e-10)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_members_have_the_columns_of_their_runs():
-    problem = SYSTEMS["2, circle"]()
+def test_members_have_the_columns_of_their_runs_and_columns_change_no_state():
+    problem = system("2, circle")
     starts = np.array([[1.0, 0, 0, 0], [0.6, -0.8, 0, 0]])
-    members = ensemble(problem, SPAN, starts, variations="state", **OPTIONS)
+    members = ensemble(problem, problem.t_span, starts, variations="state", **OPTIONS)
     for y0, columns in zip(starts, members.variations, strict=True):
-        np.testing.assert_array_equal(columns, integrate(problem, SPAN, y0, variations="state", **OPTIONS).stm[-1])
+        run, bare = (integrate(problem, y0=y0, variations=asked, **OPTIONS) for asked in ("state", None))
+        np.testing.assert_array_equal(columns, run.stm[-1])
+        np.testing.assert_array_equal(run.y, bare.y)

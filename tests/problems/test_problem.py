@@ -8,36 +8,29 @@ import pytest
 from numba import njit
 
 from eip_scipy import EIPRK4, EIPRK45, Balance, Invariant, integrate
-from eip_scipy.problems import Problem, comet, harmonic, kepler
-from eip_scipy.problems.gravity.nbody import nbody
-from eip_scipy.problems.gravity.scenes import pythagorean
-from eip_scipy.problems.time_transformed import centre_time, time_transformed
+from eip_scipy.problems import Problem, centre_time, comet, harmonic, kepler, nbody, pythagorean, time_transformed
 from eip_scipy_studies.condensates.problems import plane_wave, rotating_packet, soliton
 from eip_scipy_studies.hard_cases import hard_cases
 
-MAKERS = [kepler, lambda: kepler(relativistic=0), harmonic, pythagorean, comet, soliton]
-MAKERS += [lambda: plane_wave((8, 8)), lambda: rotating_packet(points=8)]
+MADE = [kepler(), kepler(relativistic=0), harmonic(), pythagorean(), comet(), soliton(), plane_wave((8, 8))]
+PACKET = rotating_packet(points=8)
 
 
-@pytest.mark.parametrize("problem", [*(make() for make in MAKERS), *(case.problem for case in hard_cases())], ids=str)
-def test_prints_in_five_lines_and_pickles(problem):
-    lines = repr(problem).splitlines()
-    assert len(lines) == 5
-    assert lines[0].startswith(f"{problem.name}: y = (")
-    again = pickle.loads(pickle.dumps(problem))
-    assert repr(again) == repr(problem)
-    t, y = problem.t_span[0], problem.y0
-    np.testing.assert_array_equal(again.y0, y)
-    np.testing.assert_array_equal(again.fun(t, y), problem.fun(t, y))
-    for one, other in zip(problem.invariants, again.invariants, strict=True):
-        np.testing.assert_array_equal(one.fun(t, y, *one.args), other.fun(t, y, *other.args))
-    if problem.reference is not None:
-        np.testing.assert_array_equal(again.reference(problem.t_span[1]), problem.reference(problem.t_span[1]))
-
-
-def test_a_pickled_problem_runs():
-    problem = rotating_packet(points=8)
-    runs = [integrate(p, (0, 0.01), method=EIPRK4, h=0.002) for p in (problem, pickle.loads(pickle.dumps(problem)))]
+def test_problems_print_in_five_lines_and_pickle():
+    for problem in (*MADE, PACKET, *(case.problem for case in hard_cases())):
+        lines = repr(problem).splitlines()
+        assert len(lines) == 5, problem.name
+        assert lines[0].startswith(f"{problem.name}: y = (")
+        again = pickle.loads(pickle.dumps(problem))
+        assert repr(again) == repr(problem)
+        t, y = problem.t_span[0], problem.y0
+        np.testing.assert_array_equal(again.y0, y)
+        np.testing.assert_array_equal(again.fun(t, y), problem.fun(t, y))
+        for one, other in zip(problem.invariants, again.invariants, strict=True):
+            np.testing.assert_array_equal(one.fun(t, y, *one.args), other.fun(t, y, *other.args))
+        if problem.reference is not None:
+            np.testing.assert_array_equal(again.reference(problem.t_span[1]), problem.reference(problem.t_span[1]))
+    runs = [integrate(p, (0, 0.01), method=EIPRK4, h=0.002) for p in (PACKET, pickle.loads(pickle.dumps(PACKET)))]
     np.testing.assert_array_equal(*(run.y for run in runs))
 
 
@@ -72,11 +65,6 @@ def test_component_names():
         replace(kepler(), component_names=["a", "b"])
 
 
-@pytest.mark.needs_jit
-def test_component_names_in_fictitious_time():
-    assert time_transformed(kepler(), 1.0, centre_time).component_names == ("x", "y", "vx", "vy", "t")
-
-
 def test_solve_ivp():
     problem = kepler()
     sol = problem.solve_ivp((0, 3), method=EIPRK4)
@@ -89,21 +77,13 @@ def test_solve_ivp():
     assert adaptive.t.tolist() == [1.0, 3.0]
     with pytest.raises(TypeError, match="no y0"):
         replace(problem, y0=None).solve_ivp(method=EIPRK4)
-
-
-def test_solve_ivp_by_a_method_of_scipy_gets_no_options_of_ours():
+    # A method of SciPy gets no options of ours.
     sol = harmonic().solve_ivp((0, 1), method="DOP853", rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(sol.y[:, -1], harmonic().reference(1.0), rtol=1e-9)
 
 
-def test_a_balance_is_not_written_in_another_time():
-    balance = Balance(lambda t, y: y @ y, lambda t, y: 0.0, lambda t, y: 2 * y, name="B")
-    with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is a derivative with respect to time"):
-        time_transformed(replace(kepler(), invariants=(balance,)), 1.0, centre_time)
-
-
 @pytest.mark.needs_jit
-def test_an_invariant_that_depends_on_time_is_not_written_in_another_time():
+def test_what_is_written_in_another_time():
     """x - t is constant for x' = 1; its gradient with respect to x is right, but says nothing about t."""
 
     @njit
@@ -116,5 +96,9 @@ def test_an_invariant_that_depends_on_time_is_not_written_in_another_time():
     problem = Problem("drift", lambda t, y: np.array([1.0, 0.0]), np.zeros(2), (0, 1), rhs=rhs, invariants=(kept,))
     with pytest.raises(ValueError, match=r"Invariant\(X\) depends on t, but the gradient"):
         time_transformed(problem, 1.0, g)
+    balance = Balance(lambda t, y: y @ y, lambda t, y: 0.0, lambda t, y: 2 * y, name="B")
+    with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is a derivative with respect to time"):
+        time_transformed(replace(kepler(), invariants=(balance,)), 1.0, centre_time)
+    assert time_transformed(kepler(), 1.0, centre_time).component_names == ("x", "y", "vx", "vy", "t")
     run = integrate(time_transformed(replace(problem, invariants=()), 1.0, g), method=EIPRK4, h=0.1)
     np.testing.assert_allclose(run.y[:, -1], [2.0, 0.0, 2.0], rtol=1e-14)

@@ -3,7 +3,6 @@
 import json
 from contextlib import contextmanager
 from fractions import Fraction
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,27 +20,17 @@ PAPER_EPOCH = (2456690.5, 20.3 / 24)
 
 # The initial state of the reference integration (heyoka): q in AU, v in AU/day.
 REFERENCE_START = {
-    "Sun": (
-        [0.0011837989640206819, -0.0019751320625288203, -0.0009627533357508251],
-        [5.919466866060189e-06, 2.534786548891469e-06, 9.490901114024805e-07],
-    ),
-    "Mercury": (
-        [0.10566532764145072, 0.25786427170274223, 0.12700705491725772],
-        [-0.0320884478530974, 0.008240231361241931, 0.007728730171212083],
-    ),
-    "EMB": (
-        [-0.6799288657473626, 0.6516166597956654, 0.2823810429256934],
-        [-0.01270907388166279, -0.010965268400595932, -0.004753730096071036],
-    ),
-    "Jupiter": (
-        [-1.5708001515677827, 4.544032667294449, 1.985854963834807],
-        [-0.007285431545104389, -0.0018307762686907642, -0.0006073485570974863],
-    ),
-    "Pluto": (
-        [6.360917863978618, -29.920450772357672, -11.253771308526709],
-        [0.0031396372778564564, 0.000341341610671427, -0.000839441198044002],
-    ),
-}
+    "Sun": ([0.0011837989640206819, -0.0019751320625288203, -0.0009627533357508251],
+             [5.919466866060189e-06, 2.534786548891469e-06, 9.490901114024805e-07]),
+    "Mercury": ([0.10566532764145072, 0.25786427170274223, 0.12700705491725772],
+             [-0.0320884478530974, 0.008240231361241931, 0.007728730171212083]),
+    "EMB": ([-0.6799288657473626, 0.6516166597956654, 0.2823810429256934],
+             [-0.01270907388166279, -0.010965268400595932, -0.004753730096071036]),
+    "Jupiter": ([-1.5708001515677827, 4.544032667294449, 1.985854963834807],
+             [-0.007285431545104389, -0.0018307762686907642, -0.0006073485570974863]),
+    "Pluto": ([6.360917863978618, -29.920450772357672, -11.253771308526709],
+             [0.0031396372778564564, 0.000341341610671427, -0.000839441198044002]),
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -78,242 +67,193 @@ def energy_and_angular_momentum(gm, y):
     return 0.5 * np.sum(gm * np.sum(v**2, axis=1)) - potential, gm @ np.cross(q, v)
 
 
-class TestEmbedded:
-    def test_available(self):
-        assert solar_data.available() == NAMES
-
-    @pytest.mark.parametrize("name", NAMES)
-    def test_shapes_and_labels(self, name):
-        data = solar_data.load(name)
-        assert data.name == name
-        n = 11 if name == "de440-moon" else 10
-        assert len(data.bodies) == n
-        assert data.bodies[0] == "Sun"
-        assert data.gm.shape == (n,)
-        assert data.position.shape == data.velocity.shape == (n, 3)
-        assert data.units == "AU, day"
-        assert data.epoch.endswith(" TDB")
-        assert data.axes == ("ecliptic J2000" if name == "paper" else "ICRF")
-
-    @pytest.mark.parametrize("name", NAMES)
-    def test_barycentre_rests_at_the_origin(self, name):
-        data = solar_data.load(name)
-        for rows in (data.position, data.velocity):
-            assert np.all(np.abs(data.gm @ rows) <= 4 * EPS * (data.gm @ np.abs(rows)))
-
-    def test_y0_is_positions_then_velocities(self):
-        data = solar_data.load("de440")
-        assert data.y0.shape == (60,)
-        np.testing.assert_array_equal(data.y0[:30].reshape(10, 3), data.position)
-        np.testing.assert_array_equal(data.y0[30:].reshape(10, 3), data.velocity)
-
-    def test_arrays_are_fresh(self):
-        solar_data.load("de440").gm[0] = 0.0
-        assert solar_data.load("de440").gm[0] > 0.0
-
-    def test_epochs(self):
-        assert solar_data.load("de440").epoch_jd_tdb == sum(PAPER_EPOCH) == solar_data.load("paper").epoch_jd_tdb
-        assert solar_data.load("de440-j2000").epoch_jd_tdb == 2451545.0
-
-    def test_earth_and_moon_make_up_their_barycentre(self):
-        one, two = solar_data.load("de440"), solar_data.load("de440-moon")
-        assert two.bodies == (*one.bodies[:3], "Earth", "Moon", *one.bodies[4:])
-        assert two.gm[3] + two.gm[4] == pytest.approx(one.gm[3], rel=1e-14)
-        for a, b in ((one.position, two.position), (one.velocity, two.velocity)):
-            assert_allclose(two.gm[3:5] @ b[3:5] / two.gm[3:5].sum(), a[3], rtol=0, atol=1e-14)
-            assert_allclose(np.delete(b, [3, 4], 0), np.delete(a, 3, 0), rtol=0, atol=2e-17 + 1e-15 * np.abs(a).max())
-        assert 3.56e5 < np.linalg.norm(two.position[4] - two.position[3]) * AU_KM < 4.07e5
-
-    def test_default_equals_start_of_reference(self):
-        data = solar_data.load()
-        assert data.gm[0] == 0.00029591220828411956
-        for body, (q, v) in REFERENCE_START.items():
-            i = data.bodies.index(body)
-            # The last bits of the Sun depend on how the barycentre is summed; the planets' do not.
-            rtol = 4 * EPS if body == "Sun" else 0.0
-            assert_allclose(data.position[i], q, rtol=rtol, atol=0)
-            assert_allclose(data.velocity[i], v, rtol=rtol, atol=0)
-
-    def test_unknown_name(self):
-        with pytest.raises(ValueError, match=r"'de441'; available: 'de440', 'de440-j2000', 'paper'"):
-            solar_data.load("de441")
-
-    def test_as_printed_is_for_the_paper(self):
-        with pytest.raises(ValueError, match="as_printed=True is an option of the set 'paper'"):
-            solar_data.load("de440", as_printed=True)
+# The embedded sets.
 
 
-class TestReference:
-    def test_layout(self):
-        states = solar_data.reference_states("de440")
-        assert list(states) == [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
-        assert all(y.shape == (60,) for y in states.values())
-
-    def test_states_keep_the_invariants_of_the_initial_data(self):
-        data = solar_data.load("de440")
-        energy, momentum = energy_and_angular_momentum(data.gm, data.y0)
-        problem = solar_system()
-        pairs = [zip(problem.params, axis, strict=True) for axis in problem.y0[30:].reshape(10, 3).T]
-        drift = np.array([float(sum(Fraction(gm) * Fraction(v) for gm, v in axis)) for axis in pairs]) / YEAR_D**2
-        for years, y in solar_data.reference_states("de440").items():
-            e, m = energy_and_angular_momentum(data.gm, y)
-            assert_allclose(e, energy, rtol=2e-15)
-            assert_allclose(m, momentum, rtol=0, atol=1e-15 * np.linalg.norm(momentum))
-            centre = data.gm @ y[:30].reshape(10, 3) - years * drift  # the momentum is 0 up to rounding
-            assert np.max(np.abs(centre)) < 1e-15 * data.gm[0]
-
-    def test_first_year_against_scipy(self):
-        data = solar_data.load("de440")
-
-        def fun(t, y):
-            q, v = y.reshape(2, 10, 3)
-            d = q[None] - q[:, None]
-            r = np.linalg.norm(d, axis=2) + np.eye(10)
-            return np.concatenate([v.ravel(), np.einsum("j,ijk->ik", data.gm, d / r[..., None] ** 3).ravel()])
-
-        sol = solve_ivp(fun, (0, YEAR_D), data.y0, method="DOP853", rtol=1e-13, atol=1e-16)
-        assert_allclose(sol.y[:, -1], solar_data.reference_states()[1.0], rtol=0, atol=1e-11)
-
-    @pytest.mark.parametrize(
-        ("name", "message"), [("paper", "exist for 'de440' only"), ("de441", "available: 'de440'")]
-    )
-    def test_other_sets_have_none(self, name, message):
-        with pytest.raises(ValueError, match=message):
-            solar_data.reference_states(name)
+def test_available_sets_and_their_errors():
+    assert solar_data.available() == NAMES
+    for call, says in [
+        (lambda: solar_data.load("de441"), r"'de441'; available: 'de440', 'de440-j2000', 'paper'"),
+        (lambda: solar_data.load("de440", as_printed=True), "as_printed=True is an option of the set 'paper'"),
+        (lambda: solar_data.reference_states("paper"), "exist for 'de440' only"),
+        (lambda: solar_data.reference_states("de441"), "available: 'de440'"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            call()
 
 
-class TestPaper:
-    def test_sun_is_added(self):
-        data = solar_data.load("paper")
-        assert_allclose(data.gm[0], solar_data.load("de440").gm[0], rtol=4 * EPS)
-        assert_allclose(heliocentric_km(data, "Mercury")[0][0], 1.563021412664830e7, rtol=0, atol=1e-6)
-        assert_allclose(data.gm[1] * AU_KM**3 / DAY_S**2, 2.203209e4, rtol=1e-15)
+@pytest.mark.parametrize("name", NAMES)
+def test_shapes_labels_and_barycentres_at_rest(name):
+    data, n = solar_data.load(name), 11 if name == "de440-moon" else 10
+    assert (data.name, data.bodies[0], len(data.bodies), data.units) == (name, "Sun", n, "AU, day")
+    assert data.gm.shape == (n,)
+    assert data.position.shape == data.velocity.shape == (n, 3)
+    assert data.epoch_jd_tdb == (2451545.0 if name == "de440-j2000" else sum(PAPER_EPOCH))
+    assert data.epoch.endswith(" TDB")
+    assert data.axes == ("ecliptic J2000" if name == "paper" else "ICRF")
+    np.testing.assert_array_equal(data.y0, np.concatenate([data.position, data.velocity], axis=None))
+    for rows in (data.position, data.velocity):
+        assert np.all(np.abs(data.gm @ rows) <= 4 * EPS * (data.gm @ np.abs(rows)))
+    data.gm[0] = 0.0
+    assert solar_data.load(name).gm[0] > 0.0
 
-    @pytest.mark.parametrize(("body", "km"), [("Mercury", 0.13), ("Venus", 0.11), ("Earth", 0.15), ("Mars", 0.23)])
-    def test_inner_planets_agree_with_de440(self, planets, body, km):
-        q, v = heliocentric_km(solar_data.load("paper"), body)
+
+def test_earth_and_moon_make_up_their_barycentre():
+    one, two = solar_data.load("de440"), solar_data.load("de440-moon")
+    assert two.bodies == (*one.bodies[:3], "Earth", "Moon", *one.bodies[4:])
+    assert two.gm[3] + two.gm[4] == pytest.approx(one.gm[3], rel=1e-14)
+    for a, b in ((one.position, two.position), (one.velocity, two.velocity)):
+        assert_allclose(two.gm[3:5] @ b[3:5] / two.gm[3:5].sum(), a[3], rtol=0, atol=1e-14)
+        assert_allclose(np.delete(b, [3, 4], 0), np.delete(a, 3, 0), rtol=0, atol=2e-17 + 1e-15 * np.abs(a).max())
+    assert 3.56e5 < np.linalg.norm(two.position[4] - two.position[3]) * AU_KM < 4.07e5
+
+
+def test_default_equals_start_of_reference():
+    data = solar_data.load()
+    assert data.gm[0] == 0.00029591220828411956
+    for body, (q, v) in REFERENCE_START.items():
+        i = data.bodies.index(body)
+        # The last bits of the Sun depend on how the barycentre is summed; the planets' do not.
+        rtol = 4 * EPS if body == "Sun" else 0.0
+        assert_allclose(data.position[i], q, rtol=rtol, atol=0)
+        assert_allclose(data.velocity[i], v, rtol=rtol, atol=0)
+
+
+# The reference states.
+
+
+def test_states_keep_the_invariants_of_the_initial_data():
+    data, states = solar_data.load("de440"), solar_data.reference_states("de440")
+    assert list(states) == [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
+    energy, momentum = energy_and_angular_momentum(data.gm, data.y0)
+    problem = solar_system()
+    pairs = [zip(problem.params, axis, strict=True) for axis in problem.y0[30:].reshape(10, 3).T]
+    drift = np.array([float(sum(Fraction(gm) * Fraction(v) for gm, v in axis)) for axis in pairs]) / YEAR_D**2
+    for years, y in states.items():
+        e, m = energy_and_angular_momentum(data.gm, y)
+        assert_allclose(e, energy, rtol=2e-15)
+        assert_allclose(m, momentum, rtol=0, atol=1e-15 * np.linalg.norm(momentum))
+        centre = data.gm @ y[:30].reshape(10, 3) - years * drift  # the momentum is 0 up to rounding
+        assert np.max(np.abs(centre)) < 1e-15 * data.gm[0]
+
+
+def test_first_year_against_scipy():
+    data = solar_data.load("de440")
+
+    def fun(t, y):
+        q, v = y.reshape(2, 10, 3)
+        d = q[None] - q[:, None]
+        r = np.linalg.norm(d, axis=2) + np.eye(10)
+        return np.concatenate([v.ravel(), np.einsum("j,ijk->ik", data.gm, d / r[..., None] ** 3).ravel()])
+
+    sol = solve_ivp(fun, (0, YEAR_D), data.y0, method="DOP853", rtol=1e-13, atol=1e-16)
+    assert_allclose(sol.y[:, -1], solar_data.reference_states()[1.0], rtol=0, atol=1e-11)
+
+
+# The paper's set.
+
+
+def test_the_papers_sun_is_added():
+    data = solar_data.load("paper")
+    assert_allclose(data.gm[0], solar_data.load("de440").gm[0], rtol=4 * EPS)
+    assert_allclose(heliocentric_km(data, "Mercury")[0][0], 1.563021412664830e7, rtol=0, atol=1e-6)
+    assert_allclose(data.gm[1] * AU_KM**3 / DAY_S**2, 2.203209e4, rtol=1e-15)
+
+
+def test_the_papers_planets_agree_with_de440(planets):
+    data = solar_data.load("paper")
+    for body, km in [("Mercury", 0.13), ("Venus", 0.11), ("Earth", 0.15), ("Mars", 0.23)]:
+        q, v = heliocentric_km(data, body)
         assert np.linalg.norm(q - planets[body][0]) < km
         assert np.linalg.norm(v - planets[body][1]) < 3e-7
-
-    def test_mars_misprint(self, planets):
-        _, printed = heliocentric_km(solar_data.load("paper", as_printed=True), "Mars")
-        _, corrected = heliocentric_km(solar_data.load("paper"), "Mars")
-        assert_allclose(printed[2] * 1e3, -3.711433859326417e-02, rtol=1e-12)
-        assert_allclose(corrected[2] * 1e3, -3.711433859326417e02, rtol=1e-14)
-        assert_allclose(corrected, planets["Mars"][1], rtol=0, atol=1e-7)
-        assert_allclose(printed[:2], corrected[:2], rtol=1e-14)
-
-    def test_jupiter_is_a_planet_centre(self, planets):
-        q, _ = heliocentric_km(solar_data.load("paper"), "Jupiter")
-        assert_allclose(np.linalg.norm(q - planets["Jupiter"][0]), 112, atol=1)
-
-    def test_mercury_against_astropy(self, kernel):
-        pytest.importorskip("astropy")
-        from astropy import units as u
-        from astropy.coordinates import ICRS, HeliocentricEclipticIAU76, get_body_barycentric, solar_system_ephemeris
-        from astropy.time import Time
-
-        time = Time(*PAPER_EPOCH, format="jd", scale="tdb")
-        with solar_system_ephemeris.set(str(kernel)):
-            mercury = ICRS(get_body_barycentric("mercury", time)).transform_to(HeliocentricEclipticIAU76(obstime=time))
-        q, _ = heliocentric_km(solar_data.load("paper"), "Mercury")
-        assert np.linalg.norm(q - mercury.cartesian.xyz.to_value(u.km)) < 0.2
+    # Jupiter is a planet centre, not the barycentre of its system.
+    assert_allclose(np.linalg.norm(heliocentric_km(data, "Jupiter")[0] - planets["Jupiter"][0]), 112, atol=1)
 
 
-class TestKernel:
-    def test_embedded_sets_come_from_the_kernel(self, kernel, tmp_path):
-        out = tmp_path / "solar_system.json"
-        jpl.main([str(kernel), "--out", str(out)])
-        extracted = json.loads(out.read_text())
-        assert tuple(extracted) == NAMES
-        for name in ("de440", "de440-j2000", "de440-moon"):
-            data, entry = solar_data.load(name), extracted[name]
-            assert (tuple(entry["bodies"]), entry["epoch"], entry["axes"]) == (data.bodies, data.epoch, data.axes)
-            for key in ("gm", "position", "velocity"):
-                assert_allclose(getattr(data, key), entry[key], rtol=4 * EPS, atol=0)
+def test_mars_misprint(planets):
+    printed, corrected = (
+        heliocentric_km(solar_data.load("paper", as_printed=printed), "Mars")[1] for printed in (True, False)
+    )
+    assert_allclose(printed[2] * 1e3, -3.711433859326417e-02, rtol=1e-12)
+    assert_allclose(corrected[2] * 1e3, -3.711433859326417e02, rtol=1e-14)
+    assert_allclose(corrected, planets["Mars"][1], rtol=0, atol=1e-7)
+    assert_allclose(printed[:2], corrected[:2], rtol=1e-14)
 
-    def test_any_epoch(self, kernel):
-        data = jpl.initial_data(2460000.5, kernel)
-        assert data.epoch == "2023-02-25 00:00:00 TDB"
-        assert data.epoch_jd_tdb == 2460000.5
-        assert data.axes == "ICRF"
-        assert "DE-0440" in data.source
-        for rows in (data.position, data.velocity):
-            assert np.all(np.abs(data.gm @ rows) <= 4 * EPS * (data.gm @ np.abs(rows)))
 
-    def test_two_parts_are_added_without_loss(self, kernel):
-        day, fraction = PAPER_EPOCH
-        data = jpl.initial_data(PAPER_EPOCH)
-        shifted = jpl.initial_data((day - 1000, 1000.0 + fraction), kernel)
-        single = jpl.initial_data(day + fraction, kernel)
-        assert_allclose(shifted.y0, data.y0, rtol=1e-13)
-        assert 1e-13 < np.max(np.abs(single.y0 - data.y0)) < 1e-11
-        assert single.epoch == data.epoch == solar_data.load("de440").epoch
+# The kernel.
 
-    @pytest.mark.parametrize("epoch", [2287184.4, 2688976.6, (2688976.5, 0.1)])
-    def test_outside_the_span(self, kernel, epoch):
+
+def test_embedded_sets_come_from_the_kernel(kernel, tmp_path):
+    out = tmp_path / "solar_system.json"
+    jpl.main([str(kernel), "--out", str(out)])
+    extracted = json.loads(out.read_text())
+    assert tuple(extracted) == NAMES
+    for name in ("de440", "de440-j2000", "de440-moon"):
+        data, entry = solar_data.load(name), extracted[name]
+        assert (tuple(entry["bodies"]), entry["epoch"], entry["axes"]) == (data.bodies, data.epoch, data.axes)
+        for key in ("gm", "position", "velocity"):
+            assert_allclose(getattr(data, key), entry[key], rtol=4 * EPS, atol=0)
+
+
+def test_epochs_in_one_or_two_parts(kernel):
+    data = jpl.initial_data(2460000.5, kernel)
+    assert (data.epoch, data.epoch_jd_tdb, data.axes) == ("2023-02-25 00:00:00 TDB", 2460000.5, "ICRF")
+    assert "DE-0440" in data.source
+    for rows in (data.position, data.velocity):
+        assert np.all(np.abs(data.gm @ rows) <= 4 * EPS * (data.gm @ np.abs(rows)))
+    day, fraction = PAPER_EPOCH
+    data, single = jpl.initial_data(PAPER_EPOCH), jpl.initial_data(day + fraction, kernel)
+    assert_allclose(jpl.initial_data((day - 1000, 1000.0 + fraction), kernel).y0, data.y0, rtol=1e-13)
+    assert 1e-13 < np.max(np.abs(single.y0 - data.y0)) < 1e-11
+    assert single.epoch == data.epoch == solar_data.load("de440").epoch
+    for epoch, text in [(2287184.5, "1549-12-31 00:00:00 TDB"), (2688976.5, "2650-01-25 00:00:00 TDB")]:
+        assert jpl.initial_data(epoch, kernel).epoch == text
+    for epoch in (2287184.4, 2688976.6, (2688976.5, 0.1)):
         with pytest.raises(ValueError, match=r"JD 2287184\.5 to 2688976\.5 TDB \(1549-12-31 to 2650-01-25\)"):
             jpl.initial_data(epoch, kernel)
-
-    def test_ends_of_the_span(self, kernel):
-        assert jpl.initial_data(2287184.5, kernel).epoch == "1549-12-31 00:00:00 TDB"
-        assert jpl.initial_data(2688976.5, kernel).epoch == "2650-01-25 00:00:00 TDB"
-
-    def test_epoch_not_finite(self, kernel):
-        with pytest.raises(ValueError, match="in one or two parts, got nan"):
-            jpl.initial_data(float("nan"), kernel)
-
-    def test_constants(self, kernel):
-        found = jpl.constants(kernel)
-        assert found["AU"] == AU_KM
-        assert found["CLIGHT"] == 299792.458
-        assert found["EMRAT"] == 81.300568221497215
-        assert found["DENUM"] == 440.0
-        assert found["J2SUN"] == 2.1961391516529825e-07
-        assert found["GMS"] == 2.9591220828411956e-04
-        assert found["GMSDOT"] == -9e-14
-
-    def test_mass_parameters_agree_with_constants(self, kernel):
-        found = jpl.mass_parameters(kernel)
-        assert found["GMS"] == 132712440041.279419
-        assert_allclose(found["GM3"] + found["GMM"], found["GMB"], rtol=1e-14)
-        exact = jpl.constants(kernel)
-        for key in ("GMS", "GM1", "GM2", "GMB", "GM4", "GM5", "GM6", "GM7", "GM8", "GM9"):
-            assert_allclose(solar_data.gm_from_km3_s2(found[key]), exact[key], rtol=2e-11)
-
-    @pytest.mark.parametrize("epoch", [2451545.0, 0.0])
-    def test_kernel_is_closed(self, kernel, monkeypatch, epoch):
-        from jplephem.spk import SPK
-
-        opened = []
-        original = SPK.open
-        monkeypatch.setattr(SPK, "open", lambda path: opened.append(original(path)) or opened[-1])
-        try:
-            jpl.initial_data(epoch, kernel)
-        except ValueError:
-            assert epoch == 0.0
-        assert opened
-        assert all(spk.daf.file.closed for spk in opened)
+    with pytest.raises(ValueError, match="in one or two parts, got nan"):
+        jpl.initial_data(float("nan"), kernel)
 
 
-class TestWithoutAKernel:
-    def test_path_of_the_user(self, tmp_path):
-        path = tmp_path / "own.bsp"
-        path.touch()
-        assert jpl.kernel_path(str(path)) == path
-        with pytest.raises(FileNotFoundError, match="no kernel at"):
-            jpl.kernel_path(tmp_path / "other.bsp")
+def test_constants_and_mass_parameters(kernel):
+    exact, found = jpl.constants(kernel), jpl.mass_parameters(kernel)
+    known = {"AU": AU_KM, "CLIGHT": 299792.458, "EMRAT": 81.300568221497215, "DENUM": 440.0, "GMSDOT": -9e-14}
+    known |= {"J2SUN": 2.1961391516529825e-07, "GMS": 2.9591220828411956e-04}
+    assert {key: exact[key] for key in known} == known
+    assert found["GMS"] == 132712440041.279419
+    assert_allclose(found["GM3"] + found["GMM"], found["GMB"], rtol=1e-14)
+    for key in ("GMS", "GM1", "GM2", "GMB", "GM4", "GM5", "GM6", "GM7", "GM8", "GM9"):
+        assert_allclose(solar_data.gm_from_km3_s2(found[key]), exact[key], rtol=2e-11)
 
-    def test_kernel_of_another_kind(self, monkeypatch):
-        @contextmanager
-        def satellites(path):
-            yield SimpleNamespace(pairs={(5, 501): None}, comments=lambda: "JUP365")
 
-        monkeypatch.setattr(jpl, "_open", satellites)
-        here = Path(__file__)
-        with pytest.raises(ValueError, match="no segment for Sun, Mercury"):
-            jpl.initial_data(2451545.0, here)
-        with pytest.raises(ValueError, match="list no constants"):
-            jpl.constants(here)
-        with pytest.raises(ValueError, match="no table of GM"):
-            jpl.mass_parameters(here)
+def test_a_kernel_is_closed(kernel, monkeypatch):
+    from jplephem.spk import SPK
+
+    opened, original = [], SPK.open
+    monkeypatch.setattr(SPK, "open", lambda path: opened.append(original(path)) or opened[-1])
+    jpl.initial_data(2451545.0, kernel)
+    with pytest.raises(ValueError, match="JD"):
+        jpl.initial_data(0.0, kernel)
+    assert len(opened) >= 2
+    assert all(spk.daf.file.closed for spk in opened)
+
+
+def test_kernels_of_the_user_and_of_another_kind(tmp_path, monkeypatch):
+    path = tmp_path / "own.bsp"
+    path.touch()
+    assert jpl.kernel_path(str(path)) == path
+    with pytest.raises(FileNotFoundError, match="no kernel at"):
+        jpl.kernel_path(tmp_path / "other.bsp")
+
+    @contextmanager
+    def satellites(path):
+        yield SimpleNamespace(pairs={(5, 501): None}, comments=lambda: "JUP365")
+
+    monkeypatch.setattr(jpl, "_open", satellites)
+    for call, says in [
+        (lambda: jpl.initial_data(2451545.0, path), "no segment for Sun, Mercury"),
+        (lambda: jpl.constants(path), "list no constants"),
+        (lambda: jpl.mass_parameters(path), "no table of GM"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            call()

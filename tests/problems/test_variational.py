@@ -1,41 +1,25 @@
 """Variational equations of problems: against differences of order 8 of their right-hand sides, at random states."""
 
+from dataclasses import replace
+from itertools import product
+
 import numpy as np
 import pytest
 from numba import njit
+from systems import DOUBLE_PENDULUM, HENON_HEILES, INERTIA, RELATIVISTIC_KEPLER, RIGID_BODY, SO3, TWO_RODS
 
 from eip_scipy import EIPDOP853, equations, hamiltonian, integrate
-from eip_scipy.core import jitted
-from eip_scipy.engine.native import library
-from eip_scipy.problems import ParticleField, charged_particle, harmonic, kepler, nbody
-from eip_scipy.problems.gravity.forces import ForceConstants
-from eip_scipy.problems.symbolic import system
+from eip_scipy.problems import ForceConstants, ParticleField, charged_particle, harmonic, kepler, nbody
 
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of central differences of order 8
 STEP = 2.0**-7
 RTOL = 1e-9  # of the largest number in a column
-NIGHTLY = pytest.mark.nightly
-PENDULUM = (
-    "(m2*l2**2*p1**2 + (m1 + m2)*l1**2*p2**2 - 2*m2*l1*l2*p1*p2*cos(th1 - th2))"
-    " / (2*m2*l1**2*l2**2*(m1 + m2*sin(th1 - th2)**2)) - (m1 + m2)*g*l1*cos(th1) - m2*g*l2*cos(th2)"
-)
 SYMBOLIC = {
-    "henon-heiles": lambda: hamiltonian("(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"),
-    "kepler": lambda: hamiltonian(
-        "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2) - eps/(2*(x**2 + y**2)**1.5)", params={"eps": 0.1}
-    ),
-    "double pendulum": lambda: hamiltonian(
-        PENDULUM, "th1 th2", "p1 p2", params={"m1": 1.0, "m2": 0.5, "l1": 1.0, "l2": 0.7, "g": 9.81}
-    ),
-    "rigid body": lambda: hamiltonian(
-        "(m1**2/I1 + m2**2/I2 + m3**2/I3)/2",
-        "m1 m2 m3",
-        poisson=[[0, "-m3", "m2"], ["m3", 0, "-m1"], ["-m2", "m1", 0]],
-        params={"I1": 1.0, "I2": 2.0, "I3": 3.0},
-    ),
-    "driven": lambda: hamiltonian(
-        "p**2/2 - cos(q) + a*q*sin(w*t)", params={"a": 0.3, "w": 1.7}, extended=True, name="driven"
-    ),
+    "henon-heiles": lambda: hamiltonian(HENON_HEILES),
+    "kepler": lambda: hamiltonian(RELATIVISTIC_KEPLER, params={"eps": 0.1}),
+    "double pendulum": lambda: hamiltonian(DOUBLE_PENDULUM, "th1 th2", "p1 p2", params=TWO_RODS),
+    "rigid body": lambda: hamiltonian(RIGID_BODY, "m1 m2 m3", poisson=SO3, params=INERTIA),
+    "driven": lambda: hamiltonian("p**2/2 - cos(q) + a*q*sin(w*t)", params={"a": 0.3, "w": 1.7}, extended=True),
     "friction": lambda: hamiltonian("p**2/2 + q**4/4", dissipation={"p": "-c*p"}, params={"c": 0.2}),
     "lorenz": lambda: equations(
         {"x": "s*(y - x)", "y": "x*(r - z) - y", "z": "x*y - b*z"}, params={"s": 10.0, "r": 28.0, "b": 8 / 3}
@@ -52,8 +36,9 @@ def difference(fun, x, along):
 
 
 def in_place(rhs, t, y, params):
+    """Return what a function writes, which is not compiled: there are many, and the expressions are the same."""
     out = np.full_like(y, np.nan)
-    rhs(t, y, out, *(() if params is None else (params,)))
+    getattr(rhs, "py_func", rhs)(t, y, out, *(() if params is None else (params,)))
     return out
 
 
@@ -75,41 +60,30 @@ def assert_variational(problem, y, rng, parameters=(), columns=3, t=0.4, rtol=RT
 # --- problems of expressions ---
 
 
-@pytest.mark.needs_jit
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow, NIGHTLY]) if name == "double pendulum" else name for name in SYMBOLIC],
-)
+@pytest.mark.parametrize("name", SYMBOLIC)
 def test_expressions(name):
     problem, rng = SYMBOLIC[name](), np.random.default_rng(1)
-    count = len(problem.system.parameters)
+    count = len(problem.parameters)
     for parameters in {(), tuple(range(count)), tuple(range(count))[::-2]}:
-        y = rng.uniform(0.3, 1.3, len(problem.system.components))
+        y = rng.uniform(0.3, 1.3, len(problem.component_names))
         assert_variational(problem, y, rng, parameters, columns=0 if parameters else 3)
         assert_variational(problem, y, rng, parameters, columns=2)
 
 
-@pytest.mark.parametrize("name", ["kepler", "functions"])
-def test_expressions_without_numba(monkeypatch, name):
-    caches = system._functions, system._with_columns
-    monkeypatch.setattr(jitted, "find_spec", lambda name: None)
-    for cached in caches:
-        cached.cache_clear()
-    problem, rng = SYMBOLIC[name](), np.random.default_rng(2)
-    assert not jitted.is_jitted(problem.variational(()))
-    assert_variational(problem, rng.uniform(0.3, 1.3, len(problem.system.components)), rng, (0,), columns=1)
-    for cached in caches:
-        cached.cache_clear()
-
-
-def test_expressions_that_have_no_derivative():
-    problem = equations({"x": "y", "y": "sign(x)"}, params={"a": 1.0})
-    with pytest.raises(ValueError, match="the derivative of y jumps where x is 0"):
-        problem.variational(())
-    with pytest.raises(ValueError, match="no parameter 1; expected indices of"):
-        problem.variational((1,))
-    with pytest.raises(ValueError, match="no parameter -1"):
-        problem.variational((-1,))
+@pytest.mark.needs_jit
+def test_compiled_columns_are_those_of_the_expressions_and_check_sizes():
+    problem, Y, out = SYMBOLIC["lorenz"](), np.random.default_rng(2).uniform(0.3, 1.3, 9), np.empty(9)
+    columns, params = problem.variational((0,)), problem.params
+    columns(0.4, Y, out, params)
+    np.testing.assert_allclose(out, in_place(columns, 0.4, Y, params), rtol=1e-14)
+    for arguments, says in [
+        ((np.ones(3), np.ones(3), params), "3 numbers each, and at least 1 columns"),
+        ((np.ones(7), np.ones(7), params), "3 numbers each"),
+        ((np.ones(6), np.ones(3), params), "out must be as long as y"),
+        ((np.ones(6), np.ones(6), params[:2]), "params must hold as many numbers"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            columns(0.0, *arguments)
 
 
 BRANCHES = {  # forces that are continuous where the functions change their branches
@@ -122,62 +96,51 @@ BRANCHES = {  # forces that are continuous where the functions change their bran
 }
 
 
-@pytest.mark.parametrize("name", BRANCHES)
-def test_continuous_forces_with_branches_have_derivatives(name):
+def test_continuous_forces_with_branches_have_derivatives():
     """States are away from the branches, where differences of order 8 would not have their order."""
-    problem, rng = BRANCHES[name](), np.random.default_rng(4)
-    for y in ([0.9, 0.4], [-0.8, 0.7], [0.7, -0.5]):
-        assert_variational(problem, np.array(y), rng, tuple(range(len(problem.system.parameters))), rtol=1e-6)
+    rng = np.random.default_rng(4)
+    for make in BRANCHES.values():
+        problem = make()
+        for y in ([0.9, 0.4], [-0.8, 0.7], [0.7, -0.5]):
+            assert_variational(problem, np.array(y), rng, tuple(range(len(problem.parameters))), rtol=1e-6)
 
 
-@pytest.mark.parametrize("H", ["abs(q)", "max(q, 0)", "max(q, p)**3", "sign(q)*q", "sign(q)*abs(q)", "sign(q)**3*q"])
-def test_forces_that_jump_have_none(H):
-    with pytest.raises(
-        ValueError, match=r"the derivative of [qp] jumps where .* is 0, or is not seen to be continuous"
-    ):
-        hamiltonian(f"p**2/2 + {H}").variational(())
+def test_what_has_no_derivative():
+    for H in ("abs(q)", "max(q, 0)", "max(q, p)**3", "sign(q)*q", "sign(q)*abs(q)", "sign(q)**3*q"):
+        with pytest.raises(ValueError, match=r"the derivative of [qp] jumps where .* is 0, or is not seen to be cont"):
+            hamiltonian(f"p**2/2 + {H}").variational(())
+    problem = equations({"x": "y", "y": "sign(x)"}, params={"a": 1.0})
+    for parameters, says in [
+        ((), "the derivative of y jumps where x is 0"),
+        ((1,), "no parameter 1; expected indices of"),
+        ((-1,), "no parameter -1"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            problem.variational(parameters)
 
 
 def test_derivatives_of_a_run_through_branches():
     """The force has a kink at q = 0.5, through which the run passes."""
     problem = hamiltonian("p**2/2 + q**2/2 + max(q - 0.5, 0)**2 + sign(q)*q**2/4")
-    options = {"method": EIPDOP853, "h": 0.002}
+    options, step = {"method": EIPDOP853, "h": 0.002}, 1e-6
     run = integrate(problem, (0, 5), [1.0, 0.2], variations="state", **options)
-    step = 1e-6
     for k, unit in enumerate(step * np.eye(2)):
         ends = [integrate(problem, (0, 5), [1.0, 0.2] + side * unit, **options).y[:, -1] for side in (1, -1)]
         assert run.stm[-1][:, k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
 
 
-@pytest.mark.needs_jit
-def test_arrays_of_wrong_sizes():
-    problem = SYMBOLIC["lorenz"]()
-    params = problem.params
-    with pytest.raises(ValueError, match="3 numbers each, and at least 1 columns"):
-        problem.variational((0,))(0.0, np.ones(3), np.ones(3), params)
-    with pytest.raises(ValueError, match="3 numbers each"):
-        problem.variational(())(0.0, np.ones(7), np.ones(7), params)
-    with pytest.raises(ValueError, match="out must be as long as y"):
-        problem.variational(())(0.0, np.ones(6), np.ones(3), params)
-    with pytest.raises(ValueError, match="params must hold as many numbers"):
-        problem.variational(())(0.0, np.ones(6), np.ones(6), params[:2])
-
-
 # --- problems of the library ---
 
 
-@pytest.mark.parametrize("parameters", [(), (0,)])
 @pytest.mark.parametrize("problem", [kepler(relativistic=0.3), harmonic(omega=1.7)], ids=["kepler", "harmonic"])
-def test_kepler_and_harmonic(problem, parameters):
+def test_kepler_and_harmonic(problem):
     rng = np.random.default_rng(3)
-    for columns in (0, 1, 4):
+    for columns, parameters in product((0, 1, 4), ((), (0,))):
         assert_variational(problem, rng.uniform(0.5, 1.5, problem.y0.size), rng, parameters, columns)
-    with pytest.raises(
-        ValueError, match=r"derivatives by its state and only by parameter 0, .*; got parameters=\(1,\)"
-    ):
+        with pytest.raises(ValueError, match=r"columns of [24] numbers, and 1 parameter"):
+            in_place(problem.variational(parameters), 0.0, np.ones(7), problem.params)
+    with pytest.raises(ValueError, match=r"by its state and only by parameter 0, .*; got parameters=\(1,\)"):
         problem.variational((1,))
-    with pytest.raises(ValueError, match=r"columns of [24] numbers, and 1 parameter"):
-        in_place(problem.variational(parameters), 0.0, np.ones(7), problem.params)
 
 
 def bodies(rng, n, test_particles=False):
@@ -199,29 +162,28 @@ def test_newton(n):
 
 RELATIVITY = [(), ("1pn",), ("eih",), ("gr-potential",)]
 OTHERS = [(), ("j2",), ("moon-quadrupole",), ("j2", "moon-quadrupole"), ("drag",), ("j2", "drag")]
-AIR = {"drag": 0.2, "drag_radius": 0.9, "scale_height": 1.1, "spin": 0.3}
+# They make all forces as large as Newton's.
+CONSTANTS = ForceConstants(
+    c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=1, moon=0.3, drag=0.2, drag_radius=0.9, scale_height=1.1, spin=0.3
+)
 
 
-@pytest.mark.parametrize("others", OTHERS, ids="+".join)
-@pytest.mark.parametrize("relativity", RELATIVITY, ids="+".join)
 @pytest.mark.parametrize("n", [2, 4, 10])
-def test_forces(relativity, others, n):
-    """The constants make all forces as large as Newton's."""
-    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=n - 1, moon=0.3, **AIR)
-    rng = np.random.default_rng(n)
-    for particles in (False, True):
-        given = bodies(rng, n, particles)
-        problem = nbody(*given, t_span=(0.0, 1.0), forces=(*relativity, *others), constants=constants)
-        assert_variational(problem, problem.y0, rng, (), 5)
+def test_forces(n):
+    options = {"t_span": (0.0, 1.0), "constants": replace(CONSTANTS, moon_body=n - 1)}
+    for relativity, others in product(RELATIVITY, OTHERS):
+        rng = np.random.default_rng(n)
+        for particles in (False, True):
+            problem = nbody(*bodies(rng, n, particles), forces=(*relativity, *others), **options)
+            assert_variational(problem, problem.y0, rng, (), 5)
 
 
 @pytest.mark.parametrize("force", ["1pn", "eih", "gr-potential", "j2", "moon-quadrupole", "drag"])
 def test_what_a_force_adds(force):
     """Compare the parts of each force alone, so that Newton's larger part hides nothing."""
     rng = np.random.default_rng(5)
-    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=2, moon=0.3, **AIR)
     given = bodies(rng, 5)
-    problem = nbody(*given, t_span=(0.0, 1.0), forces=force, constants=constants)
+    problem = nbody(*given, t_span=(0.0, 1.0), forces=force, constants=replace(CONSTANTS, moon_body=2))
     plain, y = nbody(*given, t_span=(0.0, 1.0)), problem.y0
     for direction in rng.standard_normal((6, y.size)):
         Y = np.append(y, direction)
@@ -242,9 +204,9 @@ def test_columns_do_not_depend_on_each_other():
     rng = np.random.default_rng(4)
     problem = nbody(*bodies(rng, 10), t_span=(0.0, 1.0))
     columns = rng.standard_normal((19, 60))
-    together = in_place(library["gravity.variational"], 0.0, np.append(problem.y0, columns), problem.params)
+    together = in_place(problem.variational(()), 0.0, np.append(problem.y0, columns), problem.params)
     for column, found in zip(columns, together.reshape(-1, 60)[1:], strict=True):
-        alone = in_place(library["gravity.variational"], 0.0, np.append(problem.y0, column), problem.params)
+        alone = in_place(problem.variational(()), 0.0, np.append(problem.y0, column), problem.params)
         np.testing.assert_array_equal(alone[60:], found)
 
 
@@ -253,7 +215,7 @@ def test_columns_do_not_depend_on_each_other():
 
 @pytest.mark.needs_jit
 @pytest.mark.slow
-@NIGHTLY
+@pytest.mark.nightly
 def test_flow_of_a_particle():
     """Sensitivities of a projected run, against complex steps through the closed form: drift in constant fields."""
     E, B = 0.3, 1.7
