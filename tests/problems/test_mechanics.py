@@ -11,7 +11,7 @@ from sympy.physics import mechanics as me
 
 from eip_scipy import EIPDOP853, ensemble, integrate
 from eip_scipy.problems import mechanics
-from eip_scipy_studies.mechanisms import examples
+from eip_scipy_studies.bench import mechanisms as examples
 
 G = 9.81
 TIME = me.dynamicsymbols._t
