@@ -39,6 +39,9 @@ def pendulum_gradient(t, y):
     return np.array([np.sin(y[0]), y[1]])
 
 
+PENDULUM_ENERGY = Invariant(pendulum_energy, pendulum_gradient, name="energy")
+
+
 # Kepler's problem in the plane, y = (x, y, vx, vy). The invariants take states (4, m) too.
 
 
@@ -93,6 +96,10 @@ def jit_energy_gradient(t, y):
 jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
 JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
 JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
+
+
+jit_oscillator = njit(oscillator)
+JIT_SQUARE = Invariant(njit(lambda t, y: y[0] * y[0] + y[1] * y[1]), njit(lambda t, y: 2 * y), name="S")
 
 
 # Two complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
