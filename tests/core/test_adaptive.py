@@ -156,6 +156,8 @@ def test_options_of_both_drivers(option):
             np.testing.assert_array_equal(found.y[:, 1:], sol.y[:, 1:])
             np.testing.assert_array_equal(sol.y[:, 0], Y0)  # as it was given
             assert found.njev > 0
+            left = abs(energy(0, sol.y[:, -1]) - (kept if option == "project_initial" else energy(0, Y0)))
+            assert d.last_defect[0] == pytest.approx(left, abs=1e-15)
             assert abs(energy(0, found.y[:, -1]) - kept) < 1e-5
             assert energy(0, found.y[:, 0]) == pytest.approx(kept, abs=1e-14)
         bare = run(method=method, rtol=1e-4, atol=1e-6, invariants=H)
