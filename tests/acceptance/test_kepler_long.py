@@ -14,24 +14,14 @@ pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.needs_jit]
 PROBLEM = kepler()
 T, H = 1e5, 0.03
 SAVE_EVERY = 97  # 34 000 states; no common factor with the 209 steps of a revolution
-PAPER = {"metric": "euclidean", "reuse_f": False}
-DEFAULT: dict[str, object] = {}
+SETTINGS = {"paper": {"metric": "euclidean", "reuse_f": False}, "default": {}}
 
 
 @cache
 def run(method, setting, iterations=1, kept="HL"):
+    options = {"method": method, "h": H, "save_every": SAVE_EVERY, "iterations": iterations, **SETTINGS[setting]}
     invariants = [item for item in PROBLEM.invariants if item.name in kept]
-    options = PAPER if setting == "paper" else DEFAULT
-    return integrate(
-        PROBLEM,
-        (0, T),
-        method=method,
-        h=H,
-        save_every=SAVE_EVERY,
-        invariants=invariants,
-        iterations=iterations,
-        **options,
-    )
+    return integrate(PROBLEM, (0, T), invariants=invariants, **options)
 
 
 def values(result):

@@ -160,9 +160,7 @@ def changed(tableau, key, place, change):
 @pytest.mark.parametrize(("tableau", "stride"), [(RKN86, 2), (RKN1210, 18)], ids=["RKN86", "RKN12(10)"])
 def test_one_wrong_coefficient_is_found(tableau, stride):
     for key, place in list(places(tableau))[::stride]:
-        with pytest.raises(
-            ValueError, match=r"bad: b\w* is not of order (6|8|10|12): a condition of order"
-        ):
+        with pytest.raises(ValueError, match=r"bad: b\w* is not of order (6|8|10|12): a condition of order"):
             NystromTableau("bad", **changed(tableau, key, place, Fraction(1, 10**40)))
 
 
