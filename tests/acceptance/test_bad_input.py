@@ -4,7 +4,6 @@ Failures on the way (NaN, blow-up, contradicting invariants, vanishing gradients
 """
 
 import math
-import time
 import warnings
 
 import numba
@@ -362,23 +361,6 @@ def test_times_of_the_solver_class():
             EIPRK4(oscillator, span[0], Y0, span[1], h=0.1)
 
 
-def test_unbounded_interval_through_the_solver_class():
-    """The solver class accepts it, because it cannot know whether an event ends the run."""
-    solver = EIPRK4(oscillator, 0.0, Y0, math.inf, h=0.1, invariants=SQUARE)
-    for _ in range(25):
-        solver.step()
-    assert solver.status == "running"
-    assert solver.t == 25 * 0.1
-
-    def far(t, y):
-        return t - 2.05
-
-    far.terminal = True
-    sol = solve_ivp(oscillator, (0, math.inf), Y0, method=EIPRK4, h=0.1, invariants=SQUARE, events=far)
-    assert sol.status == 1
-    assert sol.t_events[0][0] == pytest.approx(2.05)
-
-
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_h_longer_than_the_interval(driver):
     """One step of the interval's length, as restart loops need it at their end."""
@@ -504,17 +486,6 @@ def test_times_of_dense_output_are_real():
 
 
 # Saving.
-
-
-def test_memory_is_estimated_before_the_run():
-    begin = time.perf_counter()
-    with pytest.raises(MemoryError, match=r"needs 2\.4e\+04 GB, .*save_every"):
-        by_integrate(t_span=(0, 1e6), h=1e-6, save_every=1)
-    with pytest.raises(MemoryError, match=r"1e\+03 states of 2 components .* bound is .* \(max_bytes.*save_every"):
-        by_integrate(h=1e-3, save_every=1, max_bytes=20_000)
-    assert time.perf_counter() - begin < 2.0
-    assert by_integrate(h=1e-3, save_every=1, max_bytes=30_000).t.size == 1001
-    assert by_integrate(h=1e-3, max_bytes=1000).t.size == 2
 
 
 # Invariants.

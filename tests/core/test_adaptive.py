@@ -5,7 +5,6 @@ import warnings
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy.integrate import solve_ivp
 from systems import (
     H_USES_F,
@@ -209,13 +208,6 @@ def test_rtol_too_small_warns_as_scipy_s(driver, rtol):
     np.testing.assert_array_equal(found.y, driver(orbit, rtol=np.maximum(rtol, 100 * EPS), **options).y)
 
 
-def test_invariants_from_an_iterator():
-    """Invariants are read once, not first for their presence and then for their values."""
-    found, same = (run(invariants=given) for given in (iter([H, L]), [H, L]))
-    assert found.diagnostics.names == ("energy", "momentum")
-    np.testing.assert_array_equal(found.y, same.y)
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_endless_interval_with_a_terminal_event(sign):
     def far_side(t, y):
@@ -397,13 +389,6 @@ def test_memory_bound_of_an_adaptive_run(compiled):
     assert run(max_step=1.0, save_every=1000, **options).status == 0
 
 
-def test_t_eval_is_refused_before_the_run():
-    calls = []
-    with pytest.raises(MemoryError, match="needs"):
-        run(lambda t, y: calls.append(t) or -y, (0, 1), [1.0], t_eval=np.linspace(0, 1, 1000), max_bytes=100)
-    assert len(calls) < 10
-
-
 def test_rows_grow_beyond_the_first_thousand():
     options = {"t_span": (0, 12), "method": EIPRK23, "rtol": 1e-8, "atol": 1e-10, "invariants": H}
     found = run(**options)
@@ -421,31 +406,3 @@ def test_progress_says_that_a_run_is_compiled(capsys):
     shown = capsys.readouterr().err
     assert "EIPRK45" in shown
     assert "compiling" not in shown
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.needs_jit
-@methods
-@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
-def test_failures_of_compiled_runs_are_the_same(method):
-    lv = njit(lambda t, u: np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)]))
-    value = njit(lambda t, u: u[0] - np.log(u[0]) + u[1] - np.log(u[1]))
-    volterra = Invariant(value, njit(lambda t, u: 1 - 1 / u), name="V")
-    late_nan = njit(lambda t, u: np.array([u[1], -u[0]]) * (1.0 if t < 0.5 else np.nan))
-    ball = Invariant(njit(lambda t, u: u[0] ** 2 + u[1] ** 2 if t < 0.5 else np.nan), JIT_SQUARE.grad, name="ball")
-    cases = [
-        (lv, {"rtol": 0.5, "atol": 5.0, "first_step": 2.0, "invariants": volterra}),
-        (late_nan, {}),
-        (jit_oscillator, {"invariants": ball, "check": False}),
-        *((lv, {"h": h, "invariants": volterra}) for h in (1.0, 2.0)),
-        (late_nan, {"h": 0.01}),
-    ]
-    for fun, options in cases:
-        one, other = (run(fun, (0, 20), [4.0, 2.0], method=method, compiled=c, **options) for c in (True, False))
-        assert one.compiled
-        assert one.status == other.status
-        assert other.message.startswith(one.message)
-        np.testing.assert_array_equal(one.t, other.t)
-        np.testing.assert_array_equal(one.y, other.y)
-        assert repr(one.diagnostics) == repr(other.diagnostics)

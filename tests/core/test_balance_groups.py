@@ -137,14 +137,6 @@ def test_a_group_does_not_disturb_the_others(kept, frame):
     assert found.rank == (4 if kept is KEPT else 4 * 5)
 
 
-def test_seven_rows_of_rank_five():
-    """Energy, angular momentum and Laplace vector of an orbit obey two relations."""
-    for kept, rank in ((ALL, 5), (orbital_balances(GM, Y0, ("energy", "momentum")), 4)):
-        found = run(kept, method=EIPDOP853, h=0.005)
-        assert found.trusted
-        assert found.diagnostics.n_rank_reduced == (found.diagnostics.n_projections if rank == 5 else 0)
-
-
 def exact(times):
     return scipy.integrate.solve_ivp(derivative, (0, 0.25), Y0, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=times).y
 
@@ -242,12 +234,6 @@ def test_a_wrong_rate_is_named(options):
         assert not integrate(dragged, (0, 50), pericentre(0.2), invariants=wrong, **options).trusted
 
 
-def test_complex_states():
-    mass = Balance(lambda t, y: np.vdot(y, y).real, lambda t, y: 0.0, lambda t, y: 2 * y, name="mass", components=[0])
-    with pytest.raises(ValueError, match="but the state is complex"):
-        integrate(lambda t, y: -1j * y, (0, 1), [1 + 0j, 1j], method=EIPRK4, h=0.1, invariants=mass)
-
-
 WRONG = [
     (None, [1.0], "weights are given without components"),
     *((components, None, "must be integers of shape") for components in ([], [0.5], [1j], [[0, 1], [2]])),
@@ -260,6 +246,9 @@ def test_wrong_components_and_weights():
     for components, weights, message in WRONG:
         with pytest.raises(ValueError, match=message):
             Balance(energy, loss, components=components, weights=weights)
+    mass = Balance(lambda t, y: np.vdot(y, y).real, lambda t, y: 0.0, lambda t, y: 2 * y, components=[0])
+    with pytest.raises(ValueError, match="but the state is complex"):
+        integrate(lambda t, y: -1j * y, (0, 1), [1 + 0j, 1j], method=EIPRK4, h=0.1, invariants=mass)
 
 
 PLAIN = Invariant(momentum, momentum_gradient, name="L")

@@ -120,22 +120,6 @@ def test_the_state_is_the_one_that_is_augmented_by_hand(method, h):
     assert np.abs(found - by_hand).max() < 1e-11
 
 
-def test_a_planet_with_drag():
-    y0, end, h = pericentre(0.2), 60 * PERIOD, PERIOD / 16
-    right = reference(dragged, (0, end), y0).y[:2, -1]
-
-    def error(*invariants):
-        run = integrate(dragged, (0, end), y0, method=EIPDOP853, h=h, invariants=invariants)
-        assert run.trusted
-        return np.linalg.norm(run.y[:2, -1] - right)
-
-    assert error() > 1e-3
-    given = error(Balance(energy, loss, energy_gradient))
-    assert given < 1e-5
-    assert error(Balance(energy, grad=energy_gradient)) == pytest.approx(given, rel=1e-4)
-    assert error(Balance(smooth_energy)) == pytest.approx(given, rel=1e-4)
-
-
 @pytest.mark.parametrize("balance", [SWING, SWING_ALONE, Balance(swing_energy)], ids=["rate", "gradient", "values"])
 def test_a_slowly_varying_field(balance):
     right = reference(swinging, (0, 500), START).y[:, -1]

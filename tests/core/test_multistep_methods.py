@@ -4,7 +4,6 @@ import numba
 import numpy as np
 import pytest
 from closed_forms import kepler_state
-from scipy import LowLevelCallable
 from scipy.integrate import solve_ivp
 from systems import JIT_H, JIT_L, orbit, pericentre
 
@@ -20,7 +19,7 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.methods import GaussJackson
-from eip_scipy.problems import figure_eight, nbody, solar_system
+from eip_scipy.problems import nbody, solar_system
 from eip_scipy.problems.gravity import solar_data
 
 both = pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
@@ -158,35 +157,6 @@ def test_python_jitted_and_native_functions_give_the_same_bits():
     assert np.array_equal(compiled.y, python.y)
 
 
-def attraction(t, q, out, params):
-    w = params[0] / (q[0] * q[0] + q[1] * q[1]) ** 1.5
-    out[0], out[1] = -w * q[0], -w * q[1]
-    return 0
-
-
-def change_of_attraction(t, q, dq, out, params):
-    square = q[0] * q[0] + q[1] * q[1]
-    w = params[0] / square**1.5
-    along = 3 * (q[0] * dq[0] + q[1] * dq[1]) / square
-    out[0], out[1] = w * (along * q[0] - dq[0]), w * (along * q[1] - dq[1])
-    return 0
-
-
-def test_c_functions():
-    """C functions by pointer, with params, give the bits of Python functions that compute the same."""
-    by_pointer, in_python = [], []
-    for fun, arrays in ((attraction, 3), (change_of_attraction, 4)):
-        compiled = numba.cfunc(f"intc(f8{', CPointer(f8)' * arrays})")(fun)
-        by_pointer.append(LowLevelCallable(compiled.ctypes))
-        in_python.append(lambda *arguments, fun=fun: fun(*arguments) or None)
-    given = {"method": EIPGJ14, "h": STEP, "params": [1.0], "in_place": True, "t_span": (0, 20), "y0": Y0}
-    native, python = (integrate(acceleration=a, jacobian=j, **given) for a, j in (by_pointer, in_python))
-    assert native.calls == {"acceleration": "pointer", "jacobian": "pointer"}
-    assert np.array_equal(native.y, python.y)
-    with pytest.raises(TypeError, match="jacobian is a C function of the signature"):
-        integrate(acceleration=by_pointer[0], jacobian=by_pointer[0], **given)
-
-
 def test_events():
     """The events are passages through the pericentre, and one ends a run."""
 
@@ -284,21 +254,6 @@ def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
         run(10, [1.0, 1.0, 0.0, 0.0], acceleration=springs, jacobian=None, method=EIPGJ12, h=0.05)
     with pytest.raises(ValueError, match="is not stable"):
         solve_ivp(orbit, (0, 20), Y0, method=EIPGJ14, h=STEP)  # which has no Jacobian here
-
-
-@pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
-def test_bodies_without_relative_angular_momentum(method):
-    """Two of the figure eight's bodies start at the same velocity; their attraction is less than that of the third.
-
-    After one period of 6.32591398 the start comes back, to the digits that it is given in.
-    """
-    problem = figure_eight()
-    found = integrate(problem, (0, 6.32591398), method=method, h=0.01)
-    assert found.trusted
-    np.testing.assert_allclose(found.y[:, -1], problem.y0, rtol=0, atol=1e-7)
-    brief = integrate(problem, (0, 1e-4), method=method, h=1e-6)
-    exact = integrate(problem, (0, 1e-4), method=EIPDOP853, rtol=1e-13, atol=1e-15)
-    np.testing.assert_allclose(brief.y[:, -1], exact.y[:, -1], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("apart", [0.0, 3.0])

@@ -113,10 +113,6 @@ def test_components_alone_soften_until_the_correction_is_healthy(factor, tries, 
     check(Case([1e-3, 1.0], 0.0, factor * 1e-6, [1e-6, 1e-12], kind=kind), tries)
 
 
-def test_blocks_are_believed():
-    check(Case([1e-3, 1e-3, 1.0], 0.0, 2e-6, [1e-6, 1e-6, 1e-12], blocks=[[0, 1]]), 1)
-
-
 @pytest.mark.parametrize(
     ("bend", "tries", "good"), [(0.4, 1, True), (0.55, 2, True), (1e4, 3, True), (1e5, 4, True), (1e10, 4, False)]
 )

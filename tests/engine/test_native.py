@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from systems import SPIN_NORM, SPIN_START, H, orbit, pericentre, spin
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, Invariant
+from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12
 from eip_scipy.core.dense import Interpolants
 from eip_scipy.engine import native
 from eip_scipy.engine.data import Work
@@ -182,24 +182,6 @@ def test_arrays_of_dense_output_that_do_not_fit_are_refused(case):
             engine.sample(record._replace(**changed))
 
 
-def test_counts_are_looked_at():
-    engine, record = dense_parts(h=0.1, invariants=H)
-    y, pieces = np.zeros(4), np.zeros((2, record.piece.size))
-    for counts in ([-1, 0], [0, -1], [0, 3]):
-        record.counts[:2] = counts
-        with pytest.raises(ValueError, match="counts"):
-            engine.advance(1, y, y, np.zeros(9), np.zeros((9, 4)), pieces)
-    record.counts[:] = 0
-    with pytest.raises(ValueError, match="pieces"):
-        engine.advance(1, y, y, np.zeros(9), np.zeros((9, 4)), pieces[:, 1:].copy())
-    two = np.zeros((2, 4))
-    with pytest.raises(ValueError, match="engine: out"):
-        engine.interpolate(pieces[0], np.zeros(3), two)
-    for times in (np.zeros(2, int), [0.0, 1.0]):
-        with pytest.raises(TypeError, match="incompatible function arguments"):
-            engine.interpolate(pieces[0], times, two)
-
-
 def test_functions_by_address_are_looked_at():
     """Python events are accepted next to functions by address, as many as there is room for; then none by address."""
 
@@ -278,22 +260,6 @@ def test_an_engine_and_what_it_holds_are_freed():
     del fun
     gc.collect()
     assert gone() is None
-
-
-def test_views_handed_out_outlive_the_run():
-    kept = []
-
-    def gradient(t, y, out):
-        kept.append(out)
-        out[:] = 2 * y
-
-    length = Invariant(lambda t, y: y @ y, gradient, in_place=True)
-    given = parts(h=0.1, invariants=length, check=False)
-    engine = Engine(**given)
-    engine.step(0, 0.0, Y0, np.zeros(4))
-    del given, engine
-    gc.collect()
-    assert all(np.isfinite(view).all() for view in kept)
 
 
 RUNS = """
