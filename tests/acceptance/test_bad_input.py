@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import RK45, solve_ivp
-from systems import SQUARE, jit_oscillator, orbit, oscillator
+from systems import JIT_SQUARE, SQUARE, jit_oscillator, orbit, oscillator
 
 from eip_scipy import (
     EIPRK1,
@@ -311,40 +311,17 @@ def test_partial_whoever_raises(part):
     assert partial.y.shape == (2, len(partial.t))
 
 
-@njit
-def late(t, fails):
-    if fails and t > 0.5:
-        raise ValueError("from compiled code")
-
-
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("where", ["fun", *(pytest.param(k, marks=NIGHTLY) for k in ("grad", "in place", "value"))])
-def test_exceptions_of_compiled_functions_propagate(where):
-    of_fun, of_in_place, of_value, of_grad = (where == name for name in ("fun", "in place", "value", "grad"))
-
+@pytest.mark.slow
+def test_exceptions_of_compiled_functions_propagate():
     @njit
-    def fun(t, y):
-        late(t, of_fun)
+    def late(t, y):
+        if t > 0.5:
+            raise ValueError("from compiled code")
         return np.array([y[1], -y[0]])
 
-    @njit
-    def in_place(t, y, out):
-        late(t, of_in_place)
-        out[0], out[1] = y[1], -y[0]
-
-    @njit
-    def value(t, y):
-        late(t, of_value)
-        return y[0] * y[0] + y[1] * y[1]
-
-    @njit
-    def grad(t, y):
-        late(t, of_grad)
-        return 2 * y
-
-    options = {"in_place": of_in_place, "invariants": Invariant(value, grad, name="S"), "compiled": True}
     with pytest.raises(ValueError, match="from compiled code") as info:
-        by_integrate(in_place if of_in_place else fun, h=0.01, save_every=10, **options)
+        by_integrate(late, h=0.01, save_every=10, compiled=True, invariants=JIT_SQUARE)
     check_partial(info.value.partial)
 
 
@@ -382,30 +359,21 @@ def test_h_of_ten_spacings(driver):
         assert (np.diff(run.t) > 0).all()
 
 
+STEPS_OF_SPANS = [((0, 1), 0.3, 4), ((1, 0), 0.3, 4), ((0, 1), 0.1, 10), ((0, 0.3), 0.1, 3), ((0.1, 0.7), 0.1, 6)]
+STEPS_OF_SPANS += [((0, 1), part / 3, n) for part, n in ((1, 3), (1 - 1e-12, 3), (1 - 1e-6, 4))]
+STEPS_OF_SPANS += [((1e6, 1e6 + 1), 1e-3, 1000), ((-2.5, 1.0), 0.7, 5)]
+
+
 @both
-@pytest.mark.parametrize(
-    ("span", "h", "n"),
-    [
-        ((0, 1), 0.3, 4),
-        ((1, 0), 0.3, 4),
-        ((0, 1), 0.1, 10),
-        ((0, 0.3), 0.1, 3),
-        ((0.1, 0.7), 0.1, 6),
-        ((1e6, 1e6 + 1), 1e-3, 1000),
-        ((0, 1), 1 / 3, 3),
-        ((0, 1), 1 / 3 * (1 - 1e-12), 3),
-        ((0, 1), 1 / 3 * (1 - 1e-6), 4),
-        ((-2.5, 1.0), 0.7, 5),
-    ],
-)
-def test_steps_end_on_t_bound(driver, span, h, n):
+def test_steps_end_on_t_bound(driver):
     """All steps have the nominal length except the last one; none has the length of round-off."""
-    run = driver(t_span=span, h=h, **({"save_every": 1} if driver is by_integrate else {}))
-    assert len(run.t) == n + 1
-    assert (run.t[0], run.t[-1]) == span
-    sign = np.sign(span[1] - span[0])
-    np.testing.assert_array_equal(run.t[:-1], span[0] + np.arange(n) * (sign * h))
-    assert (sign * np.diff(run.t) > 1e-7 * h).all()
+    for span, h, n in STEPS_OF_SPANS:
+        run = driver(t_span=span, h=h, **({"save_every": 1} if driver is by_integrate else {}))
+        assert len(run.t) == n + 1
+        assert (run.t[0], run.t[-1]) == span
+        sign = np.sign(span[1] - span[0])
+        np.testing.assert_array_equal(run.t[:-1], span[0] + np.arange(n) * (sign * h))
+        assert (sign * np.diff(run.t) > 1e-7 * h).all()
 
 
 # Tolerances and options.

@@ -281,19 +281,3 @@ def test_project():
     for more in ({"iterations": 3}, {"sigma": [1, 1, 1, 1]}):
         with pytest.raises(ValueError, match="do not apply to balances with components"):
             project(y, items, target=target, **more)
-
-
-def test_the_engine_checks_the_record():
-    solver = EIPDOP853(dragged, 0, pericentre(0.2), 1, h=0.1, invariants=pair(components=range(4)))
-    solver.step()
-    options = solver._run.options
-    wrong = [("value", [0, 2]), ("first_value", [0, 3]), ("first_value", [0, 2, 1, 2]), ("first_direction", [0, 5])]
-    wrong += [("first_float", [0, 2, 1, 3, 4]), ("place", [0, 1, 2, 4]), ("weight", [1.0, 1.0, 1.0]), ("size", 3)]
-    for field, value in wrong:
-        held = getattr(options.balance_groups, field)
-        spoilt = np.array(value, held.dtype) if isinstance(held, np.ndarray) else value
-        solver._run.options = options._replace(balance_groups=options.balance_groups._replace(**{field: spoilt}))
-        with pytest.raises(ValueError, match="engine:"):
-            solver._drive(begins=False)
-    solver._run.options = options
-    solver._drive(begins=False)

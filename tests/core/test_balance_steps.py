@@ -160,24 +160,6 @@ def test_backward(run):
     np.testing.assert_array_equal(at_rest.y[:, -1], START)
 
 
-def test_a_complex_state():
-    g = 1e-4
-
-    def fun(t, y):
-        return -1j * np.array([y[0] + abs(y[0]) ** 2 * y[0] + 0.3 * y[1], 2 * y[1] + 0.3 * y[0]]) - g * y
-
-    def mass(t, y):
-        return np.vdot(y, y).real
-
-    y0 = np.array([1.0 + 0.2j, 0.5 - 0.1j])
-    for rate in (None, lambda t, y: -2 * g * mass(t, y)):
-        balance = Balance(mass, rate, lambda t, y: 2 * y)
-        run = integrate(fun, (0, 100), y0, method=EIPDOP853, h=0.4, invariants=balance, t_eval=np.linspace(0, 100, 50))
-        assert run.trusted
-        masses = np.array([mass(0, y) for y in run.y.T])
-        assert np.abs(masses - mass(0, y0) * np.exp(-2 * g * run.t)).max() < 1e-8
-
-
 def test_balances_beside_invariants_and_several_at_once():
     def both(t, y):
         return np.array([smooth_energy(t, y), y[0] * y[3] - y[1] * y[2]])

@@ -5,11 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from orders import observed_order
 from scipy.integrate import solve_ivp
 from systems import H_USES_F, SPIN_NORM, SPIN_START, H, L, energy, momentum, orbit, pericentre, spin
 
-from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invariant, eip_method, integrate
+from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invariant, eip_method
 from eip_scipy.problems import solar_system
 
 EPS = np.finfo(float).eps
@@ -304,28 +303,6 @@ def test_an_invariant_as_an_event(method):
     assert all(len(t) > 0 for t in found.t_events)
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.slow_without_jit
-@pairs
-def test_adversarial_thresholds_of_integrate(method):
-    options = {"method": method, "rtol": 1e-4, "atol": 1e-7, "invariants": [H, L], "save_every": 1}
-    run = integrate(orbit, (0.0, 8.0), Y0, **options)
-    crossed = 0
-    for _, value in thresholds(run, SHIFTS, (0,)):
-        found = integrate(orbit, (0.0, 8.0), Y0, events=passing(0, value), **options)
-        np.testing.assert_array_equal(found.y, run.y)
-        signs = np.sign(run.y[0] - value)
-        signs = signs[signs != 0]  # a state on the threshold is one event, not one of each of its steps
-        y = found.y_events[0].reshape(-1, 4)
-        # Twice within one step, around the next pericentre.
-        assert len(y) - np.count_nonzero(signs[:-1] != signs[1:]) in (0, 2), f"the threshold {value}"
-        assert np.abs(y[:, 0] - value).max(initial=0.0) <= 1e-13
-        assert defects(y.T).max(initial=0.0) <= 1e-7
-        crossed += len(y) > 0
-    assert crossed >= 57
-
-
 # Samples on the manifold.
 
 
@@ -347,16 +324,3 @@ def test_frame_and_blocks(method):
             np.array([np.atleast_1d(item.fun(0.0, state, *item.args)) for state in states.T]) for states in (y, sol.y)
         )
         assert np.abs(between - between[0]).max() <= np.ptp(at_steps, axis=0).max() + 1e-13 * np.abs(between).max()
-
-
-@pytest.mark.parametrize(
-    "blocks", [pytest.param(None, marks=pytest.mark.xfail(strict=True, reason="an estimate of odd order vanishes")), 2]
-)
-@pytest.mark.parametrize(("method", "order", "step"), [(EIPRK23, 3, 0.005), (EIPRK45, 5, 0.02)])
-def test_order_of_the_projected_steps(method, order, step, blocks):
-    """Order p is kept if the metric groups positions and velocities; see test_order for the other case."""
-    exact = solve_ivp(orbit, (0, 1), Y0, method="DOP853", rtol=3e-14, atol=1e-16).y[:, -1]
-    h = step * 0.5 ** np.arange(3)
-    options = {"invariants": [H, L], "t_span": (0.0, 1.0), "blocks": blocks}
-    errors = [np.abs(solve(method, h=x, **options).y[:, -1] - exact).max() for x in h]
-    assert observed_order(errors, h)[-1] > order - 0.2, errors

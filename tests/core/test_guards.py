@@ -162,23 +162,6 @@ def test_amplitudes_of_a_nonlinear_problem(metric, blocks, amplitude, atol):
         np.testing.assert_allclose(found.y / amplitude, one.y, rtol=0, atol=1e-12)
 
 
-@metrics
-@pytest.mark.parametrize("amplitudes", [(1.0, 1e-155), (1e150, 1e-10), (1e100, 1e-100), (1e-30, 1e-160)])
-def test_amplitudes_side_by_side(metric, amplitudes):
-    """Two oscillators that know nothing of each other, each with its norm: both are kept, however small."""
-
-    def norm(k):
-        own = slice(2 * k, 2 * k + 2)
-        mask = np.repeat(np.arange(2) == k, 2)
-        return Invariant(lambda t, y: math.hypot(*y[own]), lambda t, y: mask * y / math.hypot(*y[own]))
-
-    options = {"invariants": [norm(0), norm(1)], "metric": metric, "atol": 0.0, "h": 0.1}
-    y0 = np.kron(amplitudes, [1.0, 0.3])
-    found = run(lambda t, y: np.array([y[1], -y[0], y[3], -y[2]]), (0, 5), y0, **options)
-    assert (found.status, found.diagnostics.n_rank_reduced) == (0, 0)
-    assert (found.max_defect <= 8 * EPS * found.invariants[:, 0]).all()
-
-
 # The dead band.
 
 

@@ -6,6 +6,8 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPGJ12, EIPRKN8, EIPRKN12, Invariant, eip_method, integrate
 from eip_scipy.methods import NystromTableau
+from eip_scipy.methods.nystrom import RKN86, RKN1210
+from eip_scipy.methods.nystrom_interpolants import interpolant
 from eip_scipy.problems import kepler
 
 both = pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12])
@@ -159,3 +161,15 @@ def test_methods_of_low_order_keep_the_quintic():
     times = np.linspace(0, 5, 333)
     assert run.nfev == integrate(acceleration=pull, t_span=(0, 5), **given).nfev
     assert largest(run.sol(times) - exact_kepler(times)) < 3 * largest(run.y - exact_kepler(run.t))
+
+
+@pytest.mark.parametrize("tableau", [RKN86, RKN1210], ids=["8", "12"])
+def test_polynomial_through_the_accelerations(tableau):
+    """Legendre coefficients of powers sampled at its nodes are those that NumPy finds."""
+    _, c, legendre = interpolant(tableau)
+    nodes = np.concatenate([np.zeros(tableau.n_stages - tableau.fsal), [1.0], c])
+    used = np.flatnonzero(legendre.any(axis=0))
+    for power in range(legendre.shape[0]):
+        expected = np.polynomial.legendre.poly2leg([0.0] * power + [1.0])
+        found = legendre[:, used] @ (2 * nodes[used] - 1) ** power
+        np.testing.assert_allclose(found, np.pad(expected, (0, len(found) - len(expected))), rtol=0, atol=5e-15)

@@ -268,38 +268,6 @@ def test_complex_frame(seed, n):
     assert abs(C @ project(q.y_hat, kept, iterations=5).correction) > 1e-9
 
 
-def lattice_run(y0, phase=1.0, **options):
-    """A nonlinear Schroedinger lattice of 6 sites: mass and energy."""
-
-    def hop(y):
-        return np.roll(y, 1) + np.roll(y, -1)
-
-    def fun(t, y):
-        return 1j * (hop(y) + np.abs(y) ** 2 * y)
-
-    mass = Invariant(lambda t, y: np.sum(np.abs(y) ** 2), lambda t, y: 2 * y, name="mass")
-    energy = Invariant(
-        lambda t, y: -np.sum((np.conj(y) * hop(y)).real) - 0.5 * np.sum(np.abs(y) ** 4),
-        lambda t, y: -2 * (hop(y) + np.abs(y) ** 2 * y),
-        name="energy",
-    )
-    options |= {"method": EIPRK4, "h": 0.05, "invariants": [mass, energy], "save_every": 1, "check": False}
-    return integrate(fun, (0, 1), phase * y0, **options)
-
-
-@given(seeds, st.sampled_from([None, 2, 3]), st.sampled_from(["error", "euclidean"]))
-@settings(max_examples=15, deadline=None)
-def test_phase_of_a_complex_state(seed, blocks, metric):
-    rng = np.random.default_rng(seed)
-    y0 = 0.5 * (rng.standard_normal(6) + 1j * rng.standard_normal(6))
-    phase = np.exp(1j * rng.uniform(0, 2 * np.pi))
-    plain = lattice_run(y0, blocks=blocks, metric=metric)
-    turned = lattice_run(y0, phase, blocks=blocks, metric=metric)
-    assert plain.status == 0
-    np.testing.assert_allclose(turned.y, phase * plain.y, rtol=0, atol=1e-11 * np.abs(y0).max())
-    assert np.abs(plain.y[:, -1] - y0).max() > 0.1
-
-
 # The step: units, rotations, frames.
 
 

@@ -1,7 +1,5 @@
 """The engine's complex steps: gradients of functions in Python, and what such functions may return."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -41,12 +39,6 @@ def test_several_values_and_further_arguments():
         assert G.flags.c_contiguous
 
 
-def test_constants_have_no_slope():
-    np.testing.assert_array_equal(complex_step(lambda t, y: 7, 0.0, Y, (), STEP), np.zeros(3))
-    one_real = complex_step(lambda t, y: y[0] if y[0].imag else 1.5, 0.0, Y, (), STEP)
-    np.testing.assert_array_equal(one_real, [1, 0, 0])
-
-
 def test_each_call_has_an_array_of_its_own():
     kept = []
     complex_step(lambda t, y: kept.append(y) or y[0], 0.0, Y, (), STEP)
@@ -56,10 +48,9 @@ def test_each_call_has_an_array_of_its_own():
 
 def test_what_cannot_be_taken():
     shapes = iter([np.zeros(2), np.zeros(3), np.zeros(2)])
-    with pytest.raises(ValueError, match="values of different shapes"):
-        complex_step(lambda t, y: next(shapes), 0.0, Y, (), STEP)
-    with pytest.raises(ValueError, match="values of different shapes"):
-        complex_step(lambda t, y: np.zeros(2) if y[0].imag else 1j, 0.0, Y, (), STEP)
+    for fun in (lambda t, y: next(shapes), lambda t, y: np.zeros(2) if y[0].imag else 1j):
+        with pytest.raises(ValueError, match="values of different shapes"):
+            complex_step(fun, 0.0, Y, (), STEP)
     with pytest.raises(TypeError, match="returned None, expected numbers"):
         complex_step(lambda t, y: None, 0.0, Y, (), STEP)
     with pytest.raises(ZeroDivisionError):
@@ -69,17 +60,3 @@ def test_what_cannot_be_taken():
             complex_step(product, 0.0, y, (), STEP)
     with pytest.raises(ValueError, match="one number or more"):
         complex_step(product, 0.0, np.empty(0), (), STEP)
-    for arguments in ((product, 0.0, Y, [], STEP), (product, 0.0, Y, ()), (product, 0.0, Y, (), STEP, 1)):
-        with pytest.raises(TypeError, match="incompatible function arguments"):
-            complex_step(*arguments)
-    with pytest.raises(TypeError):
-        complex_step(product, 0.0, Y, (), "step")
-
-
-def test_nothing_is_lost():
-    argument = object()
-    before = sys.getrefcount(argument), sys.getrefcount(product), sys.getrefcount(Y)
-    for _ in range(100):
-        complex_step(lambda t, y, a: y[0], 0.0, Y, (argument,), STEP)
-        complex_step(product, 0.0, Y, (), STEP)
-    assert (sys.getrefcount(argument), sys.getrefcount(product), sys.getrefcount(Y)) == before

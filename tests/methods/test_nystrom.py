@@ -8,6 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 from mpmath import mpf
+from orders import weighted_moments
 from scipy.integrate import solve_ivp
 
 from eip_scipy import eip_method, integrate
@@ -165,19 +166,9 @@ def test_one_wrong_coefficient_is_found(tableau, stride):
 
 
 def moment_residuals(tableau, key):
-    """Return sum (b + b_low) c^k minus its exact value, in fractions, for the doubles of the step, in least units.
-
-    That is half a unit in the last place of each low part, which are the sums' only numbers that can be chosen.
-    """
-    b, low = getattr(tableau, key), getattr(tableau, f"{key}_low")
-    weights = [Fraction(w) + Fraction(x) for w, x in zip(b, low, strict=True)]
-    nodes = [Fraction(x) for x in tableau.c]
-    count = min(7, tableau.order - (key == "b"), len({x for x, w in zip(nodes, b, strict=True) if w}))
-    for k in range(count):
-        missed = sum(w * c**k for w, c in zip(weights, nodes, strict=True))
-        missed -= Fraction(1, (k + 1) * (k + 2 if key == "b" else 1))
-        least = sum(Fraction(math.ulp(x)) / 2 * c**k for w, x, c in zip(b, low, nodes, strict=True) if w)
-        yield abs(missed) / least
+    b, c = getattr(tableau, key), tableau.c
+    count = min(7, tableau.order - (key == "b"), len({x for x, w in zip(c, b, strict=True) if w}))
+    return weighted_moments(b, getattr(tableau, f"{key}_low"), c, count, key == "b")
 
 
 @pytest.mark.parametrize("tableau", METHODS, ids=name)

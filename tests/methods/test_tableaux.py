@@ -5,6 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from orders import weighted_moments
 
 from eip_scipy import eip_method, integrate
 from eip_scipy.methods import Tableau
@@ -148,16 +149,8 @@ def test_attributes():
 
 
 def moment_residuals(tableau):
-    """Return sum (b + b_low) c^k - 1/(k + 1) in fractions, for the doubles of the step, in units of the least possible.
-
-    That is half a unit in the last place of each low part, which are the sums' only numbers that can be chosen.
-    """
-    weights = [Fraction(x) + Fraction(y) for x, y in zip(tableau.b, tableau.b_low, strict=True)]
-    nodes = [Fraction(x) for x in tableau.c]
-    for k in range(min(tableau.order, len(set(nodes)))):
-        missed = sum(w * x**k for w, x in zip(weights, nodes, strict=True)) - Fraction(1, k + 1)
-        least = sum(Fraction(math.ulp(y)) / 2 * x**k for y, x in zip(tableau.b_low, nodes, strict=True))
-        yield abs(missed) / least
+    count = min(tableau.order, len(set(tableau.c)))
+    return weighted_moments(tableau.b, tableau.b_low, tableau.c, count)
 
 
 @pytest.mark.parametrize("tableau", [*METHODS, RK23, RK45, DOP853], ids=name)
