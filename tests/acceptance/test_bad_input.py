@@ -390,13 +390,6 @@ def test_tolerances_without_a_scale(driver, method, invariants):
     assert driver(y0=[1.0, 0.0], **{**options, "h": 0.1, "metric": "error"}).status == 0
 
 
-def test_estimate_that_is_not_finite_is_named():
-    """f is evaluated at the new point alone: neither a stage nor their sum is."""
-    run = by_integrate(lambda t, y: np.array([1.0, 1.0]) if t < 1 else np.array([np.nan, 1.0]), h=None, first_step=1.0)
-    assert run.status == -1
-    assert run.message.startswith("fun returned a non-finite value at t=1")
-
-
 @pytest.mark.parametrize(("wrong", "nearest"), [("invarients", "invariants"), ("Rtol", "rtol")])
 def test_unknown_options_name_the_nearest(wrong, nearest):
     with pytest.raises(TypeError, match=f"no option '{wrong}'.*did you mean '{nearest}'"):
@@ -644,6 +637,9 @@ def test_progress_goes_to_stderr(capsys):
     assert "100%" in shown.err
     by_integrate()
     assert capsys.readouterr().err == ""
+    if not numba.config.DISABLE_JIT:
+        by_integrate(jit_oscillator, progress=True)
+        assert capsys.readouterr().err.strip().startswith("compiling")
 
 
 def test_no_estimate_no_error_metric():

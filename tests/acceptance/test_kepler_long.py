@@ -28,10 +28,8 @@ def values(result):
     """Return H and L at the saved states, also if they are not kept, and the sum of the sizes of their terms."""
     q1, q2, p1, p2 = result.y
     r = np.hypot(q1, q2)
-    kinetic, potential = 0.5 * (p1**2 + p2**2), 1 / r + 0.0025 / r**3
-    return np.array([kinetic - potential, q1 * p2 - q2 * p1]), np.array(
-        [kinetic + potential, abs(q1 * p2) + abs(q2 * p1)]
-    )
+    terms = np.array([[0.5 * (p1**2 + p2**2), -1 / r - 0.0025 / r**3], [q1 * p2, -q2 * p1]])
+    return terms.sum(axis=1), np.abs(terms).sum(axis=1)
 
 
 def check_no_drift(t, defects):

@@ -15,7 +15,6 @@ from systems import (
     L,
     energy,
     energy_gradient,
-    jit_orbit,
     jit_oscillator,
     lotka_volterra,
     orbit,
@@ -306,22 +305,6 @@ def test_rhs_not_finite(driver, invariants, since):
         np.testing.assert_array_equal(found.y[:, :first], clean.y[:, :first])
 
 
-def test_rhs_not_finite_at_one_stage_only_is_passed_by():
-    """A hole that the shrunk step misses."""
-    hole = []
-
-    def fun(t, y):
-        if 0.5 < t < 0.6 and not hole:
-            hole.append(t)
-            return np.full(4, np.nan)
-        return orbit(t, y)
-
-    found = run(fun, (0, 2), invariants=[H], max_step=0.05)
-    assert hole
-    assert found.status == 0
-    assert abs(energy(0, found.y[:, -1]) - energy(0, Y0)) < 1e-4
-
-
 @pytest.mark.parametrize("driver", [run, solve_ivp])
 def test_overflow_without_a_flood_of_warnings(driver):
     """y' = 1e200 y: a handful of warnings at most, none of them of the package's own lines, and a clean end."""
@@ -380,13 +363,3 @@ def test_rows_grow_beyond_the_first_thousand():
     assert (np.diff(found.t) > 0).all()
     seldom = run(**options, save_every=1000)
     np.testing.assert_array_equal(seldom.y, found.y[:, [*range(0, len(found.t) - 1, 1000), -1]])
-
-
-@pytest.mark.needs_jit
-def test_progress_says_that_a_run_is_compiled(capsys):
-    run(jit_orbit, progress=True)
-    assert capsys.readouterr().err.strip().startswith("compiling")
-    run(jit_orbit, progress=True, compiled=False)
-    shown = capsys.readouterr().err
-    assert "EIPRK45" in shown
-    assert "compiling" not in shown

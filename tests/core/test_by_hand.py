@@ -230,16 +230,6 @@ def test_wrong_values_raise(method, name, value, match):
                 solver.rtol[:] = 1e-9
 
 
-def test_another_fixed_step():
-    """Half the step from t = 1 on: sixteen times less error from there, and no end before the bound."""
-    solver = EIPRK4(pendulum, 0, Y0, 5.0, h=0.1)
-    stepped(solver, 10)
-    solver.h = 0.05
-    rows = stepped(solver)
-    np.testing.assert_allclose(np.diff([row[0] for row in rows]), 0.05, rtol=1e-12)
-    assert solver.t == 5.0
-
-
 # Copies.
 
 

@@ -197,18 +197,6 @@ def piece_errors(piece, y):
     return errors.max(), errors[-1]
 
 
-@pytest.mark.parametrize("method", [*PAIRS, EIPRK4])
-def test_no_kink_inside_a_step(method):
-    """Between steps the curve is smooth: second differences go with the square of the spacing."""
-    sol = solve(method, invariants=[H, L], dense_output=True, rtol=1e-3)
-    shares = []
-    for piece in sol.sol.interpolants:
-        y = piece(np.linspace(piece.t_old, piece.t, 33))
-        fine, coarse = (np.abs(np.diff(y[:, ::k], 2, axis=1)).max() for k in (1, 2))
-        shares += [fine / coarse] if fine > 1e-11 else []
-    assert 0.0 < max(shares) < 0.5
-
-
 # Events near the ends of steps.
 
 
@@ -278,19 +266,6 @@ def test_thresholds_without_invariants(method, variant):
     found = solve(method, **VARIANTS[variant], events=[passing(*case) for case in cases])
     np.testing.assert_array_equal(found.y, sol.y)
     assert sum(len(t) > 0 for t in found.t_events) >= 57
-
-
-@pairs
-def test_thresholds_for_complex_states(method):
-    sol = solve(method, **COMPLEX)
-    cases = thresholds(sol, (0.0, 1e-9), (0, 1), len(sol.t))
-    found = solve(method, **COMPLEX, events=[passing(*case) for case in cases])
-    for (i, value), t, y in zip(cases, found.t_events, found.y_events, strict=True):
-        signs = np.sign(sol.y[i].real - value)
-        assert len(t) == np.count_nonzero(signs[:-1] * signs[1:] <= 0)
-        for state in y:
-            assert abs(state[i].real - value) <= 1e-13
-            assert abs(np.vdot(state, state).real - SPIN_NORM.fun(0, SPIN_START)) <= 1e-7
 
 
 @pairs

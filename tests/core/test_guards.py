@@ -272,21 +272,6 @@ def changing(value=lambda t, y: y @ y, grad=lambda t, y: 2 * y):
     return Invariant(value, grad, name="x")
 
 
-def failing_at(number, component):
-    """The oscillator, one component NaN at one call (from 1)."""
-    calls = 0
-
-    def fun(t, y):
-        nonlocal calls
-        calls += 1
-        f = oscillator(t, y)
-        if calls == number:
-            f[component] = np.nan
-        return f
-
-    return fun
-
-
 INTERRUPTED = {
     # Parallel gradients, values that part at t = 0.45: one projection before it, one failure after it.
     "contradiction": (
@@ -330,13 +315,20 @@ def test_invariant_not_finite_after_a_step():
 @pytest.mark.parametrize("component", [1, slice(None)], ids=["second", "both"])
 def test_rhs_not_finite_at_any_stage(driver, component):
     """The evaluation may be any, including the one at the new point (for the error estimate)."""
-    for call in range(3, 9):
-        fun = failing_at(call, component)
+    for number in range(3, 9):
+        calls = []
+
+        def fun(t, y, calls=calls, number=number):
+            calls.append(t)
+            f = oscillator(t, y)
+            if len(calls) == number:
+                f[component] = np.nan
+            return f
+
         found = driver(fun, (0, 1), [1.0, 2.0], method=EIPRK4, h=0.1, invariants=SQUARE)
         assert found.status == -1
         assert found.message.startswith("fun returned a non-finite value at t=0.")
         assert np.isfinite(found.y).all()
-        assert len(found.t) in (1, 2, 3)
         np.testing.assert_allclose(found.t, np.arange(len(found.t)) * 0.1, atol=1e-16)
 
 

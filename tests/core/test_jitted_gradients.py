@@ -17,7 +17,6 @@ njit = numba.njit
 pytestmark = pytest.mark.needs_jit
 
 Y = np.array([0.7, -0.4, 1.3, 0.2])
-MATRIX = np.array([[2.0, 0.5, 0.0, 1.0], [0.5, 3.0, -1.0, 0.0], [0.0, -1.0, 1.5, 0.2], [1.0, 0.0, 0.2, 4.0]])
 FUNCTIONS = {}
 
 
@@ -40,11 +39,6 @@ def kepler_by_arrays(t, y):
     return 0.5 * np.sum(y[2:] ** 2) - 1.0 / np.sqrt(y[:2] @ y[:2])
 
 
-@case(lambda a, b, c, d: 1 / mpmath.hypot(a, b) + mpmath.hypot(c, d))
-def hypot(t, y):
-    return 1.0 / math.hypot(y[0], y[1]) + np.hypot(y[2], y[3])
-
-
 @case(lambda a, b, c, d: mpmath.exp(-a * b) + mpmath.expm1(c) * mpmath.tanh(d) + mpmath.log(c) + mpmath.log1p(a))
 def exponentials(t, y):
     return math.exp(-y[0] * y[1]) + np.expm1(y[2]) * math.tanh(y[3]) + math.log(y[2]) + np.log1p(y[0])
@@ -60,15 +54,6 @@ def hyperbolic(t, y):
     return math.sinh(y[0]) / np.cosh(y[1]) + math.asinh(y[2]) + math.acosh(y[2]) + math.atanh(y[3])
 
 
-@case(lambda *y: sum(1 / abs(y[i] - y[j]) for i in range(4) for j in range(i)))
-def loop_over_bodies(t, y):
-    total = 0.0
-    for i in range(y.size):
-        for j in range(i):
-            total += 1.0 / abs(y[i] - y[j])
-    return total
-
-
 @case(lambda a, b, c, d: 1 + d**2)
 def branch_of_another_type(t, y):
     total = y[0] if y[0] < 0.0 else 1.0
@@ -81,12 +66,6 @@ def extremes(t, y):
     if y[0] > 0.5 and y[1] < 0:
         total += math.erf(y[0]) * abs(y[1]) / y[3] + math.log10(y[3]) + math.atan(y[2])
     return total
-
-
-@case(lambda a, b, c, d: a * (mpmath.cos(a) * c - mpmath.sin(a) * d) + 2 * a + b / 2 + d)
-def matrices(t, y):
-    R = np.array([[np.cos(y[0]), -np.sin(y[0])], [np.sin(y[0]), np.cos(y[0])]])
-    return y[0] * (R @ y[2:])[0] + (MATRIX @ y)[0]
 
 
 @case(lambda a, b, c, d: (a * d - b * c, mpmath.sqrt(a**2 + c**2), b * d), shape=(3,))

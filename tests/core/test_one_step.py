@@ -135,19 +135,6 @@ def test_a_method_says_what_it_evaluates():
         eip_method(type("Wrong", (Verlet,), {"evaluations": -1})())
 
 
-def test_complex_states_keep_their_type():
-    class Exact:
-        order = 8
-
-        def one_step(self, t, y, h):
-            return y * np.exp(-1j * h) * (1 + h**3)
-
-    modulus, y0 = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y), np.array([1 + 1j, 2.0])
-    options = {"method": eip_method(Exact()), "h": 0.1, "invariants": modulus, "iterations": 4}
-    run = integrate(lambda t, y: -1j * y, (0, 1), y0, **options)
-    np.testing.assert_allclose(run.y[:, -1], y0 * np.exp(-1j), atol=1e-15)
-
-
 def pendulum(g):
     return lambda t, y: np.array([y[1], -g * np.sin(y[0])])
 
