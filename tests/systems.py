@@ -39,6 +39,9 @@ def pendulum_gradient(t, y):
     return np.array([np.sin(y[0]), y[1]])
 
 
+PENDULUM_ENERGY = Invariant(pendulum_energy, pendulum_gradient, name="energy")
+
+
 # Kepler's problem in the plane, y = (x, y, vx, vy). The invariants take states (4, m) too.
 
 
@@ -95,6 +98,10 @@ JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
 JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
 
 
+jit_oscillator = njit(oscillator)
+JIT_SQUARE = Invariant(njit(lambda t, y: y[0] * y[0] + y[1] * y[1]), njit(lambda t, y: 2 * y), name="S")
+
+
 # Two complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
 
 
@@ -114,6 +121,21 @@ def twice(t, y):
 
 
 JIT_NORM = Invariant(jit_norm, twice, name="N")
+
+
+# Three complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
+
+
+def spin(t, y):
+    return -1j * (np.array([0.3 * y[1], 0.3 * y[0] + 0.7j * y[2], -0.7j * y[1]]) + np.arange(3) * abs(y) ** 2 * y)
+
+
+SPIN_NORM = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y, name="N")
+SPIN_START = np.array([0.8, 0.6j, 0.1 - 0.2j])
+
+
+def van_der_pol(t, y, mu=5.0):
+    return np.array([y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]])
 
 
 def lotka_volterra(t, u):

@@ -33,11 +33,8 @@ def test_names_bring_no_more_than_they_need():
     """Numba is not loaded either; a module that another one loads would be there at the end."""
     names = "EIPRK4, EIPDOP853, Invariant, Diagnostics, project, integrate, ensemble, problems"
     assert loaded(f"from eip_scipy import {names}", [*HEAVY_FOR_STEPS, "llvmlite", "numba"]) == []
-
-
-def test_steps_bring_no_ensembles_and_no_problems():
-    names = ["eip_scipy.ensembles", "eip_scipy.problems"]
-    assert loaded("from eip_scipy import EIPRK4, Invariant, integrate", names) == []
+    unused = ["eip_scipy.ensembles", "eip_scipy.problems"]
+    assert loaded("from eip_scipy import EIPRK4, Invariant, integrate", unused) == []
 
 
 def test_no_name_brings_the_studies():
@@ -88,12 +85,9 @@ def test_no_folder_or_module_has_a_public_name():
     assert {path.stem for path in here.iterdir()} & {*eip_scipy.__all__} == set()
 
 
-def test_an_unknown_name_is_an_attribute_error():
+def test_no_other_name_is_looked_for_in_the_studies():
     with pytest.raises(AttributeError, match="no attribute 'EIPRK7'"):
         eip_scipy.EIPRK7  # noqa: B018
-
-
-def test_no_other_name_is_looked_for_in_the_studies():
     for code in ("import eip_scipy.problems.soft_cases", "from eip_scipy.plotting import no_figure"):
         with pytest.raises(ImportError):
             exec(code)

@@ -1,13 +1,8 @@
-"""SciPy's own suite for `solve_ivp`, test_ivp.py of its wheel, run over the adaptive classes.
+"""SciPy's own suite for `solve_ivp`, test_ivp.py of its wheel, run over the classes.
 
 It runs as shipped, except for the name of the method: literal lists of methods contain the class only, without the
-other methods. Those of the 25 tests that take the default method, RK45, or Radau, keep it, except that the class takes
-the place of RK45. ``python -m pytest tests/acceptance/test_scipy_suite.py -k shipped -rP`` prints the count for each
-class.
-
-A stricter test runs each of them once per class, which also replaces the default method and implicit methods that are
-not the subject of the test. The same holds for `eip_scipy.solve_ivp` with the class EIPRK45, and with SciPy's own
-methods by name, where all tests run as they are shipped.
+other methods, and the class takes the place of SciPy's method of its name. The same tests run with the methods of SciPy
+by their names through `eip_scipy.solve_ivp`, as they are shipped.
 """
 
 import ast
@@ -21,50 +16,19 @@ import pytest
 from scipy import integrate
 
 from eip_scipy import EIPBDF, EIPDOP853, EIPRK23, EIPRK45, EIPRadau, eip_method, solve_ivp
-from eip_scipy.core.stepping import Stepping
-from eip_scipy.engine.data import Span
 
-SCIPY = {"RK23": integrate.RK23, "RK45": integrate.RK45, "DOP853": integrate.DOP853}
-# The classes, and the same tableaux through `eip_method`, where the steps are always the package's own.
-METHODS = {
-    "EIPRK23": ("RK23", EIPRK23),
-    "EIPRK45": ("RK45", EIPRK45),
-    "EIPDOP853": ("DOP853", EIPDOP853),
-    "own RK23": ("RK23", eip_method(EIPRK23.TABLEAU)),
-    "own RK45": ("RK45", eip_method(EIPRK45.TABLEAU)),
-    "own DOP853": ("DOP853", eip_method(EIPDOP853.TABLEAU)),
-    "typed RK45": ("RK45", EIPRK45),
-}
-ALL = {*SCIPY, "Radau", "BDF", "LSODA"}
-
-DOES_NOT_APPLY = {
-    "test_integration_complex_sparse": "implicit methods: a sparse Jacobian of complex numbers",
-    "test_integration_sparse_difference": "implicit methods: differences of a sparse Jacobian",
-    "test_integration_const_jac": "implicit methods: a constant Jacobian",
-    "test_integration_stiff": "implicit methods: stiffness",
-    "test_event_dense_output_LSODA": "LSODA's own interpolant",
-    "test_num_jac": "SciPy's numerical Jacobian, no method in it",
-    "test_num_jac_sparse": "SciPy's numerical Jacobian, no method in it",
-    "test_ConstantDenseOutput": "SciPy's own class, no method in it",
-    "test_OdeSolution": "SciPy's own class, no method in it",
-}
-# Written for one method, the default RK45 or Radau, with numbers that SciPy's own class of this name misses too.
-MISSED_BY_SCIPY = [
-    ("test_args", "RK23"),
-    ("test_args", "RK45"),
-    ("test_args", "DOP853"),
-    ("test_args_single_value", "RK23"),
-    ("test_duplicate_timestamps", "DOP853"),  # extrapolates an interpolant of degree 7 by 1600 steps
-    ("test_array_rtol", "DOP853"),  # both its errors are far below the tolerance
-]
-# Tests that Radau and BDF miss: neither takes an array `rtol`.
+NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+ALL = {"RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"}
+# The last explicit one is a tableau through `eip_method`, whose steps are always the package's own.
+EXPLICIT = {"EIPRK23": EIPRK23, "EIPRK45": EIPRK45, "EIPDOP853": EIPDOP853, "own RK45": eip_method(EIPRK45.TABLEAU)}
+IMPLICIT = {"EIPRadau": EIPRadau, "EIPBDF": EIPBDF, "Radau": integrate.Radau, "BDF": integrate.BDF}
+METHODS = EXPLICIT | IMPLICIT
+# Tests that Radau and BDF of SciPy miss too: neither takes an array `rtol`.
 MISSED_BY_IMPLICIT = {
     "Radau": {"test_array_rtol"},
     "BDF": {"test_args_single_value", "test_array_rtol", "test_duplicate_timestamps"},
 }
-# Radau takes no complex states; test_args names Radau.
-WITHOUT_THEM = {("test_integration_complex", "Radau"), ("test_args", "BDF")}
-IMPLICIT = {"test_integration_sparse_difference", "test_integration_const_jac", "test_integration_stiff"}
+OF_IMPLICIT = {"test_integration_sparse_difference", "test_integration_const_jac", "test_integration_stiff"}
 QUICK = {"test_integration", "test_integration_const_jac", "test_events", "test_max_step", "test_first_step"}
 # None of these may be missing.
 EXPECTED = {
@@ -87,6 +51,9 @@ def source():
     return Path(spec.origin).read_text(encoding="utf-8"), spec.origin
 
 
+SOURCE = source()
+
+
 class OneMethod(ast.NodeTransformer):
     """Reduce lists of methods to one; leave out decorators that only SciPy's test runner knows."""
 
@@ -106,193 +73,94 @@ class OneMethod(ast.NodeTransformer):
         return self.generic_visit(node)
 
 
-def module_of(name):
+def module_of(name, solver):
     """Return SciPy's module with its lists of methods reduced to one, or with all of them if the name is empty."""
     text, path = SOURCE
     tree = ast.fix_missing_locations(OneMethod(name).visit(ast.parse(text)))
     module = types.ModuleType("scipy_suite_" + name)
     exec(compile(tree, path, "exec"), module.__dict__)
+    module.solve_ivp = solver
     return module
 
 
-def suite(name, method, as_shipped=False, solver=integrate.solve_ivp):
-    """SciPy's module with the class `method` in the place of `name`, and what counts its uses.
-
-    The class takes the place of all other methods too, unless the suite is left `as_shipped`. `solver` is the function
-    in the place of `solve_ivp`.
-    """
-    module = module_of(name)
-    used = []
-    order = getattr(getattr(method, "TABLEAU", method), "error_estimator_order", None)
+def suite(label, solver=integrate.solve_ivp):
+    """Return the name of SciPy's method, its module with our class in the place of that method, and its uses."""
+    method, name, used = METHODS[label], label.split()[-1].removeprefix("EIP"), []
 
     class Counting(method):
-        error_estimator_order = order  # what one of the tests reads
+        error_estimator_order = getattr(method, "error_estimator_order", None)  # which one of the tests reads
 
         def __init__(self, *args, **options):
             used.append(name)
             super().__init__(*args, **options)
 
     Counting.__name__ = method.__name__
+    default = name if label in IMPLICIT else "RK45"
 
-    def solve_ivp(*args, method=name, **options):
-        assert method in (name, Counting, "Radau"), f"{method} is not the method under test"
-        if "jac" not in options or (options["jac"] is None and solver is not integrate.solve_ivp):
-            return solver(*args, method=Counting, **options)
-        with pytest.warns(UserWarning, match="have no effect for a chosen solver: `jac`"):
-            return solver(*args, method=Counting, **options)
-
-    def as_called(*args, method="RK45", **options):
+    def called(*args, method=default, **options):
         return solver(*args, method=Counting if method == name else method, **options)
 
-    def select_initial_step(fun, t0, y0, t_bound, max_step, f0, direction, order, rtol, atol):
-        used.append("initial_step")
-        span = Span(t0, 0.0, t_bound, direction, 0, max_step)
-        return Stepping(span, None, None, rtol, atol).estimated(fun, y0, f0, order)
-
-    solve = as_called if as_shipped else solve_ivp
-    module.__dict__.update({"solve_ivp": solve, "select_initial_step": select_initial_step, name: Counting})
-    return module, used
+    module = module_of(name, called)
+    setattr(module, name, Counting)
+    return name, module, used
 
 
-def call(module, key, name, case):
+def call(module, key, name):
+    """Run a test with the method of this name (None: with all of them); return the number of runs."""
     function = getattr(module, key)
-    arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
-    known = {"method": name, "num_parallel_threads": 1, **case}
-    function(**{argument: known[argument] for argument in arguments})
+    marks = [m.args for m in getattr(function, "pytestmark", []) if m.name == "parametrize"]
+    marks = [(argument, [name] if name and argument == "method" else values) for argument, values in marks]
+    taken = function.__code__.co_varnames[: function.__code__.co_argcount]
+    runs = list(itertools.product(*(values for _, values in marks)))
+    for values in runs:
+        known = {"num_parallel_threads": 1, **dict(zip((argument for argument, _ in marks), values, strict=True))}
+        function(**{argument: known[argument] for argument in taken})
+    return len(runs)
 
 
-def cases_of(function):
-    """Return the arguments of a parametrised test, without the method and SciPy's own fixture."""
-    marks = [m.args for m in getattr(function, "pytestmark", []) if m.args[0] != "method"]
-    assert len(marks) <= 1
-    return [{marks[0][0]: value} for value in marks[0][1]] if marks else [{}]
-
-
-SOURCE = source()
-SUITES = {
-    label: (name, *suite(name, method, solver=solve_ivp if label.startswith("typed") else integrate.solve_ivp))
-    for label, (name, method) in METHODS.items()
-}
-CASES = [
-    pytest.param(label, key, case, id="-".join([key, label, *map(str, case.values())]))
-    for label, (name, module, _) in SUITES.items()
-    for key, function in vars(module).items()
-    if key.startswith("test_") and key not in DOES_NOT_APPLY and (key, name) not in MISSED_BY_SCIPY
-    for case in cases_of(function)
-]
-
-
-@pytest.mark.parametrize(
-    "method",
-    [EIPRK45, *(pytest.param(m, marks=[pytest.mark.nightly, pytest.mark.slow]) for m in (EIPRK23, EIPDOP853))],
-    ids=lambda m: m.__name__,
-)
-def test_as_shipped(method):
-    """All tests run for each class; only the name differs, and two private functions of SciPy's."""
-    name = method._SCIPY.__name__
-    module, used = suite(name, method, as_shipped=True)
-    passed = []
+@pytest.mark.parametrize("label", EXPLICIT)
+def test_explicit_methods(label):
+    name, module, used = suite(label)
     for key in sorted(EXPECTED):
-        for case in cases_of(getattr(module, key)):
-            call(module, key, name, case)
-        passed.append(key)
-    print(f"{method.__name__}: {len(passed)} of {len(EXPECTED)} of SciPy's own tests pass")
-    assert len(passed) == len(EXPECTED) == 25
+        call(module, key, name)
+    assert len(EXPECTED) == 25
     assert used.count(name) > 40
 
 
 @pytest.mark.parametrize(
-    "key",
-    [
-        pytest.param(key, marks=[] if key in QUICK else [pytest.mark.nightly, pytest.mark.slow])
-        for key in sorted(EXPECTED | IMPLICIT)
-    ],
+    "key", [pytest.param(key, marks=[] if key in QUICK else NIGHTLY) for key in sorted(EXPECTED | OF_IMPLICIT)]
 )
-@pytest.mark.parametrize("method", [EIPRadau, EIPBDF, integrate.Radau, integrate.BDF], ids=lambda m: m.__name__)
-def test_as_shipped_for_implicit_methods(method, key):
-    """All tests, with the class in the place of Radau or BDF and of the default; those left out, SciPy's miss too."""
-    name = method.__name__.removeprefix("EIP")
-    module, used = suite(name, method, as_shipped=True)
-    solve = module.solve_ivp
-    module.solve_ivp = lambda *args, method=name, **options: solve(*args, method=method, **options)
-    missed = (
-        pytest.raises((AssertionError, TypeError, ValueError)) if key in MISSED_BY_IMPLICIT[name] else nullcontext()
-    )
-    with missed:
-        for case in cases_of(getattr(module, key)):
-            call(module, key, name, case)
-    assert used or (key, name) in WITHOUT_THEM
+@pytest.mark.parametrize("label", IMPLICIT)
+def test_implicit_methods(label, key):
+    """The class is in the place of the default too; those left out, SciPy's own methods miss too."""
+    name, module, used = suite(label)
+    missed = key in MISSED_BY_IMPLICIT[name]
+    with pytest.raises((AssertionError, TypeError, ValueError)) if missed else nullcontext():
+        call(module, key, name)
+    # Radau takes no complex states; test_args names Radau.
+    assert used or (key, name) in {("test_integration_complex", "Radau"), ("test_args", "BDF")}
 
 
 def test_all_methods_through_the_typed_function():
     """All tests of the wheel, with each method of SciPy by its name or class; a result has what SciPy's has."""
-    module, count, used = module_of(""), 0, []
+    used = []
 
     def typed(*args, method="RK45", **options):
         used.append(method)
         return solve_ivp(*args, method=method, **options)
 
-    module.solve_ivp = typed
-    for key in sorted(EXPECTED):
-        function = getattr(module, key)
-        marks = [m.args for m in getattr(function, "pytestmark", []) if m.name == "parametrize"]
-        for values in itertools.product(*(values for _, values in marks)):
-            arguments = dict(zip((name for name, _ in marks), values, strict=True))
-            call(module, key, None, arguments)
-            count += 1
-    assert count >= len(EXPECTED)
+    module = module_of("", typed)
+    assert sum(call(module, key, None) for key in EXPECTED) >= len(EXPECTED)
     assert len(used) > 100
+    name, module, used = suite("EIPRK45", solve_ivp)
+    for key in EXPECTED:
+        call(module, key, name)
+    assert used.count(name) > 40
 
 
-@pytest.mark.parametrize(("label", "key", "case"), CASES)
-def test_of_scipy(label, key, case):
-    name, module, used = SUITES[label]
-    used.clear()
-    call(module, key, name, case)
-    assert used, f"{key} never used {label}"
-
-
-@pytest.mark.parametrize(("key", "name"), MISSED_BY_SCIPY)
-def test_what_is_left_out_is_missed_by_scipy_too(key, name):
-    """They were written for RK45 or Radau and ask for more accuracy than the pair of this name has."""
-    module, used = suite(name, SCIPY[name])
-    with pytest.raises(AssertionError):
-        call(module, key, name, {})
-    assert used
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize("label", METHODS)
-def test_args_with_a_tolerance_for_explicit_pairs(label):
-    """test_args was written for Radau at rtol = 1e-10, atol = 1e-13; its growth by e^20 takes a bit more here."""
-    name, module, used = SUITES[label]
-    solve = module.solve_ivp
-    # RK23's steps are so short that its errors are well below the tolerance.
-    tighter = {"rtol": 1e-11, "atol": 1e-14} if name == "RK23" else {"rtol": 1e-12, "atol": 1e-16}
-    try:
-        module.solve_ivp = lambda *args, **options: solve(*args, **{**options, **tighter})
-        call(module, "test_args", name, {})
-    finally:
-        module.solve_ivp = solve
-    assert used
-
-
-def test_every_test_is_accounted_for():
-    """All of the wheel's tests run or have a reason; those that this SciPy has lost are noticed."""
-    present = {key for key in vars(SUITES["EIPRK45"][1]) if key.startswith("test_")}
-    assert present >= EXPECTED
-    assert not EXPECTED & set(DOES_NOT_APPLY)
-    run = {(label, key) for label, key, _ in (case.values for case in CASES)}
-    missed = {(label, key) for label, (name, _) in METHODS.items() for key, n in MISSED_BY_SCIPY if n == name}
-    assert run | missed >= {(label, key) for label in METHODS for key in EXPECTED}
-
-
-@pytest.mark.parametrize("key", ["test_first_step", "test_integration", "test_max_step"])
-@pytest.mark.parametrize("as_shipped", [True, False])
-def test_the_harness_can_fail(key, as_shipped):
+def test_the_harness_can_fail():
     """A class that takes no notice of first_step and max_step, and whose states are off, must not get through."""
-    module, used = suite("RK45", EIPRK45, as_shipped)
+    name, module, used = suite("EIPRK45")
     solve = module.solve_ivp
 
     def spoiled(*args, first_step=None, max_step=None, **options):
@@ -301,6 +169,7 @@ def test_the_harness_can_fail(key, as_shipped):
         return res
 
     module.solve_ivp = spoiled
-    with pytest.raises(AssertionError):
-        call(module, key, "RK45", {})
+    for key in ("test_first_step", "test_integration", "test_max_step"):
+        with pytest.raises(AssertionError):
+            call(module, key, name)
     assert used

@@ -78,17 +78,3 @@ def test_frame_keeps_momentum_and_centre_of_mass():
     assert framed[3:].max() < 1e-14
     assert framed[:3].max() < 1e-11
     assert free[3:].max() > 1e-12
-
-
-def test_energy_and_momentum_are_those_of_the_problem():
-    """Return H and L from their definitions, on NumPy arrays."""
-    problem = solar_system()
-    q, v = problem.y0.reshape(2, 10, 3)
-    gm = problem.params
-    distance = np.linalg.norm(q[:, None] - q[None], axis=-1)
-    upper = np.triu_indices(10, 1)
-    energy = 0.5 * gm @ (v**2).sum(axis=1) - np.sum(np.outer(gm, gm)[upper] / distance[upper])
-    momentum = (gm[:, None] * np.cross(q, v)).sum(axis=0)
-    H, L = problem.invariants
-    assert H.fun(0.0, problem.y0, gm) == pytest.approx(energy, rel=1e-14)
-    np.testing.assert_allclose(L.fun(0.0, problem.y0, gm), momentum, rtol=1e-13)

@@ -7,9 +7,7 @@ from systems import oscillator
 from eip_scipy import Invariant
 from eip_scipy.core.gradients import random_directions
 from eip_scipy.core.invariant_checks import complaints
-from eip_scipy.core.invariants import InvariantSet, with_args
-from eip_scipy.engine.data import N_FIGURES
-from eip_scipy.problems import kepler
+from eip_scipy.core.invariants import InvariantSet
 
 SIZES = [0.0, *10.0 ** np.arange(-13.0, 0.5, 0.5)]
 TAU = 0.1
@@ -77,44 +75,6 @@ def test_what_is_found_in_order_passes_the_examination(case):
     assert not np.any(np.array(in_order) & np.array(found))
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_a_look_notes_rates_and_looks(case):
-    rng = np.random.default_rng(6)
-    for size in SIZES[::6]:
-        item, fun = case(size)
-        t, y = rng.uniform(0, 10), rng.standard_normal(2)
-        f = fun(t, y)
-        known = InvariantSet(item, t, y, f, TAU, t_bound=t - 5.0, rhs=fun)
-        G, here, directions = known.gradients(t, y, f), known.values(t, y), random_directions(2, False)
-        looked, noted = np.zeros((2, 1, N_FIGURES))
-        known.note_rates(noted, t, y, f, G, here)
-        of_run = known.target, known.scales, TAU, known.t_span, directions
-        found = known.functions.look(looked, t, y, f, *of_run)
-        assert found == known.functions.is_in_order(t, y, f, G, here, TAU, known.t_span, directions)
-        assert np.array_equal(looked, noted)
-        assert known.functions.look(looked, t, y, np.array([np.nan, 1.0]), *of_run)
-        assert np.array_equal(looked, noted)
-
-
-def with_own(item, params):
-    """Return an invariant of functions of the library that contain their parameters."""
-    own = item.function.bound(params), item.gradient.bound(params)
-    return Invariant(*own, in_place=True, uses_f=item.uses_f)
-
-
-@pytest.mark.parametrize("changed", [with_own, lambda item, params: with_args(item, (params,))], ids=["own", "args"])
-def test_functions_of_the_library_have_their_bits(changed):
-    """Python does not call them then."""
-    problem, y, f = kepler(), np.array([0.7, -0.2, 0.3, 1.1]), np.ones(4)
-    params = 1.5 * problem.params
-    known = InvariantSet([changed(item, params) for item in problem.invariants], 0.0, y, f, TAU)
-    assert np.array_equal(known.values(0.3, y), [item.function(0.3, y, params) for item in problem.invariants])
-    rows = np.empty((len(problem.invariants), 4))
-    for item, row in zip(problem.invariants, rows, strict=True):
-        item.gradient(0.3, y, *([f] if item.uses_f else []), row, params)
-    assert np.array_equal(known.gradients(0.3, y, f), rows)
-
-
 def test_rates_by_values_next_to_a_kink():
     """NaN where the slopes to both sides differ by more than the rate, else the rate, and 0 for what is rounding."""
     items = [
@@ -128,11 +88,3 @@ def test_rates_by_values_next_to_a_kink():
     np.testing.assert_allclose(known.functions.rates_by_values(0.0, y, f, *at), [np.nan, 1.0, 1.0], rtol=1e-7)
     across = np.array([0.0, 0.25])
     np.testing.assert_allclose(known.functions.rates_by_values(0.0, y, across, *at), [0.25, 0.0, np.nan], rtol=1e-7)
-
-
-def test_functions_are_not_called_with_states_of_another_kind():
-    known = InvariantSet(ENERGY, 0.0, np.ones(2), np.ones(2), TAU)
-    with pytest.raises(ValueError, match="y has another dtype or size"):
-        known.values(0.0, np.ones(3))
-    with pytest.raises(ValueError, match="y has another dtype or size"):
-        known.values(0.0, np.ones(2, complex))

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from systems import SQUARE, oscillator
 
-from eip_scipy import EIPRK4, EIPRK45, ensemble, integrate, project
+from eip_scipy import EIPRK4, EIPRK45, Invariant, ensemble, integrate, project
 from eip_scipy.problems import nbody
 
 units = pytest.importorskip("astropy.units")
@@ -75,17 +75,13 @@ def test_units_and_dates_are_refused(call, name, value):
 
 @pytest.mark.parametrize("what", ["fun", "invariant 'S'", "gradient of invariant 'S'", "event 0"])
 def test_functions_that_return_units(what):
-    functions = {
-        "fun": lambda t, y: oscillator(t, y) * units.AU,
-        "invariant 'S'": lambda t, y: (y @ y) * units.AU,
-        "gradient of invariant 'S'": lambda t, y: 2 * y * units.AU,
-        "event 0": lambda t, y: y[0] * units.AU,
-    }
-    plain = {"fun": oscillator, "invariant 'S'": SQUARE.fun, "gradient of invariant 'S'": SQUARE.grad}
-    fun, value, gradient = (functions[name] if name == what else plain[name] for name in plain)
-    options = {"events": functions[what]} if what == "event 0" else {}
+    functions = {"fun": oscillator, "invariant 'S'": SQUARE.fun, "gradient of invariant 'S'": SQUARE.grad}
+    functions["event 0"] = lambda t, y: y[0]
+    plain = functions[what]
+    functions[what] = lambda t, y: plain(t, y) * units.AU
+    fun, value, gradient, event = functions.values()
     with pytest.raises(TypeError, match=f"^{what} returned: .* has a unit"):
-        by_integrate(fun=fun, invariants=type(SQUARE)(value, gradient, name="S"), **options)
+        by_integrate(fun=fun, invariants=Invariant(value, gradient, name="S"), events=event)
 
 
 @pytest.mark.parametrize(

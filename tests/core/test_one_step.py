@@ -7,9 +7,7 @@ from scipy.integrate import solve_ivp
 from systems import Verlet, oscillator
 
 from eip_scipy import EIPRK4, Diagnostics, Invariant, eip_method, integrate
-from eip_scipy.methods import Tableau
 from eip_scipy.problems import kepler
-from eip_scipy.solvers import OneStepMethod
 
 
 class RK4:
@@ -57,17 +55,13 @@ def runs(method, **options):
 
 
 @pytest.mark.parametrize("invariants", [(), LENGTH, FORCED], ids=["none", "length", "uses f"])
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"direction": "old"}, {"direction": "midpoint"}, {"iterations": 3}, {"every": 4}, {"reuse_f": False}],
-    ids=lambda o: next(iter(o), "default"),
-)
-def test_fixed_steps_are_those_of_the_tableau(invariants, options):
+def test_fixed_steps_are_those_of_the_tableau(invariants):
     """Steps agree up to rounding: sums run in another order. The method by hand never evaluates f at a raw result."""
-    options = {"h": 0.1, "metric": "euclidean", "invariants": invariants, **options}
-    ours, tableau = runs(eip_method(RK4(oscillator)), **options), runs(EIPRK4, **{**options, "reuse_f": False})
-    np.testing.assert_allclose(ours.y, tableau.y, rtol=0, atol=2e-14)
-    assert ours.njev == tableau.njev
+    for options in ({}, {"direction": "old"}, {"direction": "midpoint"}, {"iterations": 3}, {"every": 4}):
+        options = {"h": 0.1, "metric": "euclidean", "invariants": invariants, **options}
+        ours, tableau = runs(eip_method(RK4(oscillator)), **options), runs(EIPRK4, reuse_f=False, **options)
+        np.testing.assert_allclose(ours.y, tableau.y, rtol=0, atol=2e-14)
+        assert ours.njev == tableau.njev
 
 
 @pytest.mark.parametrize("metric", ["error", "euclidean"])
@@ -96,10 +90,9 @@ def test_order_and_invariant_of_a_method_in_place():
 
 
 def test_backward_and_a_shorter_last_step():
-    for options in ({"h": 0.1, "iterations": 3}, {"h": 0.03, "iterations": 3}):
-        sol = solve_ivp(
-            oscillator, (0, -1), [1.0, 0.0], method=eip_method(RK4(oscillator)), invariants=LENGTH, **options
-        )
+    for h in (0.1, 0.03):
+        options = {"method": eip_method(RK4(oscillator)), "invariants": LENGTH, "iterations": 3}
+        sol = solve_ivp(oscillator, (0, -1), [1.0, 0.0], h=h, **options)
         np.testing.assert_allclose(sol.y[:, -1], closed(-1), atol=1e-6)
         assert abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-15
 
@@ -121,13 +114,9 @@ def test_dense_output_is_the_cubic_through_both_ends():
 def test_fun_is_called_only_where_someone_asks():
     """At the start; for gradients that take f; for dense output."""
     for invariants, each in (((), 0), (LENGTH, 0), (FORCED, 1)):
-        counts = [
-            solve_ivp(
-                oscillator, (0, n / 10), [1.0, 0.0], method=eip_method(Verlet()), h=0.1, invariants=invariants
-            ).nfev
-            for n in (10, 20)
-        ]
-        assert counts[1] - counts[0] == 10 * each
+        options = {"method": eip_method(Verlet()), "h": 0.1, "invariants": invariants}
+        once, twice = (solve_ivp(oscillator, (0, end), [1.0, 0.0], **options).nfev for end in (1, 2))
+        assert twice - once == 10 * each
 
 
 def test_a_method_says_what_it_evaluates():
@@ -146,62 +135,45 @@ def test_a_method_says_what_it_evaluates():
         eip_method(type("Wrong", (Verlet,), {"evaluations": -1})())
 
 
-def test_complex_states_keep_their_type():
-    class Exact:
-        order = 8
-
-        def one_step(self, t, y, h):
-            return y * np.exp(-1j * h) * (1 + h**3)
-
-    modulus = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y)
-    run = integrate(
-        lambda t, y: -1j * y, (0, 1), [1 + 1j, 2.0], method=eip_method(Exact()), h=0.1, invariants=modulus, iterations=4
-    )
-    np.testing.assert_allclose(run.y[:, -1], np.array([1 + 1j, 2.0]) * np.exp(-1j), atol=1e-15)
-
-
 def pendulum(g):
     return lambda t, y: np.array([y[1], -g * np.sin(y[0])])
 
 
 @pytest.mark.parametrize("lib", [integrate, solve_ivp])
-@pytest.mark.parametrize("end", [1.0, -1.0])
 @pytest.mark.parametrize("method", [RK4, RK43])
-def test_steps_of_another_equation_are_reported(lib, end, method):
-    options = {"method": eip_method(method(pendulum(1.01))), "h": 0.02, "diagnostics": Diagnostics()}
-    with pytest.warns(
-        UserWarning, match=r"do not solve the equation of fun: .* rate -0\.84988., and fun gives -0\.841471"
-    ):
-        lib(pendulum(1.0), (0, end), [1.0, 0.3], **options)
-    assert "do not solve the equation" in options["diagnostics"].message
-    assert not options["diagnostics"].trusted
-    options["diagnostics"] = Diagnostics()
-    lib(pendulum(1.0), (0, end), [1.0, 0.3], check=False, **options)
-    assert options["diagnostics"].trusted
+def test_steps_of_another_equation_are_reported(lib, method):
+    for end in (1.0, -1.0):
+        options = {"method": eip_method(method(pendulum(1.01))), "h": 0.02, "diagnostics": Diagnostics()}
+        words = r"do not solve the equation of fun: .* rate -0\.84988., and fun gives -0\.841471"
+        with pytest.warns(UserWarning, match=words):
+            lib(pendulum(1.0), (0, end), [1.0, 0.3], **options)
+        assert "do not solve the equation" in options["diagnostics"].message
+        assert not options["diagnostics"].trusted
+        options["diagnostics"] = Diagnostics()
+        lib(pendulum(1.0), (0, end), [1.0, 0.3], check=False, **options)
+        assert options["diagnostics"].trusted
 
 
-@pytest.mark.parametrize("rate", 10.0 ** np.arange(0, 15, 2))
-def test_steps_of_stiff_equations_are_not_reported(rate):
+def test_steps_of_stiff_equations_are_not_reported():
     """An implicit Euler step of y' = -rate (y - z), z' = -z differs from the derivative unless it is very short."""
+    for rate in 10.0 ** np.arange(0, 15, 2):
 
-    class Implicit:
-        order = 1
+        class Implicit:
+            order = 1
 
-        def one_step(self, t, y, h):
-            z = y[1] / (1 + h)
-            return np.array([(y[0] + h * rate * z) / (1 + h * rate), z])
+            def one_step(self, t, y, h, rate=rate):
+                z = y[1] / (1 + h)
+                return np.array([(y[0] + h * rate * z) / (1 + h * rate), z])
 
-    for away in (0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0):
-        run = integrate(
-            lambda t, y: np.array([-rate * (y[0] - y[1]), -y[1]]), (0, 0.02), [1 + away, 1.0],
-            method=eip_method(Implicit()), h=0.01,
-        )  # fmt: skip
-        assert run.trusted
+        def fun(t, y, rate=rate):
+            return np.array([-rate * (y[0] - y[1]), -y[1]])
+
+        for away in (0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0):
+            assert integrate(fun, (0, 0.02), [1 + away, 1.0], method=eip_method(Implicit()), h=0.01).trusted
 
 
-@pytest.mark.parametrize("force", 10.0 ** np.arange(0, 13, 3))
-@pytest.mark.parametrize("q", [[1.0, 1.0], [0.1 + 0.2, 0.3], [1.2, 1.2 + 1e-9]])
-def test_steps_where_large_forces_cancel_are_not_reported(force, q):
+@pytest.mark.parametrize("force", [1.0, 1e6, 1e12])
+def test_steps_where_large_forces_cancel_are_not_reported(force):
     class Kicks:
         """The two forces on each mass act one after the other."""
 
@@ -216,65 +188,42 @@ def test_steps_where_large_forces_cancel_are_not_reported(force, q):
     def fun(t, y):
         return np.concatenate([y[2:], force * (y[1::-1] - y[:2])])
 
-    run = integrate(fun, (0, 1e-7), [*q, 0.0, 0.0], method=eip_method(Kicks()), h=1e-7)
-    assert run.trusted
-
-
-def test_steps_that_raise_or_do_not_move_are_not_reported():
-    class OfOneLength(RK4):
-        def one_step(self, t, y, h):
-            if h != 0.5:
-                raise ValueError("no table for this step")
-            return super().one_step(t, y, h)
-
-    class Coarse(RK4):
-        def one_step(self, t, y, h):
-            return y if h < 0.01 else super().one_step(t, y, h)
-
-    for method in (OfOneLength, Coarse):
-        assert integrate(oscillator, (0, 2), [1.0, 0.0], method=eip_method(method(oscillator)), h=0.5).trusted
+    for q in ([1.0, 1.0], [0.1 + 0.2, 0.3], [1.2, 1.2 + 1e-9]):
+        assert integrate(fun, (0, 1e-7), [*q, 0.0, 0.0], method=eip_method(Kicks()), h=1e-7).trusted
 
 
 def test_an_own_step_runs_interpreted_and_says_so():
-    method = eip_method(Verlet())
-    run = integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1)
-    assert not run.compiled
-    assert run.message == "reached the end of the interval (interpreted: Verlet is a one-step method in Python)"
+    def run(**options):
+        return integrate(oscillator, (0, 1), [1.0, 0.0], method=eip_method(Verlet()), h=0.1, **options)
+
+    assert not run().compiled
+    assert run().message == "reached the end of the interval (interpreted: Verlet is a one-step method in Python)"
     with pytest.raises(TypeError, match="Verlet is a one-step method in Python"):
-        integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1, compiled=True)
+        run(compiled=True)
     with pytest.raises(ValueError, match=r"compensated=True .* Verlet is not a tableau"):
-        integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1, compensated=True)
-
-
-@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # inf - inf, by NumPy, without the JIT
-def test_failures_end_the_run():
-    class Overflow(Verlet):
-        def one_step(self, t, y, h):
-            return np.full(2, np.inf) if t > 0.45 else y
-
-    sol = solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=eip_method(Overflow()), h=0.1)
-    assert sol.status == -1
-    assert "no longer finite at t=0.6" in sol.message
+        run(compensated=True)
+    with pytest.raises(ValueError, match="every='auto' needs an error estimate, and Verlet has none"):
+        run(invariants=LENGTH, every="auto")
 
 
 def returning(value, **attributes):
     return type("Mine", (), {"order": 2, "one_step": lambda self, t, y, h: value, **attributes})()
 
 
-@pytest.mark.parametrize(
-    ("method", "error", "match"),
-    [
-        (returning(None), TypeError, "Mine.one_step returned a state: None, expected 2 numbers"),
-        (returning([1.0]), ValueError, r"Mine.one_step returned a state: shape \(1,\), expected \(2,\)"),
-        (returning([1j, 0.0]), ValueError, "complex values at t=0, but y0 is real"),
-        (returning("ab"), TypeError, "'ab', expected 2 numbers"),
-        (returning([1.0, 0.0], error_estimator_order=1), TypeError, r"list, expected the pair \(y_hat, err\)"),
-        (returning(([1.0, 0.0], 0.0), error_estimator_order=1), ValueError, r"an estimate: shape \(\)"),
-    ],
-)
-def test_wrong_results_are_named(method, error, match):
-    with pytest.raises(error, match=match):
-        solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=eip_method(method), h=0.1)
+WRONG_RESULTS = [
+    (returning(None), TypeError, "Mine.one_step returned a state: None, expected 2 numbers"),
+    (returning([1.0]), ValueError, r"Mine.one_step returned a state: shape \(1,\), expected \(2,\)"),
+    (returning([1j, 0.0]), ValueError, "complex values at t=0, but y0 is real"),
+    (returning("ab"), TypeError, "'ab', expected 2 numbers"),
+    (returning([1.0, 0.0], error_estimator_order=1), TypeError, r"list, expected the pair \(y_hat, err\)"),
+    (returning(([1.0, 0.0], 0.0), error_estimator_order=1), ValueError, r"an estimate: shape \(\)"),
+]
+
+
+def test_wrong_results_are_named():
+    for method, error, match in WRONG_RESULTS:
+        with pytest.raises(error, match=match):
+            solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=eip_method(method), h=0.1)
 
 
 def test_wrong_methods_are_refused():
@@ -286,11 +235,3 @@ def test_wrong_methods_are_refused():
             eip_method(returning([1.0, 0.0], **{name: 0}))
     with pytest.raises(ValueError, match="has no error estimate and needs the step"):
         solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=eip_method(Verlet()))
-    with pytest.raises(ValueError, match="every='auto' needs an error estimate, and Verlet has none"):
-        integrate(oscillator, (0, 1), [1.0, 0.0], method=eip_method(Verlet()), h=0.1, invariants=LENGTH, every="auto")
-
-
-def test_the_protocol_tells_methods_from_others():
-    assert isinstance(Verlet(), OneStepMethod)
-    assert not isinstance(EIPRK4.TABLEAU, OneStepMethod)
-    assert isinstance(EIPRK4.TABLEAU, Tableau)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
+from eip_scipy import EIPRK4, EIPRK45, ensemble, integrate
 from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
 from eip_scipy.ensembles.ensemble import EnsembleKeywords
 from eip_scipy.problems import kepler
@@ -40,16 +40,6 @@ def test_documentation_names_the_options():
     assert "{" + "ProjectionOptions" not in EIPSolver.__doc__ + integrate.__doc__
 
 
-@pytest.mark.parametrize("method", [EIPRK4, EIPRKN8, EIPRKN12])
-def test_none_is_the_own_of_the_method(method):
-    p = kepler()
-    plain, none = (
-        integrate(p, (0, 3), method=method, h=0.1, compiled=False, **options)
-        for options in ({"every": 1, "compensated": False}, {"every": None, "compensated": None})
-    )
-    np.testing.assert_array_equal(plain.y, none.y)
-
-
 @pytest.mark.parametrize("options", [{"h": 0.01}, {"rtol": 1e-10, "atol": 1e-12}])
 def test_solve_ivp_compensates_as_integrate_does(options):
     p = kepler()
@@ -73,17 +63,3 @@ def test_compensated_steps_without_invariants_are_not_scipys():
     exact = 1e6 + 1.0 / 3.0
     assert abs(ends[0] - exact) <= np.spacing(exact)
     assert abs(ends[1] - exact) > np.spacing(exact)
-
-
-def test_a_frame_that_was_changed_in_place_is_checked_again():
-    def fun(t, y):
-        return np.array([y[1], -y[0], 0.0])
-
-    energy = Invariant(lambda t, y: y[0] ** 2 + y[1] ** 2, grad=lambda t, y: np.array([2 * y[0], 2 * y[1], 0.0]))
-    C, S = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0], [0.0], [1.0]])
-    options = {"method": EIPRK4, "h": 0.1, "invariants": energy, "frame": (C, S)}
-    first = integrate(fun, (0, 1), [1.0, 0.0, 2.0], **options)
-    np.testing.assert_array_equal(first.y, integrate(fun, (0, 1), [1.0, 0.0, 2.0], **options).y)
-    S[:, 0] = 1.0, 0.0, 0.0
-    with pytest.raises(ValueError, match="C S is singular"):
-        integrate(fun, (0, 1), [1.0, 0.0, 2.0], **options)

@@ -17,27 +17,20 @@ TOLERANCE = 0.1
 # Two steps per method at which the next term of the error and round-off are both small.
 STEPS = {1: (512, 1024), 2: (256, 512), 3: (256, 512), 4: (200, 400), 5: (200, 400)}
 
-BLOCKS = [[0, 1], [2, 3]]  # position and velocity
-ERROR = {"metric": "error", "blocks": BLOCKS}
+ERROR = {"metric": "error", "blocks": [[0, 1], [2, 3]]}  # position and velocity
 EUCLIDEAN = {"metric": "euclidean"}
-WEIGHTS = {"metric": [1.0, 2.0, 0.5, 1.5]}
 OPTIONS = {
     "none": {"invariants": ()},
     "error": ERROR,
     "error-old": {**ERROR, "direction": "old"},
-    "error-midpoint": {**ERROR, "direction": "midpoint"},
-    "error-2-iterations": {**ERROR, "iterations": 2},
+    "error-midpoint-2-iterations": {**ERROR, "direction": "midpoint", "iterations": 2},
     "error-every-5": {**ERROR, "every": 5},
-    "error-no-reuse": {**ERROR, "reuse_f": False},
-    "error-compensated": {**ERROR, "compensated": True},
+    "error-no-reuse-compensated": {**ERROR, "reuse_f": False, "compensated": True},
     "error-H": {**ERROR, "invariants": PROBLEM.invariants[:1]},
     "error-L": {**ERROR, "invariants": PROBLEM.invariants[1:]},
     "euclidean": EUCLIDEAN,
     "euclidean-old": {**EUCLIDEAN, "direction": "old"},
-    "euclidean-midpoint": {**EUCLIDEAN, "direction": "midpoint"},
-    "euclidean-3-iterations": {**EUCLIDEAN, "iterations": 3},
-    "weights": WEIGHTS,
-    "weights-old": {**WEIGHTS, "direction": "old"},
+    "weights": {"metric": [1.0, 2.0, 0.5, 1.5]},
 }
 
 
@@ -60,12 +53,10 @@ def order_of(method, end, options):
     return order
 
 
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-@pytest.mark.parametrize(
-    "method", [pytest.param(m, marks=pytest.mark.slow) if m in (EIPRK1, EIPRK3) else m for m in METHODS]
-)
+@pytest.mark.parametrize("options", OPTIONS)
+@pytest.mark.parametrize("method", METHODS)
 def test_order_of_the_solution(method, options, end):
-    assert order_of(method, end, options) == pytest.approx(method.TABLEAU.order, abs=TOLERANCE)
+    assert order_of(method, end, OPTIONS[options]) == pytest.approx(method.TABLEAU.order, abs=TOLERANCE)
 
 
 SYMMETRIC_POINT = pytest.mark.xfail(
@@ -87,18 +78,6 @@ def test_order_of_the_solution_without_blocks(method, end):
 # The local part: single steps from states on the manifold around an orbit of eccentricity 0.2.
 ORBIT = kepler(eccentricity=0.2)
 STATES = integrate(ORBIT, (0, 6.2), method=EIPRK5, h=0.002, t_eval=np.linspace(0.1, 6.1, 24), compiled=False).y.T
-AWAY_FROM_PERICENTRE = STATES[3:-3]  # where the error estimate of RK5 is not yet of its order
-LOCAL = (
-    "error",
-    "error-old",
-    "error-midpoint",
-    "euclidean",
-    "euclidean-old",
-    "euclidean-midpoint",
-    "weights",
-    "weights-old",
-)
-CORRECTION_STEPS = {1: 0.01, 2: 0.02, 3: 0.03, 4: 0.05, 5: 0.07}
 QUADRATIC_STEPS = {1: 0.01, 2: 0.05, 3: 0.1, 4: 0.2, 5: 0.3}
 DEFECT_STEPS = {(1, 1): 0.02, (2, 1): 0.05, (3, 1): 0.075, (4, 1): 0.19, (1, 2): 0.045, (2, 2): 0.14}
 
@@ -134,21 +113,10 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values), axis=0))
 
 
-@pytest.mark.parametrize("options", LOCAL)
-@pytest.mark.parametrize("method", METHODS)
-def test_corrections_are_of_the_size_of_the_local_error(method, options):
-    """Corrections are of order p + 1, the first half of the theorem that the residuals are of order 2 (p + 1)."""
-    p = method.TABLEAU.order
-    steps = CORRECTION_STEPS[p] * np.array([1.0, 0.6])
-    pairs = [[one_step(y, method, h, OPTIONS[options]) for y in AWAY_FROM_PERICENTRE] for h in steps]
-    sizes = [rms([np.linalg.norm(y - y_hat) for y_hat, y in at_step]) for at_step in pairs]
-    assert observed_order(sizes, steps) == pytest.approx(p + 1, abs=TOLERANCE)
-
-
-@pytest.mark.parametrize("options", LOCAL)
+@pytest.mark.parametrize("options", ["error", "error-old", "euclidean", "weights"])
 @pytest.mark.parametrize("method", METHODS)
 def test_defects_are_the_quadratic_term_of_the_correction(method, options):
-    """The other half, for every order: one Newton step leaves x H x / 2, where x is the correction."""
+    """One Newton step leaves x H x / 2, where x is the correction."""
     left, quadratic = [], []
     for y in STATES:
         y_hat, y_new = one_step(y, method, QUADRATIC_STEPS[method.TABLEAU.order], OPTIONS[options])

@@ -36,21 +36,21 @@ def test_every_function_is_listed_here():
 
 
 @pytest.mark.skipif(not BUILD.HAS_V3, reason="needs a processor with AVX2 and FMA")
-@pytest.mark.parametrize("n", [1, 7, 64, 1027])
 @pytest.mark.parametrize("name", CALLS)
-def test_both_builds_give_the_same_bits(name, n):
-    found = []
-    for build in ("_native", "_native_v3"):
-        given = arguments(CALLS[name], n)
-        value = functions(import_module(f"eip_scipy.engine.{build}"))[name](*given)
-        found.append([() if value is None else value, *given])
-    for plain, fast in zip(*found, strict=True):
-        np.testing.assert_array_equal(plain, fast)
+def test_both_builds_give_the_same_bits(name):
+    for n in (1, 7, 64, 1027):
+        found = []
+        for build in ("_native", "_native_v3"):
+            given = arguments(CALLS[name], n)
+            value = functions(import_module(f"eip_scipy.engine.{build}"))[name](*given)
+            found.append([() if value is None else value, *given])
+        for plain, fast in zip(*found, strict=True):
+            np.testing.assert_array_equal(plain, fast)
 
 
 @pytest.mark.parametrize("name", CALLS)
 def test_what_is_no_such_array_is_refused(name):
-    """In each place: no array, another type, gaps, no axis, and read-only where it is written."""
+    """In each place: no array, another type, gaps, no axis, read-only where it is written; arrays of two lengths."""
     function, kinds = functions(BUILD)[name], CALLS[name]
     for k, kind in enumerate(kinds):
         if not isinstance(kind, str):
@@ -64,24 +64,12 @@ def test_what_is_no_such_array_is_refused(name):
         for array in wrong:
             with pytest.raises(TypeError, match=rf"{name.partition('.')[2]}\(\): incompatible function arguments"):
                 function(*good[:k], array, *good[k + 1 :])
-
-
-@pytest.mark.parametrize("name", [name for name, kinds in CALLS.items() if sum(map(str.isalpha, map(str, kinds))) > 1])
-def test_arrays_of_different_lengths_are_refused(name):
-    function, kinds = functions(BUILD)[name], CALLS[name]
-    given = arguments(kinds, 6)
-    last = max(k for k, kind in enumerate(kinds) if isinstance(kind, str))
-    given[last] = given[last][:4].copy()
-    with pytest.raises(ValueError, match="expected"):
-        function(*given)
-
-
-def test_arguments_are_counted_and_numbers_are_numbers():
-    multiply, turn = BUILD.condensates.multiply, BUILD.condensates.turn
-    with pytest.raises(TypeError, match=r"multiply\(field.*, factor.*\) -> None"):
-        multiply(np.zeros(3, complex))
-    with pytest.raises(TypeError, match="factor: float"):
-        turn(np.zeros(3, complex), "1", np.zeros(3, complex))
+    arrays = [k for k, kind in enumerate(kinds) if isinstance(kind, str)]
+    if len(arrays) > 1:
+        given = arguments(kinds, 6)
+        given[arrays[-1]] = given[arrays[-1]][:4].copy()
+        with pytest.raises(ValueError, match="expected"):
+            function(*given)
 
 
 @pytest.mark.parametrize("name", ["multiply", "weighted_square"])

@@ -1,7 +1,5 @@
 """The engine's complex steps: gradients of functions in Python, and what such functions may return."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -18,34 +16,27 @@ def product(t, y, *args):
 
 GRADIENT = 2.0 * np.array([3 * Y[0] ** 2 * Y[1], Y[0] ** 3, 0.0])
 
-KINDS = {
-    "NumPy's complex": product,
-    "Python's complex": lambda t, y: complex(product(t, y)),
-    "no dimensions": lambda t, y: np.array(product(t, y)),
-    "single precision": lambda t, y: np.complex64(0) + product(t, y),
-    "extended precision": lambda t, y: np.clongdouble(product(t, y)),
-}
+KINDS = [
+    product,
+    lambda t, y: complex(product(t, y)),
+    lambda t, y: np.array(product(t, y)),
+    lambda t, y: np.complex64(0) + product(t, y),
+    lambda t, y: np.clongdouble(product(t, y)),
+]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_numbers(kind):
-    G = complex_step(KINDS[kind], 2.0, Y, (), STEP)
-    assert G.dtype == float
-    assert G.shape == (3,)
-    np.testing.assert_allclose(G, GRADIENT, rtol=4e-16)
+def test_numbers():
+    for kind in KINDS:
+        G = complex_step(kind, 2.0, Y, (), STEP)
+        assert (G.dtype, G.shape) == (float, (3,))
+        np.testing.assert_allclose(G, GRADIENT, rtol=4e-16)
 
 
-@pytest.mark.parametrize("as_kind", [np.array, list, tuple], ids=["array", "list", "tuple"])
-def test_several_values_and_further_arguments(as_kind):
-    G = complex_step(lambda t, y, a, b: as_kind([product(t, y, a), b * product(t, y)]), 2.0, Y, (4.0, 3), STEP)
-    np.testing.assert_allclose(G, [5 * GRADIENT, 3 * GRADIENT], rtol=4e-16)
-    assert G.flags.c_contiguous
-
-
-def test_constants_have_no_slope():
-    np.testing.assert_array_equal(complex_step(lambda t, y: 7, 0.0, Y, (), STEP), np.zeros(3))
-    one_real = complex_step(lambda t, y: y[0] if y[0].imag else 1.5, 0.0, Y, (), STEP)
-    np.testing.assert_array_equal(one_real, [1, 0, 0])
+def test_several_values_and_further_arguments():
+    for kind in (np.array, list, tuple):
+        G = complex_step(lambda t, y, a, b: kind([product(t, y, a), b * product(t, y)]), 2.0, Y, (4.0, 3), STEP)  # noqa: B023
+        np.testing.assert_allclose(G, [5 * GRADIENT, 3 * GRADIENT], rtol=4e-16)
+        assert G.flags.c_contiguous
 
 
 def test_each_call_has_an_array_of_its_own():
@@ -57,10 +48,9 @@ def test_each_call_has_an_array_of_its_own():
 
 def test_what_cannot_be_taken():
     shapes = iter([np.zeros(2), np.zeros(3), np.zeros(2)])
-    with pytest.raises(ValueError, match="values of different shapes"):
-        complex_step(lambda t, y: next(shapes), 0.0, Y, (), STEP)
-    with pytest.raises(ValueError, match="values of different shapes"):
-        complex_step(lambda t, y: np.zeros(2) if y[0].imag else 1j, 0.0, Y, (), STEP)
+    for fun in (lambda t, y: next(shapes), lambda t, y: np.zeros(2) if y[0].imag else 1j):
+        with pytest.raises(ValueError, match="values of different shapes"):
+            complex_step(fun, 0.0, Y, (), STEP)
     with pytest.raises(TypeError, match="returned None, expected numbers"):
         complex_step(lambda t, y: None, 0.0, Y, (), STEP)
     with pytest.raises(ZeroDivisionError):
@@ -70,17 +60,3 @@ def test_what_cannot_be_taken():
             complex_step(product, 0.0, y, (), STEP)
     with pytest.raises(ValueError, match="one number or more"):
         complex_step(product, 0.0, np.empty(0), (), STEP)
-    for arguments in ((product, 0.0, Y, [], STEP), (product, 0.0, Y, ()), (product, 0.0, Y, (), STEP, 1)):
-        with pytest.raises(TypeError, match="incompatible function arguments"):
-            complex_step(*arguments)
-    with pytest.raises(TypeError):
-        complex_step(product, 0.0, Y, (), "step")
-
-
-def test_nothing_is_lost():
-    argument = object()
-    before = sys.getrefcount(argument), sys.getrefcount(product), sys.getrefcount(Y)
-    for _ in range(100):
-        complex_step(lambda t, y, a: y[0], 0.0, Y, (argument,), STEP)
-        complex_step(product, 0.0, Y, (), STEP)
-    assert (sys.getrefcount(argument), sys.getrefcount(product), sys.getrefcount(Y)) == before

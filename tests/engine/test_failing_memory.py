@@ -15,6 +15,7 @@ HERE = Path(__file__).parent
 KEPLER = HERE.parents[1] / "examples" / "c-functions" / "kepler.c"
 
 pytestmark = [
+    pytest.mark.nightly,
     pytest.mark.slow,
     pytest.mark.needs_jit,
     pytest.mark.skipif(sys.platform != "linux", reason="preloads a library"),

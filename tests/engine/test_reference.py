@@ -6,7 +6,8 @@ from reference_step import Step
 
 from eip_scipy import EIPDOP853, EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, Invariant
 
-CLASSES = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
+NYSTROM = [EIPRKN8, EIPRKN12]
+CLASSES = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853, *NYSTROM]
 Y0 = np.array([0.7, 0.1, -0.3, 1.2, -0.2, 0.4])
 SPINS = np.array([0.6 + 0.2j, -0.3 + 0.5j, 0.4 - 0.1j])
 
@@ -97,13 +98,14 @@ OPTIONS = [
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "-".join(o) or "plain")
-@pytest.mark.parametrize("cls", CLASSES)
-def test_a_step_is_that_of_the_method(cls, options):
-    found, expected, step = both(cls, REAL, Y0, **options)
-    moved = np.abs(expected - Y0).max()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16)
-    if options.get("iterations", 1) > 2:
-        assert np.abs(step.defects(length(cls), found)).max() <= 1e-15
+def test_a_step_is_that_of_the_method(options):
+    for cls in CLASSES:
+        more = {"every": 1, "compensated": False} if cls in NYSTROM else {}
+        found, expected, step = both(cls, REAL, Y0, **more, **options)
+        moved = np.abs(expected - Y0).max()
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16, err_msg=cls.__name__)
+        if options.get("iterations", 1) > 2:
+            assert np.abs(step.defects(length(cls), found)).max() <= 1e-15
 
 
 @pytest.mark.parametrize("options", [{}, {"blocks": [[0, 3], [1, 4], [2, 5]]}, {"blocks": 3}, {"atol": 0.0}])
@@ -116,16 +118,8 @@ def test_errors_of_earlier_steps_are_remembered(cls, options):
     assert not np.array_equal(step.remembered, forgetful.remembered)
 
 
-@pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "-".join(o) or "plain")
-@pytest.mark.parametrize("cls", [EIPRKN8, EIPRKN12])
-def test_a_step_of_a_nystrom_method(cls, options):
-    found, expected, _ = both(cls, REAL, Y0, every=1, compensated=False, **options)
-    moved = np.abs(expected - Y0).max()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16)
-
-
 @pytest.mark.parametrize("options", [{}, {"metric": "euclidean"}, {"blocks": [[0, 2], [1]]}, {"direction": "old"}])
-@pytest.mark.parametrize("cls", CLASSES)
-def test_complex_states_too(cls, options):
-    found, expected, _ = both(cls, COMPLEX, SPINS, **options)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+def test_complex_states_too(options):
+    for cls in CLASSES[:8]:
+        found, expected, _ = both(cls, COMPLEX, SPINS, **options)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15, err_msg=cls.__name__)

@@ -8,10 +8,11 @@ import mpmath
 import numpy as np
 import pytest
 from mpmath import mpf
+from orders import weighted_moments
 from scipy.integrate import solve_ivp
 
 from eip_scipy import eip_method, integrate
-from eip_scipy.methods.nystrom import RKN86, RKN1210, NystromTableau, Weights, nystrom_residuals, nystrom_trees
+from eip_scipy.methods.nystrom import RKN86, RKN1210, NystromTableau, nystrom_trees
 
 DIGITS = 60
 HOLDS, FAILS = mpf("1e-30"), mpf("1e-9")
@@ -66,7 +67,7 @@ def from_package(tree):
 
 
 class Conditions:
-    """Order conditions of a method whose coefficients are lists of numbers of any kind."""
+    """Order conditions of a method whose coefficients are lists of numbers in many digits."""
 
     def __init__(self, A, c, **weights):
         self.A, self.c, self.weights = A, c, weights
@@ -89,17 +90,11 @@ class Conditions:
     def residual(self, key, tree):
         total = sum(w * x for w, x in zip(self.weights[key], self.stage_factors(tree), strict=True))
         # A position is the tree on one more vertex, its velocity.
-        whole = tree if "prime" in key else (tree,)
-        return total - Fraction(1, density(whole)) if isinstance(total, Fraction) else total - mpf(1) / density(whole)
+        return total - mpf(1) / density(tree if "prime" in key else (tree,))
 
     def residuals(self, key, order):
         """Return residuals of exactly this order of the local error: a position has gained one by its velocity."""
         return [abs(self.residual(key, tree)) for tree in special_trees(order if "prime" in key else order - 1)]
-
-
-def fractions(tableau):
-    values = {key: value.tolist() for key, value in tableau.exact.items()}
-    return Conditions(**values)
 
 
 @cache
@@ -119,16 +114,12 @@ WEIGHTS = [
 ]
 
 
-def test_number_of_special_trees():
+def test_trees_are_those_of_another_algorithm():
     """The numbers of trees are those of Hairer, Norsett & Wanner I, section II.14."""
     counts = [1, 1, 2, 3, 6, 10, 20, 36, 72, 137, 275]
-    assert [len(special_trees(k)) for k in range(1, 12)] == counts
     assert [len(nystrom_trees(k)) for k in range(1, 12)] == counts
-
-
-@pytest.mark.parametrize("order", range(1, 13))
-def test_trees_are_those_of_another_algorithm(order):
-    assert {from_package(tree) for tree in nystrom_trees(order)} == special_trees(order)
+    for order in range(1, 13):
+        assert {from_package(tree) for tree in nystrom_trees(order)} == special_trees(order)
 
 
 @pytest.mark.parametrize(("tableau", "key", "order"), WEIGHTS, ids=lambda x: getattr(x, "name", str(x)))
@@ -140,32 +131,11 @@ def test_order_in_many_digits(tableau, key, order):
         assert max(conditions.residuals(key, order + 1)) > FAILS
 
 
-@pytest.mark.parametrize(("key", "order"), [("b", 8), ("b_prime", 8), ("b_hat", 6), ("b_prime_hat", 6)])
-def test_order_of_rkn86_in_fractions(key, order):
-    conditions = fractions(RKN86)
-    assert all(x == 0 for k in range(1 if "prime" in key else 2, order + 1) for x in conditions.residuals(key, k))
-    assert all(x != 0 for x in conditions.residuals(key, order + 1))
-
-
 @pytest.mark.parametrize("tableau", HIGH, ids=name)
 def test_stage_positions_are_of_second_order(tableau):
     """The pair satisfies Sum_j A_ij = c_i^2 / 2, which the constructor does not require."""
     for row, node in zip(tableau.exact["A"], tableau.exact["c"], strict=True):
         assert abs(sum(row) - node**2 / 2) < Fraction(1, 10**50)
-
-
-def test_the_package_s_residuals_agree_with_the_sums():
-    """The weights are arbitrary, so that the residuals are large."""
-    A, c = RKN86.exact["A"], RKN86.exact["c"]
-    weights = np.array([Fraction(i + 1, 7) for i in range(9)], dtype=object)
-    conditions = Conditions(A.tolist(), c.tolist(), b=weights.tolist(), b_prime=weights.tolist())
-    rows = [Weights("b", weights, 7, True), Weights("b_prime", weights, 7, False)]
-    ours = {
-        key: sorted(r for row, _, r in nystrom_residuals(A, c, rows) if row.label == key) for key in ("b", "b_prime")
-    }
-    for key, first, last in (("b", 2, 7), ("b_prime", 1, 7)):
-        trees = [t for k in range(first, last + 1) for t in special_trees(k - (key == "b"))]
-        assert ours[key] == pytest.approx(sorted(float(conditions.residual(key, t)) for t in trees), rel=1e-15)
 
 
 def arguments(tableau):
@@ -188,51 +158,31 @@ def changed(tableau, key, place, change):
     return values
 
 
-@pytest.mark.parametrize(("key", "place"), list(places(RKN86)))
-def test_one_wrong_coefficient_is_found(key, place):
-    with pytest.raises(ValueError, match=r"bad: b\w* is not of order [68]: a condition of order \d+ is violated by"):
-        NystromTableau("bad", **changed(RKN86, key, place, Fraction(1, 10**40)))
-
-
-@pytest.mark.parametrize(("key", "place"), list(places(RKN1210))[::9])
-def test_one_wrong_coefficient_of_rkn1210_is_found(key, place):
-    with pytest.raises(ValueError, match=r"bad: b\w* is not of order 1[02]"):
-        NystromTableau("bad", **changed(RKN1210, key, place, Fraction(1, 10**40)))
+@pytest.mark.parametrize(("tableau", "stride"), [(RKN86, 2), (RKN1210, 18)], ids=["RKN86", "RKN12(10)"])
+def test_one_wrong_coefficient_is_found(tableau, stride):
+    for key, place in list(places(tableau))[::stride]:
+        with pytest.raises(ValueError, match=r"bad: b\w* is not of order (6|8|10|12): a condition of order"):
+            NystromTableau("bad", **changed(tableau, key, place, Fraction(1, 10**40)))
 
 
 def moment_residuals(tableau, key):
-    """Return sum (b + b_low) c^k minus its exact value, in fractions, for the doubles of the step, in least units.
-
-    That is half a unit in the last place of each low part, which are the sums' only numbers that can be chosen.
-    """
-    b, low = getattr(tableau, key), getattr(tableau, f"{key}_low")
-    weights = [Fraction(w) + Fraction(x) for w, x in zip(b, low, strict=True)]
-    nodes = [Fraction(x) for x in tableau.c]
-    count = min(7, tableau.order - (key == "b"), len({x for x, w in zip(nodes, b, strict=True) if w}))
-    for k in range(count):
-        missed = sum(w * c**k for w, c in zip(weights, nodes, strict=True))
-        missed -= Fraction(1, (k + 1) * (k + 2 if key == "b" else 1))
-        least = sum(Fraction(math.ulp(x)) / 2 * c**k for w, x, c in zip(b, low, nodes, strict=True) if w)
-        yield abs(missed) / least
+    b, c = getattr(tableau, key), tableau.c
+    count = min(7, tableau.order - (key == "b"), len({x for x, w in zip(c, b, strict=True) if w}))
+    return weighted_moments(b, getattr(tableau, f"{key}_low"), c, count, key == "b")
 
 
-@pytest.mark.parametrize("key", ["b", "b_prime"])
 @pytest.mark.parametrize("tableau", METHODS, ids=name)
-def test_low_parts_make_the_moments_exact(tableau, key):
-    assert max(moment_residuals(tableau, key)) <= 1
-    low = getattr(tableau, f"{key}_low")
-    assert np.abs(low).max() < 1e-16
-    assert not low[getattr(tableau, key) == 0].any()
-
-
-def test_a_first_order_position_has_no_moment():
-    drift = NystromTableau("drift", [[]], ["1/3"], [1], [0], order=1)
-    assert drift.b_low[0] == float(Fraction(1, 3) - Fraction(1 / 3))
-
-
-def test_number_of_exact_moments():
-    counts = [len(list(moment_residuals(t, key))) for t in METHODS for key in ("b", "b_prime")]
-    assert counts == [1, 2, 2, 3, 1, 2, 6, 7, 7, 7]
+def test_low_parts_make_the_moments_exact(tableau):
+    for key in ("b", "b_prime"):
+        assert max(moment_residuals(tableau, key)) <= 1
+        low = getattr(tableau, f"{key}_low")
+        assert np.abs(low).max() < 1e-16
+        assert not low[getattr(tableau, key) == 0].any()
+    for key, values in tableau.exact.items():
+        np.testing.assert_array_equal(getattr(tableau, key), values.astype(float))
+        for array in (getattr(tableau, key), values):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 1
 
 
 def test_low_parts_of_a_float_tableau():
@@ -245,22 +195,15 @@ def test_low_parts_of_a_float_tableau():
         NystromTableau("floats", **values, order=8, error_estimator_order=6)
 
 
-@pytest.mark.parametrize("tableau", METHODS, ids=name)
-def test_doubles_are_the_rounded_fractions(tableau):
-    for key, values in tableau.exact.items():
-        np.testing.assert_array_equal(getattr(tableau, key), values.astype(float))
-
-
-@pytest.mark.parametrize("key", ["b", "b_prime"])
 @pytest.mark.parametrize("tableau", HIGH, ids=name)
-def test_e_is_the_difference_of_the_weights(tableau, key):
-    pairs = zip(tableau.exact[key], tableau.exact[f"{key}_hat"], strict=True)
-    assert list(getattr(tableau, "e" if key == "b" else "e_prime")) == [float(x - y) for x, y in pairs]
+def test_e_is_the_difference_of_the_weights(tableau):
+    for key, error in (("b", tableau.e), ("b_prime", tableau.e_prime)):
+        pairs = zip(tableau.exact[key], tableau.exact[f"{key}_hat"], strict=True)
+        assert list(error) == [float(x - y) for x, y in pairs]
 
 
 @pytest.mark.parametrize("tableau", METHODS[:2], ids=name)
-@pytest.mark.parametrize("driver", ["integrate", "solve_ivp"])
-def test_a_step_uses_all_weights(tableau, driver):
+def test_a_step_uses_all_weights(tableau):
     """A step uses also the weights of a last stage at the new position; the reference is written out in NumPy."""
     h, y0 = 0.1, np.array([0.4, -0.2])
 
@@ -272,44 +215,24 @@ def test_a_step_uses_all_weights(tableau, driver):
         k[i] = acceleration(y0[0] + tableau.c[i] * h * y0[1] + h**2 * tableau.A[i, :i] @ k[:i])
     expected = [y0[0] + h * y0[1] + h**2 * tableau.b @ k, y0[1] + h * tableau.b_prime @ k]
     options = {"method": eip_method(tableau), "h": h}
-    if driver == "integrate":
-        run = integrate(acceleration=lambda t, q: acceleration(q), t_span=(0, h), y0=y0, **options)
-    else:
-        run = solve_ivp(lambda t, y: [y[1], acceleration(y[0])], (0, h), y0, **options)
-    np.testing.assert_allclose(run.y[:, -1], expected, rtol=1e-15)
+    run = integrate(acceleration=lambda t, q: acceleration(q), t_span=(0, h), y0=y0, **options)
+    sol = solve_ivp(lambda t, y: [y[1], acceleration(y[0])], (0, h), y0, **options)
+    for found in (run, sol):
+        np.testing.assert_allclose(found.y[:, -1], expected, rtol=1e-15)
 
 
-def test_the_first_stage_is_at_the_start():
-    with pytest.raises(ValueError, match="drift: the first node is 1/2, expected 0"):
-        NystromTableau("drift", A=[[]], b=["1/2"], b_prime=[1], c=["1/2"], order=2)
+ATTRIBUTES = {"n_stages": [2, 3, 2, 9, 17], "order": [2, 4, 2, 8, 12], "error_estimator_order": [1, None, None, 6, 10]}
+ATTRIBUTES |= {"has_estimate": [True, False, False, True, True], "fsal": [False, False, False, True, False]}
 
 
 def test_attributes():
-    assert [t.n_stages for t in METHODS] == [2, 3, 2, 9, 17]
-    assert [t.order for t in METHODS] == [2, 4, 2, 8, 12]
-    assert [t.error_estimator_order for t in METHODS] == [1, None, None, 6, 10]
-    assert [t.has_estimate for t in METHODS] == [True, False, False, True, True]
-    assert [t.fsal for t in METHODS] == [False, False, False, True, False]
+    for key, values in ATTRIBUTES.items():
+        assert [getattr(t, key) for t in METHODS] == values
     assert all("Dormand, El-Mikkawy & Prince" in t.reference for t in HIGH)
     assert repr(RKN86) == "<NystromTableau RKN86: 9 stages, order 8, estimate of order 6>"
     assert repr(METHODS[1]) == "<NystromTableau nystrom4: 3 stages, order 4>"
     assert not METHODS[1].e.any()
     assert METHODS[1].b_hat is None
-
-
-@pytest.mark.parametrize(
-    "key", ["A", "b", "b_prime", "c", "b_hat", "b_prime_hat", "e", "e_prime", "b_low", "b_prime_low"]
-)
-def test_arrays_are_read_only(key):
-    with pytest.raises(ValueError, match="read-only"):
-        getattr(RKN86, key)[0] = 1.0
-
-
-def test_fractions_and_fields_are_read_only():
-    with pytest.raises(ValueError, match="read-only"):
-        RKN86.exact["b"][0] = 1
-    with pytest.raises(TypeError, match="item assignment"):
-        RKN86.exact["b"] = None
     with pytest.raises(AttributeError, match="cannot assign"):
         RKN86.order = 9
 
@@ -333,6 +256,7 @@ def test_fractions_and_fields_are_read_only():
         ({"order": True}, r"bad: order must be an integer >= 1, got True"),
         ({"error_estimator_order": 1.0}, r"bad: error_estimator_order must be an integer >= 1, got 1\.0"),
         ({"c": [0, float("nan")]}, r"bad: coefficients must be finite numbers"),
+        ({"c": ["1/2", 1]}, "bad: the first node is 1/2, expected 0"),
     ],
 )
 def test_wrong_tableaux(changes, match):
