@@ -101,13 +101,15 @@ def test_by_name_nothing_listens_beyond_this_machine():
 @pytest.mark.slow
 @pytest.mark.posix
 def test_ctrl_c(client):
-    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
+    timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
     begin = time.perf_counter()
     with pytest.raises(KeyboardInterrupt) as info:
-        ensemble(kepler(), (0, 1e5), starts(64), executor=client)
+        ensemble(
+            kepler(), (0, 3e3), starts(4000), chunk=8, executor=client,
+            callback=lambda part: None if timer.ident else timer.start(),
+        )  # fmt: skip
     assert time.perf_counter() - begin < 10
-    assert (info.value.partial.status == -2).any()
+    assert set(info.value.partial.status) >= {0, -2}
 
 
 def test_a_closed_client(tmp_path):

@@ -1,6 +1,8 @@
 """REBOUND as a reference: against the packaged reference states, and the rules that keep a comparison fair."""
 
 import importlib
+import os
+import signal
 import sys
 
 import numpy as np
@@ -311,6 +313,21 @@ def test_epsilon_and_criterion_change_the_steps():
     end = problem.reference(20.0)
     assert np.abs(all_bodies.y[:, -1] - end)[:12].max() < 1e-10
     assert 1e-10 < np.abs(coarse.y[:, -1] - end)[:12].max() < 1e-6
+
+
+@pytest.mark.posix
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: run("ias15", h=10.0, n_steps=1),
+        lambda: judge.ias15_steps(DATA.gm, DATA.y0, 10.0),
+        lambda: judge.megno(DATA.gm, DATA.y0, t_end=10.0, dt=1.0),
+    ],
+)
+def test_ctrl_c_is_pythons_again_afterwards(call):
+    call()
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 @pytest.mark.parametrize(
