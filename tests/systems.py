@@ -1,6 +1,7 @@
 """Systems that several test modules share, such as Kepler's problem with G M = 1, and a comparison of results."""
 
 import math
+import re
 
 import numpy as np
 from numba import njit
@@ -141,3 +142,14 @@ def same(one, *others):
         for key in ("last_defect", "max_defect", "max_correction"):
             np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)
         assert one.message.split(" (")[0] == other.message.split(" (")[0]
+
+
+def refuse(call, rows):
+    """Check that a call with each of some options is refused with an error of this type, which has these words."""
+    for options, error, words in rows:
+        try:
+            call(**options)
+        except error as refusal:
+            assert re.search(words, str(refusal)), (words, str(refusal))
+        else:
+            raise AssertionError(f"not refused: {options}")
