@@ -150,6 +150,7 @@ def refuse(call, rows):
         try:
             call(**options)
         except error as refusal:
-            assert re.search(words, str(refusal)), (words, str(refusal))
+            said = str(refusal)
         else:
             raise AssertionError(f"not refused: {options}")
+        assert re.search(words, said), f"{said!r} does not have {words!r}"
