@@ -4,14 +4,15 @@ They write to the states they are given, leave `out` as it was, or return someth
 """
 
 import re
+from itertools import product
 
 import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
-from systems import SQUARE, oscillator
+from systems import SQUARE, oscillator, refuse
 
-from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, Invariant, check_gradient, ensemble, integrate, project
+from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, ensemble, integrate, project
 
 Y0 = [1.0, 2.0]
 needs_jit = pytest.mark.needs_jit
@@ -35,14 +36,9 @@ def filling_gradient(t, y, out):
     out[1] = 2 * y[1]
 
 
-def as_given(fun, options):
-    """Return the function, which is an acceleration if the method is Nystrom's, the interval and the start."""
-    return {"acceleration" if options["method"] is EIPRKN8 else "fun": fun, "t_span": (0, 1), "y0": Y0}
-
-
 def interpreted(fun=oscillator, invariants=(), **options):
     options = {"method": EIPRK4, "h": 0.1, "save_every": 1, **options}
-    return integrate(**as_given(fun, options), invariants=invariants, compiled=False, **options)
+    return integrate(fun, (0, 1), Y0, invariants=invariants, compiled=False, **options)
 
 
 def compiled(fun=oscillator, invariants=(), events=None, **options):
@@ -54,7 +50,7 @@ def compiled(fun=oscillator, invariants=(), events=None, **options):
     ]
     options = {"method": EIPRK4, "h": 0.1, "save_every": 1, **options}
     events = None if events is None else [njit(event) for event in events]
-    return integrate(**as_given(njit(fun), options), invariants=kept, events=events, **options)
+    return integrate(njit(fun), (0, 1), Y0, invariants=kept, events=events, **options)
 
 
 def scipy_s(fun=oscillator, invariants=(), **options):
@@ -121,51 +117,21 @@ WRITERS = [writing, writing_now_and_then, writing_by_a_function]
 @pytest.mark.nightly
 @pytest.mark.slow
 @all_of_them
-@pytest.mark.parametrize("method", [EIPRK4, EIPRK45])
-@pytest.mark.parametrize("fun", WRITERS)
-def test_right_hand_sides_that_write(how, fun, method):
+def test_right_hand_sides_that_write(how):
     """Also where SciPy takes the steps, whose own class lets them write to its state."""
-    options = {"method": method, "h": None if method is EIPRK45 else 0.1}
-    np.testing.assert_allclose(how(fun, **options).y, how(**options).y, rtol=1e-14)
-    run = how(fun, KEPT, **options)
-    np.testing.assert_allclose(run.y, how(invariants=KEPT, **options).y, rtol=1e-14)
-    if how is compiled:
-        assert run.compiled
+    for fun, method in product(WRITERS, (EIPRK4, EIPRK45)):
+        options = {"method": method, "h": None if method is EIPRK45 else 0.1}
+        np.testing.assert_allclose(how(fun, **options).y, how(**options).y, rtol=1e-14)
+        run = how(fun, KEPT, **options)
+        np.testing.assert_allclose(run.y, how(invariants=KEPT, **options).y, rtol=1e-14)
+        assert how is not compiled or run.compiled
 
 
-@compiled_at_night
-@pytest.mark.parametrize("in_place", [False, True])
-def test_accelerations_that_write(how, in_place):
-    def acc(t, q):
-        a = -q
-        q[0] = 9.0
-        return a
-
-    def acc_in_place(t, q, out):
-        out[0] = -q[0]
-        q[0] = 9.0
-
-    options = {"method": EIPRKN8, "invariants": KEPT, "in_place": in_place}
-    run = how(acc_in_place if in_place else acc, **options)
-    np.testing.assert_allclose(run.y[0], np.cos(run.t) + 2 * np.sin(run.t), atol=1e-11)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@all_of_them
-@pytest.mark.parametrize(
-    "items",
-    [
-        [Invariant(value_that_writes, square_gradient, name="S")],
-        [Invariant(square, gradient_that_writes, name="S")],
-        [Invariant(value_that_writes, gradient_that_writes, name="S")],
-        [Invariant(value_that_writes, gradient_that_writes, name="A"), KEPT],
-    ],
-    ids=["value", "gradient", "both", "before another"],
-)
-def test_invariants_that_write(how, items):
-    run = how(invariants=items)
-    np.testing.assert_array_equal(run.y, how(invariants=[KEPT] * len(items)).y)
+@pytest.mark.parametrize("how", [interpreted, pytest.param(compiled, marks=[needs_jit, pytest.mark.slow]), scipy_s])
+def test_invariants_that_write(how):
+    writer = Invariant(value_that_writes, gradient_that_writes, name="A")
+    run = how(invariants=[writer, KEPT])
+    np.testing.assert_array_equal(run.y, how(invariants=[KEPT, KEPT]).y)
     if how is compiled:
         assert run.compiled
         np.testing.assert_allclose(run.invariants, 5.0, rtol=1e-14)
@@ -195,21 +161,6 @@ def test_events_that_write(how):
     assert plain.t_events[1].size == 1
     for mine, other in zip(found.t_events, plain.t_events, strict=True):
         np.testing.assert_array_equal(mine, other)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@needs_jit
-def test_members_of_writers_are_single_runs():
-    fun, kept = njit(writing_now_and_then), Invariant(njit(value_that_writes), njit(gradient_that_writes), name="S")
-    starts = np.array(Y0) * np.linspace(1, 2, 20)[:, None]
-    run = ensemble(fun, (0, 1), starts, method=EIPRK4, h=0.1, invariants=kept)
-    assert run.success
-    for start, end in zip(starts, run.y, strict=True):
-        one = integrate(fun, (0, 1), start, method=EIPRK4, h=0.1, invariants=kept)
-        np.testing.assert_array_equal(end, one.y[:, -1])
-        plain = integrate(oscillator, (0, 1), start, method=EIPRK4, h=0.1, invariants=KEPT)
-        np.testing.assert_allclose(end, plain.y[:, -1], rtol=1e-14)
 
 
 def test_helpers_keep_what_they_are_given():
@@ -251,12 +202,11 @@ NOT_FILLING = [
 
 
 @both
-@pytest.mark.parametrize(("fun", "error", "match"), NOT_FILLING)
-def test_functions_that_do_not_fill(how, fun, error, match):
-    with pytest.raises(error, match=f"^fun {match}"):
-        how(fun, in_place=True)
-    with pytest.raises(error, match=f"gradient of invariant 'S' {match}"):
-        how(invariants=Invariant(square, fun, name="S", in_place=True))
+def test_functions_that_do_not_fill(how):
+    for fun, error, match in NOT_FILLING:
+        wrong = Invariant(square, fun, name="S", in_place=True)
+        refuse(how, [({"fun": fun, "in_place": True}, error, f"^fun {match}")])
+        refuse(how, [({"invariants": wrong}, error, f"gradient of invariant 'S' {match}")])
 
 
 @both
@@ -323,30 +273,29 @@ def check_error(how, info):
         assert info.value.partial.t[-1] == 0.4
 
 
-@interpreters
-@changes
-def test_right_hand_sides_that_change(how, change, error, match):
-    with pytest.raises(error, match=f"fun returned .*{match}") as info:
-        how(late(oscillator, change))
-    check_error(how, info)
+@pytest.mark.parametrize("how", [interpreted, scipy_s])
+def test_right_hand_sides_that_change(how):
+    for change, error, match in CHANGES.values():
+        with pytest.raises(error, match=f"fun returned .*{match}") as info:
+            how(late(oscillator, change))
+        check_error(how, info)
 
 
-@changes
 @pytest.mark.parametrize("part", ["value", "gradient"])
-def test_invariants_that_change(part, change, error, match):
-    value = late(square, change) if part == "value" else square
-    gradient = late(square_gradient, change) if part == "gradient" else square_gradient
-    with pytest.raises((TypeError, ValueError), match=r"invariant 'S' (returned|has|is)") as info:
-        interpreted(invariants=Invariant(value, gradient, name="S"))
-    check_error(interpreted, info)
+def test_invariants_that_change(part):
+    for change, *_ in CHANGES.values():
+        value = late(square, change) if part == "value" else square
+        gradient = late(square_gradient, change) if part == "gradient" else square_gradient
+        with pytest.raises((TypeError, ValueError), match=r"invariant 'S' (returned|has|is)") as info:
+            interpreted(invariants=Invariant(value, gradient, name="S"))
+        check_error(interpreted, info)
 
 
-@pytest.mark.parametrize("value", [None, 1j, "1.0", [1.0]])
-@pytest.mark.parametrize("start", [-1.0, 0.5])
-def test_events_that_change(value, start):
-    with pytest.raises(TypeError, match=r"event 0 returned .*expected a real number") as info:
-        interpreted(events=lambda t, y: y[0] if t < start else value)
-    assert info.value.partial.t[-1] == pytest.approx(max(start, 0.0))
+def test_events_that_change():
+    for value, start in product([None, 1j, "1.0", [1.0]], [-1.0, 0.5]):
+        with pytest.raises(TypeError, match=r"event 0 returned .*expected a real number") as info:
+            interpreted(events=lambda t, y, v=value, start=start: y[0] if t < start else v)
+        assert info.value.partial.t[-1] == pytest.approx(max(start, 0.0))
 
 
 @needs_jit
@@ -406,28 +355,16 @@ def raising(*args):
     raise MineError
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"fun": raising},
-        {"invariants": Invariant(raising, square_gradient)},
-        {"invariants": Invariant(square, raising)},
-        {"events": raising},
-        {"callback": raising},
-    ],
-    ids=["fun", "value", "gradient", "event", "callback"],
-)
-def test_exceptions_at_the_start_keep_the_start(options):
-    with pytest.raises(MineError) as info:
-        interpreted(**options)
-    partial = info.value.partial
-    assert partial.t.tolist() == [0.0]
-    np.testing.assert_array_equal(partial.y, np.array(Y0)[:, None])
-    assert (partial.status, partial.success) == (-1, False)
-    assert "interrupted by MineError" in partial.message
-
-
-def test_ensembles_have_no_start_to_keep():
+def test_exceptions_at_the_start_keep_the_start():
+    wrong = [Invariant(raising, square_gradient), Invariant(square, raising)]
+    for options in ({"fun": raising}, *({"invariants": i} for i in wrong), {"events": raising}, {"callback": raising}):
+        with pytest.raises(MineError) as info:
+            interpreted(**options)
+        partial = info.value.partial
+        assert partial.t.tolist() == [0.0]
+        np.testing.assert_array_equal(partial.y, np.array(Y0)[:, None])
+        assert (partial.status, partial.success) == (-1, False)
+        assert "interrupted by MineError" in partial.message
     with pytest.raises(MineError) as info:
         ensemble(raising, (0, 1), [Y0, Y0], method=EIPRK4, h=0.1, invariants=SQUARE)
     assert not hasattr(info.value, "partial")
