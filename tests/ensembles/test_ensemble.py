@@ -23,6 +23,7 @@ from systems import (
     orbit,
     oscillator,
     pericentre,
+    refuse,
 )
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, Invariant, ensemble, integrate
@@ -69,17 +70,12 @@ def same(one, other):
 # A member is the single run.
 
 CASES = {
-    "fixed step": {},
     "saved": {"save_every": 7},
     "t_eval": {"t_eval": np.linspace(0.5, 6.0, 9)},
-    "no invariants": {"invariants": ()},
     "blocks, every third": {"blocks": 2, "every": 3},
     "compensated": {"compensated": True, "every": 4, "save_every": 50},
     "midpoint, two iterations": {"direction": "midpoint", "iterations": 2},
-    "weights": {"metric": [1.0, 0.5, 0.25, 0.3]},
-    "euclidean": {"metric": "euclidean", "method": EIPRK5},
-    "last step shorter": {"h": 0.0317},
-    "adaptive": {"h": None, "method": EIPRK45, "rtol": 1e-6, "atol": 1e-9},
+    "euclidean, last step shorter": {"metric": "euclidean", "method": EIPRK5, "h": 0.0317},
     "adaptive, first step": {"h": None, "method": EIPDOP853, "first_step": 0.01, "rtol": 1e-8},
     "adaptive, t_eval": {"h": None, "method": EIPRK45, "t_eval": [0.0, 1.0, 6.0]},
 }
@@ -139,13 +135,6 @@ def test_one_number_for_each_member_of_a_problem_with_one_parameter():
         np.testing.assert_allclose(run.y, np.exp(-k[:, None]) * np.ones(2), rtol=1e-7)
     with pytest.raises(ValueError, match="params has 3 rows for 2 members"):
         ensemble(problem, (0, 1), np.ones((2, 2)), params=k)
-
-
-@pytest.mark.slow
-@needs_jit
-def test_one_set_of_params():
-    problem = kepler()
-    same(ensemble(problem, SPAN, starts(3), params=[0.005]), ensemble(problem, SPAN, starts(3)))
 
 
 @pytest.mark.parametrize("own", [RK5, RKN1210], ids=str)
@@ -226,14 +215,10 @@ def test_bits_do_not_depend_on_the_number_of_threads(more):
     runs = [ensemble(kepler(), SPAN, y0s, executor=workers, **more) for workers in (1, 2, 4)]
     runs.append(ensemble(kepler(), SPAN, y0s, **more))
     assert runs[0].chunk == 32
+    runs.append(ensemble(kepler(), SPAN, y0s, **more, params=[0.005]))  # the problem's own
     for run in runs[1:]:
         same(runs[0], run)
-
-
-@pytest.mark.slow
-@needs_jit
-def test_members_do_not_depend_on_the_chunk():
-    same(ensemble(kepler(), SPAN, starts(40), chunk=3), ensemble(kepler(), SPAN, starts(40), chunk=40))
+    same(ensemble(kepler(), SPAN, y0s, chunk=7, **more), runs[0])
 
 
 # Failures.
@@ -329,12 +314,12 @@ def test_what_was_there_survives_an_exception():
 
 @pytest.mark.slow
 @needs_jit
-def test_ctrl_c_within_a_second():
-    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+def test_ctrl_c():
+    timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
     ensemble(kepler(), (0, 4e4), starts(8))  # compiled before, for batches of members too
     timer.start()
     with pytest.raises(KeyboardInterrupt) as info:
-        ensemble(kepler(), (0, 3e6), starts(8))
+        ensemble(kepler(), (0, 1e7), starts(8))
     assert info.value.partial.wall_time < 5
     assert (info.value.partial.status == -2).any()
 
@@ -355,9 +340,10 @@ def test_progress(capsys):
 # Bad input.
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "match"),
-    [
+def test_bad_input():
+    masked = np.ma.array(np.ones((2, 2)), mask=np.eye(2))
+    with_args = Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,))
+    rows = [
         ({"metrik": "error"}, TypeError, r"ensemble\(\) has no option 'metrik'; did you mean 'metric'\?"),
         ({"y0": [[1.0, 0.0]]}, TypeError, r"ensemble\(\) has no option 'y0'; did you mean 'y0s'\?"),
         ({"diagnostics": None}, TypeError, r"ensemble\(\) has no option 'diagnostics'$"),
@@ -365,7 +351,9 @@ def test_progress(capsys):
         ({"y0s": [1.0, 2.0]}, ValueError, r"y0s must have the shape \(members, n\), got \(2,\)"),
         ({"y0s": np.zeros((0, 2))}, ValueError, r"got \(0, 2\)"),
         ({"y0s": [["a", "b"]]}, TypeError, "`y0s` must hold numbers"),
-        ({"y0s": np.ma.array(np.ones((2, 2)), mask=np.eye(2))}, ValueError, "masked values in y0s"),
+        ({"y0s": masked}, ValueError, "masked values in y0s"),
+        ({"y0s": np.full((3, 2), np.nan)}, ValueError, "must be finite"),
+        ({"fun": lambda t, y: None}, TypeError, "fun returned None"),
         ({"params": [[1.0], [2.0], [3.0]]}, ValueError, "params has 3 rows for 2 members"),
         ({"params": "abc"}, TypeError, "params must be an array of numbers"),
         ({"params": np.zeros((2, 2, 2))}, ValueError, r"\(p,\) or \(members, p\)"),
@@ -377,20 +365,10 @@ def test_progress(capsys):
         ({"reduce": "state"}, TypeError, r"reduce must be a function reduce\(result\), got 'state'"),
         ({"t_span": [(0, 1), (0, 2)]}, ValueError, "t_span must hold two numbers"),
         ({"checkpoint": 3}, TypeError, "checkpoint must be a path"),
-        ({"invariants": Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,)), "params": [[1], [2]]},
-         ValueError, "omit args"),
-    ],
-)  # fmt: skip
-def test_bad_input(options, error, match):
-    with pytest.raises(error, match=match):
-        ensemble(oscillator, **({"t_span": (0, 1), "y0s": np.eye(2), "h": 0.1} | options))
-
-
-def test_what_fails_in_every_member_is_raised():
-    with pytest.raises(ValueError, match="must be finite"):
-        ensemble(oscillator, (0, 1), np.full((3, 2), np.nan), h=0.1)
-    with pytest.raises(TypeError, match="fun returned None"):
-        ensemble(lambda t, y: None, (0, 1), np.eye(2), h=0.1)
+        ({"invariants": with_args, "params": [[1], [2]]}, ValueError, "omit args"),
+    ]
+    given = {"fun": oscillator, "t_span": (0, 1), "y0s": np.eye(2), "h": 0.1}
+    refuse(ensemble, [(given | options, *rest) for options, *rest in rows])
 
 
 # Executors of concurrent.futures.
@@ -450,15 +428,14 @@ def test_a_closed_executor():
     assert info.value.partial.status.tolist() == [-2] * 4
 
 
-@pytest.mark.parametrize("cancel", [True, False])
-def test_an_executor_that_is_closed_meanwhile(cancel, tmp_path):
+def test_an_executor_that_is_closed_meanwhile(tmp_path):
     """Members that were submitted and still return are kept too."""
     executor = ThreadPoolExecutor(1)
     options = {"h": 0.1, "chunk": 1, "checkpoint": tmp_path / "kept", "compiled": False}
     y0s = np.ones((100, 2))
 
     def callback(part):
-        executor.shutdown(wait=False, cancel_futures=cancel)
+        executor.shutdown(wait=False, cancel_futures=True)
 
     with pytest.raises(RuntimeError, match=r"the executor given as executor= (is|was) closed") as info:
         ensemble(oscillator, (0, 1), y0s, executor=executor, callback=callback, **options)

@@ -100,10 +100,6 @@ def test_invariants_with_parameters_for_each_member():
     np.testing.assert_array_equal(run.target, stiffness / 2)
 
 
-def test_invariants_that_nobody_asks_for():
-    assert ensemble(PROBLEM, SPAN, STARTS, **STEPS, invariants=()).invariants.shape == (len(STARTS), 0)
-
-
 # Events.
 
 
@@ -141,12 +137,6 @@ def test_more_events_than_the_engine_has_room_for():
         np.testing.assert_array_equal(run.t_events[k][0], alone.t_events[0])
 
 
-def test_without_events_there_are_none():
-    run = ensemble(PROBLEM, SPAN, STARTS[:2], **STEPS)
-    assert run.t_events is None
-    assert run.y_events is None
-
-
 # The result of each member for ``reduce=``.
 
 
@@ -161,16 +151,17 @@ def seen(run):
 ADAPTIVE = {"method": EIPDOP853, "rtol": 1e-8}
 
 
-@pytest.mark.parametrize("rows", [{}, {"save_every": 40}, {"t_eval": np.linspace(1.0, 7.0, 5)}], ids=str)
 @pytest.mark.parametrize(
-    "more",
-    [STEPS, ADAPTIVE, STEPS | {"compiled": False}, STEPS | {"events": EVENTS}],
+    "options",
+    [
+        STEPS | {"save_every": 40},
+        ADAPTIVE | {"t_eval": np.linspace(1.0, 7.0, 5)},
+        STEPS | {"compiled": False},
+        STEPS | {"events": EVENTS, "t_eval": np.linspace(1.0, 7.0, 5)},
+    ],
     ids=["steps", "adaptive", "python", "events"],
 )
-def test_reduce_gets_the_results_of_single_runs(rows, more):
-    options = rows | more
-    if options.keys() >= {"save_every", "rtol"}:
-        pytest.skip("adaptive steps have no save_every")
+def test_reduce_gets_the_results_of_single_runs(options):
     run = ensemble(PROBLEM, SPAN, STARTS, reduce=seen, chunk=8, **options)
     assert run.trajectories is None
     for k, alone in pairs(run, **options):
@@ -196,18 +187,17 @@ def test_what_reduce_returns():
     assert np.isnan(ensemble(PROBLEM, SPAN, STARTS[[FAILING] * 2], reduce=seen, **STEPS).reduced).tolist() == [True] * 2
 
 
-@pytest.mark.parametrize(
-    ("reduce", "error", "match"),
-    [
+def test_a_wrong_reduce():
+    given = {"t_eval": [1, 3.5, 7], "events": far_out, "chunk": 8, **STEPS}
+    rows = [
         (lambda run: None, TypeError, "reduce returned None; expected a number or an array of numbers"),
         (lambda run: np.zeros(run.t.size), ValueError, r"arrays of shape \(\d,\) and \(\d,\) for different members"),
         (lambda run: 1 / (run.t.size - 1), ZeroDivisionError, "by zero"),
-    ],
-)
-def test_a_wrong_reduce(reduce, error, match):
-    with pytest.raises(error, match=match) as info:
-        ensemble(PROBLEM, SPAN, STARTS, reduce=reduce, t_eval=[1, 3.5, 7], events=far_out, chunk=8, **STEPS)
-    assert info.value.partial.status.shape == (len(STARTS),)
+    ]
+    for reduce, error, match in rows:
+        with pytest.raises(error, match=match) as info:
+            ensemble(PROBLEM, SPAN, STARTS, reduce=reduce, **given)
+        assert info.value.partial.status.shape == (len(STARTS),)
 
 
 # Executors, files.
@@ -218,21 +208,14 @@ CASES = {
     "events": {"events": EVENTS},
     "reduced": {"save_every": 50, "reduce": seen},
 }
-cases = pytest.mark.parametrize("case", CASES)
 
 
-@cases
-def test_an_executor_returns_the_same(case):
-    more = CASES[case]
-    whole = ensemble(PROBLEM, SPAN, STARTS, **STEPS, **more)
-    with ThreadPoolExecutor(2) as executor:
-        assert_same_fields(whole, ensemble(PROBLEM, SPAN, STARTS, executor=executor, **STEPS, **more))
-
-
-@cases
-def test_saved_and_loaded(case, tmp_path):
+@pytest.mark.parametrize("case", CASES)
+def test_saved_and_loaded_and_run_elsewhere(case, tmp_path):
     more = CASES[case]
     run = ensemble(PROBLEM, SPAN, STARTS, **STEPS, **more)
+    with ThreadPoolExecutor(2) as executor:
+        assert_same_fields(run, ensemble(PROBLEM, SPAN, STARTS, executor=executor, **STEPS, **more))
     run.save(tmp_path / "run.npz")
     again = load(tmp_path / "run.npz")
     assert type(again) is EnsembleResult
@@ -274,15 +257,6 @@ def test_a_figure_of_members_in_time(tmp_path):
     assert {name: bar.get_width() for name, bar in ends.items()} == {"reached the end": 20, "failed": 1}
     plot(run).savefig(tmp_path / "run.png")
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_a_figure_of_last_states():
-    run = ensemble(PROBLEM, SPAN, STARTS, events=far_out, **STEPS)
-    states, errors, counts = drawn(run, names="q1 q2 p1 p2")
-    assert [label.get_text() for label in states.get_xticklabels()] == ["q1", "q2", "p1", "p2"]
-    assert states.get_ylabel() == "last states"
-    assert errors.get_yscale() == "log"
-    assert sum(bar.get_width() for bar in counts.patches) == len(STARTS)
 
 
 def test_a_figure_without_invariants_and_of_many_components():

@@ -48,23 +48,6 @@ def by_address(t, y):
 
 
 @njit
-def by_address_later(t, y):
-    state, out = y.copy(), np.empty(2)
-    if t > 1:
-        CALL(state.ctypes.data, out.ctypes.data)
-    else:
-        out[0], out[1] = y[1], -np.sin(y[0])
-    return out
-
-
-@njit
-def by_pointer(t, y):
-    state, out = y.copy(), np.empty(2)
-    CALL(state.ctypes, out.ctypes)
-    return out
-
-
-@njit
 def by_pointer_in_place(t, y, out):
     state = y.copy()
     CALL(state.ctypes, out.ctypes)
@@ -87,8 +70,6 @@ def by_complex_numbers(t, y):
     ("fun", "reason"),
     [
         (by_address, "Cannot give C code the address of an array of dual numbers"),
-        (by_address_later, "Cannot give C code the address of an array of dual numbers"),
-        (by_pointer, "it does not compile for dual numbers: .*Pointer"),
         (by_pointer_in_place, "it does not compile for dual numbers: .*Pointer"),
         (by_floats, "component 0 of its derivative .* near the start, but .* with dual numbers"),
         (by_complex_numbers, "it raises ValueError with dual numbers"),
@@ -157,11 +138,6 @@ def with_many_digits(t, y):
 
 
 @njit
-def fast(t, y):
-    return 1e-3 * np.sin(1e4 * y)
-
-
-@njit
 def at_the_end_of_its_domain(t, y):
     if y[0] > 1.0000001:
         raise ValueError
@@ -189,13 +165,9 @@ FAR = [1e8 - 0.5, 1e8, 1e8 + 0.5, 1e8, 0, -0.5, 0, 0.5]
     ("fun", "start"),
     [
         (kinked, [0.0, 0.0]),
-        (kinked, [0.0, 1.0]),
         (jump, [0.0, 1.0]),
-        (jump, [0.0, 0.0]),
         (with_many_digits, [1.0, 0.0]),
-        (fast, [1.0, 2.0]),
         (at_the_end_of_its_domain, [1.0, 0.0]),
-        (constant, [1.0, 1.0]),
         (constant, [0.0, 0.0]),
         (two_bodies, FAR),
     ],
@@ -205,19 +177,16 @@ def test_right_derivatives_are_not_refused(fun, start):
     assert run.columns["source"] == "dual numbers"
 
 
-@pytest.mark.parametrize("size", [1e-12, 1.0, 1e20])
-def test_parameters_of_any_size_are_compared(size):
+@pytest.mark.slow
+def test_parameters_of_any_size_are_compared():
+    size = 1e20
+
     @njit
     def fun(t, y, p):
         return np.array([y[1], -y[0] * size / p[0] - np.sin(p[0] / size)])
 
     run = integrate(fun, (0, 0.1), START, variations=["state", 0], params=[1.3 * size], **OPTIONS)
     assert run.columns["source"] == "dual numbers"
-
-
-def test_a_value_of_the_wrong_shape_has_its_message():
-    with pytest.raises(ValueError, match=r"fun returned shape \(3,\), expected \(2,\)"):
-        integrate(njit(lambda t, y: np.ones(3)), SPAN, START, variations="state", **OPTIONS)
 
 
 def test_an_invariant_that_uses_an_address_is_differentiated_by_differences():

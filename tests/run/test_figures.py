@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from eip_scipy import EIPRK4, Invariant, ensemble, integrate, solve_ivp
+from eip_scipy import EIPRK4, Invariant, integrate, solve_ivp
 from eip_scipy.problems import kepler
 from eip_scipy.results import plot
 
@@ -95,17 +95,6 @@ def test_a_result_of_the_typed_solve_ivp_is_drawn():
         figure = plot(sol)
         assert len(figure.axes) >= 1
         pyplot.close(figure)
-
-
-def test_axes_that_are_several_are_refused(run):
-    figure, axes = pyplot.subplots(1, 2)
-    with pytest.raises(TypeError, match=r"ax must be one matplotlib Axes, got ndarray of shape \(2,\); choose one"):
-        run.plot(ax=axes)
-    with pytest.raises(TypeError, match="ax must be one matplotlib Axes, got str"):
-        run.plot(ax="left")
-    with pytest.raises(TypeError, match="the figure of an ensemble takes neither ax nor orbit"):
-        plot(ensemble(kepler(), (0, 1), [kepler().y0], method=EIPRK4), ax=axes[0])
-    pyplot.close(figure)
 
 
 CELLS = {
