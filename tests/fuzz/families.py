@@ -206,9 +206,7 @@ def _angular(n: int) -> Quantity:
         return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
     return Quantity(
-        "L",
-        lambda t, y: np.cross(y[:3], y[3:]),
-        lambda t, y: np.hstack([-cross_matrix(y[3:]), cross_matrix(y[:3])]),
+        "L", lambda t, y: np.cross(y[:3], y[3:]), lambda t, y: np.hstack([-cross_matrix(y[3:]), cross_matrix(y[:3])])
     )
 
 
@@ -251,11 +249,7 @@ def kepler(rng: np.random.Generator) -> System:
         by_q = (v @ v - 1 / r) * np.eye(2) - np.outer(v, v) + np.outer(q, q) / r**3
         return np.hstack([by_q, 2 * np.outer(q, v) - np.outer(v, q) - (q @ v) * np.eye(2)])
 
-    kept = (
-        mechanical("H", lambda q: -1 / math.sqrt(q @ q), dV),
-        _angular(2),
-        Quantity("lenz", lenz, lenz_gradient),
-    )
+    kept = (mechanical("H", lambda q: -1 / math.sqrt(q @ q), dV), _angular(2), Quantity("lenz", lenz, lenz_gradient))
     start = turn @ np.array([1 - e, 0.0]), turn @ np.array([0.0, math.sqrt((1 + e) / (1 - e))])
     return second_order("kepler", lambda t, x: -dV(x), *start, kept)
 

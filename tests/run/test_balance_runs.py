@@ -297,8 +297,7 @@ def stiffness(t, q, dq, out):
 
 
 @pytest.mark.parametrize(
-    ("method", "parts", "plain_error", "error"),
-    [(EIPGJ12, 150, 5e-9, 5e-11), (EIPGJ14, 110, 5e-10, 5e-11)],
+    ("method", "parts", "plain_error", "error"), [(EIPGJ12, 150, 5e-9, 5e-11), (EIPGJ14, 110, 5e-10, 5e-11)]
 )
 def test_a_perturbed_planet_by_multistep_methods(method, parts, plain_error, error):
     """The reference is a Nystrom method with shorter steps and compensated sums, accurate to 5e-12."""

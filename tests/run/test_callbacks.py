@@ -24,10 +24,7 @@ FUNCTIONS = {
     "interpreted": {"fun": oscillator, "invariants": SQUARE},
     "compiled": {"fun": njit(oscillator), "invariants": Invariant(njit(SQUARE.fun), njit(SQUARE.grad), name="S")},
 }
-STEPS = {
-    "fixed": {"method": EIPRK4, "h": 0.01},
-    "adaptive": {"method": EIPRK45, "max_step": 0.01, "rtol": 1e-3},
-}
+STEPS = {"fixed": {"method": EIPRK4, "h": 0.01}, "adaptive": {"method": EIPRK45, "max_step": 0.01, "rtol": 1e-3}}
 
 
 def run(steps, how="interpreted", n=MANY, **options):

@@ -378,11 +378,7 @@ def test_other_arguments_are_named(old_run):
 @pytest.mark.parametrize(
     ("fun", "invariants", "match"),
     [
-        (
-            lambda t, y: orbit(t, y) * (1.0 if t < 1.0 else 1.001),
-            [H, L],
-            r"fun was \S+ at t = \S+, where it was saved",
-        ),
+        (lambda t, y: orbit(t, y) * (1.0 if t < 1.0 else 1.001), [H, L], r"fun was \S+ at t = \S+, where it was saved"),
         (
             orbit,
             [Invariant(lambda t, y: H.fun(t, y) + (t > 1.0) * 1e-6, H.grad, name="energy"), L],

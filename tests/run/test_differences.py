@@ -31,10 +31,7 @@ FUNCTIONS = {
     "near": ("1/sqrt((y[0] - 1)*(y[0] - 1) + 1e-8)", lambda y: 1 / np.sqrt((y[0] - 1) ** 2 + 1e-8)),
     "moon": ("y[2]*y[3] - 1e-6/fabs(y[0] - y[1])", lambda y: y[2] * y[3] - 1e-6 / (y[0] - y[1])),
 }
-STATES = {
-    "near": [1.0003, 0.0, 0.0, 0.0],
-    "moon": [1.0026, 1.0, 0.3, 0.2],
-}
+STATES = {"near": [1.0003, 0.0, 0.0, 0.0], "moon": [1.0026, 1.0, 0.3, 0.2]}
 SYSTEM = """
 #include <math.h>
 int orbit(double t, const double *y, double *out, const double *p) {
