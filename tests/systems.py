@@ -154,3 +154,19 @@ def refuse(call, rows):
         else:
             raise AssertionError(f"not refused: {options}")
         assert re.search(words, said), f"{said!r} does not have {words!r}"
+
+
+def same_fields(one, other, *, but=()):
+    """Compare every field of two results of `ensemble`, except those named in `but`."""
+    assert set(one) == set(other)
+    for name in set(one) - {"wall_time", *but}:
+        value = one[name]
+        if name in ("t_events", "y_events") and value is not None:
+            for a, b in zip(value, other[name], strict=True):
+                for c, d in zip(a, b, strict=True):
+                    np.testing.assert_array_equal(c, d)
+        elif isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(other[name], value, err_msg=name)
+            assert other[name].dtype == value.dtype
+        else:
+            assert other[name] == value

@@ -7,8 +7,7 @@ import time
 import numpy as np
 import pytest
 from forked import Forker
-from systems import SQUARE, oscillator, refuse
-from test_members_kept import assert_same_fields
+from systems import SQUARE, oscillator, refuse, same_fields
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, checkpoint, ensemble
 from eip_scipy.checkpoint import CheckpointError
@@ -63,12 +62,12 @@ def test_resume_runs_what_is_missing(case, tmp_path):
     for _ in range(2):  # the second time there is nothing left to do
         found = members(resume=True, checkpoint=tmp_path / "kept", callback=lambda p: ran.append(p.first), **options)
         whole.one_by_one = found.one_by_one  # of the members that ran now
-        assert_same_fields(whole, found)
+        same_fields(whole, found)
         assert ran == [6, 9]
 
 
 def test_resume_starts_where_there_is_nothing(tmp_path):
-    assert_same_fields(members(), members(resume=True, checkpoint=tmp_path / "kept"))
+    same_fields(members(), members(resume=True, checkpoint=tmp_path / "kept"))
 
 
 # Another ensemble, other functions.
@@ -121,7 +120,7 @@ def test_another_machine_is_a_warning(tmp_path, monkeypatch):
         whole = members(checkpoint=tmp_path / "kept")
     with pytest.warns(UserWarning, match="machine another machine, here") as seen:
         found = members(resume=True, checkpoint=tmp_path / "kept")
-    assert_same_fields(whole | {"one_by_one": ""}, found)
+    same_fields(whole | {"one_by_one": ""}, found)
     assert seen[0].filename == __file__
 
 
@@ -167,7 +166,7 @@ def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
 
     monkeypatch.setattr(checkpoint, "write", full)
     with pytest.warns(RuntimeWarning, match="no space left on device; the previous checkpoint is kept"):
-        assert_same_fields(members(), members(checkpoint=path))
+        same_fields(members(), members(checkpoint=path))
     assert checkpoint.read(path, "ensemble")[0]["finished"] == 0
 
 
@@ -208,4 +207,4 @@ def test_an_ensemble_that_is_killed_ten_times(tmp_path):
     forker.close()
     assert sorted(done) == done
     assert 0 < done[-1] < len(MANY)
-    assert_same_fields(whole, many(checkpoint=tmp_path / "kept", resume=True))
+    same_fields(whole, many(checkpoint=tmp_path / "kept", resume=True))

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from systems import same_fields
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, ensemble, integrate, load
 from eip_scipy.problems import kepler
@@ -45,20 +46,6 @@ def assert_rows_are(run, k, alone):
     np.testing.assert_array_equal(run.invariants[k, :, :rows], alone.invariants)
     assert np.isnan(run.trajectories[k, :, rows:]).all()
     assert np.isnan(run.invariants[k, :, rows:]).all()
-
-
-def assert_same_fields(one, other):
-    assert set(one) == set(other)
-    for name, value in one.items():
-        if name in ("t_events", "y_events") and value is not None:
-            for a, b in zip(value, other[name], strict=True):
-                for c, d in zip(a, b, strict=True):
-                    np.testing.assert_array_equal(c, d)
-        elif isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(other[name], value)
-            assert other[name].dtype == value.dtype
-        elif name != "wall_time":
-            assert other[name] == value
 
 
 # Values of the invariants.
@@ -122,19 +109,6 @@ def test_events_of_members_are_those_of_single_runs(compiled, steps):
             np.testing.assert_array_equal(run.y_events[k][i].reshape(-1, 4), alone.y_events[i].reshape(-1, 4))
     assert [t.size for t in run.t_events[0]] == [2, 2]
     assert run.status[0] == 1
-
-
-@pytest.mark.needs_jit
-def test_more_events_than_the_engine_has_room_for():
-    from numba import njit
-
-    clock = njit(lambda t, y, params: np.sin(500.0 * t))
-    options = STEPS | {"h": 0.005, "events": clock}
-    run = ensemble(PROBLEM, SPAN, STARTS[:2], **options)
-    for k in range(2):
-        alone = integrate(PROBLEM, SPAN, STARTS[k], **options)
-        assert alone.t_events[0].size > 1024
-        np.testing.assert_array_equal(run.t_events[k][0], alone.t_events[0])
 
 
 # The result of each member for ``reduce=``.
@@ -215,14 +189,14 @@ def test_saved_and_loaded_and_run_elsewhere(case, tmp_path):
     more = CASES[case]
     run = ensemble(PROBLEM, SPAN, STARTS, **STEPS, **more)
     with ThreadPoolExecutor(2) as executor:
-        assert_same_fields(run, ensemble(PROBLEM, SPAN, STARTS, executor=executor, **STEPS, **more))
+        same_fields(run, ensemble(PROBLEM, SPAN, STARTS, executor=executor, **STEPS, **more))
     run.save(tmp_path / "run.npz")
     again = load(tmp_path / "run.npz")
     assert type(again) is EnsembleResult
-    assert_same_fields(run, again)
+    same_fields(run, again)
     assert repr(again) == repr(run)
     save(again, tmp_path / "again.npz")
-    assert_same_fields(run, load(tmp_path / "again.npz"))
+    same_fields(run, load(tmp_path / "again.npz"))
     with np.load(tmp_path / "run.npz", allow_pickle=False) as file:  # no pickle
         np.testing.assert_array_equal(file["y"], run.y)
 
@@ -257,12 +231,3 @@ def test_a_figure_of_members_in_time(tmp_path):
     assert {name: bar.get_width() for name, bar in ends.items()} == {"reached the end": 20, "failed": 1}
     plot(run).savefig(tmp_path / "run.png")
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_a_figure_without_invariants_and_of_many_components():
-    starts = np.random.default_rng(1).standard_normal((9, 10))
-    run = ensemble(lambda t, y: -y, (0, 1), starts, method=EIPRK4, h=0.1, save_every=1)
-    *fans, counts = drawn(run)
-    assert fans[0].get_title() == "the first 6 of 10 components"
-    assert len(fans) == 6
-    assert counts.get_xlabel() == "members"

@@ -15,7 +15,6 @@ from eip_scipy import (
     EIPRK45,
     EIPRKN8,
     EIPRKN12,
-    Invariant,
     ensemble,
     integrate,
 )  # fmt: skip
@@ -129,55 +128,6 @@ def test_nystrom_with_parameters_of_each():
 
 
 @njit
-def pendulums(t, y, out, params):
-    """A chain: loops, functions of one and two arguments, powers, a number that every member shares."""
-    half = y.size // 2
-    for i in range(half):
-        out[i] = y[half + i]
-        out[half + i] = -params[0] * math.sin(y[i])
-    for i in range(half - 1):
-        pull = 0.25 * (y[i + 1] - y[i]) ** 3
-        out[half + i] += pull
-        out[half + i + 1] -= pull
-
-
-@njit
-def chain_energy(t, y, params):
-    half = y.size // 2
-    total = 0.0
-    for i in range(half):
-        total += 0.5 * y[half + i] * y[half + i] - params[0] * math.cos(y[i])
-    for i in range(half - 1):
-        total += math.pow(y[i + 1] - y[i], 4.0) / 16
-    return total
-
-
-@njit
-def chain_gradient(t, y, out, params):
-    half = y.size // 2
-    for i in range(half):
-        out[i] = params[0] * math.sin(y[i])
-        out[half + i] = y[half + i]
-    for i in range(half - 1):
-        pull = 0.25 * (y[i + 1] - y[i]) ** 3
-        out[i] -= pull
-        out[i + 1] += pull
-
-
-@pytest.mark.slow
-@pytest.mark.needs_jit
-def test_functions_of_the_users_own():
-    starts = np.random.default_rng(5).normal(size=(12, 10))
-    params = np.linspace(0.5, 2, 12)[:, None]
-    energy = Invariant(chain_energy, chain_gradient, in_place=True, name="H")
-    run = check_bits(
-        pendulums, (0, 5), starts, params=params, method=EIPRK4, h=0.02, in_place=True, invariants=[energy],
-        metric="euclidean",
-    )  # fmt: skip
-    assert run.side_by_side.all()
-
-
-@njit
 def with_a_branch(t, y, out):
     out[0] = y[1]
     out[1] = -y[0] if y[0] > 0 else -4 * y[0]
@@ -286,12 +236,6 @@ def test_members_of_multistep_methods(method, options):
     run = check_bits(problem, (0, 3), starts, method=method, h=1 / 620, members=[0, 4, 7, 8, 10], **options)
     assert run.side_by_side.all()
     assert run.one_by_one == ""
-
-
-def test_multistep_members_backward_and_on_two_dimensions():
-    run = check_bits(kepler(), (1.0, -40.3), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02, save_every=100)
-    assert run.side_by_side.all()
-    assert np.all(run.nlu > 0)
 
 
 def test_multistep_members_with_bodies_of_their_own():

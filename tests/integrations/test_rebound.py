@@ -7,14 +7,12 @@ import sys
 
 import numpy as np
 import pytest
-from numba import njit
 from systems import refuse
 
 rebound = pytest.importorskip("rebound")
 
 from eip_scipy.integrations import rebound as judge  # noqa: E402
 from eip_scipy.problems import comet, solar_data  # noqa: E402
-from eip_scipy_studies.comparators import stormer_verlet  # noqa: E402
 
 DATA = solar_data.load("de440")
 REFERENCE = solar_data.reference_states("de440")
@@ -33,20 +31,6 @@ def positions(y):
 
 def position_errors(result, years):
     return np.linalg.norm(positions(result.y[:, -1]) - positions(REFERENCE[years]), axis=1)
-
-
-@njit
-def attraction(t, q, gm):
-    a = np.zeros_like(q)
-    for i in range(gm.size):
-        for j in range(gm.size):
-            if i != j:
-                x, y, z = q[3 * j] - q[3 * i], q[3 * j + 1] - q[3 * i + 1], q[3 * j + 2] - q[3 * i + 2]
-                pull = gm[j] / (x**2 + y**2 + z**2) ** 1.5
-                a[3 * i] += pull * x
-                a[3 * i + 1] += pull * y
-                a[3 * i + 2] += pull * z
-    return a
 
 
 @pytest.mark.parametrize("years", [1.0, 100.0])
@@ -79,20 +63,6 @@ def test_saba_is_at_round_off_after_a_century():
     assert position_errors(run("saba(10,6,4)", h=7.305, t_end=100 * YEAR), 100.0).max() < 2e-10
 
 
-@pytest.mark.slow
-def test_leapfrog_is_the_drift_kick_drift_form():
-    h, n_steps = 0.7305, 1000
-    result = run("leapfrog", h=h, n_steps=n_steps)
-    start, end = result.y[:, 0], result.y[:, -1]
-
-    def distance(form):
-        ours = stormer_verlet(attraction, (0.0, n_steps * h), start, h, form=form, params=DATA.gm)
-        return np.abs(ours.y[:, -1] - end).max()
-
-    assert distance("drift-kick-drift") < 1e-12
-    assert distance("kick-drift-kick") > 1e-4
-
-
 @pytest.mark.parametrize("integrator", FIXED_STEP)
 def test_saving_leaves_no_trace(integrator, monkeypatch):
     every = run(integrator, h=3.0, t_end=600.0, save_every=1)
@@ -117,18 +87,6 @@ def test_invariant_errors_are_those_of_rebound():
     assert result.angular_momentum_error.max() < 1e-13
     turned = np.array([[1.0, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1, 0], [1.0, 0, 0, -1, 0, 0, 0, 0, 2, 0, 0, -2]])
     np.testing.assert_allclose(judge._invariant_errors(np.ones(2), turned)[1], [0.0, np.sqrt(5.0)])
-
-
-def test_simulation_holds_our_state_at_rest():
-    shifted = DATA.y0.copy()
-    shifted[:30] += 0.1
-    shifted[30:] += 0.01
-    sim = judge.simulation(DATA.gm, shifted)
-    assert sim.G == 1.0
-    assert [p.m for p in sim.particles] == DATA.gm.tolist()
-    com = sim.com()
-    np.testing.assert_allclose([com.x, com.y, com.z, com.vx, com.vy, com.vz], 0, atol=1e-15)
-    np.testing.assert_allclose(judge._state(sim), DATA.y0, rtol=0, atol=1e-14)
 
 
 def test_bad_input_is_named():
@@ -178,9 +136,6 @@ def test_problem_from_simulation():
     np.testing.assert_array_equal(problem.y0, judge._state(sim))
     assert problem.t_span == (0.0, 10.0)
     assert problem.h == 0.01
-    np.testing.assert_allclose(
-        problem.fun(0.0, problem.y0)[9:], attraction(0.0, problem.y0[:9], problem.params), rtol=1e-13, atol=1e-15
-    )
     other = judge.problem_from_simulation(sim, t_span=(0.0, 1.0), h=0.5)
     assert (other.t_span, other.h) == ((0.0, 1.0), 0.5)
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from systems import refuse
 
 import eip_scipy
-from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate, recommend
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRKN8, EIPRKN12, Invariant, integrate
 from eip_scipy.core.acceleration import AccelerationField
 from eip_scipy.core.problem import Problem
 
@@ -70,22 +70,6 @@ def test_every_method_takes_accelerations():
     """Runge-Kutta methods have the bits of the field derived from accelerations."""
     run = integrate(acceleration=spring, t_span=(0, 3), y0=Y0, method=EIPRK4, h=0.01)
     np.testing.assert_array_equal(run.y, integrate(field, (0, 3), Y0, method=EIPRK4, h=0.01).y)
-
-
-def test_ensembles_recommendations_and_checkpoints(tmp_path):
-    starts = Y0 * np.linspace(1, 2, 9)[:, None]
-    members = ensemble(acceleration=JITTED[spring], t_span=(0, 3), y0s=starts, method=EIPRKN12, h=0.1)
-    np.testing.assert_allclose(members.y, np.linspace(1, 2, 9)[:, None] * exact(3), rtol=0, atol=1e-12)
-    choice = recommend(acceleration=spring_in_place, t_span=(0, 20), y0=Y0, in_place=True, error=1e-9)
-    assert choice.method in (EIPRKN8, EIPRKN12, EIPGJ12)
-    run = choice.run()
-    assert np.abs(run.y[:, -1] - exact(20)).max() < 1e-8
-    given = {"acceleration": spring, "t_span": (0, 3), "y0": Y0, "method": EIPRKN12, "h": 0.1}
-    path = tmp_path / "run.npz"
-    with pytest.raises(ZeroDivisionError):
-        integrate(**given, checkpoint=path, save_every=1, callback=lambda t, y, d: 1 / 0 if t > 1.5 else None)
-    resumed = integrate(**given, checkpoint=path, save_every=1, resume=True)
-    np.testing.assert_array_equal(resumed.y, integrate(**given, save_every=1).y)
 
 
 def test_an_acceleration_as_fun_gets_a_note():

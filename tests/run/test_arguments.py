@@ -7,9 +7,8 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from systems import refuse
 
-from eip_scipy import EIPGJ14, EIPRK4, Invariant, ensemble, integrate
+from eip_scipy import EIPGJ14, EIPRK4, Invariant, integrate
 from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.ensembles import tasks
 from eip_scipy.problems import kepler
 
 Y0, SPAN, K, M = np.array([1.0, 0.5]), (0.0, 10.0), 2.0, 3
@@ -148,31 +147,6 @@ def test_c_functions_get_numbers_as_params(tmp_path):
     np.testing.assert_array_equal(run(functions, compiled=False).y, expected.y)
     with pytest.raises(TypeError, match="fun is a C function: its arguments after t and y are numbers"):
         run(functions, args=(K, "steel"))
-
-
-@pytest.mark.slow
-def test_members_of_an_ensemble_share_them(monkeypatch):
-    monkeypatch.setattr(tasks, "LEAST_WORK", 0.0)
-
-    @njit
-    def rhs(t, y, out, k, m):
-        out[0], out[1] = y[1], -k * y[0] / m
-
-    @njit
-    def gradient(t, y, out, k, m):
-        out[0], out[1] = k * y[0], m * y[1]
-
-    starts, kept = Y0 * np.linspace(0.9, 1.1, 11)[:, None], Invariant(jit_energy, gradient, in_place=True)
-    options = {"h": 0.05, "args": (K, float(M)), "invariants": kept, "in_place": True}
-    members = ensemble(rhs, SPAN, starts, **options)
-    assert members.success
-    assert members.one_by_one == ""
-    for start, y in zip(starts, members.y, strict=True):
-        alone = integrate(rhs, SPAN, start, method=EIPRK4, **options)
-        np.testing.assert_array_equal(alone.y[:, -1], y)
-    members = ensemble(oscillator_of, SPAN, starts, h=0.05, args=(np.array([K, M]),))  # an array for all
-    alone = integrate(oscillator_of, SPAN, starts[2], method=EIPRK4, h=0.05, params=[K, M])
-    np.testing.assert_array_equal(members.y[2], alone.y[:, -1])
 
 
 def test_they_belong_to_a_run(tmp_path):

@@ -6,7 +6,7 @@ from c_compiler import low_level, shared_library
 from numba import njit
 from systems import jit_orbit, orbit, pericentre
 
-from eip_scipy import EIPRK4, EIPRK45, Invariant, ensemble, integrate, project
+from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate, project
 from eip_scipy.core.invariants import LARGE, InvariantSet
 
 # In C, and in Python for complex steps.
@@ -132,15 +132,6 @@ def test_beside_other_functions(c):
     moved = start * [1.01, 1, 1, 1]
     found = project(moved, momentum, target=1.0, iterations=4)
     assert abs(found.defect[0]) < 1e-15
-
-
-def test_members_are_the_single_runs(c):
-    starts = pericentre(0.5) * np.linspace(0.98, 1.02, 5)[:, None]
-    options = {"h": 0.02, "invariants": Invariant(c("both"), size=2)}
-    members = ensemble(c("orbit"), (0, 10), starts, **options)
-    assert members.one_by_one == "the gradient of an invariant is computed by differences"
-    for start, y in zip(starts, members.y, strict=True):
-        np.testing.assert_array_equal(integrate(c("orbit"), (0, 10), start, method=EIPRK4, **options).y[:, -1], y)
 
 
 def test_a_status_where_a_shift_leaves_the_domain(c):

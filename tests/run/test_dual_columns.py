@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from eip_scipy import EIPDOP853, Invariant, integrate
+from eip_scipy import EIPDOP853, ensemble, integrate
 from eip_scipy.core import jitted_columns
+from eip_scipy.ensembles import tasks
 
 pytestmark = pytest.mark.needs_jit
 SPAN, START = (0.0, 3.0), [1.0, 0.3]
@@ -22,12 +23,6 @@ TWO = ctypes.c_double * 2
 def CALL(state, out):
     y, f = TWO.from_address(state), TWO.from_address(out)
     f[0], f[1] = y[1], -math.sin(y[0])
-
-
-@ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)
-def ENERGY(state):
-    y = TWO.from_address(state)
-    return y[1] ** 2 / 2 - math.cos(y[0])
 
 
 @njit
@@ -87,6 +82,15 @@ def test_functions_that_depend_on_the_memory_of_arrays_are_refused(fun, reason):
         np.testing.assert_array_equal(run.y, plain.y)
         right = integrate(pendulum, SPAN, START, variations="state", **OPTIONS)
         np.testing.assert_allclose(run.stm[-1], right.stm[-1], rtol=0, atol=1e-13)
+
+
+def test_members_are_not_compiled_for_eight_whose_arrays_they_would_misread(monkeypatch):
+    monkeypatch.setattr(tasks, "LEAST_WORK", 0)  # functions are compiled for eight members if they can be
+    starts, options = np.array(START) * np.linspace(1, 1.1, 16)[:, None], OPTIONS | {"in_place": True}
+    found = ensemble(by_pointer_in_place, SPAN, starts, executor=1, **options)
+    assert not found.side_by_side.any()
+    for k in (0, 9):
+        np.testing.assert_array_equal(found.y[k], integrate(by_pointer_in_place, SPAN, starts[k], **options).y[:, -1])
 
 
 def test_a_component_is_compared_at_its_own_size():
@@ -175,32 +179,3 @@ FAR = [1e8 - 0.5, 1e8, 1e8 + 0.5, 1e8, 0, -0.5, 0, 0.5]
 def test_right_derivatives_are_not_refused(fun, start):
     run = integrate(fun, (0, 0.1), start, variations="state", **OPTIONS)
     assert run.columns["source"] == "dual numbers"
-
-
-@pytest.mark.slow
-def test_parameters_of_any_size_are_compared():
-    size = 1e20
-
-    @njit
-    def fun(t, y, p):
-        return np.array([y[1], -y[0] * size / p[0] - np.sin(p[0] / size)])
-
-    run = integrate(fun, (0, 0.1), START, variations=["state", 0], params=[1.3 * size], **OPTIONS)
-    assert run.columns["source"] == "dual numbers"
-
-
-def test_an_invariant_that_uses_an_address_is_differentiated_by_differences():
-    energy = ENERGY
-
-    @njit
-    def H(t, y):
-        state = y.copy()
-        return energy(state.ctypes.data)
-
-    exact = Invariant(njit(lambda t, y: y[1] ** 2 / 2 - np.cos(y[0])))
-    with pytest.warns(UserWarning, match="its gradient comes from central differences"):
-        run = integrate(pendulum, SPAN, START, invariants=[H], **OPTIONS)
-    assert run.trusted
-    assert "Cannot give C code the address of an array of dual numbers" in run.message
-    right = integrate(pendulum, SPAN, START, invariants=[exact], **OPTIONS)
-    np.testing.assert_allclose(run.y[:, -1], right.y[:, -1], rtol=0, atol=1e-13)

@@ -2,7 +2,6 @@
 
 import sys
 import types
-import warnings
 
 import numpy as np
 import pytest
@@ -13,12 +12,6 @@ from eip_scipy.results import plot
 
 pyplot = pytest.importorskip("matplotlib.pyplot")
 PNG = b"\x89PNG"
-CODE = """
-from eip_scipy import EIPRK4, integrate
-from eip_scipy.problems import kepler
-
-run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=5)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -95,30 +88,3 @@ def test_a_result_of_the_typed_solve_ivp_is_drawn():
         figure = plot(sol)
         assert len(figure.axes) >= 1
         pyplot.close(figure)
-
-
-CELLS = {
-    CODE + "run.plot()": 1,
-    "run.plot();": 1,
-    "figure = run.plot()\nimport matplotlib.pyplot as plt\nplt.show()": 1,
-    "figure": 1,
-    "figure, ax = plt.subplots()\nrun.plot(ax=ax)": 1,
-    "plt.rcParams['figure.max_open_warning'] = 3\nfor _ in range(5):\n    run.plot()": 5,
-    "%matplotlib inline": 0,
-    "run.plot()": 1,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_a_notebook_shows_the_figure_once(monkeypatch):
-    """The figure is shown without the magic of IPython, and with it."""
-    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
-    pytest.importorskip("ipykernel")
-    monkeypatch.delenv("MPLBACKEND")  # that of these tests
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of Jupyter's own
-        nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
-    found = [sum("image/png" in output.get("data", {}) for output in cell.outputs) for cell in notebook.cells]
-    assert found == list(CELLS.values())

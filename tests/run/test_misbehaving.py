@@ -26,16 +26,6 @@ def square_gradient(t, y):
     return 2 * y
 
 
-def filling(t, y, out):
-    out[0] = y[1]
-    out[1] = -y[0]
-
-
-def filling_gradient(t, y, out):
-    out[0] = 2 * y[0]
-    out[1] = 2 * y[1]
-
-
 def interpreted(fun=oscillator, invariants=(), **options):
     options = {"method": EIPRK4, "h": 0.1, "save_every": 1, **options}
     return integrate(fun, (0, 1), Y0, invariants=invariants, compiled=False, **options)
@@ -58,9 +48,6 @@ def scipy_s(fun=oscillator, invariants=(), **options):
 
 
 both = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled, marks=needs_jit)])
-compiled_at_night = pytest.mark.parametrize(
-    "how", [interpreted, pytest.param(compiled, marks=[needs_jit, pytest.mark.nightly, pytest.mark.slow])]
-)
 all_of_them = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled, marks=needs_jit), scipy_s])
 KEPT = Invariant(square, square_gradient, name="S")
 
@@ -105,12 +92,6 @@ def gradient_that_writes(t, y):
     return y
 
 
-def event_that_writes(t, y):
-    value = y[0]
-    y[1] = 100.0
-    return value
-
-
 WRITERS = [writing, writing_now_and_then, writing_by_a_function]
 
 
@@ -150,17 +131,6 @@ def test_gradients_that_write_to_f(how):
     np.testing.assert_array_equal(
         how(invariants=Invariant(square, grad, uses_f=True, name="S")).y, how(invariants=good).y
     )
-
-
-@compiled_at_night
-def test_events_that_write(how):
-    """Neither the state nor the input of the next event changes."""
-    events = [event_that_writes, lambda t, y: y[1] - 1.0]
-    found, plain = (how(invariants=KEPT, events=e) for e in (events, [lambda t, y: y[0], events[1]]))
-    np.testing.assert_array_equal(found.y, plain.y)
-    assert plain.t_events[1].size == 1
-    for mine, other in zip(found.t_events, plain.t_events, strict=True):
-        np.testing.assert_array_equal(mine, other)
 
 
 def test_helpers_keep_what_they_are_given():
@@ -236,19 +206,6 @@ def test_functions_that_stop_filling(how):
     np.testing.assert_array_equal(run.y, interpreted().y[:, : run.t.size])
 
 
-@both
-def test_gradients_that_stop_filling(how):
-    def grad(t, y, out):
-        out[0] = 2 * y[0]
-        if t < 0.5:
-            out[1] = 2 * y[1]
-
-    run = how(invariants=Invariant(square, grad, name="S", in_place=True))
-    assert run.status == -1
-    assert "projection failed at t=0.5: invariant 'S'" in run.message
-    assert "the gradient of 'S' is not finite there" in run.message
-
-
 # Values that change on the way.
 
 CHANGES = {
@@ -258,8 +215,6 @@ CHANGES = {
     "shape": (lambda y: np.ones((3, 1)), ValueError, r"shape \(3, 1\)"),
     "ragged": (lambda y: [1.0, [2.0, 3.0]], (TypeError, ValueError), r"\[1.0, \[2.0, 3.0\]\]"),
 }
-changes = pytest.mark.parametrize(("change", "error", "match"), CHANGES.values(), ids=CHANGES)
-interpreters = pytest.mark.parametrize("how", [interpreted, scipy_s])
 
 
 def late(good, change):
@@ -296,52 +251,6 @@ def test_events_that_change():
         with pytest.raises(TypeError, match=r"event 0 returned .*expected a real number") as info:
             interpreted(events=lambda t, y, v=value, start=start: y[0] if t < start else v)
         assert info.value.partial.t[-1] == pytest.approx(max(start, 0.0))
-
-
-@needs_jit
-@pytest.mark.parametrize(
-    "part",
-    ["fun", *(pytest.param(part, marks=[pytest.mark.nightly, pytest.mark.slow]) for part in ("value", "gradient"))],
-)
-def test_compiled_functions_that_return_none(part):
-    """Such a function does not enter compiled code, and the interpreted error says what is wrong."""
-
-    def fun(t, y):
-        return np.array([y[1], -y[0]]) if t < 0.5 or part != "fun" else None
-
-    def value(t, y):
-        return y[0] * y[0] + y[1] * y[1] if t < 0.5 or part != "value" else None
-
-    def grad(t, y):
-        return 2 * y if t < 0.5 or part != "gradient" else None
-
-    kept = Invariant(njit(value), njit(grad), name="S")
-    with pytest.raises(TypeError, match=r"returned None .*at t=0\.5|returned None, expected 2 numbers, at t=0\.5"):
-        integrate(njit(fun), (0, 1), Y0, method=EIPRK4, h=0.1, invariants=kept)
-    with pytest.raises(TypeError, match="returns None in some places"):
-        integrate(njit(fun), (0, 1), Y0, method=EIPRK4, h=0.1, invariants=kept, compiled=True)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@needs_jit
-@pytest.mark.parametrize("part", ["fun", "value", "gradient"])
-@pytest.mark.parametrize("late", [1, 3])
-def test_compiled_shapes_that_change(part, late):
-    """Values are neither spread over the components, nor written or read beyond an array's end."""
-    number = ["fun", "value", "gradient"].index(part)
-
-    @njit
-    def size(place, t):
-        return late if place == number and t > 0.55 else 2
-
-    fun = njit(lambda t, y: np.array([y[1], -y[0], 0.0])[: size(0, t)])
-    value = njit(lambda t, y: np.full(size(1, t), y @ y))
-    grad = njit(lambda t, y: np.ones((size(2, t), 1)) * (2 * y))
-    name = {"fun": "fun", "value": "invariant 'S'", "gradient": "gradient of invariant 'S'"}[part]
-    with pytest.raises(ValueError, match=f"{name} .*another shape than at the start, in the step from t=0.5") as info:
-        integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.1, invariants=Invariant(value, grad, name="S"), compiled=True)
-    assert info.value.partial.t[-1] == 0.5
 
 
 # Exceptions before the first step.

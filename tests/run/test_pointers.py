@@ -17,7 +17,6 @@ from scipy.integrate import solve_ivp
 from systems import refuse, same
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, ensemble, integrate, project
-from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.problems import Problem
 
 HERE = Path(__file__).parent
@@ -93,24 +92,6 @@ def turn(t, y, p):
     return y[0] * y[2] + y[1] * y[3]
 
 
-def phases(t, y):
-    out = np.empty_like(y)
-    for k in range(3):
-        out[k] = complex((1 + k) * y[k].imag, -(1 + k) * y[k].real)
-    return out
-
-
-def mass(t, y):
-    total = 0.0
-    for k in range(3):
-        total += y[k].real * y[k].real + y[k].imag * y[k].imag
-    return total
-
-
-def mass_gradient(t, y):
-    return 2 * y
-
-
 def kepler_s(fun, H, dH, L, dL, event):
     """Return arguments of `integrate`: Kepler's problem by these functions."""
     invariants = [Invariant(H, dH, name="H", uses_f=True), Invariant(L, dL, name="L")]
@@ -146,20 +127,6 @@ def test_the_bits_are_those_of_python_and_of_numba(c, options):
     assert [run.compiled for run in runs] == [False, True, True, False, True]
     assert list(runs[2].calls) == ["fun", "H", "gradient of H", "L", "gradient of L", "event 0"]
     assert runs[2].t_events[0].size > 5
-
-
-@pytest.mark.needs_jit
-def test_complex_states(c):
-    y0 = np.array([1 + 1j, 0.5 - 1j, 2j])
-    plain = phases, mass, mass_gradient
-    every = (plain, [njit(function) for function in plain], (c.phases, c.mass, c.mass_gradient))
-    for options in ({"h": 0.05}, {"rtol": 1e-6, "method": EIPRK45}):
-        options = {"method": EIPRK4, "save_every": 1} | options
-        runs = [integrate(fun, (0, 3), y0, invariants=Invariant(N, dN, name="N"), **options) for fun, N, dN in every]
-        fun, N, dN = every[2]
-        runs.append(integrate(fun, (0, 3), y0, invariants=Invariant(N, dN, name="N"), compiled=False, **options))
-        same(*runs)
-        assert runs[2].calls == {"fun": "pointer", "N": "pointer", "gradient of N": "pointer"}
 
 
 @both
@@ -448,17 +415,6 @@ def test_events_in_python_beside_native_functions(c, options, alone):
         integrate(**given, **options, compiled=True)
 
 
-def test_what_an_event_in_python_raises_ends_the_run(c):
-    def event(t, y, p):
-        if t > 1:
-            raise ZeroDivisionError("by the event")
-        return y[0]
-
-    with pytest.raises(ZeroDivisionError, match="by the event") as caught:
-        integrate(c.kepler, (0, 3), Y0, method=EIPRK4, h=0.1, params=MU, events=event)
-    assert 0.9 < caught.value.partial.t[-1] < 1.2
-
-
 # Ensembles and checkpoints.
 
 
@@ -484,20 +440,3 @@ def test_members_are_single_runs(c):
 
 def alone(c):
     return Invariant(c.kept, c.kept_gradient, size=2, name="H L")
-
-
-def test_a_checkpoint_knows_them_by_what_they_do(c, tmp_path):
-    path, options = tmp_path / "run.npz", {"method": EIPRK4, "h": 0.05, "params": MU, "save_every": 10}
-    calls = []
-
-    def stopping(t, y, defects):
-        calls.append(t)
-        if t > 5:
-            raise InterruptedError
-
-    with pytest.raises(InterruptedError):
-        integrate(c.kepler, (0, 10), Y0, checkpoint=path, callback=stopping, **options)
-    with pytest.raises(CheckpointError, match="fun was"):
-        integrate(c.repelled, (0, 10), Y0, checkpoint=path, resume=True, **options)
-    resumed = integrate(c.kepler, (0, 10), Y0, checkpoint=path, resume=True, **options)
-    same(resumed, integrate(c.kepler, (0, 10), Y0, **options))

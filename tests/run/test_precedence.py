@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from systems import refuse
 
-from eip_scipy import EIPDOP853, EIPRK1, EIPRK4, EIPRK45, ensemble, integrate
+from eip_scipy import EIPDOP853, EIPRK1, EIPRK4, ensemble, integrate
 from eip_scipy.problems import harmonic, kepler
 
 PROBLEM = kepler(0.3, 0.0, t_end=2.0)
@@ -95,14 +95,3 @@ def test_rtol_is_obeyed():
     exact = PROBLEM.reference(2.0)
     errors = [np.abs(run.y[:, -1] - exact).max() for run in (coarse, fine)]
     assert errors[1] < 1e-10 < errors[0]
-
-
-@pytest.mark.needs_jit
-def test_compiled_runs_and_their_checkpoints(tmp_path):
-    """A run is resumed by the same arguments, not by those of the other kind of steps."""
-    options = {"method": EIPRK45, "rtol": 1e-6, "checkpoint": tmp_path / "a.npz"}
-    first = integrate(PROBLEM, **options)
-    again = integrate(PROBLEM, **options, resume=True)
-    np.testing.assert_array_equal(first.y, again.y)
-    assert first.h is again.h is None
-    assert first.compiled

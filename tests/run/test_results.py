@@ -30,7 +30,6 @@ from eip_scipy_studies.condensates.problems import soliton
 
 Y0 = np.array([1.0, 2.0])
 NAMES = ("x", "y", "vx", "vy")
-FIELDS = {"t", "y", "invariants", "target", "max_defect"}
 
 
 def crossing(t, y, params=None):
@@ -133,15 +132,6 @@ def test_to_dataframe():
     assert list(twice.to_dataframe().columns)[2:] == ["S", "S error", "S (1)", "S (1) error"]
 
 
-def test_tables_of_solve_ivp():
-    sol = of_solve_ivp()
-    data, frame = to_xarray(sol, names=["q", "p"]), to_dataframe(sol)
-    np.testing.assert_array_equal(data.y.sel(component="p"), sol.y[1])
-    assert data.attrs["message"] == sol.message
-    assert "method" not in data.attrs
-    assert list(frame.columns) == ["y0", "y1"]
-
-
 def test_tables_of_ensembles():
     """A row for each member; as many members as components do not confuse them."""
     starts = kepler().y0 * np.linspace(0.99, 1.01, 4)[:, None]
@@ -230,24 +220,6 @@ def test_an_untrusted_run_says_so_when_it_is_loaded(tmp_path):
     again = load(tmp_path / "run.npz")
     assert again.trusted is again.diagnostics.trusted is False
     assert again.diagnostics.message == run.diagnostics.message != ""
-
-
-def test_save_and_load_of_solve_ivp(tmp_path):
-    sol = of_solve_ivp(dense_output=True)
-    save(sol, tmp_path / "sol.npz")
-    again = load(tmp_path / "sol.npz")
-    assert_same(sol, again)
-    assert not isinstance(again, IntegrationResult)
-    assert to_dataframe(again).equals(to_dataframe(sol))
-
-
-def test_files_hold_plain_arrays(tmp_path):
-    run = kepler_run()
-    run.note = {"why": ["a test", 1]}
-    run.save(tmp_path / "run.npz")
-    with np.load(tmp_path / "run.npz", allow_pickle=False) as data:
-        np.testing.assert_array_equal(data["y"], run.y)
-    assert load(tmp_path / "run.npz").note == run.note
 
 
 def test_a_field_that_cannot_be_kept(tmp_path):
@@ -392,19 +364,6 @@ def test_from_the_last_state_though_it_was_not_saved():
     np.testing.assert_array_equal(integrate(oscillator, (0, -1), Y0, method=EIPRK4).continue_to(-2.0).t[-1], -2.0)
 
 
-def test_from_an_event_on():
-    def down(t, y, params):
-        return y[1]
-
-    down.terminal, down.direction = True, -1
-    first = kepler_run(20.0, events=down)
-    assert first.status == 1
-    joined = first.continue_to(20.0, events=None)
-    assert joined.status == 0
-    assert joined.t[-1] == 20.0
-    np.testing.assert_allclose(joined.y[:, -1], kepler_run(20.0).y[:, -1], rtol=0, atol=1e-3)
-
-
 def test_what_cannot_be_continued():
     beyond = "must lie beyond the end of the run, 3, got"
     rows = [
@@ -471,21 +430,6 @@ def test_plot_of_components():
     np.testing.assert_array_equal(first.lines[3].get_ydata(), np.abs(field.y[3]))
 
 
-def test_a_component_that_grows_hides_no_other():
-    run = integrate(lambda t, y: [y[1], -np.sin(y[0])], (0, 100), [0.0, 2.5], method=EIPRK4, h=0.05, save_every=5)
-    above, below = axes_of(run.plot(names="theta omega"))
-    for axis, row, name in zip((above, below), run.y, ("theta", "omega"), strict=True):
-        assert [line.get_label() for line in axis.lines] == [name]
-        np.testing.assert_array_equal(axis.lines[0].get_ydata(), row)
-    low, high = below.get_ylim()
-    assert high - low < 2 * np.ptp(run.y[1])
-
-
 def test_a_run_prints_what_it_has():
     assert "units" not in repr(integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1))
     assert "units: G M = 1" in repr(kepler_run())
-
-
-def test_methods_are_listed():
-    assert {"continue_to", "plot", "save", "to_xarray", "t", "y"} <= set(dir(kepler_run()))
-    assert set(kepler_run()) >= FIELDS

@@ -1,14 +1,13 @@
 """States between steps and roots of events in the loop: those of solve_ivp, and of functions in Python."""
 
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
-from systems import JIT_NORM, jit_spin, same
+from systems import same
 
 from eip_scipy import (
     EIPDOP853,
@@ -68,11 +67,6 @@ def acceleration(t, q, params):
     return -(w + 1.5 * params[0] * w / r2) * q
 
 
-@njit
-def upright(t, y):
-    return y[0].real
-
-
 def run(method, events=None, span=(0.0, 30.0), **options):
     """Return Kepler's problem by Numba functions; a Nystrom method gets its acceleration."""
     if method in NYSTROM:
@@ -93,15 +87,6 @@ def test_roots_and_samples_of_compiled_and_interpreted_runs(method, steps):
     assert [len(t) > 4 for t in compiled.t_events] == [True, True, True]
     same(compiled, interpreted)
     np.testing.assert_array_equal(compiled.sol(times), interpreted.sol(times))
-
-
-def test_roots_of_a_complex_state():
-    options = {"method": EIPRK4, "h": 0.1, "invariants": JIT_NORM, "events": upright, "t_eval": np.linspace(0, 40, 333)}
-    y0 = np.array([0.8, 0.6j])
-    compiled = integrate(jit_spin, (0.0, 40.0), y0, **options)
-    assert compiled.compiled
-    assert len(compiled.t_events[0]) > 4
-    same(compiled, integrate(jit_spin, (0.0, 40.0), y0, compiled=False, **options))
 
 
 @pytest.mark.parametrize(("method", "steps"), [STEPS["RK4"], STEPS["RK45"], STEPS["DOP853"]])
@@ -288,27 +273,6 @@ def test_a_checkpoint_keeps_no_solution(tmp_path):
         run(EIPRK4, h=0.1, dense_output="yes")
 
 
-def test_roots_and_times_of_a_resumed_run(tmp_path):
-    """Roots and counts of the loop continue from a checkpoint."""
-    event = njit(lambda t, y, params: y[1])
-    event.terminal = 7
-    options = {"h": 0.01, "t_eval": np.linspace(0, 30, 4000), "events": [event, clock]}
-    whole = run(EIPRK4, **options)
-    assert len(whole.t_events[0]) == 7
-
-    class BrokenError(Exception):
-        pass
-
-    def stop(t, y, defects):
-        if t > 12:
-            raise BrokenError
-
-    kept = {"checkpoint": tmp_path / "run.npz", "checkpoint_every": 1e-9}
-    with pytest.raises(BrokenError):
-        run(EIPRK4, callback=stop, **options, **kept)
-    same(run(EIPRK4, resume=True, **options, **kept), whole)
-
-
 def test_an_unprojected_state_is_told():
     """A level that no state near the interpolant meets is reported once, and the state is returned unchanged."""
 
@@ -338,31 +302,3 @@ def test_a_callback_stops_at_the_time_it_sees():
     assert seen == times[:8].tolist()
     assert found.t_events[0][-1] <= 7.5
     assert found.nfev <= run(t_eval=times[:8], span=(0.0, 7.0), **options).nfev + 30
-
-
-def test_threads_may_ask_at_once():
-    """Threads evaluate solutions of compiled functions, without the GIL, and of Python's."""
-    times = np.linspace(0, 30, 3001)
-    for compiled in (None, False):
-        found = run(EIPRK4, h=0.05, dense_output=True, compiled=compiled)
-        expected = found.sol(times)
-        with ThreadPoolExecutor(4) as pool:
-            parts = list(pool.map(found.sol, np.split(times[:3000], 30)))
-        np.testing.assert_array_equal(np.concatenate(parts, axis=1), expected[:, :3000])
-
-
-def test_events_of_long_states():
-    """The state has more numbers than the loop has room for among its roots."""
-
-    @njit
-    def decay(t, y):
-        return -y
-
-    @njit
-    def level(t, y):
-        return y[0] - 0.5
-
-    found = integrate(decay, (0, 1), np.ones(200_000), method=EIPRK4, h=0.25, events=level)
-    assert found.compiled
-    np.testing.assert_allclose(found.t_events[0], [np.log(2)], rtol=1e-3)
-    assert found.y_events[0].shape == (1, 200_000)

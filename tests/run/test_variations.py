@@ -135,19 +135,6 @@ def test_complex_steps_are_kept_where_forces_cancel():
     np.testing.assert_allclose(far, near, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("refuses", [False, True])
-def test_complex_steps_are_kept_where_there_are_no_differences(refuses):
-    # The state comes closer to the end of the domain of fun than the lengths of differences.
-    def fun(t, y):
-        if refuses and y[0].real >= 1:
-            raise ArithmeticError("a share must be below 1")
-        return (1 - y) * (1 - 0.01 * np.log(1 - y))
-
-    run = integrate(fun, (0, 20), [0.5], method=EIPDOP853, h=0.25, variations="state")
-    assert 1 - run.y[0, -1] < 1e-9
-    np.testing.assert_allclose(run.stm[-1], fun(20, run.y[:, -1:]) / fun(0, run.y[:, :1]), rtol=1e-5, atol=0)
-
-
 def test_a_jvp_is_right_at_a_kink():
     def fun(t, y):
         return np.array([y[1], -4 * min(y[0], 0.0)])
@@ -183,15 +170,6 @@ def test_results_without_derivatives_say_what_to_ask_for():
         _ = run_of(variations="state").sensitivities
     with pytest.raises(AttributeError, match='variations="state"'):
         _ = run_of(variations=0, params=[1.0]).stm
-
-
-def test_columns_are_saved(tmp_path):
-    run = run_of(variations=["state", 0], params=[1.0])
-    run.save(tmp_path / "run.npz")
-    found = load(tmp_path / "run.npz")
-    assert found.columns == run.columns
-    np.testing.assert_array_equal(found.stm, run.stm)
-    np.testing.assert_array_equal(found.sensitivities, run.sensitivities)
 
 
 def broken_off(tmp_path, **options):
@@ -258,28 +236,3 @@ def test_members_of_an_ensemble_have_the_bits_of_their_runs(tmp_path, rows):
     assert found.columns == run.columns
     found.save(tmp_path / "members.npz")
     np.testing.assert_array_equal(load(tmp_path / "members.npz").stm, found.stm)
-
-
-def test_members_go_on_from_a_checkpoint_with_the_same_derivatives(tmp_path):
-    starts = np.array(START) * np.linspace(0.9, 1.1, 20)[:, None]
-    options = {"method": EIPDOP853, "h": 0.1, "invariants": [Invariant(energy)], "variations": "state", "chunk": 8}
-    whole = ensemble(pendulum, SPAN, starts, **options)
-    file = {"checkpoint": tmp_path / "file"}
-    ensemble(pendulum, SPAN, starts, **options, **file, callback=lambda part: part.first == 8)
-    with pytest.raises(CheckpointError, match="symplectic"):
-        ensemble(pendulum, SPAN, starts, **options, **file, resume=True, symplectic=True)
-    np.testing.assert_array_equal(ensemble(pendulum, SPAN, starts, **options, **file, resume=True).stm, whole.stm)
-
-
-def test_a_member_that_fails_leaves_the_others_alone():
-    def fun(t, y):
-        if y[0] < -0.5:
-            raise RuntimeError("too far")
-        return np.array([y[1], -y[0]])
-
-    invariants = [Invariant(lambda t, y: y @ y)]
-    found = ensemble(fun, SPAN, [[1.0, 0.0], [0.1, 0.0]], method=EIPDOP853, h=0.1, variations="state",
-                     invariants=invariants)  # fmt: skip
-    assert found.status.tolist() == [-1, 0]
-    turned = [[np.cos(3.0), np.sin(3.0)], [-np.sin(3.0), np.cos(3.0)]]
-    np.testing.assert_allclose(found.stm[1], turned, rtol=0, atol=1e-12)
