@@ -1,12 +1,7 @@
 """Checkpoints of ensembles: what is missing runs on, bit for bit; other ensembles and damaged files are refused."""
 
-import os
-import signal
-import time
-
 import numpy as np
 import pytest
-from forked import Forker
 from systems import SQUARE, oscillator, refuse, same_fields
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, checkpoint, ensemble
@@ -168,43 +163,3 @@ def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
     with pytest.warns(RuntimeWarning, match="no space left on device; the previous checkpoint is kept"):
         same_fields(members(), members(checkpoint=path))
     assert checkpoint.read(path, "ensemble")[0]["finished"] == 0
-
-
-# Kills.
-
-KILLED = """
-    import sys
-
-    sys.path.append(folder)
-    import test_checkpoints
-
-    print("running", flush=True)
-    test_checkpoints.many(checkpoint=place, checkpoint_every=1e-9, resume=True)
-"""
-MANY = STARTS[np.arange(1500) % 11] * (1 + 1e-3 * np.arange(1500))[:, None]
-
-
-def many(**options):
-    """Run an ensemble of some seconds, whose chunks take a few milliseconds each."""
-    return members(y0s=MANY, h=0.02, reduce=peak, events=height, save_every=10, compiled=False, **options)
-
-
-@pytest.mark.slow
-@pytest.mark.posix
-def test_an_ensemble_that_is_killed_ten_times(tmp_path):
-    """Kill the process at a random time, ten times; the result has the bits of an uninterrupted ensemble."""
-    rng, forker, begin = np.random.default_rng(), Forker(tmp_path), time.perf_counter()
-    whole, done = many(), []
-    longest = (time.perf_counter() - begin) / 6
-    for _ in range(10):
-        process = forker.start(KILLED, folder=os.path.dirname(__file__), place=str(tmp_path / "kept"))
-        process.until("running")
-        time.sleep(longest * rng.random())
-        os.kill(process.pid, signal.SIGKILL)
-        assert process.wait()[0] == -signal.SIGKILL
-        if (tmp_path / "kept").exists():
-            done.append(checkpoint.read(tmp_path / "kept", "ensemble")[0]["finished"])
-    forker.close()
-    assert sorted(done) == done
-    assert 0 < done[-1] < len(MANY)
-    same_fields(whole, many(checkpoint=tmp_path / "kept", resume=True))

@@ -224,19 +224,3 @@ def test_ctrl_c_is_pythons_again_afterwards(call):
     call()
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
-
-
-def test_what_prepare_adds_is_in_the_run():
-    """Return a force that cancels gravity: bodies move on straight lines."""
-
-    def cancel(sim):
-        def force(_):
-            for p in sim.particles:
-                p.ax = p.ay = p.az = 0.0
-
-        sim.additional_forces = force
-        return force
-
-    result = run("ias15", h=10.0, n_steps=1, prepare=cancel)
-    q, v = result.y[:, 0].reshape(2, -1)
-    np.testing.assert_allclose(result.y[:30, -1], q + 10.0 * v, rtol=1e-13, atol=1e-14)

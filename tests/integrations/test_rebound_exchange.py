@@ -293,14 +293,3 @@ def test_forces_of_reboundx(theirs, ours):
     assert error < 1e-3 * effect
     with pytest.warns(UserWarning, match=ours[0]):
         exchange.to_simulation(problem)
-
-
-def test_forces_of_reboundx_that_are_not_known():
-    with pytest.raises(ValueError, match="REBOUNDx's additional forces radiation_forces; expected one of gr"):
-        exchange.problem_from_simulation(with_force("radiation_forces", c=1e4))
-    with pytest.raises(ValueError, match="'1pn' needs constants"):
-        exchange.problem_from_simulation(with_force("gr"))
-    sim = with_force("gr", c=1e4)
-    sim.particles[2].params["gr_source"] = 1
-    with pytest.raises(ValueError, match="particle 2 is its source"):
-        exchange.problem_from_simulation(sim)

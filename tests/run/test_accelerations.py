@@ -1,7 +1,6 @@
 """One meaning of `fun` for all methods: the derivative of y = (q, v); accelerations have a separate argument."""
 
 import math
-import pickle
 from itertools import product
 
 import numpy as np
@@ -11,9 +10,7 @@ from scipy.integrate import solve_ivp
 from systems import refuse
 
 import eip_scipy
-from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRKN8, EIPRKN12, Invariant, integrate
-from eip_scipy.core.acceleration import AccelerationField
-from eip_scipy.core.problem import Problem
+from eip_scipy import EIPGJ12, EIPRK4, EIPRKN8, EIPRKN12, Invariant, integrate
 
 Y0 = np.array([1.0, 0.5, 0.2, -0.3])
 SECOND_ORDER = {EIPRKN8: {"rtol": 1e-11, "atol": 1e-13}, EIPRKN12: {"rtol": 1e-11, "atol": 1e-13}}
@@ -97,35 +94,8 @@ def test_what_is_neither():
     refuse(solve_ivp, [(given | rows[0][0], ValueError, message), (given | rows[1][0], KeyError, "mass")])
 
 
-@pytest.mark.needs_jit
-@pytest.mark.parametrize("method", SECOND_ORDER)
-def test_a_division_by_zero_in_fun_is_not_explained_away(method):
-    """Half of `out` is filled before; as Python code the function gives NaN for the other half."""
-
-    @njit
-    def attraction(t, y, out):
-        out[0], out[1] = y[2], y[3]
-        out[2] = -y[0] / (y[0] * y[0] + y[1] * y[1]) ** 1.5
-        out[3] = -y[1] / (y[0] * y[0] + y[1] * y[1]) ** 1.5
-
-    with pytest.raises(ZeroDivisionError):
-        integrate(attraction, (0, 1), np.zeros(4), method=method, h=0.01, in_place=True)
-
-
 def test_accelerations_that_depend_on_velocities():
     """Accelerations are the second half of fun: q'' = -q - v/50, whose solution decays as exp(-t/100)."""
     rate = math.sqrt(1 - 1e-4)
     run = integrate(lambda t, y: np.array([y[1], -y[0] - y[1] / 50]), (0, 10), [1.0, -0.01], method=EIPGJ12, h=0.01)
     np.testing.assert_allclose(run.y[0, -1], math.exp(-0.1) * math.cos(10 * rate), rtol=0, atol=1e-12)
-
-
-def test_a_field_made_of_accelerations():
-    """Accelerations work as the function of a Problem and in solve_ivp; the field pickles if the acceleration does."""
-    made = AccelerationField(spring)
-    np.testing.assert_array_equal(made(0.0, Y0), field(0.0, Y0))
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(made))(0.0, Y0), field(0.0, Y0))
-    problem = Problem("spring", made, Y0, (0.0, 3.0))
-    run = integrate(problem, method=EIPRKN12, rtol=1e-10)
-    assert list(run.calls) == ["acceleration"]
-    sol = solve_ivp(made, (0, 3), Y0, method=EIPDOP853, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(sol.y[:, -1], exact(3), rtol=0, atol=1e-8)

@@ -7,7 +7,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from systems import refuse
 
-from eip_scipy import EIPGJ14, EIPRK4, Invariant, integrate
+from eip_scipy import EIPRK4, Invariant, integrate
 from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.problems import kepler
 
@@ -109,22 +109,6 @@ def test_other_arguments_are_python_s():
     by_name = {"k": K}
     integrate(lambda t, y, a: seen.append(a) or -a["k"] * y, SPAN, Y0, method=EIPRK4, h=0.5, args=(by_name,))
     assert all(a is by_name for a in seen)
-
-
-def test_second_order_in_place_and_jacobian():
-    @njit
-    def acc(t, q, out, k, m):
-        out[0] = -k / m * q[0]
-
-    @njit
-    def jacobian(t, q, dq, out, k, m):
-        out[0] = -k / m * dq[0]
-
-    exact = np.cos(np.sqrt(K / M) * SPAN[1]) + 0.5 * np.sqrt(M / K) * np.sin(np.sqrt(K / M) * SPAN[1])
-    options = {"h": 0.05, "args": (K, M), "in_place": True, "jacobian": jacobian}
-    result = integrate(acceleration=acc, t_span=SPAN, y0=Y0, method=EIPGJ14, **options)
-    assert set(result.calls.values()) == {"jitted"}
-    np.testing.assert_allclose(result.y[0, -1], exact, rtol=1e-12)
 
 
 C_SOURCE = """

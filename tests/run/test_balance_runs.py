@@ -19,7 +19,6 @@ from eip_scipy import (
     ProjectionWarning,
     ensemble,
     integrate,
-    load,
 )
 from eip_scipy.checkpoint import CheckpointError
 
@@ -247,15 +246,6 @@ def test_members_of_ensembles_are_single_runs(options):
     assert members.trusted.all()
     assert np.isnan(members.target).all()
     assert "the runs have balances" in str(members)
-
-
-def test_results_are_saved_with_their_slowness(tmp_path):
-    found = run(method=EIPRK4, h=0.1, end=5.0)
-    found.save(tmp_path / "run.npz")
-    again = load(tmp_path / "run.npz")
-    assert np.array_equal(again.diagnostics.slowness, found.diagnostics.slowness)
-    assert 0 < again.diagnostics.slowness[0] < 1e-3
-    assert np.isnan(again.target).all()
 
 
 def stiffness(t, q, dq, out):

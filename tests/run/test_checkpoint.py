@@ -104,26 +104,22 @@ def checkpoint_step(error):
 @pytest.mark.usefixtures("fine")
 def test_a_result_is_there_at_once(tmp_path):
     """A finished run that is resumed calls nothing beyond its start and leaves the file alone."""
-    calls = [0]
+    path, calls, seen = tmp_path / "run.npz", itertools.count(), []
 
     def counted(t, y):
-        calls[0] += 1
+        next(calls)
         return orbit(t, y)
 
-    path = tmp_path / "run.npz"
-    seen = []
-    options = {"callback": lambda t, y, defects: seen.append(t), "checkpoint": path}
-    whole = run(fun=counted, **options)
-    before, content = calls[0], path.read_bytes()
-    seen.clear()
-    again = run(fun=counted, resume=True, **options)
+    options = {"checkpoint": path, "fun": counted}
+    whole = run(**options)
+    before, content = next(calls), path.read_bytes()
+    again = run(resume=True, callback=lambda t, y, defects: seen.append(t), **options)
     same(whole, again)
-    assert calls[0] - before < 20
+    assert next(calls) - before < 20
     assert seen == []
     assert path.read_bytes() == content
     assert again.wall_time >= checkpoint.read(path)[0]["wall_time"] > 0
     assert "resumed at step 200" in again.message
-    # Nor does it need a folder that can be written to.
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.npz"]
 
 
@@ -208,29 +204,16 @@ def test_options_and_places(tmp_path, monkeypatch):
 
 
 OTHERS = {
-    "method": {"method": EIPRK5},
-    "h": {"h": 0.02},
-    "rtol": {"rtol": 1e-4},
-    "invariants": {"invariants": [H]},
-    "metric": {"metric": "euclidean"},
-    "blocks": {"blocks": 2},
-    "frame": {"frame": FRAME},
-    "direction": {"direction": "midpoint"},
-    "iterations": {"iterations": 2},
-    "every": {"every": 2},
-    "reuse_f": {"reuse_f": False},
-    "compensated": {"compensated": True},
-    "save_every": {"save_every": 8},
-    "t_eval": {"save_every": None, "t_eval": [0.0, 1.0]},
-    "events": {"events": crossing},
-    "params": {
-        "fun": lambda t, y, p: orbit(t, y),
-        "params": [1.0],
-        "invariants": [Invariant(lambda t, y, p: H.fun(t, y), lambda t, y, p: H.grad(t, y), name="energy")],
-    },
-    "y0": {"y0": pericentre(0.5)},
-    "t_span": {"t_span": (0, 7)},
+    "method": EIPRK5,
+    "h": 0.02,
+    "rtol": 1e-4,
+    "invariants": [H],
+    "metric": "euclidean",
+    "blocks": 2,
+    "frame": FRAME,
 }
+OTHERS |= {"direction": "midpoint", "iterations": 2, "every": 2, "reuse_f": False, "compensated": True, "save_every": 8}
+OTHERS |= {"events": crossing, "y0": pericentre(0.5), "t_span": (0, 7)}
 
 
 @pytest.fixture(scope="module")
@@ -241,10 +224,12 @@ def old_run(tmp_path_factory):
 
 
 def test_other_arguments_are_named(old_run):
-    same_run = {"checkpoint": old_run[1], "resume": True}
-    words = "belongs to another run: (.*; )?{} (is .* in the checkpoint and|differs)"
-    rows = [(same_run | other, CheckpointError, words.format(name)) for name, other in OTHERS.items()]
-    refuse(run, rows)
+    others = [{name: value} for name, value in OTHERS.items()]
+    others += [{"t_eval": [0.0, 1.0], "save_every": None}]
+    others += [{"params": [1.0], "fun": lambda t, y, p: orbit(t, y), "invariants": ()}]
+    for other in others:
+        words = f"belongs to another run: (.*; )?{next(iter(other))} (is .* in the checkpoint and|differs)"
+        refuse(run, [({"checkpoint": old_run[1], "resume": True, **other}, CheckpointError, words)])
 
 
 ANOTHER = [

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from c_compiler import low_level, shared_library
 from numba import njit
-from systems import jit_orbit, orbit, pericentre
+from systems import pericentre
 
-from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate, project
+from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
 from eip_scipy.core.invariants import LARGE, InvariantSet
 
 # In C, and in Python for complex steps.
@@ -120,18 +120,6 @@ def test_complex_states(c):
     assert native.compiled
     np.testing.assert_allclose(native.y, by_python.y, rtol=0, atol=1e-14)
     np.testing.assert_allclose(native.y, expected.y, rtol=0, atol=1e-13)
-
-
-def test_beside_other_functions(c):
-    start, momentum = pericentre(0.3), Invariant(c("overwrites"), name="L")
-    native = integrate(jit_orbit, (0, 10), start, invariants=momentum, **ORBIT)
-    assert set(native.calls.values()) == {"jitted", "pointer", "differences"}
-    assert native.max_defect[0] < 1e-14
-    interpreted = integrate(orbit, (0, 10), start, invariants=momentum, **ORBIT)
-    np.testing.assert_allclose(native.y, interpreted.y, rtol=0, atol=1e-12)
-    moved = start * [1.01, 1, 1, 1]
-    found = project(moved, momentum, target=1.0, iterations=4)
-    assert abs(found.defect[0]) < 1e-15
 
 
 def test_a_status_where_a_shift_leaves_the_domain(c):

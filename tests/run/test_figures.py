@@ -6,7 +6,7 @@ import types
 import numpy as np
 import pytest
 
-from eip_scipy import EIPRK4, Invariant, integrate, solve_ivp
+from eip_scipy import EIPRK4, integrate
 from eip_scipy.problems import kepler
 from eip_scipy.results import plot
 
@@ -78,13 +78,3 @@ def test_axes_of_the_user(run):
     assert right.get_title() == "my own"
     assert figure.axes == [left, right]
     pyplot.close(figure)
-
-
-def test_a_result_of_the_typed_solve_ivp_is_drawn():
-    """A record has the corrections, and not the values of the invariants."""
-    kept = [Invariant(lambda t, y: y @ y, name="square"), Invariant(lambda t, y: np.array([y @ y, 2 * (y @ y)]))]
-    for invariants in (kept[0], kept[1], ()):
-        sol = solve_ivp(lambda t, y: [y[1], -y[0]], (0, 5), [1.0, 0.0], method=EIPRK4, h=0.1, invariants=invariants)
-        figure = plot(sol)
-        assert len(figure.axes) >= 1
-        pyplot.close(figure)

@@ -180,20 +180,6 @@ def test_functions_that_do_not_fill(how):
 
 
 @both
-def test_functions_whose_values_are_not_finite_at_the_start(how):
-    """Values that are not finite are not mistaken for values that were not filled in."""
-
-    def fun(t, y, out):
-        out[0] = y[1]
-        out[1] = np.log(y[0] - 2)
-
-    with np.errstate(invalid="ignore"):
-        run = how(fun, in_place=True)
-    assert run.status == -1
-    assert run.message.startswith("fun returned a non-finite value at t=0")
-
-
-@both
 def test_functions_that_stop_filling(how):
     def fun(t, y, out):
         out[0] = y[1]

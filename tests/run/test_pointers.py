@@ -13,10 +13,9 @@ import pytest
 from c_compiler import shared_library
 from numba import cfunc, njit
 from scipy import LowLevelCallable
-from scipy.integrate import solve_ivp
 from systems import refuse, same
 
-from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, ensemble, integrate, project
+from eip_scipy import EIPRK4, EIPRK45, Invariant, ensemble, integrate
 from eip_scipy.problems import Problem
 
 HERE = Path(__file__).parent
@@ -203,16 +202,6 @@ def test_the_run_holds_the_only_reference():
         np.testing.assert_allclose(run.y, plain.y, atol=1e-5)
         assert run.compiled
         assert run.max_defect[0] < 1e-14
-
-
-def test_elsewhere_they_are_called_from_python(c):
-    kept = Invariant(c.ending_square, c.ending_gradient, args=([9.0, 0.0],), name="S")
-    assert kept.fun(0.0, np.array([1.0, 2.0]), [9.0, 0.0]) == 5.0
-    assert check_gradient(kept, 0.0, [1.0, 2.0]) < 1e-11
-    assert project([1.0, 2.0], Invariant(kept.fun, kept.grad, args=kept.args, target=5.000001)).defect[0] < 1e-12
-    circle = {"fun": lambda t, y: [y[1], -y[0]], "t_span": (0, 3), "y0": [1, 2], "method": EIPRK4, "h": 0.1}
-    assert solve_ivp(**circle, invariants=kept).success
-    assert integrate(**circle, invariants=kept).max_defect[0] < 1e-14
 
 
 # Statuses.

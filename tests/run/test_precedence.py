@@ -84,14 +84,3 @@ def test_a_step_and_bounds_of_adaptive_ones_contradict(how):
     needs = [(given, ValueError, r"EIPRK1 has no error estimate and needs the step h=\.\.\.") for given in ASKED[:4]]
     refuse(partial(how, harmonic(), method=EIPRK1), needs)
     assert how(harmonic(), method=EIPRK1, check=False)[0] == harmonic().h
-
-
-def test_rtol_is_obeyed():
-    """The argument is not dropped in favour of the problem's own step."""
-    coarse, fine = (
-        integrate(PROBLEM, method=EIPDOP853, rtol=rtol, atol=1e-3 * rtol, compiled=False) for rtol in (1e-4, 1e-12)
-    )
-    assert fine.nfev > 3 * coarse.nfev
-    exact = PROBLEM.reference(2.0)
-    errors = [np.abs(run.y[:, -1] - exact).max() for run in (coarse, fine)]
-    assert errors[1] < 1e-10 < errors[0]

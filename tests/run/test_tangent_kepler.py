@@ -82,23 +82,6 @@ def test_states_are_those_of_the_run_without(method, options):
 
 
 @pytest.mark.parametrize("method", [EIPDOP853, EIPRKN8])
-def test_a_run_goes_on_behind_its_terminal_event(method):
-    def crossing(t, y):
-        return y[1]
-
-    crossing.terminal, crossing.direction = True, -1.0
-    options = {"method": method, "h": 0.05, "events": crossing, "dense_output": True}
-    plain, run = (
-        integrate(kepler, (0, 20), START, **options, **more).continue_to(20) for more in ({}, {"variations": "state"})
-    )
-    assert run.status == 1
-    assert run.t[-1] == pytest.approx(3 * np.pi, abs=1e-3)  # the second apocentre
-    assert run.sol(5.0).shape == (4,)
-    np.testing.assert_allclose(run.sol(5.0), plain.sol(5.0), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(run.y[:, -1], plain.y[:, -1], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("method", [EIPDOP853, EIPRKN8])
 def test_solve_ivp_has_the_same_columns(method):
     kept = [Invariant(item.function.py_func, name=item.name) for item in KEPT]
     options = {"invariants": kept, "h": 0.05, "variations": "state"}

@@ -104,20 +104,6 @@ def test_complex_steps_that_are_wrong_are_refused():
     refuse(run_of, [(given | options, ValueError, "does not support complex steps") for options in wrong])
 
 
-def test_takes_a_jvp_whose_components_have_sizes_of_their_own():
-    # 7e6 m and 1e-3 m/s with a drag that is not linear: a direction of the largest size would leave the region.
-    def fun(t, y):
-        return np.array([y[1], -np.tanh(1e3 * y[1])])
-
-    def jvp(t, y, dy):
-        return np.array([dy[1], -1e3 * dy[1] / np.cosh(1e3 * y[1]) ** 2])
-
-    run = integrate(fun, (0, 1e-3), [7e6, 1e-3], method=EIPDOP853, h=1e-4, variations="state", jvp=jvp)
-    w = np.arcsinh(np.sinh(1.0) * np.exp(-1.0))  # 1e3 v at the end, in closed form
-    assert run.y[1, -1] == pytest.approx(w / 1e3, rel=1e-9)
-    assert run.stm[-1][1, 1] == pytest.approx(np.cosh(1.0) * np.exp(-1.0) / np.cosh(w), rel=1e-8)
-
-
 def test_complex_steps_are_kept_where_forces_cancel():
     # The rounding of the differences of positions is larger than the comparison with differences of fun allows, and
     # these differences, whose lengths follow from the positions, are wrong.
@@ -133,18 +119,6 @@ def test_complex_steps_are_kept_where_forces_cancel():
         for x in (0.0, 1e6)
     )
     np.testing.assert_allclose(far, near, rtol=0, atol=1e-6)
-
-
-def test_a_jvp_is_right_at_a_kink():
-    def fun(t, y):
-        return np.array([y[1], -4 * min(y[0], 0.0)])
-
-    def jvp(t, y, dy):
-        return np.array([dy[1], -4 * dy[0] if y[0] <= 0 else 0.0])
-
-    run = integrate(fun, (0, 1.5), [0.0, -1.0], jvp=jvp, method=EIPDOP853, h=0.1, variations="state")
-    right = [[np.cos(3), np.sin(3) / 2], [-2 * np.sin(3), np.cos(3)]]
-    np.testing.assert_allclose(run.stm[-1], right, rtol=0, atol=1e-8)
 
 
 def test_says_where_the_products_come_from():
