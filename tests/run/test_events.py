@@ -231,20 +231,14 @@ def test_a_run_goes_on_from_event_to_event(method):
         assert run.t[-1] == run.t_events[0][-1]
 
 
-@pytest.mark.parametrize("h", [0.125, 0.12])
-def test_a_zero_at_the_end_of_a_step_counts_once(h):
+def test_zeros_at_steps_and_at_the_start_count_once():
     def event(t, y):
         return (t - 0.25) * (t - 0.5) * (t - 0.75)
 
     event.terminal = 3
-    run = integrate(lambda t, y: [y[1], -y[0]], (0, 2), [1.0, 0.0], method=EIPRK4, h=h, events=event)
-    np.testing.assert_allclose(run.t_events[0], [0.25, 0.5, 0.75], rtol=1e-14)
-
-
-@pytest.mark.parametrize("end", [8.0, -8.0])
-def test_zeros_at_steps_and_at_the_start_count_once(end):
-    for time in (0.0, np.sign(end) * 5.0):
-        run = integrate(
-            lambda t, y: [y[1], -y[0]], (0, end), [1.0, 0.0], method=EIPRK4, h=0.01, events=lambda t, y, s=time: t - s
-        )
+    for h in (0.125, 0.12):
+        run = integrate(oscillator, (0, 2), [1.0, 0.0], method=EIPRK4, h=h, events=event)
+        np.testing.assert_allclose(run.t_events[0], [0.25, 0.5, 0.75], rtol=1e-14)
+    for end, time in ((8.0, 0.0), (8.0, 5.0), (-8.0, 0.0), (-8.0, -5.0)):
+        run = integrate(oscillator, (0, end), [1.0, 0.0], method=EIPRK4, h=0.01, events=lambda t, y, s=time: t - s)
         np.testing.assert_allclose(run.t_events[0], [time], atol=1e-14)

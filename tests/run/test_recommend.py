@@ -164,7 +164,7 @@ def test_arguments():
         ({"invariants": WRONG}, ValueError, "gradient of invariant 'E' is wrong"),
         ({"t_eval": [0.5, 6.0]}, ValueError, "not within `t_span`"),
     ]
-    given = {"fun": pendulum, "t_span": (0, 1), "y0": [1.0, 0.0]}
+    given = {"fun": pendulum, "t_span": (0, 1), "y0": [1.0, 0.5]}
     refuse(recommend, [(given | options, *rest) for options, *rest in rows])
 
 

@@ -318,6 +318,7 @@ def test_continue_to(method, options):
     np.testing.assert_allclose(joined.y[:, -1], whole.y[:, -1], rtol=0, atol=3e-6 if method is EIPRK4 else 1e-8)
     # The second run keeps the values of the first start.
     np.testing.assert_array_equal(joined.target, first.target)
+    assert np.all(first.max_defect <= joined.max_defect)
     assert np.all(joined.max_defect <= 2 * whole.max_defect + 1e-14)
     assert joined.trusted
     assert joined.nfev > first.nfev
