@@ -12,7 +12,10 @@ distributed with this package; versions 4.6 and 5 are supported.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter
@@ -33,8 +36,8 @@ from ._rebound_exchange import exit_events, problem_from_simulation, read_archiv
 from ._rebound_exchange import state as _state
 
 __all__ = [
-    "INTEGRATORS", "ReboundRun", "ReboundSteps", "exit_events", "ias15_steps", "megno", "problem_from_simulation",
-    "read_archive", "run", "simulation", "to_archive", "to_simulation",
+    "INTEGRATORS", "ReboundRun", "ReboundSteps", "exit_events", "ias15_steps", "keep_ctrl_c", "megno",
+    "problem_from_simulation", "read_archive", "run", "simulation", "to_archive", "to_simulation",
 ]  # fmt: skip
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
@@ -99,6 +102,26 @@ class ReboundSteps:
     nfev: int
 
 
+@contextmanager
+def keep_ctrl_c() -> Iterator[None]:
+    """Give Ctrl-C back to Python after calls of ``Simulation.integrate``.
+
+    REBOUND handles the signal itself from the first such call on, so that Ctrl-C afterwards stops nothing but its own
+    integrations. Python can take the signal back in the main thread only; elsewhere this function does nothing.
+
+    Examples
+    --------
+    >>> with keep_ctrl_c():  # doctest: +SKIP
+    ...     sim.integrate(100.0)
+    """
+    try:
+        yield
+    finally:
+        handler = signal.getsignal(signal.SIGINT)
+        if handler is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, handler)
+
+
 def simulation(gm: Any, y: Any) -> rebound.Simulation:
     """Build a REBOUND simulation from one of our states.
 
@@ -157,7 +180,8 @@ def megno(gm: Any, y: Any, *, t_end: float, dt: float, seed: int = 1) -> tuple[f
     # Version 4 stores the variational particles after the others.
     varied = list(sim.particles_var) if hasattr(sim, "particles_var") else list(sim.particles)[n:]
     deviation = np.array([*(p.xyz for p in varied), *(p.vxyz for p in varied)]).ravel()
-    sim.integrate(t_end)
+    with keep_ctrl_c():
+        sim.integrate(t_end)
     return float(sim.megno()), float(sim.lyapunov()), deviation
 
 
@@ -251,7 +275,8 @@ def run(
     for row, (first, last) in enumerate(pairwise(saved.tolist()), start=1):
         start = perf_counter()
         if integrator == "ias15":
-            sim.integrate(last * h, exact_finish_time=1)
+            with keep_ctrl_c():
+                sim.integrate(last * h, exact_finish_time=1)
         else:
             for done in range(first, last, _CHUNK):
                 sim.steps(min(_CHUNK, last - done))
@@ -310,7 +335,8 @@ def ias15_steps(
             states.append(_state(sim))
 
     sim.additional_forces, sim.heartbeat = note, look
-    sim.integrate(t_end, exact_finish_time=1)
+    with keep_ctrl_c():
+        sim.integrate(t_end, exact_finish_time=1)
     return ReboundSteps(np.array(times), np.array(states).T, evaluations)
 
 

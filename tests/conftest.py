@@ -15,13 +15,20 @@ import pytest
 os.environ["MPLBACKEND"] = "Agg"
 os.environ["MATPLOTLIBRC"] = str(Path(__file__).with_name("matplotlibrc"))
 
-# As in a terminal: what a shell starts in the background ignores Ctrl-C, with all its children, and tests press it.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-
 # Each run uses the same examples, without a deadline: the first call of a function compiles it. To look for new
 # counterexamples: python -m pytest --hypothesis-profile=default
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Let Ctrl-C, which tests press, raise KeyboardInterrupt.
+
+    A shell makes the processes that it starts in the background ignore it, and ``rebound.Simulation.integrate`` takes
+    it away from Python for the rest of the process.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """Systems that several test modules share, such as Kepler's problem with G M = 1, and a comparison of results."""
 
 import math
+import re
 
 import numpy as np
 from numba import njit
@@ -177,3 +178,31 @@ DOUBLE_PENDULUM = (
     " / (2*m2*l1**2*l2**2*(m1 + m2*sin(th1 - th2)**2)) - (m1 + m2)*g*l1*cos(th1) - m2*g*l2*cos(th2)"
 )
 TWO_RODS = {"m1": 1.0, "m2": 0.5, "l1": 1.0, "l2": 0.7, "g": 9.81}
+
+
+def refuse(call, rows):
+    """Check that a call with each of some options is refused with an error of this type, which has these words."""
+    for options, error, words in rows:
+        try:
+            call(**options)
+        except error as refusal:
+            said = str(refusal)
+        else:
+            raise AssertionError(f"not refused: {options}")
+        assert re.search(words, said), f"{said!r} does not have {words!r}"
+
+
+def same_fields(one, other, *, but=()):
+    """Compare every field of two results of `ensemble`, except those named in `but`."""
+    assert set(one) == set(other)
+    for name in set(one) - {"wall_time", *but}:
+        value = one[name]
+        if name in ("t_events", "y_events") and value is not None:
+            for a, b in zip(value, other[name], strict=True):
+                for c, d in zip(a, b, strict=True):
+                    np.testing.assert_array_equal(c, d)
+        elif isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(other[name], value, err_msg=name)
+            assert other[name].dtype == value.dtype
+        else:
+            assert other[name] == value

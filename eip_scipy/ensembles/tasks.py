@@ -339,8 +339,9 @@ class Sweeper:
         driver, m = self.loop.driver, len(y0s)
         if not driver.run.invariants.size:
             return
-        params = np.ascontiguousarray(params)
-        out.target[:] = _values(driver, np.full(m, plan.t0), np.ascontiguousarray(y0s), params)
+        # Arrays that come from other processes may be read-only or not aligned, which the engine does not take.
+        y0s, params = (np.require(a, requirements=["A", "C", "W"]) for a in (y0s, params))
+        out.target[:] = _values(driver, np.full(m, plan.t0), y0s, params)
         ran = np.flatnonzero(~np.isnan(out.t))
         out.values[ran] = _values(driver, out.t[ran], out.y[ran], params[ran])
         if plan.times.size:

@@ -36,7 +36,9 @@ def numbers(line):
         ("periodic_orbit", r"open by (\S+)\npublished: period off by (\S+), start by (\S+)", (1e-11, 1e-10, 1e-10)),
         ("trajectory_fit", r"off by (\S+) errors\n6 runs, mean square of the residuals (\S+)", (3.0, 1.2)),
         ("linkage", r"ends 1.4e\+00 m from its pivot\n.* kept: the last link ends (\S+) m", (1e-10,)),
-        ("stiff_systems", r"magnet +\S+ +(\S+) .*\nchain +\S+ +(\S+) ", (5e-9, 1e-6)),
+        pytest.param(
+            "stiff_systems", r"magnet +\S+ +(\S+) .*\nchain +\S+ +(\S+) ", (5e-9, 1e-6), marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_numbers_within_bounds(name, pattern, bounds, tmp_path):

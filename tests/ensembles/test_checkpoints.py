@@ -1,14 +1,8 @@
 """Checkpoints of ensembles: what is missing runs on, bit for bit; other ensembles and damaged files are refused."""
 
-import os
-import signal
-import time
-
 import numpy as np
 import pytest
-from forked import Forker
-from systems import SQUARE, oscillator
-from test_members_kept import assert_same_fields
+from systems import SQUARE, oscillator, refuse, same_fields
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, checkpoint, ensemble
 from eip_scipy.checkpoint import CheckpointError
@@ -63,54 +57,36 @@ def test_resume_runs_what_is_missing(case, tmp_path):
     for _ in range(2):  # the second time there is nothing left to do
         found = members(resume=True, checkpoint=tmp_path / "kept", callback=lambda p: ran.append(p.first), **options)
         whole.one_by_one = found.one_by_one  # of the members that ran now
-        assert_same_fields(whole, found)
+        same_fields(whole, found)
         assert ran == [6, 9]
 
 
-def test_the_chunk_may_differ(tmp_path):
-    half_done(tmp_path / "kept")
-    found = members(resume=True, checkpoint=tmp_path / "kept", chunk=4)
-    assert_same_fields(members() | {"chunk": 4}, found)
-
-
 def test_resume_starts_where_there_is_nothing(tmp_path):
-    assert_same_fields(members(), members(resume=True, checkpoint=tmp_path / "kept"))
-
-
-def test_members_that_all_failed(tmp_path):
-    half_done(tmp_path / "kept", y0s=np.where(np.arange(11)[:, None] < 7, np.nan, STARTS), reduce=peak)
-    found = members(
-        resume=True, checkpoint=tmp_path / "kept", y0s=np.where(np.arange(11)[:, None] < 7, np.nan, STARTS), reduce=peak
-    )
-    assert np.isnan(found.reduced[:7]).all()
-    np.testing.assert_array_equal(found.reduced[7:], members(reduce=peak).reduced[7:])
+    same_fields(members(), members(resume=True, checkpoint=tmp_path / "kept"))
 
 
 # Another ensemble, other functions.
 
 
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
+def test_another_ensemble_is_refused(tmp_path):
+    half_done(tmp_path / "kept")
+    before = (tmp_path / "kept").read_bytes()
+    params = {"params": np.ones((11, 1)), "fun": lambda t, y, p: oscillator(t, y), "invariants": ()}
+    rows = [
         ({"h": 0.2}, r"belongs to another run: h is 0\.1 in the checkpoint and 0\.2 in this run"),
         ({"method": EIPDOP853}, "method is"),
         ({"y0s": np.ones((11, 2))}, "y0 differs"),
         ({"y0s": STARTS[:10]}, "y0 differs"),
         ({"t_span": (0, 2)}, "t_span"),
-        ({"params": np.ones((11, 1)), "fun": lambda t, y, p: oscillator(t, y), "invariants": ()}, "params"),
+        (params, "params"),
         ({"save_every": 5}, "save_every is 4"),
         ({"events": height}, "events"),
         ({"metric": "euclidean"}, "metric"),
         ({"reduce": trough}, r'reduce is null in the checkpoint and "trough" in this run'),
-    ],
-)
-def test_another_ensemble_is_refused(options, match, tmp_path):
-    half_done(tmp_path / "kept")
-    before = (tmp_path / "kept").read_bytes()
-    with pytest.raises(CheckpointError, match=match):
-        members(resume=True, checkpoint=tmp_path / "kept", **options)
-    with pytest.raises(CheckpointError, match="Pass resume=True to continue the ensemble"):
-        members(checkpoint=tmp_path / "kept")
+        ({"resume": False}, "Pass resume=True to continue the ensemble"),
+    ]
+    kept = {"resume": True, "checkpoint": tmp_path / "kept"}
+    refuse(members, [(kept | options, CheckpointError, words) for options, words in rows])
     assert (tmp_path / "kept").read_bytes() == before
 
 
@@ -139,24 +115,21 @@ def test_another_machine_is_a_warning(tmp_path, monkeypatch):
         whole = members(checkpoint=tmp_path / "kept")
     with pytest.warns(UserWarning, match="machine another machine, here") as seen:
         found = members(resume=True, checkpoint=tmp_path / "kept")
-    assert_same_fields(whole | {"one_by_one": ""}, found)
+    same_fields(whole | {"one_by_one": ""}, found)
     assert seen[0].filename == __file__
 
 
-@pytest.mark.parametrize("what", ["text", "a missing array", "too few members", "another kind"])
-def test_what_is_no_checkpoint_of_an_ensemble(what, tmp_path):
+def test_files_that_hold_no_ensemble(tmp_path):
     place = tmp_path / "kept"
     members(checkpoint=place)
     header, arrays = checkpoint.read(place)
-    if what == "text":
-        place.write_text("something")
-    elif what == "another kind":
-        checkpoint.write(place, header | {"kind": "integrate"}, arrays)
-    else:
-        arrays["members_y"] = arrays["members_y"][:4]
-        if what == "a missing array":
-            del arrays["members_y"]
-        checkpoint.write(place, header, arrays)
+    few = arrays | {"members_y": arrays["members_y"][:4]}
+    missing = {name: array for name, array in arrays.items() if name != "members_y"}
+    for given in ((header | {"kind": "integrate"}, arrays), (header, few), (header, missing)):
+        checkpoint.write(place, *given)
+        with pytest.raises(CheckpointError, match="kept"):
+            members(resume=True, checkpoint=place)
+    place.write_text("something")
     with pytest.raises(CheckpointError, match="kept"):
         members(resume=True, checkpoint=place)
 
@@ -188,45 +161,5 @@ def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
 
     monkeypatch.setattr(checkpoint, "write", full)
     with pytest.warns(RuntimeWarning, match="no space left on device; the previous checkpoint is kept"):
-        assert_same_fields(members(), members(checkpoint=path))
+        same_fields(members(), members(checkpoint=path))
     assert checkpoint.read(path, "ensemble")[0]["finished"] == 0
-
-
-# Kills.
-
-KILLED = """
-    import sys
-
-    sys.path.append(folder)
-    import test_checkpoints
-
-    print("running", flush=True)
-    test_checkpoints.many(checkpoint=place, checkpoint_every=1e-9, resume=True)
-"""
-MANY = STARTS[np.arange(1500) % 11] * (1 + 1e-3 * np.arange(1500))[:, None]
-
-
-def many(**options):
-    """Run an ensemble of some seconds, whose chunks take a few milliseconds each."""
-    return members(y0s=MANY, h=0.02, reduce=peak, events=height, save_every=10, compiled=False, **options)
-
-
-@pytest.mark.slow
-@pytest.mark.posix
-def test_an_ensemble_that_is_killed_ten_times(tmp_path):
-    """Kill the process at a random time, ten times; the result has the bits of an uninterrupted ensemble."""
-    rng, forker, begin = np.random.default_rng(), Forker(tmp_path), time.perf_counter()
-    whole, done = many(), []
-    longest = (time.perf_counter() - begin) / 6
-    for _ in range(10):
-        process = forker.start(KILLED, folder=os.path.dirname(__file__), place=str(tmp_path / "kept"))
-        process.until("running")
-        time.sleep(longest * rng.random())
-        os.kill(process.pid, signal.SIGKILL)
-        assert process.wait()[0] == -signal.SIGKILL
-        if (tmp_path / "kept").exists():
-            done.append(checkpoint.read(tmp_path / "kept", "ensemble")[0]["finished"])
-    forker.close()
-    assert sorted(done) == done
-    assert 0 < done[-1] < len(MANY)
-    assert_same_fields(whole, many(checkpoint=tmp_path / "kept", resume=True))

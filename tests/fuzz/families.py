@@ -1,4 +1,4 @@
-"""Random conservative systems, each with all that it keeps: polynomials, bodies, lattices, spins, vortices, fields."""
+"""Random conservative systems, each with all that it keeps: polynomials, bodies, lattices, spins, quantum states."""
 
 from __future__ import annotations
 
@@ -137,14 +137,6 @@ def driven(rng: np.random.Generator) -> System:
     return second_order("driven", acc, rng.standard_normal(1), rng.standard_normal(1), kept, rate=drive)
 
 
-def separable(rng: np.random.Generator) -> System:
-    """H = p.p / 2 + V(q), V of degree 4."""
-    n = int(rng.integers(1, 5))
-    V, dV = bowl(rng, n)
-    q, v = rng.standard_normal((2, n)) * rng.uniform(0.3, 1.0)
-    return second_order("separable", lambda t, x: -dV(x), q, v, (mechanical("H", V, dV),))
-
-
 def poisson(rng: np.random.Generator) -> System:
     """y' = S(y) grad H(y) with a skew matrix S that is linear in y."""
     n = int(rng.integers(2, 8))
@@ -197,39 +189,7 @@ def toda(rng: np.random.Generator) -> System:
     return second_order("toda", lambda t, x: -dV(x), q, v, kept, frame=(C, C.T.copy()))
 
 
-def _angular(n: int) -> Quantity:
-    """Angular momentum of a body: a number in the plane, a vector in space."""
-    if n == 2:
-        return Quantity("L", lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]))
-
-    def cross_matrix(v: Array) -> Array:
-        return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-    return Quantity(
-        "L",
-        lambda t, y: np.cross(y[:3], y[3:]),
-        lambda t, y: np.hstack([-cross_matrix(y[3:]), cross_matrix(y[:3])]),
-    )
-
-
-def central(rng: np.random.Generator) -> System:
-    """A body in a central potential, a sum of powers of r and a logarithm."""
-    n = int(rng.integers(2, 4))
-    a, b, c, d = rng.uniform(0.0, 1.0, 4) * rng.integers(0, 2, 4) + np.array([0.1, 0.0, 0.0, 0.0])
-
-    def V(q: Array) -> float:
-        s = q @ q
-        return a * s / 2 + b * s * s / 4 + c * math.log(s) / 2 - d / math.sqrt(s)
-
-    def dV(q: Array) -> Array:
-        s = q @ q
-        return q * (a + b * s + c / s + d / s**1.5)
-
-    q, v = rng.standard_normal(n), rng.standard_normal(n)
-    q *= rng.uniform(0.7, 1.5) / np.linalg.norm(q)
-    v -= (v @ q) / (q @ q) * q * rng.uniform(0.5, 1.0)  # not towards the centre
-    v *= rng.uniform(0.6, 1.2) / np.linalg.norm(v)
-    return second_order("central", lambda t, x: -dV(x), q, v, (mechanical("H", V, dV), _angular(n)))
+MOMENTUM = Quantity("L", lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]))
 
 
 def kepler(rng: np.random.Generator) -> System:
@@ -251,28 +211,9 @@ def kepler(rng: np.random.Generator) -> System:
         by_q = (v @ v - 1 / r) * np.eye(2) - np.outer(v, v) + np.outer(q, q) / r**3
         return np.hstack([by_q, 2 * np.outer(q, v) - np.outer(v, q) - (q @ v) * np.eye(2)])
 
-    kept = (
-        mechanical("H", lambda q: -1 / math.sqrt(q @ q), dV),
-        _angular(2),
-        Quantity("lenz", lenz, lenz_gradient),
-    )
+    kept = (mechanical("H", lambda q: -1 / math.sqrt(q @ q), dV), MOMENTUM, Quantity("lenz", lenz, lenz_gradient))
     start = turn @ np.array([1 - e, 0.0]), turn @ np.array([0.0, math.sqrt((1 + e) / (1 - e))])
     return second_order("kepler", lambda t, x: -dV(x), *start, kept)
-
-
-def lotka_volterra(rng: np.random.Generator) -> System:
-    a, b, c, d = rng.uniform(0.5, 2.0, 4)
-
-    def value(t: float, u: Array) -> float:
-        if not (u > 0).all():
-            return math.nan
-        return d * u[0] - c * math.log(u[0]) + b * u[1] - a * math.log(u[1])
-
-    def fun(t: float, u: Array) -> Array:
-        return np.array([u[0] * (a - b * u[1]), u[1] * (d * u[0] - c)])
-
-    kept = (Quantity("V", value, lambda t, u: np.array([d - c / u[0], b - a / u[1]])),)
-    return System("lotka volterra", fun, np.array([c / d, a / b]) * rng.uniform(0.5, 1.8, 2), kept)
 
 
 def spins(rng: np.random.Generator) -> System:
@@ -297,32 +238,6 @@ def spins(rng: np.random.Generator) -> System:
     return System("spins", lambda t, y: np.cross(y.reshape(n, 3), force(y)).ravel(), rng.standard_normal(3 * n), kept)
 
 
-def vortices(rng: np.random.Generator) -> System:
-    """Point vortices in the complex plane: the energy, the centre (two numbers), the second moment."""
-    n = int(rng.integers(2, 5))
-    G = rng.uniform(0.5, 2.0, n)
-    z = 1.5 * np.exp(2j * np.pi * (np.arange(n) + 0.3 * rng.uniform(size=n)) / n) * rng.uniform(0.8, 1.2, n)
-    pairs = np.triu_indices(n, 1)
-
-    def inverse(z: Array) -> Array:
-        d = z[:, None] - z[None, :] + np.eye(n)
-        return 1 / d - np.eye(n)
-
-    def fun(t: float, z: Array) -> Array:
-        return 1j * np.conj(inverse(z) @ G)
-
-    def energy(t: float, z: Array) -> float:
-        d = z[pairs[0]] - z[pairs[1]]
-        return -float((G[pairs[0]] * G[pairs[1]] * np.log(np.abs(d))).sum())
-
-    kept = (
-        Quantity("H", energy, lambda t, z: -G * np.conj(inverse(z) @ G)),
-        Quantity("centre", lambda t, z: np.array([G @ z.real, G @ z.imag]), lambda t, z: np.array([G, 1j * G])),
-        Quantity("moment", lambda t, z: float(G @ np.abs(z) ** 2), lambda t, z: 2 * G * z),
-    )
-    return System("vortices", fun, z, kept)
-
-
 def quantum(rng: np.random.Generator) -> System:
     """i c' = H c; closed form."""
     n = int(rng.integers(1, 8))
@@ -339,8 +254,8 @@ def quantum(rng: np.random.Generator) -> System:
 
 
 FAMILIES = (
-    *(oscillators, driven, separable, poisson, rigid_body, toda),
-    *(central, kepler, lotka_volterra, spins, vortices, quantum),
+    *(oscillators, driven, poisson, rigid_body, toda),
+    *(kepler, spins, quantum),
 )
 
 

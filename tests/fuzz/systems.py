@@ -281,12 +281,7 @@ def resumed(runs: Runs, *, compiled: bool = False) -> Iterator[str]:
     whole, case = runs.whole, runs.case
     broken, kinds = 0, [_at_a_row] if compiled else [_at_a_row, _at_a_call]
     with tempfile.TemporaryDirectory() as folder, mock.patch("time.perf_counter", _hasty_clock()):
-        options = {
-            "save_every": 1,
-            "checkpoint": Path(folder) / "run",
-            "resume": True,
-            "compiled": compiled,
-        }
+        options = {"save_every": 1, "checkpoint": Path(folder) / "run", "resume": True, "compiled": compiled}
         for _ in range(MOST_BREAKS):
             breaking = kinds[runs.rng.integers(len(kinds))](runs)
             try:

@@ -27,8 +27,7 @@ HALO = CCompositePotential(
     disk=MiyamotoNagaiPotential(m=6e10, a=3, b=0.3, units=galactic), halo=NFWPotential(m=6e11, r_s=15, units=galactic)
 )
 BAR = CCompositePotential(
-    disk=HALO["disk"],
-    bar=LongMuraliBarPotential(m=1e10, a=4, b=0.5, c=0.3, alpha=0.3, units=galactic),
+    disk=HALO["disk"], bar=LongMuraliBarPotential(m=1e10, a=4, b=0.5, c=0.3, alpha=0.3, units=galactic)
 )
 SPEED = [0, 0, -40] * u.km / u.s / u.kpc
 TIMES = {"dt": 5.0, "n_steps": 400}

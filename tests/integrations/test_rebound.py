@@ -1,17 +1,18 @@
 """REBOUND as a reference: against the packaged reference states, and the rules that keep a comparison fair."""
 
 import importlib
+import os
+import signal
 import sys
 
 import numpy as np
 import pytest
-from numba import njit
+from systems import refuse
 
 rebound = pytest.importorskip("rebound")
 
 from eip_scipy.integrations import rebound as judge  # noqa: E402
 from eip_scipy.problems import comet, solar_data  # noqa: E402
-from eip_scipy_studies.comparators import stormer_verlet  # noqa: E402
 
 DATA = solar_data.load("de440")
 REFERENCE = solar_data.reference_states("de440")
@@ -32,21 +33,7 @@ def position_errors(result, years):
     return np.linalg.norm(positions(result.y[:, -1]) - positions(REFERENCE[years]), axis=1)
 
 
-@njit
-def attraction(t, q, gm):
-    a = np.zeros_like(q)
-    for i in range(gm.size):
-        for j in range(gm.size):
-            if i != j:
-                x, y, z = q[3 * j] - q[3 * i], q[3 * j + 1] - q[3 * i + 1], q[3 * j + 2] - q[3 * i + 2]
-                pull = gm[j] / (x**2 + y**2 + z**2) ** 1.5
-                a[3 * i] += pull * x
-                a[3 * i + 1] += pull * y
-                a[3 * i + 2] += pull * z
-    return a
-
-
-@pytest.mark.parametrize("years", [1.0, 10.0, 100.0])
+@pytest.mark.parametrize("years", [1.0, 100.0])
 def test_ias15_meets_the_reference(years):
     result = run("ias15", h=years * YEAR, n_steps=1)
     assert result.t.tolist() == [0.0, years * YEAR]
@@ -58,10 +45,8 @@ def test_ias15_meets_the_reference(years):
 @pytest.mark.parametrize(
     ("integrator", "h", "expected"),
     [
-        ("leapfrog", 0.7305, [0.617334, 0.103679, 0.0334126]),
         ("leapfrog", 5.0, [0.801388, 0.221009, 1.40035]),
         ("whfast", 5.0, [2.55278e-5, 4.20151e-6, 9.25150e-6]),
-        ("whfast-c17", 5.0, [1.87944e-7, 2.84383e-9, 1.63568e-9]),
         ("whfast-c17", 7.305, [9.87987e-6, 6.55663e-8, 4.26511e-9]),
     ],
 )
@@ -78,61 +63,18 @@ def test_saba_is_at_round_off_after_a_century():
     assert position_errors(run("saba(10,6,4)", h=7.305, t_end=100 * YEAR), 100.0).max() < 2e-10
 
 
-def test_whfast_agrees_with_ias15_where_no_reference_is_stored():
-    h, n_steps = 0.7305, 5000
-    corrected, plain, judge_run = (run(name, h=h, n_steps=n_steps) for name in ("whfast-c17", "whfast", "ias15"))
-    distance = [np.abs(positions(r.y[:, -1]) - positions(judge_run.y[:, -1])).max() for r in (corrected, plain)]
-    assert distance[0] < 1e-10
-    assert distance[1] > 1e-9
-
-
-@pytest.mark.slow
-def test_leapfrog_is_the_drift_kick_drift_form():
-    h, n_steps = 0.7305, 1000
-    result = run("leapfrog", h=h, n_steps=n_steps)
-    start, end = result.y[:, 0], result.y[:, -1]
-
-    def distance(form):
-        ours = stormer_verlet(attraction, (0.0, n_steps * h), start, h, form=form, params=DATA.gm)
-        return np.abs(ours.y[:, -1] - end).max()
-
-    assert distance("drift-kick-drift") < 1e-12
-    assert distance("kick-drift-kick") > 1e-4
-
-
 @pytest.mark.parametrize("integrator", FIXED_STEP)
-def test_saving_leaves_no_trace(integrator):
-    every = run(integrator, h=3.0, n_steps=200, save_every=1)
+def test_saving_leaves_no_trace(integrator, monkeypatch):
+    every = run(integrator, h=3.0, t_end=600.0, save_every=1)
+    monkeypatch.setattr(judge, "_CHUNK", 7)
     third = run(integrator, h=3.0, n_steps=200, save_every=3)
     ends = run(integrator, h=3.0, n_steps=200)
     np.testing.assert_array_equal(third.t, 3.0 * np.append(np.arange(0, 200, 3), 200))
     np.testing.assert_array_equal(third.y[:, :-1], every.y[:, :200:3])
     np.testing.assert_array_equal(third.y[:, -1], every.y[:, -1])
     np.testing.assert_array_equal(ends.y, every.y[:, [0, -1]])
-
-
-@pytest.mark.parametrize("integrator", FIXED_STEP)
-def test_times_are_whole_numbers_of_steps(integrator, monkeypatch):
-    monkeypatch.setattr(judge, "_CHUNK", 7)
-    chunks = run(integrator, h=0.1, t_end=10.0, save_every=50)
-    monkeypatch.undo()
-    whole = run(integrator, h=0.1, n_steps=100, save_every=50)
-    assert whole.t.tolist() == [0.0, 50 * 0.1, 100 * 0.1]
-    assert whole.steps == chunks.steps == 100
-    np.testing.assert_array_equal(whole.y, chunks.y)
-
-
-def test_ias15_ends_on_the_saved_times():
-    result = run("ias15", h=2.5, n_steps=40, save_every=10)
-    assert result.t.tolist() == [0.0, 25.0, 50.0, 75.0, 100.0]
-    at_end = run("ias15", h=50.0, n_steps=1)
-    np.testing.assert_allclose(result.y[:, 2], at_end.y[:, -1], rtol=0, atol=1e-14)
-
-
-def test_record():
-    result = run("leapfrog", h=5.0, n_steps=100, save_every=10)
-    assert (result.name, result.version) == ("leapfrog", rebound.__version__)
-    assert result.wall_time > 0
+    assert every.steps == ends.steps == 200
+    assert (ends.name, ends.version) == (integrator, rebound.__version__)
 
 
 def test_invariant_errors_are_those_of_rebound():
@@ -147,27 +89,8 @@ def test_invariant_errors_are_those_of_rebound():
     np.testing.assert_allclose(judge._invariant_errors(np.ones(2), turned)[1], [0.0, np.sqrt(5.0)])
 
 
-def test_energy_error_is_absolute_where_the_energy_is_zero():
-    parabola = np.array([0.5, 0, 0, -0.5, 0, 0, 0, 1, 0, 0, -1, 0])
-    energy_error, _ = judge._invariant_errors(np.ones(2), np.array([parabola, 2 * parabola]))
-    assert energy_error.tolist() == [0.0, 3.5]
-
-
-def test_simulation_holds_our_state_at_rest():
-    shifted = DATA.y0.copy()
-    shifted[:30] += 0.1
-    shifted[30:] += 0.01
-    sim = judge.simulation(DATA.gm, shifted)
-    assert sim.G == 1.0
-    assert [p.m for p in sim.particles] == DATA.gm.tolist()
-    com = sim.com()
-    np.testing.assert_allclose([com.x, com.y, com.z, com.vx, com.vy, com.vz], 0, atol=1e-15)
-    np.testing.assert_allclose(judge._state(sim), DATA.y0, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+def test_bad_input_is_named():
+    rows = [
         ({"integrator": "rk4"}, "unknown integrator 'rk4': expected one of 'whfast'"),
         ({"gm": DATA.gm[::-1]}, "Sun"),
         ({"gm": DATA.gm * np.arange(10)}, "must be positive"),
@@ -180,12 +103,12 @@ def test_simulation_holds_our_state_at_rest():
         ({"n_steps": None, "t_end": -1.0}, "t_end must be positive"),
         ({"n_steps": None, "t_end": 10.5}, "whole number"),
         ({"save_every": 0}, "save_every must be an integer >= 1"),
-    ],
-)
-def test_bad_input_is_named(changes, message):
-    call = {"gm": DATA.gm, "y0": DATA.y0, "integrator": "whfast", "h": 1.0, "n_steps": 10} | changes
-    with pytest.raises(ValueError, match=message):
-        judge.run(**call)
+        ({"epsilon": 1e-6}, "epsilon can be given only with integrator='ias15', got 'whfast'"),
+        ({"integrator": "ias15", "epsilon": 0.0}, "epsilon must be positive and finite, got 0.0"),
+        ({"integrator": "ias15", "criterion": "aarseth"}, "unknown criterion 'aarseth': expected one of 'global'"),
+    ]
+    given = {"gm": DATA.gm, "y0": DATA.y0, "integrator": "whfast", "h": 1.0, "n_steps": 10}
+    refuse(judge.run, [(given | options, ValueError, words) for options, words in rows])
 
 
 def test_a_missing_package_says_how_to_get_it(monkeypatch):
@@ -213,9 +136,6 @@ def test_problem_from_simulation():
     np.testing.assert_array_equal(problem.y0, judge._state(sim))
     assert problem.t_span == (0.0, 10.0)
     assert problem.h == 0.01
-    np.testing.assert_allclose(
-        problem.fun(0.0, problem.y0)[9:], attraction(0.0, problem.y0[:9], problem.params), rtol=1e-13, atol=1e-15
-    )
     other = judge.problem_from_simulation(sim, t_span=(0.0, 1.0), h=0.5)
     assert (other.t_span, other.h) == ((0.0, 1.0), 0.5)
 
@@ -231,55 +151,34 @@ def test_problem_from_simulation_is_at_the_synchronised_state():
     np.testing.assert_allclose(problem.y0, judge._state(accurate), rtol=0, atol=1e-6)
 
 
-def add_variation(sim):
-    sim.add_variation()
+REFUSED = [
+    (lambda sim: sim.add_variation(), "variational particles"),
+    (lambda sim: changed(sim, N_active=1, testparticle_type=1), "test particles with masses.*testparticle_type 1"),
+    (lambda sim: changed(sim, additional_forces=print), "additional forces that are not REBOUNDx's.*'gr-potential'"),
+    (lambda sim: changed(sim, post_timestep_modifications=print), "modifications before or after a step"),
+    (lambda sim: sim.create_ode(1), "differential equations"),
+    (lambda sim: changed(sim, softening=0.1), "softened"),
+    (lambda sim: changed(sim, gravity="none"), "gravity 'none'"),
+    (lambda sim: changed(sim, collision="direct"), "collisions"),
+    (lambda sim: changed(sim, boundary="open"), "boundaries"),
+    (lambda sim: changed(sim, integrator="sei"), "shearing sheet"),
+]
 
 
-def add_force(sim):
-    sim.additional_forces = lambda pointer: None
+def changed(sim, **values):
+    for name, value in values.items():
+        setattr(sim, name, value)
 
 
-def modify_steps(sim):
-    sim.post_timestep_modifications = lambda pointer: None
-
-
-def add_active_test_particles(sim):
-    sim.N_active, sim.testparticle_type = 1, 1
-
-
-def set_attribute(name, value):
-    return lambda sim: setattr(sim, name, value)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (add_variation, "variational particles"),
-        (add_active_test_particles, "test particles with masses.*testparticle_type 1"),
-        (add_force, "additional forces that are not REBOUNDx's.*forces='gr-potential'"),
-        (modify_steps, "modifications before or after a step"),
-        (lambda sim: sim.create_ode(1), "differential equations"),
-        (set_attribute("softening", 0.1), "softened"),
-        (set_attribute("gravity", "none"), "gravity 'none'"),
-        (set_attribute("collision", "direct"), "collisions"),
-        (set_attribute("boundary", "open"), "boundaries"),
-        (set_attribute("integrator", "sei"), "shearing sheet"),
-    ],
-)
-def test_problem_from_simulation_refuses(change, message):
-    sim = binary()
-    change(sim)
-    with pytest.raises(ValueError, match=message):
-        judge.problem_from_simulation(sim)
-
-
-@pytest.mark.parametrize("given", ["archive.bin", None, np.zeros(12)])
-def test_problem_from_simulation_needs_a_simulation(given):
-    with pytest.raises(TypeError, match=r"got .*; read one from an archive by rebound\.Simulation\(path\)"):
-        judge.problem_from_simulation(given)
-
-
-def test_problem_from_simulation_needs_two_bodies():
+def test_problem_from_simulation_refuses():
+    for change, message in REFUSED:
+        sim = binary()
+        change(sim)
+        with pytest.raises(ValueError, match=message):
+            judge.problem_from_simulation(sim)
+    for given in ("archive.bin", None, np.zeros(12)):
+        with pytest.raises(TypeError, match=r"got .*; read one from an archive by rebound\.Simulation\(path\)"):
+            judge.problem_from_simulation(given)
     with pytest.raises(ValueError, match="0 particles"):
         judge.problem_from_simulation(rebound.Simulation())
 
@@ -292,13 +191,12 @@ def comet_run(**options):
     return problem, judge.run(problem.params, problem.y0, "ias15", h=20.0, n_steps=1, **options)
 
 
-@pytest.mark.parametrize("options", [{}, {"epsilon": 1e-5}, {"criterion": "global", "epsilon": 1e-4}])
-def test_steps_of_ias15_are_those_of_the_timed_run(options):
+def test_steps_of_ias15_are_those_of_the_timed_run():
+    options = {"criterion": "global", "epsilon": 1e-4}
     problem, timed = comet_run(**options)
     looked = judge.ias15_steps(problem.params, problem.y0, 20.0, **options)
     np.testing.assert_array_equal(looked.y[:, -1], timed.y[:, -1])
-    assert looked.t[0] == 0.0
-    assert looked.t[-1] == 20.0
+    assert looked.t[[0, -1]].tolist() == [0.0, 20.0]
     assert looked.t.size == timed.steps + 1
     assert looked.nfev >= 14 * timed.steps
 
@@ -313,31 +211,16 @@ def test_epsilon_and_criterion_change_the_steps():
     assert 1e-10 < np.abs(coarse.y[:, -1] - end)[:12].max() < 1e-6
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize(
-    ("integrator", "options", "message"),
+    "call",
     [
-        ("whfast", {"epsilon": 1e-6}, "epsilon can be given only with integrator='ias15', got 'whfast'"),
-        ("ias15", {"epsilon": 0.0}, "epsilon must be positive and finite, got 0.0"),
-        ("ias15", {"criterion": "aarseth"}, "unknown criterion 'aarseth': expected one of 'global', 'prs23'"),
+        lambda: run("ias15", h=10.0, n_steps=1),
+        lambda: judge.ias15_steps(DATA.gm, DATA.y0, 10.0),
+        lambda: judge.megno(DATA.gm, DATA.y0, t_end=10.0, dt=1.0),
     ],
 )
-def test_wrong_options_of_ias15(integrator, options, message):
-    problem = comet()
-    with pytest.raises(ValueError, match=message):
-        judge.run(problem.params, problem.y0, integrator, h=1.0, n_steps=1, **options)
-
-
-def test_what_prepare_adds_is_in_the_run():
-    """Return a force that cancels gravity: bodies move on straight lines."""
-
-    def cancel(sim):
-        def force(_):
-            for p in sim.particles:
-                p.ax = p.ay = p.az = 0.0
-
-        sim.additional_forces = force
-        return force
-
-    result = run("ias15", h=10.0, n_steps=1, prepare=cancel)
-    q, v = result.y[:, 0].reshape(2, -1)
-    np.testing.assert_allclose(result.y[:30, -1], q + 10.0 * v, rtol=1e-13, atol=1e-14)
+def test_ctrl_c_is_pythons_again_afterwards(call):
+    call()
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)

@@ -1,15 +1,6 @@
 /* C functions for test_pointers.py, beside those of examples/c-functions/kepler.c. */
 #include <math.h>
 
-/* Kepler's problem for a Nystrom method: q = (x, y). */
-int acceleration(double t, const double *q, double *out, const double *params)
-{
-    double r2 = q[0] * q[0] + q[1] * q[1], r3 = r2 * sqrt(r2);
-    out[0] = -params[0] * q[0] / r3;
-    out[1] = -params[0] * q[1] / r3;
-    return 0;
-}
-
 int energy(double t, const double *y, double *value, const double *params)
 {
     *value = 0.5 * (y[2] * y[2] + y[3] * y[3]) - params[0] / sqrt(y[0] * y[0] + y[1] * y[1]);
@@ -40,31 +31,6 @@ int momentum_gradient(double t, const double *y, const double *f, double *out, c
     return 0;
 }
 
-/* Three complex numbers, each turning at its own rate, and the sum of their squares. */
-int phases(double t, const double *y, double *out, const double *params)
-{
-    for (int k = 0; k < 3; ++k) {
-        out[2 * k] = (1 + k) * y[2 * k + 1];
-        out[2 * k + 1] = -(1 + k) * y[2 * k];
-    }
-    return 0;
-}
-
-int mass(double t, const double *y, double *value, const double *params)
-{
-    double total = 0.0;
-    for (int k = 0; k < 3; ++k)
-        total += y[2 * k] * y[2 * k] + y[2 * k + 1] * y[2 * k + 1];
-    *value = total;
-    return 0;
-}
-
-int mass_gradient(double t, const double *y, const double *f, double *out, const double *params)
-{
-    for (int k = 0; k < 6; ++k)
-        out[k] = 2 * y[k];
-    return 0;
-}
 
 /* An oscillator, with y^2. After the time params[0] the k-th function returns params[k] where that is not 0; for 99 it
    returns 0, but fills nothing. */
@@ -132,12 +98,3 @@ int reads_f(double t, const double *y, const double *f, double *out, const doubl
     return 0;
 }
 
-int repelled(double t, const double *y, double *out, const double *params)
-{
-    double r2 = y[0] * y[0] + y[1] * y[1], r3 = r2 * sqrt(r2);
-    out[0] = y[2];
-    out[1] = y[3];
-    out[2] = params[0] * y[0] / r3;
-    out[3] = params[0] * y[1] / r3;
-    return 0;
-}

@@ -5,10 +5,10 @@ import pytest
 from c_compiler import low_level, shared_library
 from numba import njit
 from scipy.integrate import solve_ivp
+from systems import refuse
 
-from eip_scipy import EIPGJ14, EIPRK4, Invariant, ensemble, integrate
+from eip_scipy import EIPRK4, Invariant, integrate
 from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.ensembles import tasks
 from eip_scipy.problems import kepler
 
 Y0, SPAN, K, M = np.array([1.0, 0.5]), (0.0, 10.0), 2.0, 3
@@ -111,22 +111,6 @@ def test_other_arguments_are_python_s():
     assert all(a is by_name for a in seen)
 
 
-def test_second_order_in_place_and_jacobian():
-    @njit
-    def acc(t, q, out, k, m):
-        out[0] = -k / m * q[0]
-
-    @njit
-    def jacobian(t, q, dq, out, k, m):
-        out[0] = -k / m * dq[0]
-
-    exact = np.cos(np.sqrt(K / M) * SPAN[1]) + 0.5 * np.sqrt(M / K) * np.sin(np.sqrt(K / M) * SPAN[1])
-    options = {"h": 0.05, "args": (K, M), "in_place": True, "jacobian": jacobian}
-    result = integrate(acceleration=acc, t_span=SPAN, y0=Y0, method=EIPGJ14, **options)
-    assert set(result.calls.values()) == {"jitted"}
-    np.testing.assert_allclose(result.y[0, -1], exact, rtol=1e-12)
-
-
 C_SOURCE = """
 int rhs(double t, const double *y, double *out, const double *p) {
     out[0] = y[1]; out[1] = -p[0] * y[0] / p[1]; return 0; }
@@ -149,35 +133,6 @@ def test_c_functions_get_numbers_as_params(tmp_path):
         run(functions, args=(K, "steel"))
 
 
-@pytest.mark.parametrize("work", [0.0, np.inf])
-def test_members_of_an_ensemble_share_them(work, monkeypatch):
-    monkeypatch.setattr(tasks, "LEAST_WORK", work)
-
-    @njit
-    def rhs(t, y, out, k, m):
-        out[0], out[1] = y[1], -k * y[0] / m
-
-    @njit
-    def gradient(t, y, out, k, m):
-        out[0], out[1] = k * y[0], m * y[1]
-
-    starts, kept = Y0 * np.linspace(0.9, 1.1, 11)[:, None], Invariant(jit_energy, gradient, in_place=True)
-    options = {"h": 0.05, "args": (K, float(M)), "invariants": kept, "in_place": True}
-    members = ensemble(rhs, SPAN, starts, **options)
-    assert members.success
-    assert bool(members.one_by_one) == (work > 0)
-    for start, y in zip(starts, members.y, strict=True):
-        alone = integrate(rhs, SPAN, start, method=EIPRK4, **options)
-        np.testing.assert_array_equal(alone.y[:, -1], y)
-
-
-def test_an_array_for_all_members():
-    starts = Y0 * np.linspace(0.9, 1.1, 3)[:, None]
-    members = ensemble(oscillator_of, SPAN, starts, h=0.05, args=(np.array([K, M]),))
-    alone = integrate(oscillator_of, SPAN, starts[2], method=EIPRK4, h=0.05, params=[K, M])
-    np.testing.assert_array_equal(members.y[2], alone.y[:, -1])
-
-
 def test_they_belong_to_a_run(tmp_path):
     path = tmp_path / "run"
     whole = run(JITTED, events=None, checkpoint=path)
@@ -189,19 +144,14 @@ def test_they_belong_to_a_run(tmp_path):
 
 
 def test_what_is_refused():
-    fun = oscillator
-    with pytest.raises(TypeError, match=r"args must be a tuple, got 2.0; write args=\(x,\)"):
-        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=K)
-    with pytest.raises(TypeError, match="args or params, not both"):
-        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K,), params=[K])
-    with pytest.raises(TypeError, match="pass params="):
-        integrate(kepler(), method=EIPRK4, args=(K,))
-    with pytest.raises(TypeError, match=r"fun is called with \(t, y, args\[0\]\): missing a required argument: 'm'"):
-        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K,))
     deaf = Invariant(lambda t, y: y @ y, name="S")
-    with pytest.raises(
-        TypeError, match=r"'S' is called with \(t, y, args\[0\], args\[1\]\).* then the args of the run"
-    ):
-        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K, M), invariants=deaf)
-    with pytest.raises(TypeError, match=r"event 0 is called with \(t, y, args\[0\], args\[1\]\)"):
-        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K, M), events=lambda t, y: y[0])
+    rows = [
+        ({"args": K}, r"args must be a tuple, got 2.0; write args=\(x,\)"),
+        ({"params": [K]}, "args or params, not both"),
+        ({"fun": kepler(), "y0": None}, "pass params="),
+        ({"args": (K,)}, r"fun is called with \(t, y, args\[0\]\): missing a required argument: 'm'"),
+        ({"invariants": deaf}, r"'S' is called with \(t, y, args\[0\], args\[1\]\).* then the args of the run"),
+        ({"events": lambda t, y: y[0]}, r"event 0 is called with \(t, y, args\[0\], args\[1\]\)"),
+    ]
+    given = {"fun": oscillator, "t_span": SPAN, "y0": Y0, "method": EIPRK4, "h": 0.1, "args": (K, M)}
+    refuse(integrate, [(given | options, TypeError, words) for options, words in rows])

@@ -2,23 +2,16 @@
 
 import sys
 import types
-import warnings
 
 import numpy as np
 import pytest
 
-from eip_scipy import EIPRK4, Invariant, ensemble, integrate, solve_ivp
+from eip_scipy import EIPRK4, integrate
 from eip_scipy.problems import kepler
 from eip_scipy.results import plot
 
 pyplot = pytest.importorskip("matplotlib.pyplot")
 PNG = b"\x89PNG"
-CODE = """
-from eip_scipy import EIPRK4, integrate
-from eip_scipy.problems import kepler
-
-run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=5)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -85,51 +78,3 @@ def test_axes_of_the_user(run):
     assert right.get_title() == "my own"
     assert figure.axes == [left, right]
     pyplot.close(figure)
-
-
-def test_a_result_of_the_typed_solve_ivp_is_drawn():
-    """A record has the corrections, and not the values of the invariants."""
-    kept = [Invariant(lambda t, y: y @ y, name="square"), Invariant(lambda t, y: np.array([y @ y, 2 * (y @ y)]))]
-    for invariants in (kept[0], kept[1], ()):
-        sol = solve_ivp(lambda t, y: [y[1], -y[0]], (0, 5), [1.0, 0.0], method=EIPRK4, h=0.1, invariants=invariants)
-        figure = plot(sol)
-        assert len(figure.axes) >= 1
-        pyplot.close(figure)
-
-
-def test_axes_that_are_several_are_refused(run):
-    figure, axes = pyplot.subplots(1, 2)
-    with pytest.raises(TypeError, match=r"ax must be one matplotlib Axes, got ndarray of shape \(2,\); choose one"):
-        run.plot(ax=axes)
-    with pytest.raises(TypeError, match="ax must be one matplotlib Axes, got str"):
-        run.plot(ax="left")
-    with pytest.raises(TypeError, match="the figure of an ensemble takes neither ax nor orbit"):
-        plot(ensemble(kepler(), (0, 1), [kepler().y0], method=EIPRK4), ax=axes[0])
-    pyplot.close(figure)
-
-
-CELLS = {
-    CODE + "run.plot()": 1,
-    "run.plot();": 1,
-    "figure = run.plot()\nimport matplotlib.pyplot as plt\nplt.show()": 1,
-    "figure": 1,
-    "figure, ax = plt.subplots()\nrun.plot(ax=ax)": 1,
-    "plt.rcParams['figure.max_open_warning'] = 3\nfor _ in range(5):\n    run.plot()": 5,
-    "%matplotlib inline": 0,
-    "run.plot()": 1,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_a_notebook_shows_the_figure_once(monkeypatch):
-    """The figure is shown without the magic of IPython, and with it."""
-    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
-    pytest.importorskip("ipykernel")
-    monkeypatch.delenv("MPLBACKEND")  # that of these tests
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of Jupyter's own
-        nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
-    found = [sum("image/png" in output.get("data", {}) for output in cell.outputs) for cell in notebook.cells]
-    assert found == list(CELLS.values())

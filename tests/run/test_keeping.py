@@ -1,12 +1,10 @@
 """Exclusive use of checkpoint files by a run, against other runs and processes, and SIGTERM."""
 
 import contextlib
-import errno
 import os
 import signal
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from eip_scipy import EIPRK4, ensemble, integrate
 from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.checkpoint.locks import Lock
 
-TESTS = Path(__file__).parents[1]
 Y0 = pericentre(0.6)
 SPAN = (0.0, 6.0)
 OPTIONS = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7, "compiled": False}
@@ -87,18 +84,6 @@ def test_a_relative_path_is_that_of_the_start(keep, tmp_path, monkeypatch):
     assert content(elsewhere) == content(here) == ["kept"]
     monkeypatch.chdir(here)
     same(whole, keep("kept", resume=True))
-
-
-def test_notes_name_the_file_wherever_one_is(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def callback(*_):
-        os.chdir("/")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt) as info:
-        run("kept", callback=callback)
-    assert f"the checkpoint {str(tmp_path / 'kept')!r} holds step 0" in info.value.__notes__[-1]
 
 
 # One run at a time.
@@ -192,37 +177,6 @@ def test_children_do_not_keep_the_lock(child, tmp_path, forker):
 
 
 @posix
-@keeping
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
-def test_where_locks_do_not_work(number, keep, tmp_path, monkeypatch):
-    def flock(descriptor, operation):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr("fcntl.flock", flock)
-    with pytest.warns(RuntimeWarning, match=r"kept' could not be locked \(.*\)\. Make sure that") as record:
-        whole = keep(tmp_path / "kept")
-    assert [warning.filename for warning in record] == [__file__]
-    assert content(tmp_path) == ["kept"]
-    with pytest.warns(RuntimeWarning, match="could not be locked"):
-        same(whole, keep(tmp_path / "kept", resume=True))
-
-
-@posix
-def test_a_folder_that_cannot_be_written_to(tmp_path, monkeypatch):
-    """A finished run can be read there."""
-    whole, place = run(tmp_path / "kept"), tmp_path / "kept"
-    opened = os.open
-
-    def refuse(path, flags, *mode):
-        if flags & os.O_CREAT:
-            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-        return opened(path, flags, *mode)
-
-    monkeypatch.setattr(os, "open", refuse)
-    same(whole, run(place, resume=True))
-
-
-@posix
 def test_a_link_in_the_place_of_the_lock(tmp_path):
     """A link planted by another user of the folder is not followed."""
     (tmp_path / "precious").write_bytes(b"precious")
@@ -258,23 +212,6 @@ def test_one_holder_at_any_time(tmp_path):
     assert most == [1]
     assert taken[0] > 10
     assert content(tmp_path) == []
-
-
-# Files that are moved or replaced meanwhile.
-
-
-@pytest.mark.parametrize("keep", [kept_by_integrate, kept_by_ensemble])
-def test_a_folder_in_the_place_of_the_file(keep, tmp_path):
-    """The run ends nevertheless."""
-    place = tmp_path / "kept"
-
-    def change():
-        place.unlink()
-        place.mkdir()
-
-    with pytest.warns(RuntimeWarning, match="cannot write the checkpoint .*: (is a directory|access denied)"):
-        assert keep(place, callback=at_once(change)).success
-    assert content(tmp_path) == ["kept"]
 
 
 # SIGTERM.

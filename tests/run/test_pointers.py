@@ -4,6 +4,7 @@ import ctypes
 import gc
 import math
 import pickle
+from functools import partial
 from pathlib import Path
 
 import cffi
@@ -12,11 +13,9 @@ import pytest
 from c_compiler import shared_library
 from numba import cfunc, njit
 from scipy import LowLevelCallable
-from scipy.integrate import solve_ivp
-from systems import same
+from systems import refuse, same
 
-from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, Invariant, check_gradient, ensemble, integrate, project
-from eip_scipy.checkpoint import CheckpointError
+from eip_scipy import EIPRK4, EIPRK45, Invariant, ensemble, integrate
 from eip_scipy.problems import Problem
 
 HERE = Path(__file__).parent
@@ -72,12 +71,6 @@ def orbit(t, y, p):
     return np.array([y[2], y[3], -p[0] * y[0] / r3, -p[0] * y[1] / r3])
 
 
-def acceleration(t, q, p):
-    r2 = q[0] * q[0] + q[1] * q[1]
-    r3 = r2 * math.sqrt(r2)
-    return np.array([-p[0] * q[0] / r3, -p[0] * q[1] / r3])
-
-
 def energy(t, y, p):
     return 0.5 * (y[2] * y[2] + y[3] * y[3]) - p[0] / math.sqrt(y[0] * y[0] + y[1] * y[1])
 
@@ -98,33 +91,10 @@ def turn(t, y, p):
     return y[0] * y[2] + y[1] * y[3]
 
 
-def phases(t, y):
-    out = np.empty_like(y)
-    for k in range(3):
-        out[k] = complex((1 + k) * y[k].imag, -(1 + k) * y[k].real)
-    return out
-
-
-def mass(t, y):
-    total = 0.0
-    for k in range(3):
-        total += y[k].real * y[k].real + y[k].imag * y[k].imag
-    return total
-
-
-def mass_gradient(t, y):
-    return 2 * y
-
-
 def kepler_s(fun, H, dH, L, dL, event):
     """Return arguments of `integrate`: Kepler's problem by these functions."""
     invariants = [Invariant(H, dH, name="H", uses_f=True), Invariant(L, dL, name="L")]
     return {"fun": fun, "t_span": (0, 30), "y0": Y0, "params": MU, "invariants": invariants, "events": event}
-
-
-def second_order(acceleration, *others):
-    """Return these arguments with the acceleration in the place of `fun`."""
-    return kepler_s(None, *others) | {"acceleration": acceleration}
 
 
 IN_PYTHON = orbit, energy, energy_gradient, momentum, momentum_gradient, turn
@@ -146,36 +116,16 @@ def test_the_bits_are_those_of_python_and_of_numba(c, options):
     runs = [integrate(**kepler_s(*functions), **options) for functions in (IN_PYTHON, jitted, in_c(c))]
     runs.append(integrate(**kepler_s(*in_c(c)), **options, compiled=False))
     same(*runs)
-    kinds = [set(run.calls.values()) for run in runs]
+    _, H, _, _, dL, _ = in_c(c)
+    mixed = njit(orbit), H, njit(energy_gradient), njit(momentum), dL, njit(turn)
+    runs.append(integrate(**kepler_s(*mixed), **options))
+    assert list(runs[4].calls.values()) == ["jitted", "pointer", "jitted", "jitted", "pointer", "jitted"]
+    same(runs[0], runs[4])
+    kinds = [set(run.calls.values()) for run in runs[:4]]
     assert kinds == [{"python"}, {"jitted"}, {"pointer"}, {"python"}]
-    assert [run.compiled for run in runs] == [False, True, True, False]
+    assert [run.compiled for run in runs] == [False, True, True, False, True]
     assert list(runs[2].calls) == ["fun", "H", "gradient of H", "L", "gradient of L", "event 0"]
     assert runs[2].t_events[0].size > 5
-
-
-@pytest.mark.needs_jit
-def test_a_nystrom_method(c):
-    options = {"method": EIPRKN12, "h": 0.2, "save_every": 3}
-    jitted = [njit(function) for function in (acceleration, *IN_PYTHON[1:])]
-    by_c = (c.acceleration, *in_c(c)[1:])
-    every = ((acceleration, *IN_PYTHON[1:]), jitted, by_c)
-    runs = [integrate(**second_order(*functions), **options) for functions in every]
-    same(*runs, integrate(**second_order(*by_c), **options, compiled=False))
-    assert set(runs[2].calls.values()) == {"pointer"}
-
-
-@pytest.mark.needs_jit
-def test_complex_states(c):
-    y0 = np.array([1 + 1j, 0.5 - 1j, 2j])
-    plain = phases, mass, mass_gradient
-    every = (plain, [njit(function) for function in plain], (c.phases, c.mass, c.mass_gradient))
-    for options in ({"h": 0.05}, {"rtol": 1e-6, "method": EIPRK45}):
-        options = {"method": EIPRK4, "save_every": 1} | options
-        runs = [integrate(fun, (0, 3), y0, invariants=Invariant(N, dN, name="N"), **options) for fun, N, dN in every]
-        fun, N, dN = every[2]
-        runs.append(integrate(fun, (0, 3), y0, invariants=Invariant(N, dN, name="N"), compiled=False, **options))
-        same(*runs)
-        assert runs[2].calls == {"fun": "pointer", "N": "pointer", "gradient of N": "pointer"}
 
 
 @both
@@ -190,16 +140,6 @@ def test_invariants_of_several_values(c, options):
     assert one.compiled
     assert one.diagnostics.names == ("HL[0]", "HL[1]")
     assert one.max_defect.max() < 1e-10
-
-
-@pytest.mark.needs_jit
-def test_numba_functions_and_c_functions_go_together(c):
-    _, H, _, _, dL, _ = in_c(c)
-    mixed = njit(orbit), H, njit(energy_gradient), njit(momentum), dL, njit(turn)
-    run = integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, save_every=7)
-    same(run, integrate(**kepler_s(*in_c(c)), method=EIPRK4, h=0.05, save_every=7))
-    assert run.compiled
-    assert list(run.calls.values()) == ["jitted", "pointer", "jitted", "jitted", "pointer", "jitted"]
 
 
 @pytest.mark.needs_jit
@@ -264,22 +204,6 @@ def test_the_run_holds_the_only_reference():
         assert run.max_defect[0] < 1e-14
 
 
-def test_elsewhere_they_are_called_from_python(c):
-    kept = Invariant(c.ending_square, c.ending_gradient, args=([9.0, 0.0],), name="S")
-    assert kept.fun(0.0, np.array([1.0, 2.0]), [9.0, 0.0]) == 5.0
-    assert check_gradient(kept, 0.0, [1.0, 2.0]) < 1e-11
-    assert project([1.0, 2.0], Invariant(kept.fun, kept.grad, args=kept.args, target=5.000001)).defect[0] < 1e-12
-    circle = {"fun": lambda t, y: [y[1], -y[0]], "t_span": (0, 3), "y0": [1, 2], "method": EIPRK4, "h": 0.1}
-    assert solve_ivp(**circle, invariants=kept).success
-    assert integrate(**circle, invariants=kept).max_defect[0] < 1e-14
-
-
-def test_columns_of_an_array_are_states_too(c):
-    kept = Invariant(c.ending_square, c.ending_gradient)
-    states = np.array([[1.0, 3.0], [2.0, 4.0]])
-    assert [kept.fun(0.0, y, [1.0, 0.0]) for y in states.T] == [5.0, 25.0]
-
-
 # Statuses.
 
 
@@ -293,8 +217,8 @@ def ending(c, k, status, **options):
     params = np.zeros(5)
     params[[0, 1 + k]] = 1.0, status
     kept = Invariant(c.ending_square, c.ending_gradient, name="S")
-    options = {"method": EIPRK4, "h": 0.1, "save_every": 1, "events": c.ending_event} | options
-    return integrate(c.ending, (0, 3), [1, 2], params=params, invariants=kept, **options)
+    options = {"method": EIPRK4, "h": 0.1, "save_every": 1, "events": c.ending_event, "params": params} | options
+    return integrate(c.ending, (0, 3), [1, 2], invariants=kept, **options)
 
 
 @native_or_not
@@ -309,36 +233,27 @@ def test_a_negative_status_ends_the_run(c, k, compiled):
     assert partial.status == -1
     whole = ending(c, k, 0)
     np.testing.assert_array_equal(partial.y, whole.y[:, : partial.t.size])
-
-
-@native_or_not
-@which
-def test_at_the_start_too(c, k, compiled):
-    params = [-1.0, *np.where(np.arange(4) == k, -3.0, 0.0)]
-    options = {"method": EIPRK4, "h": 0.1, "events": c.ending_event}
-    kept = Invariant(c.ending_square, c.ending_gradient, name="S")
+    params = [-1.0, *np.where(np.arange(4) == k, -3.0, 0.0)]  # from the start on
     with pytest.raises(RuntimeError, match=f"{NAMES[k]} returned the status -3 at t=0") as caught:
-        integrate(c.ending, (0, 3), [1, 2], compiled=compiled, params=params, invariants=kept, **options)
+        ending(c, k, 0, compiled=compiled, params=params)
     assert caught.value.partial.t.tolist() == [0.0]
 
 
 @native_or_not
-@pytest.mark.parametrize("status", [1, 99], ids=["no value", "nothing filled"])
 @which
-def test_no_value(c, k, status, compiled):
+def test_no_value(c, k, compiled):
     """At fixed steps a step without values is the last one; an event without a value has no sign."""
-    run = ending(c, k, status, compiled=compiled)
-    if k == 3:
-        assert run.status == 0
-        assert (run.t_events[0] < 1.2).all()
-        return
-    assert run.status == -1
-    assert 0.9 < run.t[-1] < 1.2
-    assert np.isfinite(run.y).all()
-    assert "t=1" in run.message
-    assert ("if its status is above 0" in run.message) == (k == 0)
-    with_python = ending(c, k, status, compiled=not compiled)
-    assert with_python.message.partition(" (")[0] == run.message.partition(" (")[0]
+    for status in (1, 99):  # no value, and nothing filled
+        run = ending(c, k, status, compiled=compiled)
+        if k == 3:
+            assert run.status == 0
+            assert (run.t_events[0] < 1.2).all()
+            continue
+        assert run.status == -1
+        assert 0.9 < run.t[-1] < 1.2
+        assert np.isfinite(run.y).all()
+        assert "t=1" in run.message
+        assert ("if its status is above 0" in run.message) == (k == 0)
 
 
 @native_or_not
@@ -421,20 +336,14 @@ def test_refused_functions(c):
             integrate(c.kepler, (0, 1), Y0, method=EIPRK4, h=0.1, params=MU, events=[fun])
 
 
-def test_a_cfunc_of_numba():
-    run = integrate(LowLevelCallable(decay.ctypes), (0, 1), [1.0], method=EIPRK4, h=0.01)
-    assert run.y[0, -1] == pytest.approx(math.exp(-1), rel=1e-9)
-
-
 def test_a_gradient_s_signature_is_another_one(c):
     with pytest.raises(TypeError, match=r"gradient of invariant 'H' is a C .* expected int .*const double \*f"):
         Invariant(c.energy, c.energy, name="H")
 
 
 def test_invariants_say_their_size(c):
-    for size in (0, 1.5, "2"):
-        with pytest.raises(ValueError, match="size"):
-            Invariant(c.kept, c.kept_gradient, size=size)
+    sized = partial(Invariant, c.kept, c.kept_gradient)
+    refuse(sized, [({"size": size}, ValueError, "size") for size in (0, 1.5, "2")])
     wrong = Invariant(lambda t, y: y[:2], lambda t, y: np.eye(2), size=3, name="I")
     with pytest.raises(ValueError, match="invariant 'I' returned 2 values, but has size=3"):
         integrate(lambda t, y: np.zeros(2), (0, 1), [1, 2], method=EIPRK4, h=0.1, invariants=wrong)
@@ -495,33 +404,6 @@ def test_events_in_python_beside_native_functions(c, options, alone):
         integrate(**given, **options, compiled=True)
 
 
-@pytest.mark.needs_jit
-def test_events_in_python_beside_numba_functions():
-    given = kepler_s(*map(njit, IN_PYTHON[:-1]), turn)
-    run = integrate(**given, method=EIPRK4, h=0.05)
-    same(run, integrate(**given, method=EIPRK4, h=0.05, compiled=False))
-    assert set(run.calls.values()) == {"jitted", "python"}
-
-
-def test_what_an_event_in_python_raises_ends_the_run(c):
-    def event(t, y, p):
-        if t > 1:
-            raise ZeroDivisionError("by the event")
-        return y[0]
-
-    with pytest.raises(ZeroDivisionError, match="by the event") as caught:
-        integrate(c.kepler, (0, 3), Y0, method=EIPRK4, h=0.1, params=MU, events=event)
-    assert 0.9 < caught.value.partial.t[-1] < 1.2
-
-
-def test_an_event_in_python_may_integrate(c):
-    def event(t, y, p):
-        return integrate(c.kepler, (t, t + 0.1), y, method=EIPRK4, h=0.1, params=p).y[0, -1]
-
-    run = integrate(c.kepler, (0, 10), Y0, method=EIPRK4, h=0.1, params=MU, events=event)
-    assert run.t_events[0].size > 2
-
-
 # Ensembles and checkpoints.
 
 
@@ -529,58 +411,21 @@ def test_members_are_single_runs(c):
     starts = Y0 * np.linspace(0.9, 1.1, 5)[:, None]
     masses = np.linspace(0.9, 1.1, 5)[:, None]
     invariants = kepler_s(*in_c(c))["invariants"]
-    options = {"method": EIPRK4, "h": 0.05, "invariants": invariants}
+    event = c.turn
+    event.function.terminal = 3
+    options = {"method": EIPRK45, "h": 0.05, "invariants": invariants, "events": event}
     run = ensemble(c.kepler, (0, 10), starts, params=masses, executor=2, **options)
     for k in range(5):
         alone = integrate(c.kepler, (0, 10), starts[k], params=masses[k], **options)
         np.testing.assert_array_equal(run.y[k], alone.y[:, -1])
+        assert (run.status[k], run.t[k], run.nfev[k]) == (1, alone.t_events[0][-1], alone.nfev)
     assert not any("interpreted" in message for message in run.message)
-    assert run.one_by_one == "fun is a C function, which is called for one member at a time"
+    assert run.one_by_one == "events may end members at different times"
+    plain = ensemble(c.kepler, (0, 1), starts, params=masses, h=0.05)
+    assert plain.one_by_one == "fun is a C function, which is called for one member at a time"
     with pytest.raises(TypeError, match="fun is a C function by pointer, which cannot be pickled"):
         ensemble(c.kepler, (0, 10), starts, params=masses, executor="dask", **options)
 
 
-@pytest.mark.parametrize("more", [{"t_eval": np.linspace(0, 9.9, 7)}, {"h": None, "rtol": 1e-6}, {"save_every": 20}])
-def test_members_end_by_an_event_within_the_loop(c, more):
-    starts = Y0 * np.linspace(0.9, 1.1, 5)[:, None]
-    event = c.turn
-    event.function.terminal = 3
-    options = {
-        "method": EIPRK45,
-        "h": 0.05,
-        "params": MU,
-        "invariants": alone(c),
-        "events": event,
-        "check": False,
-        **more,
-    }
-    run = ensemble(c.kepler, (0, 10), starts, executor=1, **options)
-    for k in range(5):
-        single = integrate(c.kepler, (0, 10), starts[k], **options)
-        assert (run.status[k], run.t[k], run.nfev[k]) == (1, single.t_events[0][-1], single.nfev)
-        np.testing.assert_array_equal(run.y[k], single.y_events[0][-1])
-        if run.trajectories is not None:
-            rows = single.t.size - ("save_every" in more)  # where the run's last row is that of the event
-            np.testing.assert_array_equal(run.trajectories[k, :, :rows], single.y[:, :rows])
-            assert np.isnan(run.trajectories[k, :, rows:]).all()
-
-
 def alone(c):
     return Invariant(c.kept, c.kept_gradient, size=2, name="H L")
-
-
-def test_a_checkpoint_knows_them_by_what_they_do(c, tmp_path):
-    path, options = tmp_path / "run.npz", {"method": EIPRK4, "h": 0.05, "params": MU, "save_every": 10}
-    calls = []
-
-    def stopping(t, y, defects):
-        calls.append(t)
-        if t > 5:
-            raise InterruptedError
-
-    with pytest.raises(InterruptedError):
-        integrate(c.kepler, (0, 10), Y0, checkpoint=path, callback=stopping, **options)
-    with pytest.raises(CheckpointError, match="fun was"):
-        integrate(c.repelled, (0, 10), Y0, checkpoint=path, resume=True, **options)
-    resumed = integrate(c.kepler, (0, 10), Y0, checkpoint=path, resume=True, **options)
-    same(resumed, integrate(c.kepler, (0, 10), Y0, **options))

@@ -1,4 +1,4 @@
-"""Compiled and interpreted runs of the same jitted functions agree, over a table of options, and with solve_ivp."""
+"""One table of runs, each in several ways: compiled and interpreted, resumed, as a member, and by solve_ivp."""
 
 from math import sqrt
 
@@ -13,9 +13,21 @@ from systems import jit_energy_gradient as energy_gradient
 from systems import jit_momentum as momentum
 from systems import jit_momentum_gradient as momentum_gradient
 from systems import jit_orbit as fun
-from systems import pericentre
+from systems import pericentre, same
 
-from eip_scipy import EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPGJ14,
+    EIPRK2,
+    EIPRK4,
+    EIPRK5,
+    EIPRK45,
+    EIPRKN12,
+    Invariant,
+    ensemble,
+    integrate,
+)
 from eip_scipy.problems import nbody
 
 pytestmark = pytest.mark.needs_jit
@@ -77,111 +89,29 @@ def momentum_gradient_in_place(t, y, out, p):
 
 
 @njit
-def clock(t, y):
-    return np.array([y[1], -y[0] + np.sin(3.0 * t), 1.0])
+def attraction(t, q):
+    return -q / np.sqrt(q[0] * q[0] + q[1] * q[1]) ** 3
 
 
 @njit
-def clock_value(t, y):
-    return y[2] - t
+def attraction_gradient(t, q, dq, out):
+    r2, along = q[0] * q[0] + q[1] * q[1], q[0] * dq[0] + q[1] * dq[1]
+    for k in range(2):
+        out[k] = (3 * q[k] * along / r2 - dq[k]) / r2**1.5
 
 
 @njit
-def clock_gradient(t, y):
-    return np.array([0.0, 0.0, 1.0])
+def crossing(t, y):
+    return y[1]
 
 
-Y0 = pericentre(0.6)
-H_OF_F = Invariant(energy, energy_gradient_of_f, uses_f=True, name="H")
-HL = Invariant(both, both_gradients, name="HL")
-WITH_PARAMS = [
-    Invariant(energy_of_params, energy_gradient_in_place, in_place=True, uses_f=True, name="H"),
-    Invariant(momentum_of_params, momentum_gradient_in_place, in_place=True, name="L"),
-]
-FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))
+@njit
+def falling(t, y):
+    return y[0]
 
 
-def compare(fun, span, y0, **options):
-    options = {"method": EIPRK4, "h": 0.03, "save_every": 1} | options
-    compiled, interpreted = (integrate(fun, span, y0, compiled=c, **options) for c in (True, False))
-    assert compiled.compiled
-    assert not interpreted.compiled
-    assert_same(compiled, interpreted)
-    return compiled
-
-
-def assert_same(one, other):
-    """Compare to a few roundings: the two drivers take the same steps, and compilers may round differently."""
-    for name in ("t", "y", "invariants"):
-        np.testing.assert_allclose(one[name], other[name], rtol=1e-11, atol=1e-12)
-    for name in ("status", "nfev", "njev", "nlu"):
-        assert one[name] == other[name]
-
-
-CASES = {
-    "no invariants": {},
-    "one": {"invariants": H},
-    "two": {"invariants": [H, L]},
-    "one of two values": {"invariants": HL},
-    "uses f": {"invariants": [H_OF_F, L]},
-    "weights": {"invariants": [H, L], "metric": [1.0, 0.5, 0.25, 0.3]},
-    "tolerances": {"invariants": [H, L], "rtol": [1e-3, 1e-4, 1e-5, 1e-2], "atol": 0.0},
-    "blocks": {"invariants": [H, L], "blocks": 2},
-    "frame": {"invariants": [H, L], "frame": FRAME},
-    "old, two iterations, frame": {"invariants": [H_OF_F, L], "direction": "old", "iterations": 2, "frame": FRAME},
-    "midpoint, two iterations": {"invariants": [H, L], "direction": "midpoint", "iterations": 2, "blocks": 4},
-    "every seventh, blocks, frame": {"invariants": [H, L], "every": 7, "blocks": 2, "frame": FRAME},
-    "compensated": {"invariants": [H, L], "compensated": True},
-    "compensated, every second": {"invariants": [H_OF_F, L], "compensated": True, "every": 2, "iterations": 2},
-    "saved now and then": {"invariants": [H, L], "save_every": 7, "h": 0.0317},
-    "t_eval": {"invariants": [H, L], "save_every": None, "t_eval": np.sqrt(np.linspace(0.0, 36.0, 57))},
-    "RK2": {"invariants": [H, L], "method": EIPRK2},
-    "RK5, compensated": {"invariants": [H, L], "method": EIPRK5, "compensated": True, "reuse_f": False},
-}
-# Their invariants are compiled for them alone.
-ALONE = "one of two values", "one"
-
-
-def cases(names):
-    return [pytest.param(name, marks=pytest.mark.slow) if name in ALONE else name for name in names]
-
-
-@pytest.mark.parametrize("case", cases(CASES))
-def test_real(case):
-    run = compare(fun, (0.0, 6.0), Y0, **CASES[case])
-    assert run.status == 0
-    if "invariants" in CASES[case]:
-        assert run.diagnostics.n_projections > 0
-
-
-@pytest.mark.parametrize("in_place", [False, True])
-@pytest.mark.parametrize("options", [{}, {"direction": "old", "compensated": True, "iterations": 2}])
-def test_params_and_in_place(in_place, options):
-    rhs = fun_in_place if in_place else fun_of_params
-    options = options | {"in_place": in_place, "invariants": WITH_PARAMS}
-    run = compare(rhs, (0, 6), Y0, params=[1.0], **options)
-    other = integrate(rhs, (0, 6), Y0, params=[1.1], method=EIPRK4, h=0.03, compiled=False, **options)
-    assert (run.y[:, -1] != other.y[:, -1]).any()
-
-
-def test_time_dependent_functions():
-    kept = Invariant(clock_value, clock_gradient, name="clock")
-    compare(clock, (1.0, 4.0), np.array([1.0, 0.5, 1.0]), invariants=kept, method=EIPRK3, h=0.07)
-
-
-def test_n_bodies():
-    """Return a vector-valued invariant in place, blocks and a frame."""
-    rng = np.random.default_rng(1)
-    gm, q = np.array([1.0, 1e-3, 2e-4]), np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0.1]])
-    v = np.array([[0.0, 0, 0], [0, 1.0, 0.1], [-0.7, 0, 0]]) + 1e-3 * rng.standard_normal((3, 3))
-    problem = nbody(gm, q, v, t_span=(0.0, 20.0), h=0.05)
-    for options in ({}, {"every": 5, "compensated": True}):
-        compiled, interpreted = (
-            integrate(problem, method=EIPRK4, save_every=1, compiled=c, **options) for c in (True, False)
-        )
-        assert_same(compiled, interpreted)
-
-
+third = njit(crossing.py_func)
+falling.direction, third.terminal = -1, 2
 # A nonlinear Schroedinger lattice.
 
 
@@ -233,43 +163,140 @@ Z0 = np.exp(1j * np.arange(7.0)) * (1.0 + 0.1 * np.arange(7.0))
 MASS = Invariant(mass, mass_gradient, name="mass")
 ENERGY = Invariant(lattice_energy, lattice_energy_gradient, uses_f=True, name="energy")
 COMPLEX_FRAME = (np.full((1, 7), 1.0 + 0.5j), np.full((7, 1), 0.2 - 0.1j))
-COMPLEX_CASES = {
-    "mass and energy": {"invariants": [MASS, ENERGY]},
-    "weights": {"invariants": [ENERGY, MASS], "metric": np.linspace(0.1, 1.0, 7)},
-    "blocks, every": {"invariants": [MASS, ENERGY], "blocks": [[0, 1, 2], [5, 3]], "every": 4},
-    "frame": {"invariants": [MASS, ENERGY], "frame": COMPLEX_FRAME},
-    "midpoint, compensated": {"invariants": [MASS, ENERGY], "direction": "midpoint", "compensated": True},
+
+
+Y0 = pericentre(0.6)
+H_OF_F = Invariant(energy, energy_gradient_of_f, uses_f=True, name="H")
+HL = Invariant(both, both_gradients, name="HL")
+WITH_PARAMS = [
+    Invariant(energy_of_params, energy_gradient_in_place, in_place=True, uses_f=True, name="H"),
+    Invariant(momentum_of_params, momentum_gradient_in_place, in_place=True, name="L"),
+]
+FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))
+TARGET = Invariant(energy, energy_gradient, target=-0.4, name="H")
+USUAL = {"fun": fun, "t_span": (0.0, 6.0), "y0": Y0, "method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7}
+SAMPLED = {"save_every": None, "t_eval": np.sqrt(np.linspace(0.0, 36.0, 57))}
+ADAPTIVE = {"method": EIPRK45, "h": None, "rtol": 1e-7, "atol": 1e-10, **SAMPLED}
+SECOND_ORDER = {"fun": None, "acceleration": attraction, "h": 0.01}
+GROUPS = [[0, 1, 2], [5, 3]]
+PARAMS = {"params": [1.0], "invariants": WITH_PARAMS}
+WAVES = {"fun": lattice, "t_span": (0.0, 2.0), "y0": Z0, "check": False}
+RUNS = {
+    "no invariants, backward": {"invariants": (), "t_span": (0.0, -6.0)},
+    "one of two values": {"invariants": HL},
+    "uses f": {"invariants": [H_OF_F, L], "reuse_f": False},
+    "weights": {"metric": [1.0, 0.5, 0.25, 0.3]},
+    "tolerances": {"rtol": [1e-3, 1e-4, 1e-5, 1e-2], "atol": 0.0},
+    "old, two iterations, frame": {"invariants": [H_OF_F, L], "direction": "old", "iterations": 2, "frame": FRAME},
+    "midpoint, two iterations, blocks": {"direction": "midpoint", "iterations": 2, "blocks": 4},
+    "every seventh, blocks, frame": {"every": 7, "blocks": 2, "frame": FRAME},
+    "compensated, every second": {"invariants": [H_OF_F, L], "compensated": True, "every": 2, "iterations": 2},
+    "euclidean, RK2": {"metric": "euclidean", "method": EIPRK2, "h": 0.01},
+    "RK5, compensated": {"method": EIPRK5, "compensated": True, "h": 0.0317},
+    "DOP853, every auto": {"every": "auto", "method": EIPDOP853, "h": 0.02},
+    "projected start": {"invariants": TARGET, "project_initial": True},
+    "samples": SAMPLED,
+    "adaptive, events": ADAPTIVE | {"events": [falling, crossing]},
+    "adaptive, first step": ADAPTIVE | {"method": EIPDOP853, "first_step": 1e-3, "rtol": 1e-11, "atol": 1e-13},
+    "an event that ends it": {"events": [crossing, third], "every": 45},
+    "Nystrom": SECOND_ORDER | {"method": EIPRKN12, "h": 0.05, "every": "auto", "compensated": True, "save_every": 2},
+    "multistep": SECOND_ORDER | {"method": EIPGJ12},
+    "multistep, corrected": SECOND_ORDER | {"method": EIPGJ14, "jacobian": attraction_gradient},
+    "params": PARAMS | {"fun": fun_of_params, "direction": "old", "iterations": 2},
+    "params, in place": PARAMS | {"fun": fun_in_place, "in_place": True},
+    "waves": WAVES | {"invariants": [ENERGY, MASS], "metric": np.linspace(0.1, 1.0, 7)},
+    "waves, frame": WAVES | {"invariants": [MASS, ENERGY], "frame": COMPLEX_FRAME, "blocks": GROUPS, "every": 4},
+    "waves, midpoint": WAVES | {"invariants": [MASS, ENERGY], "direction": "midpoint", "compensated": True},
 }
+# They compile functions for themselves alone.
+SLOW = "one of two values", "waves", "waves, frame", "waves, midpoint", "projected start", "multistep, corrected"
+names = pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in RUNS])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", COMPLEX_CASES)
-def test_complex(case):
-    run = compare(lattice, (0.0, 2.0), Z0, check=False, **COMPLEX_CASES[case])
-    assert run.status == 0
-    assert run.y.dtype == complex
+def run(name, **more):
+    return integrate(**USUAL | RUNS[name] | more)
 
 
-# solve_ivp takes the same steps.
+@names
+def test_compiled_and_interpreted(name):
+    """They differ by a few roundings: the two drivers take the same steps, and compilers may round differently."""
+    compiled, interpreted = (run(name, compiled=c) for c in (True, False))
+    assert (compiled.compiled, interpreted.compiled) == (True, False)
+    assert compiled.status == (1 if "ends" in name else 0)
+    assert compiled.diagnostics.n_projections + compiled.diagnostics.n_skipped > 0 or not compiled.max_defect.size
+    for key in ("t", "y", "invariants"):
+        np.testing.assert_allclose(compiled[key], interpreted[key], rtol=1e-11, atol=1e-12)
+    for key in ("status", "nfev", "njev", "nlu"):
+        assert compiled[key] == interpreted[key]
 
 
-IVP_CASES = [name for name, options in CASES.items() if not {"compensated", "save_every"} & options.keys()]
+def test_n_bodies():
+    """Return a vector-valued invariant in place, blocks and a frame."""
+    rng = np.random.default_rng(1)
+    gm, q = np.array([1.0, 1e-3, 2e-4]), np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0.1]])
+    v = np.array([[0.0, 0, 0], [0, 1.0, 0.1], [-0.7, 0, 0]]) + 1e-3 * rng.standard_normal((3, 3))
+    problem = nbody(gm, q, v, t_span=(0.0, 20.0), h=0.05)
+    for options in ({}, {"every": 5, "compensated": True}):
+        one, other = (integrate(problem, method=EIPRK4, save_every=1, compiled=c, **options) for c in (True, False))
+        np.testing.assert_allclose(one.y, other.y, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize("case", cases(IVP_CASES))
-def test_solve_ivp_is_the_same_step(case):
-    options = {"method": EIPRK4, "h": 0.03} | CASES[case]
-    run = integrate(fun, (0, -6), Y0, save_every=1, compiled=False, **options)
-    sol = solve_ivp(fun, (0, -6), Y0, **options)
-    np.testing.assert_array_equal(sol.t, run.t)
-    projected = [*range(0, len(run.t), options.get("every", 1)), -1]  # in between integrate saves projected copies
-    np.testing.assert_array_equal(sol.y[:, projected], run.y[:, projected])
-    assert (sol.nfev, sol.njev, sol.nlu) == (run.nfev, run.njev, run.nlu)
+@names
+def test_members_of_ensembles(name):
+    options = USUAL | RUNS[name]
+    y0 = options.pop("y0")
+    many = ensemble(y0s=np.array([0.999 * y0, y0, 1.001 * y0]), executor=1, **options)
+    alone = run(name)
+    end = (alone.t_events[1][-1], alone.y_events[1][-1]) if alone.status else (alone.t[-1], alone.y[:, -1])
+    assert (many.t[1], many.status[1], many.message[1]) == (end[0], alone.status, alone.message)
+    np.testing.assert_array_equal(many.y[1], end[1])
+    rows = alone.t.size - ("save_every" in options and alone.status)  # where the run's last row is that of the event
+    np.testing.assert_array_equal(many.trajectories[1, :, :rows], alone.y[:, :rows])
+    assert np.isnan(many.trajectories[1, :, rows:]).all()
+    np.testing.assert_array_equal(many.max_defect[1], alone.max_defect)
+    np.testing.assert_array_equal(many.max_correction[1], alone.diagnostics.max_correction)
+    assert [many[key][1] for key in ("nfev", "njev", "nlu")] == [alone[key] for key in ("nfev", "njev", "nlu")]
+    for found, times in zip(many.t_events[1] if many.t_events else (), alone.t_events or (), strict=True):
+        np.testing.assert_array_equal(found, times)
+
+
+@names
+@pytest.mark.usefixtures("fine")
+def test_resumed_runs(name, tmp_path, stopped):
+    """The run is stopped after every few chunks, and changes on the way from interpreted to compiled steps."""
+    whole, options = run(name), {"checkpoint": tmp_path / "run", "resume": True}
+    for k in range(1000):
+        with stopped(7 if k == 0 else 9):
+            found = run(name, compiled=None if k > 1 else False, **options)
+            break
+    assert k >= 4
+    same(whole, found)
+
+
+BY_SCIPY = [
+    name
+    for name, options in RUNS.items()
+    if not {"compensated", "params", "acceleration", "t_eval", "events", "project_initial"} & options.keys()
+]
+
+
+@pytest.mark.parametrize("name", [name for name in BY_SCIPY if name not in SLOW])
+def test_solve_ivp_is_the_same_step(name):
+    found = run(name, save_every=1, compiled=False)
+    options = USUAL | RUNS[name]
+    del options["save_every"]
+    sol = solve_ivp(**options)
+    every = options.get("every", 1)
+    np.testing.assert_array_equal(sol.t, found.t)
+    # In between integrate saves projected copies.
+    projected = [*range(0, len(found.t), every), -1] if isinstance(every, int) else [0]
+    np.testing.assert_array_equal(sol.y[:, projected], found.y[:, projected])
+    assert (sol.nfev, sol.njev, sol.nlu) == (found.nfev, found.njev, found.nlu)
 
 
 def test_results_do_not_depend_on_what_is_saved():
     """The steps are the same whatever is saved, interpolated or called back, and again in a second run."""
-    options = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "compiled": True}
-    end = integrate(fun, (0, 6), Y0, **options).y[:, -1]
-    for more in ({"save_every": 1}, {"t_eval": [0.5, 6.0], "callback": lambda t, y, d: None}):
-        np.testing.assert_array_equal(integrate(fun, (0, 6), Y0, **options, **more).y[:, -1], end)
+    end = run("weights").y[:, -1]
+    sampled = {"save_every": None, "t_eval": [0.5, 6.0], "callback": lambda t, y, d: None}
+    for more in ({"save_every": 1}, {"save_every": None}, sampled):
+        np.testing.assert_array_equal(run("weights", **more).y[:, -1], end)

@@ -350,7 +350,7 @@ def _jax_pairs(jnp: Any, case: Case) -> Any:
 
 def rebound(integrator: str, case: Case) -> Solve:
     """Return calls of REBOUND; IAS15 and the like get a tolerance, others a number of steps."""
-    package = import_module("rebound")
+    package, keep_ctrl_c = import_module("rebound"), import_module("eip_scipy.integrations.rebound").keep_ctrl_c
     q, v = case.y0.reshape(2, -1, 3)
     name = integrator.partition(" ")[0].lower()
 
@@ -368,7 +368,8 @@ def rebound(integrator: str, case: Case) -> Solve:
             simulation.dt = case.t_end / setting
         if integrator == "WHFast c17":
             options.corrector, options.safe_mode = 17, 0
-        simulation.integrate(case.t_end)
+        with keep_ctrl_c():
+            simulation.integrate(case.t_end)
         found = np.empty((2, len(case.gm), 3))
         simulation.serialize_particle_data(xyz=found[0], vxvyvz=found[1])
         return found.ravel()
