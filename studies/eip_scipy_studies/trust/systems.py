@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -373,7 +374,7 @@ def spoilt(on: str, factor: float = 1.0, at: Any = slice(None), way: str = "none
 
 _spring_acc = njit(lambda t, q, params: -params[0] * q + params[2] * np.sin(params[3] * t))
 _spring_energy = njit(lambda t, y, params: 0.5 * (y[1] * y[1] + params[0] * y[0] * y[0]))
-_pendulum_energy = njit(lambda t, y, params: 0.5 * y[1] * y[1] - np.cos(y[0]))
+_pendulum_energy = njit(lambda t, y, params: 0.5 * y[1] * y[1] - math.cos(y[0]))
 _trap_acc = njit(lambda t, q, params: np.array([-q[0], -params[0] * q[1]]))
 _turning = njit(lambda t, y, params: y[0] * y[3] - y[1] * y[2])
 
@@ -396,12 +397,12 @@ def _doubled_slope(t, y, out, params):
 
 @njit
 def _pendulum(t, y, out, params):
-    out[0], out[1] = y[1], -np.sin(y[0]) - params[0] * y[1]
+    out[0], out[1] = y[1], -math.sin(y[0]) - params[0] * y[1]
 
 
 @njit
 def _pendulum_slope(t, y, out, params):
-    out[0], out[1] = np.sin(y[0]), y[1]
+    out[0], out[1] = math.sin(y[0]), y[1]
 
 
 @njit
