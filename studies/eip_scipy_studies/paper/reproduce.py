@@ -10,17 +10,18 @@ from typing import Any
 from ..commands import DONE, INTERRUPTED
 from ..condensates.efficiency import Efficiency
 from ..kepler.figures import KeplerFigures
+from ..output import run
 from ..particles.charged_particle import ChargedParticle
 from ..report import document, write_json
-from ..solar.solar_system import SolarSystem
-from ..study import Command, Session, Study, option, perform
+from ..solar.command import solar_system
+from ..study import Command, Session, option, perform
 from .tables import TABLES, PaperTable
 
-Make = Callable[[], Study[Any]]
+Make = Callable[..., Any]
 STUDIES: dict[str, Make] = {
     **{name: partial(PaperTable, name=name) for name in TABLES},
     "fig-kepler": KeplerFigures,
-    "fig-solar": SolarSystem,
+    "fig-solar": partial(run, "solar-system", solar_system),
     "fig-particle": partial(ChargedParticle, scenes=("uniform",), paper_only=True, stem="fig-particle"),
     "fig-tokamak": partial(
         ChargedParticle, scenes=("tokamak-banana", "tokamak-transit"), paper_only=True, stem="fig-tokamak"
@@ -57,7 +58,9 @@ class Reproduce(Command):
                 session.say()
             own = Session(name, session.out, None, session.quiet, session.absent)
             if name == "fig-solar":  # a separate command, which leaves its numbers
-                own.name, own.json = "solar-system", session.out / "solar-system.json"
+                words = ["--cost", "--out", str(session.out), "--json", str(session.out / "solar-system.json")]
+                status = max(status, self.studies[name]([*words, *["--quiet"] * session.quiet]))
+                continue
             judged, numbers = perform(self.studies[name](), own)
             if judged == INTERRUPTED:
                 return INTERRUPTED
