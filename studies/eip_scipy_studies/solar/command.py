@@ -10,7 +10,7 @@ from eip_scipy.problems.gravity.solar_data import load
 
 from ..output import Output, checkpoint_options, require_positive
 from ..report import UsageError
-from .comparison import Comparison, rows, text
+from .comparison import Comparison, text
 from .cost import cost_methods, show_costs
 from .epoch import kernels, one_line, parse_epoch
 from .runs import Rebound, Run, drawing, make_scene, methods, tableaux
@@ -116,8 +116,8 @@ def rebound_or_none(out: Output) -> Rebound | None:
 def show(out: Output, found: Comparison, order: int, asked: float) -> None:
     """Write the table, the checks and the figures of the runs."""
     data = found.scene.data
-    out.numbers |= {"step_yr": found.scene.h, "data": [data.epoch, data.axes, data.source], "methods": rows(found)}
-    out.rows("solar-system.csv", out.numbers["methods"])
+    out.numbers |= {"step_yr": found.scene.h, "data": [data.epoch, data.axes, data.source], "methods": found.rows}
+    out.rows("solar-system.csv", found.rows)
     out.text(text(found, asked))
     for line, passed in found.checks(order):
         out.check(line, passed)

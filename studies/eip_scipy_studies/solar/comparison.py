@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,27 +22,14 @@ ROUND_OFF = 1e-13
 FASTEST = 40.0  # rad/yr: Mercury at its perihelion
 TIGHT_POSITION = {"IAS15": 1e-8, TIGHT: 1e-7}  # AU, after 2000 years
 
-NOTES = {
-    "SV": "SV: Stoermer-Verlet, kick-drift-kick.",
-    "IAS15": "WHFast (c17: corrector of order 17), IAS15: REBOUND.",
-    "EIPRKN12": "EIPRKN12: Nystroem, order 12, projected at each tenth step, compensated.",
-    "EIPGJ14": "EIPGJ14: multistep, order 14, one evaluation a step, projected when it pays; balances: keeps each "
-    "planet's energy about the Sun, at its rate.",
-    TIGHT: f"{TIGHT}: half of its step.",
-    "EMB": "EMB: barycentre of Earth and Moon.",
-}
-"""Notes about runs and planets, by name."""
-
-
-class PointErrors(NamedTuple):
-    """Errors (9,) of the planets in a run at one time, and the name of the reference.
-
-    Errors of longitude are signed, in rad, and nan if whole turns cannot be counted; those of position are in AU.
-    """
-
-    reference: str | None
-    longitude: np.ndarray
-    position: np.ndarray
+NOTES = (
+    "dH, dL: largest along the saved states. Longitude: heliocentric, ecliptic, with whole turns; lost: it grows too "
+    "much between saved states for its turns to be counted. Position: from the centre of mass. SV: Stoermer-Verlet, "
+    "kick-drift-kick. WHFast (c17: corrector of order 17), IAS15: REBOUND. EIPRKN12: Nystroem, order 12, projected at "
+    "each tenth step, compensated; tight: half of its step. EIPGJ14: multistep, order 14, one evaluation a step, "
+    "projected when it pays; balances: keeps each planet's energy about the Sun, at its rate. EMB: barycentre of Earth "
+    "and Moon."
+)
 
 
 class Comparison:
@@ -52,29 +39,39 @@ class Comparison:
         self.scene, self.runs, self.tight = scene, runs, tight
         others = () if tight is None else [(run, tight) for run in runs if run is not tight]
         self.longitudes = {run.name: longitude_errors(scene, run, truth) for run, truth in others}
-        self.at = {year: {run.name: self._errors(run, year) for run in runs} for year in scene.report_times()}
-        self.end = self.at[scene.years]
+        self.planets, self.span = scene.data.bodies[1:], f"{scene.years:g} yr, {scene.data.name}"
+        self.rows = [self._row(run, year) for year in scene.report_times() for run in runs]
+        self.end = {row["method"]: row for row in self.rows if row["year"] == scene.years}
 
-    def _errors(self, run: Run, year: float) -> PointErrors | None:
-        """Return the errors of a run at a time; None after its end, and if there is no reference.
+    def _row(self, run: Run, year: float) -> dict[str, Any]:
+        """Return the errors of a run at a time; nan after its end, and if there is no reference.
 
-        The reference is a stored state or else that of the run `tight`, along which whole turns are counted; without
-        this run longitudes are nan. Positions are relative to the centre of mass.
+        Errors of longitude are signed, in rad, those of position distances from the centre of mass in AU. The reference
+        is a stored state or else that of the run `tight`, along which whole turns are counted; without this run
+        longitudes are nan.
         """
         k, truth, source, counting = saved_at(run, year), self.scene.stored(year), "stored states", None
         if self.tight is not None:
             counting = saved_at(self.tight, year)
             if truth is None and counting is not None and run is not self.tight:
                 truth, source = self.tight.y[:, counting], self.tight.name
+        longitude = position = np.full(len(self.planets), np.nan)
         if k is None or truth is None:
-            return None
-        own = run.y[:, k]
-        position = np.linalg.norm((own - truth)[: own.size // 2].reshape(-1, 3)[1:], axis=1)
-        error = _wrapped(self.scene, own[:, None], truth[:, None])[:, 0]
-        if counting is None:
-            return PointErrors(source, np.full_like(error, np.nan), position)
-        counted = error if run is self.tight else self.longitudes[run.name][:, counting]
-        return PointErrors(source, error + 2 * np.pi * np.round((counted - error) / (2 * np.pi)), position)
+            source = ""
+        else:
+            own = run.y[:, k]
+            position = np.linalg.norm((own - truth)[: own.size // 2].reshape(-1, 3)[1:], axis=1)
+            if counting is not None:
+                error = _wrapped(self.scene, own[:, None], truth[:, None])[:, 0]
+                counted = error if run is self.tight else self.longitudes[run.name][:, counting]
+                longitude = error + 2 * np.pi * np.round((counted - error) / (2 * np.pi))
+        return {
+            "method": run.name, "step_yr": run.step, "wall_time_s": run.wall_time,
+            "max_relative_error_H": run.energy_error.max(), "max_relative_error_L": run.momentum_error.max(),
+            "year": year, "reference": source or None,
+            **{f"longitude_{p}_rad": value for p, value in zip(self.planets, longitude, strict=True)},
+            **{f"position_{p}_AU": value for p, value in zip(self.planets, position, strict=True)},
+        }  # fmt: skip
 
     def checks(self, order: int) -> Iterator[tuple[str, bool]]:
         """Yield checks, with their texts, that hold for any sensible settings of a method of the given order.
@@ -92,14 +89,14 @@ class Comparison:
             yield f"{main.name} keeps {name}: relative error {value:.1e} (bound {bound:.1e})", value <= bound
         if self.tight is None:
             return
-        name, stored = self.tight.name, [year for year in self.at if self.scene.stored(year) is not None]
-        errors = self.at[stored[-1]][name] if stored else None
-        if errors is None:
+        name = self.tight.name
+        stored = [row for row in self.rows if row["method"] == name and row["reference"] == "stored states"]
+        if not stored:
             yield f"{name} reached the end", not self.tight.failure
             return
-        worst, bound = float(errors.position.max()), TIGHT_POSITION[name]
-        text = f"{name} agrees with the stored states at {stored[-1]:g} yr to {worst:.1e} AU (bound {bound:g})"
-        yield text, worst <= bound
+        worst, year = max(stored[-1][f"position_{planet}_AU"] for planet in self.planets), stored[-1]["year"]
+        text = f"{name} agrees with the stored states at {year:g} yr to {worst:.1e} AU (bound {TIGHT_POSITION[name]:g})"
+        yield text, worst <= TIGHT_POSITION[name]
 
 
 def heliocentric(scene: Scene, y: np.ndarray) -> np.ndarray:
@@ -120,7 +117,7 @@ def longitude_errors(scene: Scene, run: Run, truth: Run) -> np.ndarray:
     n = min(run.t.size, truth.t.size)
     same = np.isclose(run.t[:n], truth.t[:n], rtol=1e-9, atol=1e-12)
     n = n if same.all() else int(np.argmin(same))
-    error = np.full((len(scene.planets), truth.t.size), np.nan)
+    error = np.full((len(scene.data.bodies) - 1, truth.t.size), np.nan)
     error[:, :n] = np.unwrap(_wrapped(scene, run.y[:, :n], truth.y[:, :n]), axis=1)
     too_fast = np.abs(np.diff(error[:, :n], axis=1)) > COUNTABLE_CHANGE
     error[:, 1:n][np.logical_or.accumulate(too_fast, axis=1)] = np.nan
@@ -141,68 +138,36 @@ def saved_at(run: Run, year: float) -> int | None:
 
 def text(found: Comparison, asked: float) -> str:
     """Lay out the head, the table and the notes; `asked` is the step that the user wants."""
-    scene, runs = found.scene, found.runs
+    scene, runs, end = found.scene, found.runs, found.end
     shortened = "" if np.isclose(scene.h, asked, rtol=1e-12) else f", shortened from {asked:g} to divide the run"
-    rows: list[tuple[str, Sequence[str]]] = [
+    sources = {row["reference"] for row in end.values() if row["reference"]}
+    counted = f"; turns counted along {found.tight.name}" if found.tight else ""
+    body: list[tuple[str, Sequence[str]]] = [
         ("step [d]", ["adaptive" if run.step is None else f"{run.step * YEAR_D:.4g}" for run in runs]),
         ("wall [s]", [compact(run.wall_time) for run in runs]),
         ("max |dH/H|", [compact(float(run.energy_error.max())) for run in runs]),
         ("max |dL/L|", [compact(float(run.momentum_error.max())) for run in runs]),
     ]
-    for heading, quantity in (("error of longitude [rad]", "longitude"), ("error of position [AU]", "position")):
-        rows.append((heading, ()))
-        for k, planet in enumerate(scene.planets):
-            rows.append((f"  {planet}", [_cell(found, run, quantity, k) for run in runs]))
-    shown = {*(run.name for run in runs), *scene.planets}
-    notes = [
-        "dH, dL: largest along the saved states. Longitude: heliocentric, ecliptic, with whole turns; lost: it grows",
-        "by too much between saved states for its turns to be counted. Position: from the centre of mass.",
-        *(note for name, note in NOTES.items() if name in shown),
-    ]
+    for quantity, unit in (("longitude", "rad"), ("position", "AU")):
+        body.append((f"error of {quantity} [{unit}]", ()))
+        for p in found.planets:
+            body.append((f"  {p}", [_cell(found, run, end[run.name][f"{quantity}_{p}_{unit}"]) for run in runs]))
     lines = [
         "",
         f"Solar system, {scene.years:g} yr from {scene.data.epoch}, initial data {scene.data.name!r}",
         f"h = {scene.h:.6g} yr = {scene.h * YEAR_D:.6g} d{shortened}; {scene.n_saves + 1} states saved",
-        _reference(found),
+        f"Reference: {', '.join(sorted(sources)) or 'none'} at {scene.years:g} yr{counted}",
         "",
-        table([run.name.replace("(", "").replace(")", "").split() for run in runs], rows),
+        table([run.name.replace("(", "").replace(")", "").split() for run in runs], body),
         "",
-        fill(" ".join(notes), 79, break_on_hyphens=False),
+        fill(NOTES, 79, break_on_hyphens=False),
         *(f"{run.name} ended at {run.t[-1]:g} yr: {run.failure}" for run in runs if run.failure),
         "",
     ]
     return "\n".join(lines)
 
 
-def _reference(found: Comparison) -> str:
-    sources = {errors.reference for errors in found.end.values() if errors}
-    if not sources:
-        return "No reference: the runs did not get to the end."
-    if sources == {"stored states"}:
-        counted = f"; turns counted along {found.tight.name}" if found.tight else ""
-        return f"Reference: stored states (80 bits) at {found.scene.years:g} yr{counted}"
-    return f"Reference: the tightest available run, {sources.pop()}"
-
-
-def _cell(found: Comparison, run: Run, quantity: str, k: int) -> str:
-    errors = found.end[run.name]
-    if errors is None:
+def _cell(found: Comparison, run: Run, error: float) -> str:
+    if not found.end[run.name]["reference"]:
         return "failed" if run.failure else "ref." if run is found.tight else "-"
-    value = float(getattr(errors, quantity)[k])
-    return "lost" if np.isnan(value) and found.tight and not found.tight.failure else compact(value)
-
-
-def rows(found: Comparison) -> list[dict[str, Any]]:
-    """Return a row for each time and method, with columns for all planets; unknown errors are nan."""
-    made, planets = [], found.scene.planets
-    nothing = PointErrors(None, np.full(len(planets), np.nan), np.full(len(planets), np.nan))
-    for year, run in ((year, run) for year in found.at for run in found.runs):
-        errors = found.at[year][run.name] or nothing
-        row = {
-            "method": run.name, "step_yr": run.step, "wall_time_s": run.wall_time,
-            "max_relative_error_H": run.energy_error.max(), "max_relative_error_L": run.momentum_error.max(),
-            "year": year, "reference": errors.reference,
-        }  # fmt: skip
-        row |= {f"longitude_{p}_rad": value for p, value in zip(planets, errors.longitude, strict=True)}
-        made.append(row | {f"position_{p}_AU": value for p, value in zip(planets, errors.position, strict=True)})
-    return made
+    return "lost" if np.isnan(error) and found.tight and not found.tight.failure else compact(error)

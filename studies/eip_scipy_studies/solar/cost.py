@@ -13,23 +13,11 @@ from eip_scipy.solvers import EIPSolver
 
 from ..output import Output
 from ..report import compact, describe_machine, table
-from .runs import (
-    KEPT,
-    Rebound,
-    Scene,
-    Solve,
-    by_rebound,
-    by_us,
-    by_verlet,
-    drawing,
-    metric_of,
-    tightest,
-    whole_number,
-)  # fmt: skip
+from .runs import KEPT, Rebound, Scene, by_rebound, by_us, by_verlet, drawing, metric_of, tightest, whole_number
 
 REPEATS, ENOUGH_SECONDS = 3, 0.2  # a longer run is not repeated: disturbances of it are invisible on log axes
 MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first number would be unstable
-Methods = Mapping[str, tuple[Solve, Sequence[float]]]
+Methods = Mapping[str, tuple[Callable[..., Any], Sequence[float]]]  # `solve`, see `runs`, and steps
 
 
 class TimedRun(NamedTuple):
@@ -54,7 +42,7 @@ def cost_methods(scene: Scene, method: type[EIPSolver], metric: str, rebound: Re
 
     other, own = EIPRK4 if method is EIPRK5 else EIPRK5, metric_of(method, metric)
     usual = steps([scene.h * factor for factor in (4, 2, 1, 0.5)])
-    found: dict[str, tuple[Solve, Sequence[float]]] = {
+    found: dict[str, tuple[Callable[..., Any], Sequence[float]]] = {
         f"{method.__name__} ({own})": (by_us(scene, method, metric=own), usual),
         method.TABLEAU.name: (by_us(scene, method, invariants=()), usual),
         f"{other.__name__} ({metric})": (by_us(scene, other, metric=metric), usual),

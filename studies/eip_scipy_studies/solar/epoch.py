@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from datetime import date
 from fractions import Fraction
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..report import UsageError
 
@@ -19,23 +19,16 @@ _TDB = re.compile(r" ?TDB$", re.IGNORECASE)
 _ORDINAL_ZERO_JD = Fraction(3442849, 2)  # of date.toordinal(), at midnight
 
 
-class Epoch(NamedTuple):
-    """A Julian date, TDB, in two parts: the last midnight, and the time since then in days."""
+def parse_epoch(text: str) -> tuple[float, float]:
+    """Read an epoch without loss, and return the Julian date (TDB) of the last midnight and the days since then.
 
-    midnight: float
-    rest: float
-
-
-def parse_epoch(text: str) -> Epoch:
-    """Read an epoch without loss: both parts are the numbers nearest to the text.
-
-    The text is a date of the proleptic Gregorian calendar with or without time, or a Julian date; "TDB" may follow. TDB
-    has no leap seconds. Other texts raise a ValueError, whose message lists the accepted forms.
+    Both are the numbers nearest to the text, which is a date of the proleptic Gregorian calendar with or without time,
+    or a Julian date; "TDB" may follow. TDB has no leap seconds. Other texts raise a ValueError.
 
     Examples
     --------
     >>> parse_epoch("2000-01-01T12:00")
-    Epoch(midnight=2451544.5, rest=0.5)
+    (2451544.5, 0.5)
     """
     words = _TDB.sub("", text.strip())
     if written := _JULIAN_DATE.fullmatch(words):
@@ -51,7 +44,7 @@ def parse_epoch(text: str) -> Epoch:
         raise ValueError(f"expected an epoch such as {FORMS}, got {text!r}")
     half = Fraction(1, 2)
     midnight = (julian_date - half) // 1 + half
-    return Epoch(float(midnight), float(julian_date - midnight))
+    return float(midnight), float(julian_date - midnight)
 
 
 def kernels() -> Any:

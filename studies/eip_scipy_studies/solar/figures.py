@@ -19,14 +19,10 @@ MERCURY = 0
 PANELS = ("Mercury", "EMB", "Mars", "Jupiter")  # of the figure of force models
 
 
-def _span(found: Comparison) -> str:
-    return f"{found.scene.years:g} yr, {found.scene.data.name}"
-
-
 def invariant_errors(found: Comparison) -> Any:
     """Draw errors of H and L in time, and next to them the error of Mercury's longitude."""
     assert found.tight is not None
-    title = f"Preserved invariants do not prove a correct orbit: solar system, {_span(found)}"
+    title = f"Preserved invariants do not prove a correct orbit: solar system, {found.span}"
     longitude = f"|longitude of Mercury - {found.tight.name}| [rad]"
     styles = method_styles(run.name for run in found.runs)
     figure = blank_figure(11.7, 4.4, title)
@@ -45,15 +41,15 @@ def invariant_errors(found: Comparison) -> Any:
 def longitude_errors(found: Comparison) -> Any:
     """Draw errors of all planets' longitudes in time."""
     assert found.tight is not None
-    planets = found.scene.planets
+    planets = found.planets
     series = {name: dict(zip(planets, errors, strict=True)) for name, errors in found.longitudes.items()}
-    title = f"Error of heliocentric longitude against {found.tight.name}: {_span(found)}"
+    title = f"Error of heliocentric longitude against {found.tight.name}: {found.span}"
     return _by_planet(found.tight.t, series, planets, "time [yr]", "|error of longitude| [rad]", title)
 
 
-def solar_truth(runs: Sequence[ModelRun], start: str) -> Any:
+def solar_truth(years: np.ndarray, runs: Sequence[ModelRun], start: str) -> Any:
     """Draw the errors of force models in time; `start` is the epoch as text."""
-    years, series = runs[0].years, {run.model: run.km for run in runs}
+    series = {run.model: run.km for run in runs}
     time = f"years {'after' if years[-1] > 0 else 'before'} {start[:10]}"
     return _by_planet(np.abs(years), series, PANELS, time, "error against DE440 [km]", "What each force is worth")
 
@@ -81,7 +77,7 @@ def orbits(found: Comparison) -> Any:
     """Draw where the planets were at the saved times, by Stoermer-Verlet, the chosen method and the reference."""
     assert found.tight is not None
     shown = dict.fromkeys(["SV", found.runs[0].name, found.tight.name])
-    figure = blank_figure(4.1 * len(shown), 9.0, f"Heliocentric positions during {_span(found)}, plane of the ecliptic")
+    figure = blank_figure(4.1 * len(shown), 9.0, f"Heliocentric positions during {found.span}, plane of the ecliptic")
     axes = figure.subplots(2, len(shown), sharex="row", sharey="row", squeeze=False)
     for column, name in zip(axes.T, shown, strict=True):
         (run,) = (run for run in found.runs if run.name == name)
@@ -90,7 +86,7 @@ def orbits(found: Comparison) -> Any:
             axis.plot(0, 0, ls="", marker="+", color="black", ms=8)
             for k in range(first, last):
                 axis.plot(*places[k, :2], ls="", marker=".", ms=1.5, mew=0, color=PALETTE[k], rasterized=True)
-                end = {"marker": MARKERS[k], "mec": "white", "ms": 7, "label": found.scene.planets[k]}
+                end = {"marker": MARKERS[k], "mec": "white", "ms": 7, "label": found.planets[k]}
                 axis.plot(*places[k, :2, -1], ls="", color=PALETTE[k], **end)
             axis.set(aspect="equal", xlabel="x [AU]")
             axis.grid(alpha=0.2)

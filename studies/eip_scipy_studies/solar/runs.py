@@ -45,11 +45,6 @@ class Scene(NamedTuple):
     n_saves: int
     every: int
 
-    @property
-    def planets(self) -> tuple[str, ...]:
-        """Return the names of the bodies without the Sun."""
-        return self.data.bodies[1:]
-
     def dividing(self, longest: float) -> tuple[float, int]:
         """Return the longest step up to `longest` that divides the time between saves, and how often it does."""
         interval = self.years / self.n_saves

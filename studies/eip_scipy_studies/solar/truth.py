@@ -32,22 +32,15 @@ Errors = Mapping[str, np.ndarray]
 
 
 class ModelRun(NamedTuple):
-    """Errors of a model against the ephemeris, (m,) at the times `years` (m,) for each body.
+    """Errors of a model against the ephemeris, (m,) at the saved times for each body.
 
     `km` are distances, `arcsec` angles seen from the Sun, and `step_km` what halving the step changes at the end.
     """
 
     model: str
-    years: np.ndarray
     km: Errors
     arcsec: Errors
     step_km: Mapping[str, float]
-
-    def rows(self, places: Sequence[int]) -> list[dict[str, Any]]:
-        """Return a row for each body and each of the indices `places` in `years`."""
-        about = ("model", "years", "body", "km", "arcsec")
-        numbers = ((self.years[k], body, self.km[body][k], self.arcsec[body][k]) for k in places for body in self.km)
-        return [dict(zip(about, (self.model, *row), strict=True)) for row in numbers]
 
 
 def compare_forces(
@@ -73,15 +66,20 @@ def compare_forces(
         return
     begin, span = next(iter(data.values())).epoch, np.abs(times)
     places = [int(np.argmin(np.abs(span - year))) for year in REPORTED if year < span[-1] * (1 - 1e-9)]
-    errors = [row for run in runs for row in run.rows([*places, times.size - 1])]
-    out.numbers |= {"epoch": begin, "step_yr": step, "errors": errors, "step_km": {r.model: r.step_km for r in runs}}
-    out.rows("solar-truth.csv", [row for run in runs for row in run.rows(range(1, times.size))])
-    out.text(_text(runs, [*places, times.size - 1], begin, step))
+    rows = [
+        {"model": run.model, "years": times[k], "body": body, "km": run.km[body][k], "arcsec": run.arcsec[body][k]}
+        for run in runs
+        for k in range(1, times.size)
+        for body in run.km
+    ]
+    out.numbers |= {"epoch": begin, "step_yr": step, "errors": rows, "step_km": {r.model: r.step_km for r in runs}}
+    out.rows("solar-truth.csv", rows)
+    out.text(_text(runs, times, [*places, times.size - 1], begin, step))
     for model, body, moved, error in ((r.model, b, moved, r.km[b][-1]) for r in runs for b, moved in r.step_km.items()):
         if moved > STEP_KM + STEP_SHARE * error:
             moves = f"{model}: halving the step moves {body} by {moved:.2g} km, its error is {error:.2g} km"
             out.check(f"{moves}; take a smaller --h", False)
-    out.figure("solar-truth.png", drawing("solar-truth", runs, begin))
+    out.figure("solar-truth.png", drawing("solar-truth", times, runs, begin))
 
 
 def models(forces: Sequence[str]) -> list[tuple[str, ...]]:
@@ -118,7 +116,7 @@ def run_model(
     name = " + ".join(["Newton", *model])
     halved, own = (_positions(name, problem, data, times, every, parts) for parts in (2, 1))
     moved = {body: float(np.linalg.norm((own[body] - halved[body])[-1])) for body in truth}
-    return ModelRun(name, times, *errors(own, truth), moved)
+    return ModelRun(name, *errors(own, truth), moved)
 
 
 def _positions(name: str, problem: Problem, data: SolarSystemData, times: np.ndarray, every: int, parts: int) -> Errors:
@@ -141,17 +139,17 @@ def _positions(name: str, problem: Problem, data: SolarSystemData, times: np.nda
 
 def errors(own: Errors, truth: Errors) -> tuple[Errors, Errors]:
     """Return by body the distances in km and the angles in arcsec (m,) between heliocentric positions (m, 3) in km."""
-    km, arcsec = {}, {}
-    for body, there in truth.items():
-        km[body] = np.linalg.norm(own[body] - there, axis=1)
-        units = [q / np.linalg.norm(q, axis=1, keepdims=True) for q in (own[body], there)]
-        chord = np.linalg.norm(units[0] - units[1], axis=1)
-        arcsec[body] = 2 * np.arcsin(np.minimum(chord / 2, 1.0)) * ARCSEC
-    return km, arcsec
+    unit = {body: own[body] / _norm(own[body]) - there / _norm(there) for body, there in truth.items()}
+    km = {body: _norm(own[body] - there)[:, 0] for body, there in truth.items()}
+    return km, {body: 2 * np.arcsin(np.minimum(_norm(d)[:, 0] / 2, 1.0)) * ARCSEC for body, d in unit.items()}
 
 
-def _text(runs: Sequence[ModelRun], places: Sequence[int], start: str, step: float) -> str:
-    years, bodies = runs[0].years, list(runs[0].km)
+def _norm(vectors: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _text(runs: Sequence[ModelRun], years: np.ndarray, places: Sequence[int], start: str, step: float) -> str:
+    bodies = list(runs[0].km)
     lines: list[tuple[str, Sequence[str]]] = []
     for place in places:
         for unit in ("km", "arcsec"):
