@@ -9,6 +9,7 @@ commands share `report` (numbers and tables as text, and writing of files), `wor
 (figures), `comparators` (methods to compare with), and `hard_cases` (problems with exact final states). `measurements`
 has the commands ``eip-scipy study NAME``, which measure the numbers of the documentation.
 
-``solar.solar_system`` is the command of that name. It uses `solar.runs`, `solar.errors` (distance of each run from
-the truth), `solar.cost` (error against cost), `solar.report` and `solar.figures`.
+``solar.command`` is the command ``solar-system``. It uses `solar.runs` (the methods and their runs), `solar.comparison`
+(distance of each run from the truth), `solar.cost` (error against cost), `solar.truth` (force models against the
+ephemeris) and `solar.figures`.
 """

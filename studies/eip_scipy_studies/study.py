@@ -30,7 +30,7 @@ from .report import (
 )
 
 # Packages whose comparison is not among the integrations.
-PEERS = {"heyoka": "eip_scipy_studies.heyoka_runs"}
+PEERS = {"heyoka": "heyoka"}
 
 Found = TypeVar("Found")
 Rows = Sequence[Mapping[str, Any]]

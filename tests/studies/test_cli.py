@@ -18,18 +18,10 @@ from eip_scipy_studies.commands import COMMANDS
 from eip_scipy_studies.study import Check, PartlyDone, Session, Study, option
 from eip_scipy_studies.timing import least
 
-HEYOKA, REBOUND, REBOUNDX = ("heyoka",), ("rebound",), ("heyoka", "rebound", "reboundx")
 RUNS = [
     ("bench metric", "--only gear", ()),
-    ("study bodies", "--periods 2 --bodies 10", REBOUND),
     ("study charged-particle", "--quick", ()),
-    ("study exoplanets", "--share 0.002", REBOUNDX),
     ("study gpe-efficiency", "--points 16 --repeats 1", ()),
-    ("study long-orbits", "--years 1", ()),
-    ("study multistep", "--quick --parts 1 2 4", REBOUND),
-    ("study multistep", "--quick --parts 3", HEYOKA),
-    ("study relativity", "--years 1", REBOUNDX),
-    ("study solar-cloud", "--members 16 --years 1 --sample 2", REBOUND),
 ]
 
 
@@ -97,7 +89,7 @@ def test_status_and_files(settings, status, files, tmp_path, capsys):
         (["solar"], 2),
         (["solar-system", "--years", "-1"], 2),
         (["solar-system", "--resume"], 2),
-        (["solar-system", "truth", "--checkpoint", "a"], 2),
+        (["solar-system", "truth"], 2),
         (["hard-cases", "--out", "/dev/null/folder"], 2),
     ],
 )

@@ -1,1 +1,1 @@
-"""The commands ``eip-scipy hard-cases`` and ``eip-scipy hard-scenes``."""
+"""The command ``eip-scipy hard-cases``."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from ..condensates.efficiency import Efficiency
 from ..output import Output
 from ..particles.charged_particle import ChargedParticle
-from ..solar.solar_system import SolarSystem
+from ..solar.command import solar_system
 from ..study import Session, perform
 from .figures import kepler_figures
 from .tables import table
@@ -20,7 +20,7 @@ Name = Literal[
 ]  # fmt: skip
 FIGURES: dict[str, Callable[[Output], None]] = {
     "fig-kepler": kepler_figures,
-    "fig-solar": lambda out: _class(out, "solar-system", SolarSystem()),
+    "fig-solar": partial(solar_system, cost=True),
     "fig-particle": lambda out: _particle(out, "fig-particle", "uniform"),
     "fig-tokamak": lambda out: _particle(out, "fig-tokamak", "tokamak-banana", "tokamak-transit"),
     "fig-efficiency": lambda out: _class(out, "fig-efficiency", Efficiency()),

@@ -1,1 +1,1 @@
-"""The commands ``eip-scipy solar-system``, ``solar-system frontier`` and ``solar-system truth``."""
+"""The command ``eip-scipy solar-system``."""

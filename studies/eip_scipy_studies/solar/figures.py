@@ -1,178 +1,112 @@
-"""The figures of ``eip-scipy solar-system``, made from a `SolarRuns` with `eip_scipy_studies.plotting`."""
+"""The figures of ``eip-scipy solar-system``: functions with the names of their files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from eip_scipy.plotting import method_styles
-from eip_scipy.problems.gravity.solar_data import YEAR_D
+from eip_scipy.plotting import MARKERS, PALETTE, log_errors, method_styles
 
-from .. import plotting
+from ..plot import blank_figure, cost_figure, envelope, legend_below, log_x
 from ..report import describe_machine
-from .cost import ENOUGH_SECONDS, MERCURY, panels
-from .errors import SolarRuns, ecliptic, longitude_errors
-from .runs import MethodRun, SolarScene
+from .comparison import Comparison, heliocentric
+from .cost import ENOUGH_SECONDS, REPEATS, TimedRun
+from .truth import ModelRun
 
-ELLIPSES = 40
-
-
-def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, Any]]:
-    """Make those `FIGURES` that are in the slice `part` one by one, and yield file names and figures.
-
-    The runs must include the reference run; the last figure also needs the timings.
-    """
-    # A method has one style in all figures; timed methods come last, so that the runs look the same without them.
-    styles = method_styles(dict.fromkeys([*(run.name for run in study.runs), *(item.method for item in study.cost)]))
-    for name, figure in list(FIGURES.items())[part]:
-        yield name, figure(study, styles)
+MERCURY = 0
+PANELS = ("Mercury", "EMB", "Mars", "Jupiter")  # of the figure of force models
 
 
-def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities of each planet relative to the centre of mass of all bodies before it.
-
-    `y` are states (60, m). The results (9, 3, m) are in AU and AU/yr, in ecliptic axes.
-    """
-    q, v = y.reshape(2, -1, 3, y.shape[1])
-    gm = scene.data.gm[:, None, None]
-    inside = np.cumsum(gm, axis=0)[:-1]
-    return tuple(ecliptic(scene, x[1:] - np.cumsum(gm * x, axis=0)[:-1] / inside) for x in (q, v))  # type: ignore
-
-
-def osculating_orbits(scene: SolarScene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
-    """Compute the osculating ellipses: the orbit of each planet if all bodies before it were a single one.
-
-    `y` are states (60, m). The result (9, m, 2, n_points) is in AU, in the plane of the ecliptic; nan for a planet that
-    is not on an ellipse.
-    """
-    r, v = (np.moveaxis(x, 1, -1) for x in jacobi(scene, y))
-    mu = np.cumsum(scene.data.gm)[1:, None, None] * YEAR_D**2
-    momentum = np.cross(r, v)
-    perihelion = np.cross(v, momentum) / mu - r / _norm(r)  # as long as the eccentricity
-    eccentricity = _norm(perihelion)
-    major = 1 / (2 / _norm(r) - np.sum(v * v, axis=-1, keepdims=True) / mu)
-    minor = major * np.sqrt(np.where(eccentricity < 1, 1 - eccentricity**2, np.nan))
-    across = np.cross(momentum, perihelion)
-    E = np.linspace(0, 2 * np.pi, n_points)
-    path = (major * perihelion / eccentricity)[..., None] * (np.cos(E) - eccentricity[..., None])
-    path += (minor * across / _norm(across))[..., None] * np.sin(E)
-    return path[..., :2, :]
+def invariant_errors(found: Comparison) -> Any:
+    """Draw errors of H and L in time, and next to them the error of Mercury's longitude."""
+    assert found.tight is not None
+    title = f"Preserved invariants do not prove a correct orbit: solar system, {found.span}"
+    longitude = f"|longitude of Mercury - {found.tight.name}| [rad]"
+    styles = method_styles(run.name for run in found.runs)
+    figure = blank_figure(11.7, 4.4, title)
+    axes = figure.subplots(1, 3, sharex=True)
+    for run in found.runs:
+        unknown = np.full((1, run.t.size), np.nan)
+        series = run.energy_error, run.momentum_error, found.longitudes.get(run.name, unknown)[MERCURY]
+        for axis, values in zip(axes, series, strict=True):
+            envelope(axis, run.t, values, styles[run.name])
+    for axis, label in zip(axes, ("relative error of H", "relative error of L", longitude), strict=True):
+        log_errors(axis, "time [yr]", label)
+    legend_below(figure, axes[0])
+    return figure
 
 
-def _norm(vectors: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(vectors, axis=-1, keepdims=True)
+def longitude_errors(found: Comparison) -> Any:
+    """Draw errors of all planets' longitudes in time."""
+    assert found.tight is not None
+    planets = found.planets
+    series = {name: dict(zip(planets, errors, strict=True)) for name, errors in found.longitudes.items()}
+    title = f"Error of heliocentric longitude against {found.tight.name}: {found.span}"
+    return _by_planet(found.tight.t, series, planets, "time [yr]", "|error of longitude| [rad]", title)
 
 
-def _span(study: SolarRuns) -> str:
-    return f"{study.scene.years:g} yr, {study.scene.data.name}"
+def solar_truth(years: np.ndarray, runs: Sequence[ModelRun], start: str) -> Any:
+    """Draw the errors of force models in time; `start` is the epoch as text."""
+    series = {run.model: run.km for run in runs}
+    time = f"years {'after' if years[-1] > 0 else 'before'} {start[:10]}"
+    return _by_planet(np.abs(years), series, PANELS, time, "error against DE440 [km]", "What each force is worth")
 
 
-def _longitudes(study: SolarRuns) -> dict[str, np.ndarray]:
-    """Return the errors of longitude (9, m) in rad along each run except the reference, by the name of the run.
-
-    Without a reference run the dictionary is empty.
-    """
-    tight = study.tight
-    if tight is None:
-        return {}
-    return {run.name: longitude_errors(study.scene, run, tight) for run in study.runs if run is not tight}
-
-
-def _errors_figure(study: SolarRuns, styles: Any) -> Any:
-    longitude = _longitudes(study)
-    series = {}
-    for run in study.runs:
-        mercury = longitude[run.name][MERCURY] if run.name in longitude else np.full(run.t.size, np.nan)
-        series[run.name] = plotting.ErrorSeries(run.t, {"H": run.energy_error, "L": run.momentum_error}, mercury)
-    return plotting.errors_figure(
-        series,
-        styles=styles,
-        time="time [yr]",
-        trajectory=f"|longitude of Mercury - {_reference_name(study)}| [rad]",
-        title=f"Preserved invariants do not prove a correct orbit: solar system, {_span(study)}",
-    )
+def _by_planet(
+    t: np.ndarray, series: Mapping[str, Mapping[str, Any]], planets: Sequence[str], time: str, error: str, title: str
+) -> Any:
+    """Draw errors in time by method and planet, a panel for each planet; on log axes a power is a straight line."""
+    styles, columns = method_styles(series), 2 if len(planets) == 4 else 3
+    rows = -(-len(planets) // columns)
+    figure = blank_figure(3.7 * columns, 2.5 * rows + 1.2, title)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for k, (axis, planet) in enumerate(zip(axes.flat, planets, strict=True)):
+        for method, errors in series.items():
+            envelope(axis, t, errors[planet], styles[method], log=True)
+        log_x(axis)
+        log_errors(axis, time if k + columns >= len(planets) else "", "")
+        axis.set_title(planet, fontsize="medium")
+    figure.supylabel(error, fontsize="medium")
+    legend_below(figure, axes[0, 0])
+    return figure
 
 
-def _reference_name(study: SolarRuns) -> str:
-    return study.tight.name if study.tight else "reference"
+def orbits(found: Comparison) -> Any:
+    """Draw where the planets were at the saved times, by Stoermer-Verlet, the chosen method and the reference."""
+    assert found.tight is not None
+    shown = dict.fromkeys(["SV", found.runs[0].name, found.tight.name])
+    figure = blank_figure(4.1 * len(shown), 9.0, f"Heliocentric positions during {found.span}, plane of the ecliptic")
+    axes = figure.subplots(2, len(shown), sharex="row", sharey="row", squeeze=False)
+    for column, name in zip(axes.T, shown, strict=True):
+        (run,) = (run for run in found.runs if run.name == name)
+        places = heliocentric(found.scene, run.y)
+        for axis, first, last in zip(column, (4, 0), (9, 4), strict=True):
+            axis.plot(0, 0, ls="", marker="+", color="black", ms=8)
+            for k in range(first, last):
+                axis.plot(*places[k, :2], ls="", marker=".", ms=1.5, mew=0, color=PALETTE[k], rasterized=True)
+                end = {"marker": MARKERS[k], "mec": "white", "ms": 7, "label": found.planets[k]}
+                axis.plot(*places[k, :2, -1], ls="", color=PALETTE[k], **end)
+            axis.set(aspect="equal", xlabel="x [AU]")
+            axis.grid(alpha=0.2)
+            if name == found.tight.name:
+                axis.legend(fontsize="x-small", title="final position", title_fontsize="x-small")
+        column[0].set_title(f"{name}, ended at {run.t[-1]:.4g} yr" if run.failure else name, fontsize="medium")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y [AU]")
+    return figure
 
 
-def _longitude_figure(study: SolarRuns, styles: Any) -> Any:
-    return plotting.longitude_figure(
-        study.tight.t if study.tight else (),
-        _longitudes(study),
-        study.scene.planets,
-        styles=styles,
-        time="time [yr]",
-        title=f"Error of heliocentric longitude against {_reference_name(study)}: {_span(study)}",
-    )
-
-
-def _shown(study: SolarRuns) -> dict[str, MethodRun]:
-    """Return, by title, the runs that the figures of orbits show: Stoermer-Verlet, the chosen method, the reference."""
-    verlet = next(run for run in study.runs if run.name == "SV")
-    shown = {"Störmer-Verlet": verlet, study.runs[0].name: study.runs[0]}
-    if study.tight:
-        shown[f"{study.tight.name} (reference)"] = study.tight
-    return {f"{name}, ended at {run.t[-1]:.4g} yr" if run.failure else name: run for name, run in shown.items()}
-
-
-def _sample(run: MethodRun) -> np.ndarray:
-    """Return the indices of some saved states.
-
-    They are not equally spaced, because equal spacing could hide a precession with the same period.
-    """
-    golden = np.arange(1, ELLIPSES) * (np.sqrt(5.0) - 1) / 2 % 1.0
-    return np.unique(np.append((golden * run.t.size).astype(int), [0, run.t.size - 1]))
-
-
-def _orbits_figure(which: slice, title: str, study: SolarRuns, styles: Any) -> Any:
-    scene = study.scene
-    panels = {}
-    for name, run in _shown(study).items():
-        orbits = osculating_orbits(scene, run.y[:, _sample(run)])[which]
-        panels[name] = plotting.Orbits(orbits, jacobi(scene, run.y[:, -1:])[0][which, :2, 0])
-    return plotting.orbits_figure(
-        panels,
-        scene.planets[which],
-        unit="AU",
-        title=f"{title}: osculating orbits during {_span(study)}, plane of the ecliptic",
-    )
-
-
-def _mercury_figure(study: SolarRuns, styles: Any) -> Any:
-    panels = {}
-    for name, run in _shown(study).items():
-        sample = _sample(run)
-        panels[name] = (run.t[sample], osculating_orbits(study.scene, run.y[:, sample])[MERCURY])
-    return plotting.orbit_in_time_figure(
-        panels,
-        unit="AU",
-        time="time [yr]",
-        title=f"Mercury's osculating orbit during {_span(study)}, plane of the ecliptic",
-    )
-
-
-def _cost_figure(study: SolarRuns, styles: Any) -> Any:
-    assert study.cost_scene is not None
-    return plotting.cost_figure(
-        panels(study.cost),
-        error="error of position [AU]",
-        styles=styles,
-        title=f"Error against cost: runs of {study.cost_scene.years:g} yr, {study.scene.data.name}",
-        footnote=f"{describe_machine()}; one thread, least of {study.repeats} timings, or one above {ENOUGH_SECONDS} s",
-    )
-
-
-FIGURES: dict[str, Callable[[SolarRuns, Any], Any]] = {
-    "invariant-errors.png": _errors_figure,
-    "longitude-errors.png": _longitude_figure,
-    "orbits-outer.png": partial(_orbits_figure, slice(4, 9), "Outer planets and Pluto"),
-    "orbits-inner.png": partial(_orbits_figure, slice(0, 4), "Inner planets"),
-    "orbit-mercury.png": _mercury_figure,
-    "error-against-cost.png": _cost_figure,
-}
-"""By file name; the last shows the timings, the others the runs."""
+def error_against_cost(data: str, runs: Sequence[TimedRun]) -> Any:
+    """Draw error against cost, for Mercury and for the worst of the other planets; `data` names the start."""
+    panels = []
+    for title, kind in (("Mercury", "error"), ("the worst of the other planets", "error_others")):
+        curves: dict[str, tuple[list[float], list[float]]] = {run.method: ([], []) for run in runs}
+        for run in runs:
+            curves[run.method][0].append(run.wall_time)
+            curves[run.method][1].append(getattr(run, kind))
+        panels.append((title, curves))
+    footnote = f"{describe_machine()}; one thread, least of {REPEATS} timings, or one above {ENOUGH_SECONDS} s"
+    title = f"Error against cost: runs of {runs[0].years:g} yr, {data}"
+    return cost_figure(panels, cost="wall time [s]", error="error of position [AU]", title=title, footnote=footnote)

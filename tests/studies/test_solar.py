@@ -1,0 +1,266 @@
+"""``eip-scipy solar-system``: a short run with all of its files, stored states, checkpoints, epochs, force models."""
+
+import csv
+import json
+import math
+import sys
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from eip_scipy.integrations import jpl
+from eip_scipy.problems import solar_data
+from eip_scipy.problems import solar_system as problem_of
+from eip_scipy_studies.cli import main
+from eip_scipy_studies.solar import command, comparison, cost, runs, truth
+from eip_scipy_studies.solar.epoch import parse_epoch
+
+FIGURES = {"invariant-errors.png", "longitude-errors.png", "orbits.png", "error-against-cost.png"}
+SPAN = ("--years", "0.1", "--h", "0.005")  # quick in plain Python, too; four times that resolves Mercury
+
+
+def solar(folder, *words):
+    """Run the command, and return its status and the rows of its CSV files without times."""
+    status = main(["solar-system", *words, "--out", str(folder), "--json", str(folder / "run.json")])
+    rows = {}
+    for file in folder.glob("*.csv"):
+        with open(file, newline="") as stream:
+            rows[file.stem] = [{k: v for k, v in row.items() if "wall" not in k} for row in csv.DictReader(stream)]
+    return status, rows
+
+
+@pytest.fixture
+def few_methods(monkeypatch):
+    """Run less than the command would: no REBOUND, no figures."""
+    monkeypatch.setattr(command, "rebound_or_none", lambda out: None)
+    monkeypatch.setattr(command, "FIGURES", ())
+
+
+@pytest.mark.slow
+def test_short_run_with_everything(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("rebound")
+    monkeypatch.setattr(cost, "REPEATS", 1)
+    status, rows = solar(tmp_path, *SPAN, "--cost")
+    text = capsys.readouterr().out
+    assert status == 0
+    assert "FAILED" not in text
+    assert max(map(len, text.splitlines()[1:40])) <= 100  # ten columns
+    assert {path.name for path in tmp_path.glob("*.png")} == FIGURES
+    assert all(path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n") for path in tmp_path.glob("*.png"))
+    mercury = {row["method"]: float(row["position_Mercury_AU"] or "nan") for row in rows["solar-system"]}
+    own = ["EIPRK4 (error)", "EIPRK4 (euclidean)", "RK4", "SV", "EIPRKN12", "EIPGJ14", "EIPGJ14 (balances)"]
+    assert list(mercury) == [*own, "WHFast", "WHFast (c17)", "IAS15"]
+    assert math.isnan(mercury["IAS15"])  # it is the reference
+    assert mercury["EIPRK4 (error)"] < mercury["SV"] / 10
+    assert mercury["WHFast (c17)"] < mercury["WHFast"] / 10
+    assert max(mercury["EIPRKN12"], mercury["EIPGJ14"]) < 1e-3 * mercury["EIPRK4 (error)"]
+    assert {row["method"] for row in rows["error-against-cost"]} >= {"EIPRK5 (error)", "EIPRKN12", "WHFast (c17)"}
+    assert all(float(row["error"]) > 0 for row in rows["error-against-cost"])
+    content = json.loads((tmp_path / "run.json").read_text())
+    assert (content["command"], content["trusted"], len(content["checks"])) == ("solar-system", True, 4)
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_one_year_against_the_stored_states(tmp_path, monkeypatch):
+    pytest.importorskip("rebound")
+    monkeypatch.setattr(command, "FIGURES", ())
+    status, rows = solar(tmp_path, "--years", "1")
+    assert status == 0
+    assert {row["reference"] for row in rows["solar-system"]} == {"stored states"}
+    mercury = {row["method"]: abs(float(row["longitude_Mercury_rad"])) for row in rows["solar-system"]}
+    assert mercury["IAS15"] < 1e-12
+    assert mercury["EIPRKN12"] < 1e-9
+    assert mercury["EIPGJ14"] < 1e-11
+    assert mercury["SV"] == pytest.approx(0.05, rel=0.5)
+    steps = {row["method"]: row["step_yr"] for row in rows["solar-system"]}
+    assert float(steps["EIPGJ14"]) == 0.1 / 60
+    assert float(steps["EIPRKN12"]) == 0.1 / 7  # of the steps that divide the time between saved states
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_methods")
+def test_an_interrupted_command_goes_on(tmp_path, capsys, monkeypatch):
+    """With --checkpoint, completed runs are not repeated; the numbers are those of an uninterrupted command."""
+    folder = tmp_path / "kept"
+    words = [*SPAN, "--checkpoint", str(folder)]
+    whole = solar(tmp_path / "whole", *SPAN)
+
+    def interrupted(scene):
+        def solve(*arguments, **options):
+            raise KeyboardInterrupt
+
+        return solve
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runs, "by_verlet", interrupted)
+        status, rows = solar(tmp_path / "first", *words)
+    assert (status, len(rows["solar-system"])) == (130, 3)
+    assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in capsys.readouterr().err
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert set(before) == {"EIPRK4-error.npz", "EIPRK4-euclidean.npz", "RK4.npz"}
+    assert solar(tmp_path / "again", *words)[0] == 2
+    assert solar(tmp_path / "second", *words, "--resume") == whole
+    assert {name: (folder / name).read_bytes() for name in before} == before
+
+
+@pytest.mark.parametrize(
+    ("years", "h", "expected"),
+    [
+        (2000.0, 0.002, (2000, 500, 0.002)),
+        (100.0, 0.002, (200, 250, 0.002)),
+        (2.0, 0.003, (20, 34, 0.1 / 34)),
+        (2.5, 0.002, (25, 50, 0.002)),
+        (1.0, 1.0, (1, 1, 1.0)),
+        (1e6, 1.0, (20_000, 50, 1.0)),
+    ],
+)
+def test_saved_times_are_whole_numbers_of_steps(years, h, expected):
+    scene = runs.make_scene("de440", years, h)
+    assert (scene.n_saves, scene.every, scene.h) == (*expected[:2], pytest.approx(expected[2], rel=1e-14))
+
+
+@pytest.mark.parametrize("rate", [0.01, -0.7, 4.5])
+def test_turns_are_counted(rate):
+    """The planets of a run gain `rate` rad/yr on those of another, both on circles."""
+    scene, t, made = runs.make_scene("paper", 100.0, 1.0), np.linspace(0.0, 100.0, 201), []
+    for extra in (rate, 0.0):
+        y = np.zeros((60, t.size))
+        for body in range(1, 10):
+            angle = (2 * np.pi / body + extra) * t
+            y[3 * body], y[3 * body + 1] = body * np.cos(angle), body * np.sin(angle)
+        made.append(runs.Run("run", 1.0, 0.0, t, y, t, t))
+    np.testing.assert_allclose(comparison.longitude_errors(scene, *made), np.tile(rate * t, (9, 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "offset", "passed"),
+    [("IAS15", 5e-9, True), ("IAS15", 2e-8, False), (runs.TIGHT, 5e-8, True), (runs.TIGHT, 2e-7, False)],
+)
+def test_the_tightest_run_is_checked_against_the_stored_states(name, offset, passed):
+    scene = runs.make_scene("de440", 1.0, 0.1)
+    y = np.stack([scene.problem.y0, scene.stored(1.0)], axis=1)
+    y[3:5, 1] += offset  # Mercury
+    run = runs.Run(name, 0.1, 0.0, np.array([0.0, 1.0]), y, np.zeros(2), np.zeros(2))
+    *_, (text, found) = comparison.Comparison(scene, [run], run).checks(4)
+    assert text.startswith(f"{name} agrees with the stored states at 1 yr")
+    assert found == passed
+
+
+# Epochs.
+
+
+@pytest.mark.parametrize(
+    ("text", "julian_date"),
+    [
+        ("2000-01-01", "2451544.5"),
+        ("2000-01-01 12:00:00 TDB", "2451545"),
+        ("1549-12-31", "2287184.5"),
+        ("2000-02-29T23:59:59", "2451604.49998842592592592592592"),
+        ("2014-02-02T00:00:00.000000123", "2456690.500000000001423611111111111111111"),
+        ("2451545.", "2451545"),
+        ("JD 2451544.5 TDB", "2451544.5"),
+        ("2456690.123456789012345678", "2456690.123456789012345678"),
+        ("jd-3027215.5", "-3027215.5"),
+    ],
+)
+def test_epochs_without_loss(text, julian_date):
+    midnight, rest = parse_epoch(text)
+    assert midnight % 1 == 0.5
+    assert rest == float(Fraction(julian_date) - Fraction(midnight))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "tomorrow", "nan", "2.4e6", "2014-2-2", "2014-02-02T20", "2014-02-02T20:18Z", "2000-01-01T24:00",
+             "2000-01-01T12:00:60", "2001-02-29", "0000-01-01"],
+)  # fmt: skip
+def test_other_epochs_are_refused(text):
+    with pytest.raises(ValueError, match=r"no such date|\"2451545\.0\", got"):
+        parse_epoch(text)
+
+
+@pytest.mark.parametrize(("text", "name"), [("2014-02-02T20:18", "de440"), ("JD2451545.0", "de440-j2000")])
+def test_epochs_of_the_package_bit_for_bit(kernel, text, name):
+    data, packaged = jpl.initial_data(parse_epoch(text)), solar_data.load(name)
+    np.testing.assert_array_equal(data.y0, packaged.y0)
+    assert (problem_of(data).reference(100.0) is None) == (name != "de440")
+
+
+@pytest.mark.usefixtures("few_methods")
+def test_the_command_at_the_packages_epoch_and_at_another(kernel, tmp_path, capsys):
+    span = ("--years", "1", "--h", "0.01")
+    assert solar(tmp_path / "a", *span) == solar(tmp_path / "b", *span, "--epoch", "2014-02-02T20:18")
+    assert solar(tmp_path / "c", *SPAN, "--epoch", "JD2460000.5", "--kernel", str(kernel))[0] == 0
+    printed = capsys.readouterr().out
+    assert "from 2023-02-25 00:00:00 TDB" in printed
+    assert "Reference: EIPRKN12 (tight) at 0.1 yr" in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--epoch", "3000-01-01"], "outside the kernel's span"),
+        (["--epoch", "2000-01-01", "--data", "paper"], "not allowed with --data"),
+        (["--kernel", "x.bsp"], "--kernel goes with --epoch"),
+        (["--method", "EIPRK7"], "unknown method"),
+        (["--forces", "1pn"], "--forces goes with --truth"),
+        (["--truth", "--forces", "1pn", "eih"], "only one of them"),
+        (["--truth", "--forces", "drag"], "unknown force"),
+        (["--truth", "--h", "2", "--years", "-1"], "does not fit"),
+        (["--truth", "--years", "0"], "expected a positive number"),
+    ],
+)
+@pytest.mark.usefixtures("kernel", "few_methods")
+def test_wrong_usage_is_one_line(tmp_path, capsys, words, message):
+    assert solar(tmp_path, *words)[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.mark.usefixtures("few_methods")
+def test_a_missing_extra(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "jplephem.spk", None)
+    assert solar(tmp_path, *SPAN, "--epoch", "2000-01-01")[0] == 2
+    assert 'pip install "eip_scipy[jpl]"' in capsys.readouterr().err
+
+
+# Force models.
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("years", [1.05, -1.05])
+def test_force_models_both_ways_in_time(kernel, tmp_path, years):
+    status, rows = solar(tmp_path, "--truth", "--years", str(years), "--forces", "1pn", "moon")
+    assert status == 0
+    assert len(rows["solar-truth"]) == 2 * 11 * 9
+    end = {row["model"]: row for row in rows["solar-truth"] if (float(row["years"]), row["body"]) == (years, "Mercury")}
+    newton, better = (float(end[name]["km"]) for name in ("Newton", "Newton + 1pn + moon"))
+    assert newton > 300 > 1 > better
+    assert float(end["Newton"]["arcsec"]) == pytest.approx(newton / 300, rel=0.5)  # an arcsec in 0.4 AU
+    assert (tmp_path / "solar-truth.png").stat().st_size > 10_000
+
+
+@pytest.mark.needs_jit
+def test_a_step_that_is_too_long_fails(kernel, tmp_path, capsys):
+    assert solar(tmp_path, "--truth", "--years", "2", "--h", "0.05", "--forces", "1pn")[0] == 1
+    assert "FAILED Newton: halving the step moves Mercury by" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("years", [100.05, 0.3, -7.0, 350.5])
+def test_saved_times_of_force_models(years):
+    times, every, step = truth.save_times(years, 0.001)
+    assert (times[0], times[-1]) == (0, years)
+    assert step <= 0.001
+    assert all(np.abs(np.abs(times) - year).min() < 1e-12 for year in (1.0, 10.0, 100.0) if year <= abs(years))
+    assert np.diff(times[:-1]) == pytest.approx(math.copysign(every * step, years))
+
+
+def test_angles_and_distances():
+    own = {"x": np.array([[1e8, 0, 0], [1.0, 0, 0], [1.0, 0, 0]])}
+    there = {"x": np.array([[1e8, 1.0, 0], [0, 1.0, 0], [-1.0, 0, 0]])}
+    km, arcsec = truth.errors(own, there)
+    np.testing.assert_allclose(km["x"], [1.0, math.sqrt(2), 2.0])
+    np.testing.assert_allclose(arcsec["x"], [1e-8 * 206264.806247, 90 * 3600, 180 * 3600], rtol=1e-8)
