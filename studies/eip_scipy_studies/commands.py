@@ -28,22 +28,20 @@ COMMANDS = {
     ),
     "solar-system truth": Entry("solar.truth:Truth", "compare force models with the ephemeris DE440 itself"),
     "charged-particle": Entry(
-        "particles.charged_particle:ChargedParticle",
+        "particles.charged_particle:charged_particle",
         "charged particles in two fields by several methods (the paper's Experiment III)",
     ),
-    "charged-particle uniform": Entry("particles.charged_particle:Uniform", "the uniform field alone"),
-    "charged-particle tokamak": Entry("particles.charged_particle:Tokamak", "the tokamak alone, or one orbit of it"),
     "hard-cases": Entry("hard.cases:HardCases", "run 35 hard cases with and without projection"),
     "hard-scenes": Entry(
         "hard.scenes:HardScenes",
         "error against cost on high eccentricities, chaos and close encounters, compared with IAS15",
     ),
     "gpe ground-state": Entry(
-        "condensates.states:GroundStates", "ground states of the rotating Gross-Pitaevskii equation (Experiment IV)"
+        "condensates.states:ground_states", "ground states of the rotating Gross-Pitaevskii equation (Experiment IV)"
     ),
-    "gpe ring": Entry("condensates.ring:Ring", "run the paper's ring of vortices after its trap is tightened"),
+    "gpe ring": Entry("condensates.quench:ring", "run the paper's ring of vortices after its trap is tightened"),
     "gpe vortex-lines": Entry(
-        "condensates.lines:VortexLines", "run the paper's condensate in 3D after its rotation is made faster"
+        "condensates.quench:vortex_lines", "run the paper's condensate in 3D after its rotation is made faster"
     ),
     "mechanisms": Entry(
         "mechanisms.study:Mechanisms",
@@ -58,16 +56,12 @@ COMMANDS = {
     "bench metric": Entry("bench.metric:metric", "the default metric against none and euclidean, case by case"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, compared with IAS15"),
-    "study charged-particle": Entry(
-        "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
-    ),
     "study ensembles": Entry(
         "measurements.ensembles:Ensembles", "ensembles: cost of a member, gain from threads and workers, memory"
     ),
     "study exoplanets": Entry(
         "measurements.exoplanets:Exoplanets", "three systems of exoplanets compared with WHFast and IAS15"
     ),
-    "study gpe-efficiency": Entry("condensates.efficiency:AllRuns", "the paper's test of efficiency with all its runs"),
     "study long-orbits": Entry(
         "measurements.long_orbits:LongOrbits", "effect of projection and compensated sums over 1000 years"
     ),

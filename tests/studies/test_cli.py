@@ -22,10 +22,8 @@ HEYOKA, REBOUND, REBOUNDX = ("heyoka",), ("rebound",), ("heyoka", "rebound", "re
 RUNS = [
     ("bench metric", "--only gear", ()),
     ("study bodies", "--periods 2 --bodies 10", REBOUND),
-    ("study charged-particle", "--quick", ()),
     ("study ensembles", "--members 10 --steps 100 --repeats 1 --largest 10", ()),
     ("study exoplanets", "--share 0.002", REBOUNDX),
-    ("study gpe-efficiency", "--points 16 --repeats 1", ()),
     ("study long-orbits", "--years 1", ()),
     ("study multistep", "--quick --parts 1 2 4", REBOUND),
     ("study multistep", "--quick --parts 3", HEYOKA),

@@ -74,8 +74,10 @@ class _Descent:
         """Iterate, and return the result once it converged or no direction descends."""
         message, iteration = "", 0
         while not message:
-            if iteration % REFRESH == 0:
-                self.refresh()
+            if iteration % REFRESH == 0:  # removes rounding errors of what is carried along
+                self.psi /= sqrt(self.inner(self.psi, self.psi))
+                self.apply(self.psi, self.image)
+                self.preconditioner.fit(self.psi)
             mu, norm = self.gradient()
             if norm <= tol:
                 message = "converged"
@@ -86,12 +88,6 @@ class _Descent:
             else:
                 iteration += 1
         return GroundState(self.psi, self.gpe.energy(self.psi), mu, norm, iteration, norm <= tol, message)
-
-    def refresh(self) -> None:
-        """Normalise psi, recompute its `image` by `apply` to remove rounding errors, and adapt the preconditioner."""
-        self.psi /= sqrt(self.inner(self.psi, self.psi))
-        self.apply(self.psi, self.image)
-        self.preconditioner.fit(self.psi)
 
     def gradient(self) -> tuple[float, float]:
         """Compute the residual H psi - mu psi; return mu and the norm of the residual."""
@@ -174,20 +170,20 @@ class _Preconditioner:
 # Starts.
 
 
+def _square(gpe: GrossPitaevskii) -> Any:
+    """Return r^2 = x^2 + y^2, of the grid's dimension."""
+    return sum(a**2 for a in gpe.grid.mesh()[:2])
+
+
 def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
     """Return the Thomas-Fermi density of mass 1, (mu - V + Omega^2 r^2 / 2) / beta where this is positive, and else 0.
 
     A ValueError is raised if the density reaches the ends of the box.
     """
-    r2 = sum(a**2 for a in gpe.grid.mesh()[:2]) if gpe.Omega else 0.0
-    well = gpe.V - 0.5 * gpe.Omega**2 * r2
+    well = gpe.V - 0.5 * gpe.Omega**2 * (_square(gpe) if gpe.Omega else 0.0)
     cell, low = gpe.grid.cell, float(well.min())
-
-    def excess(mu: float) -> float:
-        return cell * float(np.maximum(mu - well, 0.0).sum()) / gpe.beta - 1.0
-
-    volume = cell * gpe.grid.size
-    mu = brentq(excess, low, float(well.max()) + gpe.beta / volume, xtol=1e-12)
+    excess = lambda mu: cell * float(np.maximum(mu - well, 0.0).sum()) / gpe.beta - 1.0  # noqa: E731
+    mu = brentq(excess, low, float(well.max()) + gpe.beta / (cell * gpe.grid.size), xtol=1e-12)
     density = np.maximum(mu - well, 0.0) / gpe.beta
     if any(np.any(np.take(density, 0, axis=axis)) for axis in range(gpe.grid.dim)):
         raise ValueError("the condensate does not fit into the box of the grid: enlarge the box, or lower Omega.")
@@ -221,8 +217,7 @@ def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
 
 def _mean_square_radius(gpe: GrossPitaevskii) -> float:
     density = thomas_fermi(gpe)
-    x, y, *_ = gpe.grid.mesh()
-    return float(((x**2 + y**2) * density).sum() / density.sum())
+    return float((_square(gpe) * density).sum() / density.sum())
 
 
 def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -> np.ndarray:
@@ -237,18 +232,15 @@ def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[n
     The lattices have 0.6 to 1.2 times as many vortices as a condensate that turns as a rigid body.
     """
     rng = np.random.default_rng(seed)
-    amplitude = np.sqrt(thomas_fermi(gpe))
+    density = thomas_fermi(gpe)
     for _ in range(count):
-        psi = amplitude.astype(complex)
-        if gpe.Omega:
-            psi = imprint(gpe, _lattice(gpe, amplitude, rng))
+        psi = imprint(gpe, _lattice(gpe, density, rng)) if gpe.Omega else np.sqrt(density).astype(complex)
         yield with_noise(psi, rng)
 
 
-def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _lattice(gpe: GrossPitaevskii, density: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the points (k, 2) of a random triangular lattice within the outer radius of the condensate."""
-    x, y, *_ = gpe.grid.mesh()
-    radius = sqrt(float(np.max((x**2 + y**2) * (amplitude > 0))))
+    radius = sqrt(float(np.max(_square(gpe) * (density > 0))))
     area = pi / abs(gpe.Omega) / rng.uniform(0.6, 1.2)
     side, angle = sqrt(2 * area / sqrt(3.0)), rng.uniform(0, pi / 3)
     reach = int(2 * radius / side) + 2
@@ -268,10 +260,9 @@ def lowest_ring(
     from each pair the search goes on to its neighbour of lowest energy, until no neighbour is lower. The last search
     starts from the best state with noise, to break its symmetry.
     """
-    x, y = gpe.grid.mesh()
-    r2 = (x**2 + y**2)[thomas_fermi(gpe) > 0]
+    r2 = _square(gpe)[thomas_fermi(gpe) > 0]
     count = round(ROW * abs(gpe.Omega) * (r2.max() - r2.min()))
-    here = count, round(abs(gpe.Omega) * _mean_square_radius(gpe) - count / 2)
+    best = count, round(abs(gpe.Omega) * _mean_square_radius(gpe) - count / 2)
     found: dict[tuple[int, int], GroundState] = {}
 
     def energy(pair: tuple[int, int]) -> float:
@@ -281,10 +272,9 @@ def lowest_ring(
             report(*pair, found[pair].energy)
         return found[pair].energy
 
-    while True:
-        best = min([here, *((here[0] + a, here[1] + b) for a, b in NEIGHBOURS)], key=energy)
-        if best == here:
-            break
+    here = None
+    while here != best:
         here = best
-    start = with_noise(found[here].psi, np.random.default_rng(seed), BREAK_SYMMETRY)
+        best = min([here, *((here[0] + a, here[1] + b) for a, b in NEIGHBOURS)], key=energy)
+    start = with_noise(found[best].psi, np.random.default_rng(seed), BREAK_SYMMETRY)
     return ground_state(gpe, start, tol=tol)

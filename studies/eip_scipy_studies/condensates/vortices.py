@@ -1,7 +1,8 @@
-"""Vortices of a field, around which the phase winds, and surfaces of equal density that show them as tubes."""
+"""Vortices of a field, around which the phase winds, their motion, and surfaces of equal density around them."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import ceil, sqrt
 from typing import Any, NamedTuple
 
@@ -72,6 +73,39 @@ def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: 
     return middle[0] + a * dx, middle[1] + b * dy
 
 
+class Motion:
+    """Vortices in the states `fields` (n, m) at the times `t` (m,), and the `angle` (m,) by which they have turned.
+
+    From one state to the next, the angle of each vortex about the centre is extrapolated and matched with the nearest.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> None:
+        self.t, self.vortices = t, [vortices(gpe, y) for y in fields.T]
+        turned, step = [0.0], 0.0
+        for old, new in pairwise(np.arctan2(*each.positions.T[::-1]) for each in self.vortices):
+            if old.size and new.size:
+                off = _wrapped(new[None, :] - old[:, None] - step)
+                nearest = np.abs(off).argmin(axis=1)
+                step += float(np.median(off[np.arange(old.size), nearest]))
+            turned.append(turned[-1] + step)
+        self.angle = np.array(turned)
+
+    def off(self, k: int, x: Any, y: Any) -> Any:
+        """Return polar angles of points in the k-th state, relative to the first vortex with the largest x, turned."""
+        a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
+        return _wrapped(np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])
+
+    def followed(self, k: int) -> int | None:
+        """Return the index of the vortex closest to the reference of `off` in the k-th state; None without vortices."""
+        if not (self.vortices[0].charges.size and self.vortices[k].charges.size):
+            return None
+        return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
+
+
+def _wrapped(angle: Any) -> Any:
+    return np.angle(np.exp(1j * angle))
+
+
 class Surface(NamedTuple):
     """Triangles: their corners (m, 3, 3), and whether they lie inside the condensate (m,), around a vortex line."""
 
@@ -84,13 +118,10 @@ def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
 
     The field, 0 at the ends of the box, is interpolated to twice as many points on each axis.
     """
+    from skimage.measure import marching_cubes
+
     psi = gpe.as_field(psi)
     top = float((np.abs(psi) ** 2).max())
-    try:
-        from skimage.measure import marching_cubes
-    except ModuleNotFoundError as error:
-        message = 'surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"'
-        raise ImportError(message, name="skimage") from error
     for axis, n in enumerate(gpe.grid.shape):
         psi = scipy.signal.resample(psi, 2 * n, axis=axis)
     density = np.abs(psi) ** 2

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from ..commands import DONE, INTERRUPTED
-from ..condensates.efficiency import Efficiency
+from ..commands import CHECK_FAILED, DONE, INTERRUPTED
+from ..condensates.efficiency import efficiency
 from ..kepler.figures import KeplerFigures
-from ..particles.charged_particle import ChargedParticle
+from ..output import Output
+from ..particles.charged_particle import paper_figure
 from ..report import document, write_json
 from ..solar.solar_system import SolarSystem
 from ..study import Command, Session, Study, option, perform
@@ -21,11 +22,11 @@ STUDIES: dict[str, Make] = {
     **{name: partial(PaperTable, name=name) for name in TABLES},
     "fig-kepler": KeplerFigures,
     "fig-solar": SolarSystem,
-    "fig-particle": partial(ChargedParticle, scenes=("uniform",), paper_only=True, stem="fig-particle"),
-    "fig-tokamak": partial(
-        ChargedParticle, scenes=("tokamak-banana", "tokamak-transit"), paper_only=True, stem="fig-tokamak"
-    ),
-    "fig-efficiency": Efficiency,
+}
+FIGURES: dict[str, Callable[[Output], None]] = {
+    "fig-particle": partial(paper_figure, name="fig-particle"),
+    "fig-tokamak": partial(paper_figure, name="fig-tokamak"),
+    "fig-efficiency": efficiency,
 }
 
 
@@ -35,10 +36,10 @@ class Reproduce(Command):
 
     table: Sequence[str] = option(
         (),
-        f"{', '.join(STUDIES)} or all; several may be given",
+        f"{', '.join([*STUDIES, *FIGURES])} or all; several may be given",
         positional=True,
         nargs="+",
-        choices=(*STUDIES, "all"),
+        choices=(*STUDIES, *FIGURES, "all"),
         metavar="WHAT",
     )
     studies: Mapping[str, Make] = field(default_factory=lambda: STUDIES)
@@ -49,7 +50,7 @@ class Reproduce(Command):
         If a JSON file is wanted, it is one for all; its lists `cells` and `orders` hold the numbers of all tables.
         """
         session.out.mkdir(parents=True, exist_ok=True)
-        wanted = list(dict.fromkeys(self.studies if "all" in self.table else self.table))
+        wanted = list(dict.fromkeys([*self.studies, *FIGURES] if "all" in self.table else self.table))
         content: dict[str, Any] = {"cells": [], "orders": []}
         status = DONE
         for k, name in enumerate(wanted):
@@ -58,7 +59,12 @@ class Reproduce(Command):
             own = Session(name, session.out, None, session.quiet, session.absent)
             if name == "fig-solar":  # a separate command, which leaves its numbers
                 own.name, own.json = "solar-system", session.out / "solar-system.json"
-            judged, numbers = perform(self.studies[name](), own)
+            if name in FIGURES:
+                out = Output(own.out, quiet=own.quiet)
+                FIGURES[name](out)
+                judged, numbers = DONE if out.passed else CHECK_FAILED, out.numbers
+            else:
+                judged, numbers = perform(self.studies[name](), own)
             if judged == INTERRUPTED:
                 return INTERRUPTED
             status = max(status, judged)

@@ -19,7 +19,7 @@ from eip_scipy.problems import Problem, SolarSystemData, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
 from eip_scipy.solvers import EIPSolver
 
-from ..comparators import FixedSteps, StormerVerletResult, newton, stormer_verlet
+from ..comparators import FixedSteps, Result, newton, stormer_verlet
 from ..long_runs import named
 
 Peer = Callable[..., Any]
@@ -217,8 +217,8 @@ def _verlet(scene: SolarScene) -> MethodRun:
     return _finished(scene, "SV", ("SV",), scene.h, result, failure)
 
 
-def leapfrog(problem: Problem, step: float, save_every: int | None) -> StormerVerletResult:
-    """Run Stoermer-Verlet in its kick-drift-kick form with steps of length `step`; return its `StormerVerletResult`.
+def leapfrog(problem: Problem, step: float, save_every: int | None) -> Result:
+    """Run Stoermer-Verlet in its kick-drift-kick form with steps of length `step`; return its `Result`.
 
     Every `save_every`-th state is saved in addition to the first and the last; None saves only these two.
     """
