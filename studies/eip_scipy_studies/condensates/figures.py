@@ -12,7 +12,7 @@ import numpy as np
 from eip_scipy.plotting import PALETTE, log_errors, method_styles, typeset  # isort: skip
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgba
+from matplotlib.colors import LightSource, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -160,8 +160,12 @@ def surfaces_figure(quench: Quench) -> Figure:
         x, y, _ = corners.mean(axis=1).T
         followed = np.abs(moved.off(k, x, y)) < np.pi / len(moved.vortices[k].charges)
         axis: Any = figure.add_subplot(rows, columns, place, projection="3d", proj_type="ortho")
-        colours = _shaded(corners, np.where(inside, 1 + followed, 0))
-        axis.add_collection3d(Poly3DCollection(corners, facecolors=colours, lw=0))
+        colours = np.array([to_rgba(PALETTE[5], VEIL), to_rgba(PALETTE[0]), to_rgba(PALETTE[2])])
+        shown_part = np.where(inside, 1 + followed, 0)
+        light = LightSource(VIEW[1] - 30, VIEW[0] + 15)
+        axis.add_collection3d(
+            Poly3DCollection(corners, facecolors=colours[shown_part], lw=0, shade=True, lightsource=light)
+        )
         axis.view_init(*VIEW)
         axis.set(xlim=ROOM[0], ylim=ROOM[1], zlim=ROOM[2], xlabel="x", ylabel="y", zlabel="z")
         axis.set_box_aspect([high - low for low, high in ROOM], zoom=0.98)
@@ -169,20 +173,6 @@ def surfaces_figure(quench: Quench) -> Figure:
         for side in (axis.xaxis, axis.yaxis, axis.zaxis):
             side.set_major_locator(MaxNLocator(4, steps=(2, 5, 10)))
     return figure
-
-
-def _shaded(corners: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Return colours (m, 4) of triangles, by part, in a light that comes from the viewer's side."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal /= np.where(length > 0, length, 1.0)
-    high, around = np.radians([VIEW[0] + 15, VIEW[1] - 30])
-    light = np.array([np.cos(high) * np.cos(around), np.cos(high) * np.sin(around), np.sin(high)])
-    # Both sides are lit, because the far side of the surface is seen from behind through the transparent one.
-    shade = 0.45 + 0.55 * np.abs(normal @ light)
-    colour = np.array([to_rgba(PALETTE[5], VEIL), to_rgba(PALETTE[0]), to_rgba(PALETTE[2])])[part]
-    colour[:, :3] *= shade[:, None]
-    return colour
 
 
 def errors_figure(quench: Quench) -> Figure:

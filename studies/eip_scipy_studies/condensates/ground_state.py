@@ -52,14 +52,21 @@ def ground_state(gpe: GrossPitaevskii, start: Any, *, tol: float = 1e-8, max_ite
 
 
 class _Descent:
-    """State of the search: psi, the direction p, and their images under the linear part plus the potential."""
+    """State of the search: psi, the direction p, and their images under the linear part plus the potential.
+
+    The preconditioner is D (a - Laplace / 2)^(-1) D, D = (a + W)^(-1/2), W = V - min V + ``|beta| |psi|^2``, where the
+    typical energy a is that of psi every `REFRESH` iterations.
+    """
 
     def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray) -> None:
         self.gpe, self.psi = gpe, psi
         self.residual, self.old_residual = np.empty_like(psi), np.zeros_like(psi)
         self.p, self.image, self.p_image = np.zeros_like(psi), np.empty_like(psi), np.empty_like(psi)
         self.slope = 0.0  # <residual, preconditioned residual> of the last iteration
-        self.preconditioner = _Preconditioner(gpe)
+        self.axes, self.V, self.zero = tuple(range(gpe.grid.dim)), gpe.V - gpe.V.min(), np.zeros(gpe.grid.shape)
+        self.kinetic: Any = sum(gpe.kinetic_factor(axis) for axis in self.axes)
+        self.energy = Multiplier(gpe.grid, self.axes, self.kinetic)
+        self.scaled, self.out = np.empty_like(psi), np.empty_like(psi)
 
     def inner(self, a: np.ndarray, b: np.ndarray) -> float:
         """Return Re <a, b>, with the size of a cell as weight."""
@@ -77,7 +84,7 @@ class _Descent:
             if iteration % REFRESH == 0:  # removes rounding errors of what is carried along
                 self.psi /= sqrt(self.inner(self.psi, self.psi))
                 self.apply(self.psi, self.image)
-                self.preconditioner.fit(self.psi)
+                self.fit()
             mu, norm = self.gradient()
             if norm <= tol:
                 message = "converged"
@@ -89,11 +96,26 @@ class _Descent:
                 iteration += 1
         return GroundState(self.psi, self.gpe.energy(self.psi), mu, norm, iteration, norm <= tol, message)
 
+    def fit(self) -> None:
+        """Compute a: the kinetic energy plus the sum of W ``|psi|^2`` times the size of a cell."""
+        density = np.abs(self.psi) ** 2
+        local = float(np.vdot(density, self.V + abs(self.gpe.beta) * density))
+        self.a = self.gpe.grid.cell * (self.energy.expectation(self.gpe.transforms, self.psi, self.scaled) + local)
+        self.inverse = Multiplier(self.gpe.grid, self.axes, 1 / (self.a + self.kinetic))
+
+    def preconditioned(self, r: np.ndarray) -> np.ndarray:
+        """Return the preconditioned residual `r` in a buffer, which the next call overwrites."""
+        local = (self.psi, self.V, abs(self.gpe.beta), self.a)
+        divide_by_root(r, *local, self.scaled)
+        self.inverse.apply(self.gpe.transforms, self.scaled, self.out)
+        divide_by_root(self.out, *local, self.out)
+        return self.out
+
     def gradient(self) -> tuple[float, float]:
         """Compute the residual H psi - mu psi; return mu and the norm of the residual."""
         r = self.residual
         np.copyto(r, self.image)
-        add_potential(self.psi, self.preconditioner.zero, self.gpe.beta, r)
+        add_potential(self.psi, self.zero, self.gpe.beta, r)
         mu = self.inner(self.psi, r)
         rotate(r, self.psi, 1.0, -mu)
         return mu, sqrt(self.inner(r, r))
@@ -101,7 +123,7 @@ class _Descent:
     def conjugate_direction(self) -> bool:
         """Choose the next direction: conjugate, or steepest if that does not descend; return False if neither does."""
         r, old = self.residual, self.old_residual
-        d = self.preconditioner(r, self.psi)
+        d = self.preconditioned(r)
         slope = self.inner(r, d)
         factor = max((slope - self.inner(old, d)) / self.slope, 0.0) if self.slope > 0 else 0.0
         self.slope, self.residual, self.old_residual = slope, old, r
@@ -136,38 +158,6 @@ def _least_energy(e: tuple[float, float, float, float, float]) -> float:
     t = roots[np.abs(roots.imag) <= 1e-6 * np.abs(roots)].real
     values = (e0 + t * (e1 + t * (e2 + t * (e3 + t * e4)))) / (1 + t * t) ** 2
     return float(t[np.argmin(values)]) if t.size else 0.0
-
-
-class _Preconditioner:
-    """Operator D (a - Laplace / 2)^(-1) D, D = (a + W)^(-1/2), W = V - min V + ``|beta| |psi|^2``, typical energy a."""
-
-    def __init__(self, gpe: GrossPitaevskii) -> None:
-        self._gpe = gpe
-        self._axes = tuple(range(gpe.grid.dim))
-        self._kinetic: Any = sum(gpe.kinetic_factor(axis) for axis in self._axes)
-        self._V = gpe.V - gpe.V.min()
-        self._energy = Multiplier(gpe.grid, self._axes, self._kinetic)
-        self._scaled, self._out = np.empty(gpe.grid.shape, complex), np.empty(gpe.grid.shape, complex)
-        self.zero = np.zeros(gpe.grid.shape)
-
-    def fit(self, psi: np.ndarray) -> None:
-        """Compute a from a field: its kinetic energy plus the sum of W ``|psi|^2`` times the size of a cell."""
-        gpe = self._gpe
-        density = np.abs(psi) ** 2
-        local = float(np.vdot(density, self._V + abs(gpe.beta) * density))
-        self._a = gpe.grid.cell * (self._energy.expectation(gpe.transforms, psi, self._scaled) + local)
-        self._inverse = Multiplier(gpe.grid, self._axes, 1 / (self._a + self._kinetic))
-
-    def __call__(self, r: np.ndarray, psi: np.ndarray) -> np.ndarray:
-        """Return the preconditioned residual `r` in a buffer, which the next call overwrites."""
-        local = (psi, self._V, abs(self._gpe.beta), self._a)
-        divide_by_root(r, *local, self._scaled)
-        self._inverse.apply(self._gpe.transforms, self._scaled, self._out)
-        divide_by_root(self._out, *local, self._out)
-        return self._out
-
-
-# Starts.
 
 
 def _square(gpe: GrossPitaevskii) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -83,48 +82,47 @@ class Quench:
         lines = {name: self.runs[name] for name in METHODS if name in self.runs}
         if not lines:
             return
-        columns = {name: {"t": run.t, **self.errors[name]} for name, run in lines.items()}
         out.numbers["errors"] = [
-            {"method": name, **{key: values[k] for key, values in found.items()}}
-            for name, found in columns.items()
-            for k in range(found["t"].size)
+            {"method": name, "t": t, **{key: values[k] for key, values in self.errors[name].items()}}
+            for name, run in lines.items()
+            for k, t in enumerate(run.t)
         ]
         out.rows(f"{self.stem}.csv", out.numbers["errors"])
-        reduced = {name: run.diagnostics.n_rank_reduced for name, run in lines.items()}
-        times = {name: run.wall_time for name, run in lines.items()}
-        out.numbers |= {"wall_time_s": times, "rank_reduced": reduced}
+        out.numbers["rank_reduced"] = {name: run.diagnostics.n_rank_reduced for name, run in lines.items()}
+        out.numbers["wall_time_s"] = {name: run.wall_time for name, run in lines.items()}
         out.text(f"{self.title}, RK4, h = {self.h:g}, to t = {self.t_end:g}\n{describe_machine()}")
         out.text("Largest errors, absolute; that of psi is the norm of the difference from the reference:")
         out.text("\n".join([f"{REFERENCE}, h = {self.reference_h:g}", *notes, ""]))
         head = [["wall time", "[s]"], ["evaluations", "of f"], *(["error of", x] for x in ("mass", "energy", "psi"))]
-        body = []
-        for name, run in lines.items():
-            errors = [compact(float(values.max())) for values in self.errors[name].values()]
-            body.append((name, [compact(run.wall_time, 3), str(run.nfev), *errors, str(reduced[name])]))
+        largest = {name: [float(values.max()) for values in self.errors[name].values()] for name in lines}
+        body = [
+            (name, [compact(run.wall_time, 3), str(run.nfev), *map(compact, largest[name]),
+                    str(run.diagnostics.n_rank_reduced)])
+            for name, run in lines.items()
+        ]  # fmt: skip
         out.text(f"{table([*head, ['rank', 'reduced']], body)}\n")
         if self.moved is not None:
             self._report_motion(out, self.moved)
         for name in lines:
-            for item, bound in zip(("mass", "energy"), self.kept, strict=True):
-                error = float(self.errors[name][f"{item}_error"].max())
+            for item, bound, error in zip(("mass", "energy"), self.kept, largest[name], strict=False):
                 if item in METHODS[name]:
                     checked(out, f"{name}: error of the {item} below {bound:.0e}", error, error < bound)
 
     def _report_motion(self, out: Output, moved: Motion) -> None:
         """Print where the vortices are, and check that they keep their number and turn as expected."""
-        counts, at = [len(each.charges) for each in moved.vortices], list(self.shown().values())
+        counts, at = [len(each.charges) for each in moved.vortices], self.shown()
         out.numbers |= {"vortices": counts, "turned_rad": moved.angle}
-        radii = [np.hypot(*each.positions.T).mean() if each.charges.size else np.nan for each in moved.vortices]
-        body = [
-            (name, [f"{counts[k]}", compact(radii[k], 4), f"{moved.angle[k]:+.3f}"]) for name, k in self.shown().items()
-        ]
+        body = []
+        for name, k in at.items():
+            radius = np.hypot(*moved.vortices[k].positions.T).mean() if counts[k] else np.nan
+            body.append((name, [str(counts[k]), compact(radius, 4), f"{moved.angle[k]:+.3f}"]))
         out.text("Vortices, in the rotating frame; turned: positive anticlockwise, with x to the right and y up\n")
         out.text(f"{table([['number'], ['mean radius'], ['turned [rad]']], body)}\n")
-        seen = [counts[k] for k in at]
+        seen = [counts[k] for k in at.values()]
         checked(out, "vortices in the snapshots", seen, seen[0] > 0 and len(set(seen)) == 1)
-        turned, sense = float(moved.angle[at[-1]]), f"vortices turn {SENSES[self.sense]}"
+        sense, turned = f"vortices turn {SENSES[self.sense]}", float(moved.angle[[*at.values()][-1]])
         if len(at) > 1:
-            checked(out, f"{sense}, angle at t = {moved.t[at[-1]]:g} [rad]", turned, self.sense * turned > 0)
+            checked(out, f"{sense}, angle at {[*at][-1]} [rad]", turned, self.sense * turned > 0)
         else:
             out.text(f"{'-':<6} not checked: that {sense}, because the run ends before t = {self.snapshots[1]:g}")
 
@@ -161,8 +159,8 @@ def ring(
     require_positive(t_end=t_end)
     checkpoint_options(checkpoint, resume, "ring")
     before, after = (ring_condensate(kappa) for kappa in (0.3, 0.7))
-    search = partial(states.search_ring, seed)
-    psi = states.load_state(start, before) if start else states.kept_state(out, before, checkpoint, resume, search)
+    with states.searching(out) as update:
+        psi = states.load_state(start, before) if start else states.search_ring(seed, update).state.psi
     quench = Quench(
         "ring", "Ring, kappa = 0.3 -> 0.7", after, psi, t_end, h=(2e-4, 5e-4), saved=0.02,
         snapshots=(0.0, 0.24, 0.44, 0.72, 0.8, 1.0), sense=1, kept=(1e-14, 1e-12),
@@ -211,8 +209,8 @@ def vortex_lines(
     require_positive(t_end=t_end, points=points)
     checkpoint_options(checkpoint, resume, "lines")
     before, after = (line_condensate(Omega, points) for Omega in (0.7, 0.9))
-    start = states.kept_state(out, before, checkpoint, resume, partial(states.search_saddle, points))
     with states.searching(out) as update:
+        start = states.search_saddle(points, update).state.psi
         update("lines, down from the saddle")
         lower = ground_state(before, with_noise(start, np.random.default_rng(seed)), **states.ROUGH)
     quench = Quench(

@@ -15,7 +15,7 @@ import numpy as np
 from eip_scipy.problems import Grid, GrossPitaevskii
 
 from ..output import Output, require_positive
-from ..report import UsageError, compact, describe_machine, table, write_file
+from ..report import UsageError, compact, describe_machine, table
 from . import draw
 from .ground_state import GroundState, ground_state, imprint, lowest_ring, polygon, vortex_starts, with_noise
 from .problems import harmonic_trap, line_condensate, ring_condensate
@@ -33,7 +33,7 @@ TITLES = {
     "ring": "ring: V = -0.1 r^2 + 0.075 r^4, beta = 1000, Omega = 3.5; a row of vortices around a winding",
     "lines": "lines: V = (x^2 + y^2 + z^2 / 4) / 2, beta = 400, Omega = 0.7; by lines imprinted on the start",
 }
-OTHER = "Give another file, or leave out --resume or --start."
+OTHER = "Give another file, or leave out --start."
 Update = Callable[[str], Any]
 
 
@@ -102,10 +102,7 @@ def lines(seed: int, update: Update) -> list[Found]:
 
 
 def search_saddle(points: int, update: Update) -> Found:
-    """Return the paper's state with four vortex lines, on a grid with `points` points along each axis.
-
-    It is a saddle of the energy, which the descent reaches because it keeps the square symmetry of the start.
-    """
+    """Return the paper's state with four lines, a saddle that the descent reaches as it keeps the start's symmetry."""
     update("lines, 4 imprinted without noise")
     gpe = line_condensate(points=points)
     return Found("4 without noise: a saddle", gpe, ground_state(gpe, imprint(gpe, polygon(4, LINES_RADIUS))))
@@ -190,20 +187,6 @@ def searching(out: Output) -> Iterator[Update]:
     """Show the elapsed time of a search and its subject, which the function that is yielded sets."""
     with out.bar(bar_format="{desc} [{elapsed}]") as bar:
         yield bar.set_description_str
-
-
-def kept_state(
-    out: Output, gpe: GrossPitaevskii, checkpoint: Path | None, resume: bool, search: Callable[[Update], Found]
-) -> np.ndarray:
-    """Return the initial field: to resume a run the one in the folder of its checkpoints, else that of `search`."""
-    kept = None if checkpoint is None else checkpoint / "state.npz"
-    if kept is not None and resume and kept.exists():
-        return load_state(kept, gpe)
-    with searching(out) as update:
-        found = search(update)
-    if kept is not None:
-        write_file(kept, partial(_save, found))
-    return found.state.psi
 
 
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:

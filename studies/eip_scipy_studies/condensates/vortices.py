@@ -26,10 +26,9 @@ class Vortices(NamedTuple):
 def vortices(gpe: GrossPitaevskii, psi: Any) -> Vortices:
     """Return the vortices of a field inside the condensate; in three dimensions those in the middle plane.
 
-    Places where the density is below `THRESHOLD` are outside, after cores have been filled by a grey closing. From the
-    phase differences along the edges of a cell those of the rigid rotation are subtracted, because the phase of a fast
-    rotating field may turn by more than pi between two points. The sum of the rests, reduced to (-pi, pi], plus the
-    circulation 2 Omega dx dy of the rotation, is 2 pi times the charge.
+    Places where the density is below `THRESHOLD`, after cores have been filled by a grey closing, are outside. The
+    phase differences along the edges of a cell are those beyond the rigid rotation, by which the phase may turn by more
+    than pi between two points. Their sum, plus the circulation 2 Omega dx dy of the rotation, is 2 pi times the charge.
     """
     psi = gpe.as_field(psi)
     top = float((np.abs(psi) ** 2).max())
@@ -106,17 +105,11 @@ def _wrapped(angle: Any) -> Any:
     return np.angle(np.exp(1j * angle))
 
 
-class Surface(NamedTuple):
-    """Triangles: their corners (m, 3, 3), and whether they lie inside the condensate (m,), around a vortex line."""
-
-    corners: np.ndarray
-    inside: np.ndarray
-
-
-def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
+def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the surface on which ``|psi|^2`` has a value `level`, by marching cubes (Lewiner et al. 2003).
 
-    The field, 0 at the ends of the box, is interpolated to twice as many points on each axis.
+    These are corners (m, 3, 3) of triangles, and whether they lie inside the condensate (m,), around a vortex line. The
+    field, 0 at the ends of the box, is interpolated to twice as many points on each axis.
     """
     from skimage.measure import marching_cubes
 
@@ -129,4 +122,4 @@ def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
     closed = scipy.ndimage.grey_closing(density, size=[*(2 * n + 1 for n in _core_size(gpe, top)), 1])
     filled = scipy.ndimage.gaussian_filter(closed, SMOOTH)
     around = scipy.ndimage.map_coordinates(filled, points[triangles].mean(axis=1).T, order=1)
-    return Surface((gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level)
+    return (gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level
