@@ -37,17 +37,10 @@ def scaled(t, q, params):
 
 
 @njit
-def gyration(t, x, out):
-    """B = 2 e_z."""
-    out[:] = 0.0
-    out[5] = 2.0
-
-
-@njit
 def crossed(t, x, out, params):
-    """B = e_z, E = params[0] e_y."""
+    """Write E = params[0] e_y and B = params[1] e_z."""
     out[:] = 0.0
-    out[1], out[5] = params[0], 1.0
+    out[1], out[5] = params
 
 
 @njit
@@ -74,7 +67,7 @@ def gyrated(t, omega):
         (stormer_verlet, kepler, 2 * np.pi, ORBIT, ORBIT, 4000, {}),
         (stormer_verlet, kepler, 2 * np.pi, ORBIT, ORBIT, 4000, OTHER),
         (stormer_verlet, scaled, 10.0, [1.0, 0.0], [math.cos(30), -3 * math.sin(30)], 4000, {"params": [9.0]}),
-        (boris, gyration, 5.0, Y0, gyrated(5.0, -3.0), 1000, {"mass": 2.0, "charge": -3.0}),
+        (boris, crossed, 5.0, Y0, gyrated(5.0, -3.0), 1000, {"mass": 2.0, "charge": -3.0, "params": [0.0, 2.0]}),
         (implicit_midpoint, oscillator, 10.0, [1.0, 0.0], [math.cos(10), -math.sin(10)], 100, {}),
         (implicit_midpoint, driven, 3.0, [0.0], [math.sin(6.0)], 1000, {"params": [2.0]}),
     ],
@@ -101,9 +94,9 @@ def test_closed_forms_of_steps():
     for options, form in (({}, [1 - 0.1**2 / 4, 1.0]), (OTHER, [1.0, 1 - 0.1**2 / 4])):
         y = stormer_verlet(scaled, (0.0, 100.0), [0.8, -0.6], 0.1, params=[1.0], save_every=1, **options).y
         assert np.ptp(np.array(form) @ y**2) < 1e-13
-    run = boris(gyration, (0.0, 300 * 0.3), Y0, 0.3, save_every=1)
+    run = boris(crossed, (0.0, 300 * 0.3), Y0, 0.3, params=[0.0, 2.0], save_every=1)
     np.testing.assert_allclose(np.diff(np.unwrap(np.arctan2(run.y[4], run.y[3]))), -2 * math.atan(0.3), rtol=1e-12)
-    run = boris(crossed, (0.0, 50.0), [0, 0, 0, 0.2, 0, 0.1], 0.7, params=[0.2])
+    run = boris(crossed, (0.0, 50.0), [0, 0, 0, 0.2, 0, 0.1], 0.7, params=[0.2, 1.0])
     np.testing.assert_allclose(run.y[:, -1], [10.0, 0, 5.0, 0.2, 0, 0.1], atol=1e-13)
     assert run.nfev == math.ceil(50 / 0.7)
     run = implicit_midpoint(oscillator, (0.0, 100.0), [1.0, 0.0], 0.5, save_every=1)
@@ -130,19 +123,15 @@ def test_midpoint_is_symplectic_and_reports_where_it_does_not_converge():
 
 
 @pytest.mark.parametrize(
-    ("change", "error", "words"),
+    ("change", "words"),
     [
-        ({"h": 0.0}, ValueError, "positive"),
-        ({"h": 2.0}, ValueError, "exceeds"),
-        ({"t_span": (0, np.inf)}, ValueError, "finite"),
-        ({"y0": [1.0, 0.0, 2.0]}, ValueError, "even"),
-        ({"y0": [1j, 0.0]}, TypeError, "real"),
-        ({"form": "kick"}, ValueError, "form"),
-        ({"acc": lambda t, q: 1.0}, ValueError, "acc"),
+        ({"h": 0.0}, "positive"), ({"h": 2.0}, "exceeds"), ({"t_span": (0, np.inf)}, "finite"),
+        ({"y0": [1.0, 0.0, 2.0]}, "even"), ({"y0": [1j, 0.0]}, "real"), ({"form": "kick"}, "form"),
+        ({"acc": lambda t, q: 1.0}, "acc"),
     ],
-)
-def test_wrong_arguments(change, error, words):
-    with pytest.raises(error, match=words):
+)  # fmt: skip
+def test_wrong_arguments(change, words):
+    with pytest.raises((ValueError, TypeError), match=words):
         stormer_verlet(**{"acc": lambda t, q: -q, "t_span": (0.0, 1.0), "y0": [1.0, 0.0], "h": 0.1} | change)
 
 
@@ -173,31 +162,21 @@ def test_order_two_of_fields(scheme):
     assert max(abs(y - wave.reference(t)).max() for t, y in zip(run.t, run.y.T, strict=True)) < 1e-3
 
 
-def kinetic_matrix(grid):
-    """Return -Laplace / 2 as a dense matrix, with NumPy's transforms."""
-    total = 0.0
-    for axis, n in enumerate(grid.shape):
-        k = 2 * np.pi * np.fft.fftfreq(n, grid.spacing[axis])
-        ones = [np.eye(m) for m in grid.shape]
-        ones[axis] = np.fft.ifft(0.5 * k[:, None] ** 2 * np.fft.fft(np.eye(n), axis=0), axis=0)
-        total = total + np.kron(*ones)
-    return total
-
-
 def test_steps_solve_the_papers_equations():
     """Crank-Nicolson by SciPy's root finder; the second step of the linearly implicit scheme is a dense system."""
     gpe, psi0 = modulated((6, 4), beta=2.0)
-    K, h = kinetic_matrix(gpe.grid), 0.1
+    h, one, free = 0.1, np.eye(psi0.size), GrossPitaevskii(gpe.grid, gpe.V)
+    L = np.array([1j * free.fun(0.0, row) for row in one.astype(complex)]).T  # K + V
 
     def residual(x):
         new = x.view(complex)
         mean, density = 0.5 * (new + psi0), 0.5 * gpe.beta * (abs(new) ** 2 + abs(psi0) ** 2)
-        return (1j * (new - psi0) / h - K @ mean - (gpe.V.ravel() + density) * mean).view(float)
+        return (1j * (new - psi0) / h - L @ mean - density * mean).view(float)
 
     psi1 = root(residual, psi0.view(float).copy(), tol=1e-13).x.view(complex)
     np.testing.assert_allclose(crank_nicolson(gpe, (0, h), psi0, h).y[:, -1], psi1, rtol=0, atol=1e-11)
     run = linearly_implicit(gpe, (0, 2 * h), psi0, h, save_every=1)
-    A, one = 1j * h * (K + np.diag(gpe.V.ravel() + gpe.beta * abs(run.y[:, 1]) ** 2)), np.eye(psi0.size)
+    A = 1j * h * (L + np.diag(gpe.beta * abs(run.y[:, 1]) ** 2))
     np.testing.assert_allclose(run.y[:, 2], np.linalg.solve(one + A, (one - A) @ psi0), rtol=0, atol=1e-11)
 
 

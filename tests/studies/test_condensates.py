@@ -13,7 +13,6 @@ from eip_scipy_studies.condensates.ground_state import (
     _least_energy,
     ground_state,
     imprint,
-    lowest_ring,
     polygon,
     ring_start,
     thomas_fermi,
@@ -68,19 +67,6 @@ def test_without_rotation_it_is_the_radial_solution():
     assert gpe.mass(state.psi) == pytest.approx(1, abs=1e-14)
     residual = 1j * gpe.fun(0.0, state.psi) - state.mu * state.psi
     assert np.sqrt(gpe.mass(residual)) == pytest.approx(state.residual, rel=1e-3)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_small_ring_search_ends_below_all_its_neighbours():
-    gpe = GrossPitaevskii(Grid((96, 96), -6, 6), quartic_trap(1.2, 0.6, 1, 1), Omega=2.5, beta=300)
-    tried = {}
-    state = lowest_ring(gpe, tol=1e-4, report=lambda n, w, energy: tried.update({(n, w): energy}))
-    assert state.converged
-    n, w = min(tried, key=tried.get)
-    assert {(n + 1, w), (n - 1, w), (n, w + 1), (n, w - 1)} <= tried.keys()
-    assert state.energy <= tried[n, w] + 1e-9
-    assert len(vortices(gpe, state.psi).charges) == n
 
 
 def test_line_search_and_thomas_fermi_density():

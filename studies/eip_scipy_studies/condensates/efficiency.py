@@ -23,7 +23,6 @@ from eip_scipy.problems import FieldProblem
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..output import Output
 from ..report import describe_machine, table
-from . import draw
 from .problems import plane_wave
 from .splitting import Splitting
 
@@ -34,17 +33,6 @@ FIT_BETWEEN = 1e-11, 1e-2  # smaller errors are round-off, larger ones are not i
 FITTED = 3  # number of the finest steps used: longer steps of splittings are not in the asymptotic range
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 KEPT = ("mass", "energy")
-ORDERS = {
-    "RK4": 4,
-    "EIP-M": 4,
-    "EIP-E": 4,
-    "EIP-ME": 4,
-    "CN": 2,
-    "LIC": 2,
-    "SAV/CN": 2,
-    "Strang": 2,
-    "splitting4-EIP": 4,
-}
 
 
 def ours(base: Callable[..., Any] | None, *names: str) -> Callable[..., Any]:
@@ -70,31 +58,29 @@ def remark(run: Any) -> str:
     return f"rank 1 in {made.n_rank_reduced} of {made.n_projections} projections" if made.n_rank_reduced else ""
 
 
-# Methods with their steps; those of RK4 depend on its limit of stability.
-METHODS: dict[str, tuple[Callable[..., Any], Sequence[float]]] = {
-    "RK4": (ours(None), ()),
-    "EIP-M": (ours(None, "mass"), ()),
-    "EIP-E": (ours(None, "energy"), ()),
-    "EIP-ME": (ours(None, *KEPT), ()),
-    "CN": (implicit(crank_nicolson), LONG),
-    "LIC": (implicit(linearly_implicit), LONG),
-    "SAV/CN": (implicit(sav_crank_nicolson), LONG),
-    "Strang": (ours(partial(Splitting, scheme="strang")), LONG),
-    "splitting4-EIP": (ours(Splitting, *KEPT), FOURTH),
+# Methods, their steps (those of RK4 depend on its limit of stability), and their orders.
+METHODS: dict[str, tuple[Callable[..., Any], Sequence[float], int]] = {
+    "RK4": (ours(None), (), 4),
+    "EIP-M": (ours(None, "mass"), (), 4),
+    "EIP-E": (ours(None, "energy"), (), 4),
+    "EIP-ME": (ours(None, *KEPT), (), 4),
+    "CN": (implicit(crank_nicolson), LONG, 2),
+    "LIC": (implicit(linearly_implicit), LONG, 2),
+    "SAV/CN": (implicit(sav_crank_nicolson), LONG, 2),
+    "Strang": (ours(partial(Splitting, scheme="strang")), LONG, 2),
+    "splitting4-EIP": (ours(Splitting, *KEPT), FOURTH, 4),
 }
 
 
 class Trial:
     """A wave with its exact state (n,) at the end, and the rows of its runs by (name of a method, h)."""
 
-    names = tuple(METHODS)
-
     def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:
         self.problem, self.exact = problem, exact
         limit = problem.equation.largest_step(problem.y0)
         stable = [1 / ceil(1 / (share * limit)) for share in SHARES]
         self.rows: dict[tuple[str, float], dict[str, Any]] = {
-            (name, h): {"method": name, "h": h} for name, (_, steps) in METHODS.items() for h in steps or stable
+            (name, h): {"method": name, "h": h} for name, (_, steps, _) in METHODS.items() for h in steps or stable
         }
         self.single = dict.fromkeys(METHODS, np.inf)  # seconds of a single step, including set-up
 
@@ -169,11 +155,23 @@ def efficiency(out: Output, points: int = 64, repeats: int = 3) -> None:
         body = [(name, [f"{x:.3g}" if np.isfinite(x) else "-" for x in own]) for name, own in numbers.items()]
         out.text(f"\n{wave}: slope in h, and processor seconds to reach an error (max)\n")
         out.text(table([["slope"], *([f"{level:.0e}"] for level in LEVELS)], body))
-        for name, order in ORDERS.items():
+        for name, (*_, order) in METHODS.items():
             slope = trial.slope(name)
             if np.isfinite(slope):
                 out.check(f"{wave}, slope of {name}: {slope:.3g}, known {order}", abs(slope - order) <= 0.1, ours=slope)
     left = max(float(found["modulated wave"].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
     out.check(f"modulated wave, mass and energy of EIP-ME: {left:.3g}, at most 1e-12", left <= 1e-12, ours=left)
-    title = f"NLS equation, {points} x {points} points: accuracy and cost"
-    draw(out, "fig-efficiency.png", "efficiency_figure", found, ("CN", "EIP-ME"), title)
+    for key, cost in (("seconds", "processor time [s]"), ("h", "step h")):
+        title = f"NLS equation, {points} x {points} points"
+        out.figure(f"fig-efficiency{'-steps' * (key == 'h')}.png", partial(draw, found, key, cost, title))
+
+
+def draw(found: dict[str, Trial], key: str, cost: str, title: str) -> Any:
+    """Draw the errors of each wave against one of the columns."""
+    from ..plot import cost_figure
+
+    curves = {
+        wave: {n: (trial.column(n, key), trial.column(n, "error_max")) for n in METHODS}
+        for wave, trial in found.items()
+    }
+    return cost_figure([*curves.items()], cost=cost, error=r"max $|\delta\psi|$ at t = 1", title=title)

@@ -1,4 +1,4 @@
-"""Figures of condensates: densities with vortices, surfaces in space, errors in time, and error against cost."""
+"""Figures of condensates: densities with vortices, surfaces in space, and errors in time."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from eip_scipy.problems import Grid
 
-from ..plot import blank_figure, envelope, legend_below, log_x
+from ..plot import blank_figure, envelope, legend_below
 from .vortices import density_surface, vortices
 
 if TYPE_CHECKING:
-    from .efficiency import Trial
     from .quench import Quench
     from .states import Found
 
@@ -72,7 +71,7 @@ def states_figure(found: Sequence[Found], title: str) -> Figure:
         psi = min(found, key=lambda item: item.state.energy).state.psi
         side = cropped(np.abs(psi[psi.shape[0] // 2]) ** 2, grid, (1, 2))
         shown["the lowest, x = 0"] = Panel(*side, "yz", np.zeros((0, 2)))
-    return fields_figure(shown, title, columns=3 if len(shown) <= 6 else 4)
+    return fields_figure(shown, title)
 
 
 def moving_panels(quench: Quench, densities: np.ndarray, half: float | None = None) -> list[Panel]:
@@ -91,7 +90,7 @@ def snapshots_figure(quench: Quench, densities: np.ndarray, half: float | None) 
     """Draw densities in a plane at the snapshots."""
     panels = moving_panels(quench, densities, half)
     shown = {name: panels[k] for name, k in quench.shown().items()}
-    return fields_figure(shown, f"{quench.title}: density and vortices, EIP-ME", shared=True)
+    return fields_figure(shown, f"{quench.title}: density and vortices, EIP-ME")
 
 
 def movie(quench: Quench, densities: np.ndarray) -> Callable[[Path], None]:
@@ -110,27 +109,22 @@ def movie(quench: Quench, densities: np.ndarray) -> Callable[[Path], None]:
     return lambda path: film.save(path, writer=writer)
 
 
-def fields_figure(panels: Mapping[str, Panel], title: str, *, columns: int = 3, shared: bool = False) -> Figure:
-    """Draw densities by title with their vortices; all have one colour scale if it is `shared`."""
-    columns = min(columns, len(panels))
+def fields_figure(panels: Mapping[str, Panel], title: str) -> Figure:
+    """Draw densities by title with their vortices, on one colour scale."""
+    columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
-    figure = blank_figure(4.1 * columns if columns > 1 else 5.6, 3.9 * rows + 0.4, title)
-    if columns == 1:
-        figure.suptitle(typeset(title), fontsize="medium")
+    figure = blank_figure(max(4.1 * columns, 6.5), 3.9 * rows + 0.4, title)
     axes = figure.subplots(rows, columns, squeeze=False)
-    top = max(float(np.max(panel.density)) for panel in panels.values()) if shared else None
+    top = max(float(np.max(panel.density)) for panel in panels.values())
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)
     for axis, (name, panel) in zip(axes.flat, panels.items(), strict=False):
         image = _draw(axis, name, panel, top)
-        if not shared:
-            figure.colorbar(image, cax=axis.inset_axes((1.03, 0.0, 0.05, 1.0)), label=DENSITY)
-    if shared:
-        figure.colorbar(image, ax=list(axes.flat), shrink=0.8, pad=0.02, label=DENSITY)
+    figure.colorbar(image, ax=list(axes.flat), shrink=0.8, pad=0.02, label=DENSITY)
     return figure
 
 
-def _draw(axis: Any, title: str, panel: Panel, top: float | None) -> Any:
+def _draw(axis: Any, title: str, panel: Panel, top: float) -> Any:
     """Draw one density and its vortices, with colours up to `top`, and return the image, for a colour scale."""
     density, ends, names, where, followed = panel
     image = axis.imshow(
@@ -191,30 +185,4 @@ def errors_figure(quench: Quench) -> Figure:
             envelope(axis, quench.runs[name].t, quench.errors[name][f"{item}_error"] / sizes.get(item, 1.0), style)
         log_errors(axis, "t", label)
     legend_below(figure, axes[0])
-    return figure
-
-
-def efficiency_figure(found: Mapping[str, Trial], sloped: Sequence[str], title: str) -> Figure:
-    """Draw errors of each wave against step and against time; dotted lines have the slopes of the methods `sloped`."""
-    figure = blank_figure(10.6, 4.2 * len(found) + 1.1, title)
-    axes = figure.subplots(len(found), 2, sharex="col", sharey="row")
-    for line, (wave, trial) in zip(axes, found.items(), strict=True):
-        for axis, cost in zip(line, ("h", "seconds"), strict=True):
-            for name, style in method_styles(trial.names).items():
-                x, error = trial.column(name, cost), trial.column(name, "error_max")
-                axis.plot(x[error > 0], error[error > 0], ms=5, lw=1.2, **style)
-            axis.set_title(wave, fontsize="medium")
-    for line, trial in zip(axes, found.values(), strict=True):
-        for axis, cost, label in zip(
-            line, ("step h", "processor time [s]"), ("max $|\\delta\\psi|$ at t = 1", ""), strict=True
-        ):
-            log_x(axis)
-            log_errors(axis, cost, label)
-        for name in sloped:  # a line a little below the method's curve
-            h, slope = trial.column(name, "h"), trial.slope(name)
-            ends = np.array([h.min(), h.max()])
-            below = 0.25 * trial.column(name, "error_max")[np.argmax(h)] * (ends / ends[1]) ** slope
-            line[0].plot(ends, below, color="0.4", lw=1.0, ls=":")
-            line[0].annotate(f"slope {slope:.2f}", (ends[0], below[0]), va="top", fontsize="small")
-    legend_below(figure, axes[0, 0])
     return figure

@@ -133,6 +133,13 @@ def checked(out: Output, what: str, value: Any, passed: bool) -> None:
     out.check(f"{what}: {shown}", passed, what=what, value=value)
 
 
+def check_options(t_end: float, least: float, checkpoint: Path | None, resume: bool) -> None:
+    """Check options of both commands before the search for the start."""
+    if not least <= t_end < np.inf:
+        raise UsageError(f"--t-end: expected at least {least:g}, the reference's step, got {t_end:g}")
+    checkpoint_options(checkpoint, resume, "runs")
+
+
 def ring(
     out: Output, *, start: Path | None = None, t_end: float = 1.0, movie: bool = False, seed: int = 0,
     checkpoint: Path | None = None, resume: bool = False,
@@ -156,11 +163,10 @@ def ring(
     resume : bool
         continue from the checkpoints in the folder of --checkpoint
     """
-    require_positive(t_end=t_end)
-    checkpoint_options(checkpoint, resume, "ring")
+    check_options(t_end, 5e-4, checkpoint, resume)
     before, after = (ring_condensate(kappa) for kappa in (0.3, 0.7))
-    with states.searching(out) as update:
-        psi = states.load_state(start, before) if start else states.search_ring(seed, update).state.psi
+    with states.searching(out) as bar:
+        psi = states.load_state(start, before) if start else states.search_ring(seed, bar.set_description_str).state.psi
     quench = Quench(
         "ring", "Ring, kappa = 0.3 -> 0.7", after, psi, t_end, h=(2e-4, 5e-4), saved=0.02,
         snapshots=(0.0, 0.24, 0.44, 0.72, 0.8, 1.0), sense=1, kept=(1e-14, 1e-12),
@@ -170,10 +176,6 @@ def ring(
 
 def run_ring(out: Output, quench: Quench, movie: bool, checkpoint: Path | None, resume: bool) -> None:
     """Run a condensate in two dimensions, and draw its density at the snapshots and as a movie."""
-    if quench.t_end < quench.reference_h:
-        raise UsageError(
-            f"--t-end: expected at least the reference's step, {quench.reference_h:g}, got {quench.t_end:g}"
-        )
     quench.run(out, checkpoint, resume)
     quench.report(out)
     if not out.interrupted:
@@ -206,12 +208,12 @@ def vortex_lines(
     resume : bool
         continue from the checkpoints in the folder of --checkpoint
     """
-    require_positive(t_end=t_end, points=points)
-    checkpoint_options(checkpoint, resume, "lines")
+    require_positive(points=points)
+    check_options(t_end, 1e-2, checkpoint, resume)
     before, after = (line_condensate(Omega, points) for Omega in (0.7, 0.9))
-    with states.searching(out) as update:
-        start = states.search_saddle(points, update).state.psi
-        update("lines, down from the saddle")
+    with states.searching(out) as bar:
+        start = states.search_saddle(points, bar.set_description_str).state.psi
+        bar.set_description_str("lines, down from the saddle")
         lower = ground_state(before, with_noise(start, np.random.default_rng(seed)), **states.ROUGH)
     quench = Quench(
         "vortex-lines", "Vortex lines, Omega = 0.7 -> 0.9", after, start, t_end, h=(5e-3, 1e-2),

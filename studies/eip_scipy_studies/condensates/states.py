@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -57,13 +56,6 @@ class Found:
         known = {"Omega": gpe.Omega, "beta": gpe.beta, "energy": state.energy, "published": self.published}
         found = {name: getattr(state, name) for name in ("mu", "residual", "iterations", "converged")}
         return {"scene": scene, "start": self.label, **known, **found, "vortices": self.count}
-
-    def cells(self) -> list[str]:
-        """Return the cells of the table."""
-        state, energy = self.state, self.state.energy
-        known = [] if self.published is None else [f"{self.published:.7f}", f"{energy - self.published:+.1e}"]
-        found = [f"{energy:.8f}", f"{state.mu:.8f}", compact(state.residual), str(state.iterations), str(self.count)]
-        return [*found, *known]
 
 
 def trap(starts: int, seed: int, update: Update, points: int = 128) -> list[Found]:
@@ -129,8 +121,8 @@ def ground_states(
         "ring": lambda update: [search_ring(seed, update)],
         "lines": partial(lines, seed),
     }
-    with searching(out) as update:
-        found = {str(name): searches[name](update) for name in dict.fromkeys(scene)}
+    with searching(out) as bar:
+        found = {str(name): searches[name](bar.set_description_str) for name in dict.fromkeys(scene)}
     report(out, found, starts)
 
 
@@ -140,11 +132,15 @@ def report(out: Output, found: Mapping[str, list[Found]], starts: int) -> None:
     out.rows("ground-states.csv", out.numbers["states"])
     out.text("Ground states of the rotating Gross-Pitaevskii equation")
     out.text(f"{describe_machine()}; residual: norm of H psi - mu psi.")
-    head, known = [["E"], ["mu"], ["residual"], ["iterations"], ["vortices"]], [["published"], ["difference"]]
+    head = [["E"], ["mu"], ["residual"], ["iterations"], ["vortices"], ["published"], ["difference"]]
     for name, items in found.items():
-        size = " x ".join(map(str, items[0].equation.grid.shape))
-        made = table([*head, *(known if name == "trap" else [])], [(item.label, item.cells()) for item in items])
-        out.text(f"\n{TITLES[name].format(starts=starts)}\n{size} points\n\n{made}")
+        size, body = " x ".join(map(str, items[0].equation.grid.shape)), []
+        for item in items:
+            state, known = item.state, item.published
+            cells = [f"{state.energy:.8f}", f"{state.mu:.8f}", compact(state.residual), f"{state.iterations}"]
+            compared = ["-", "-"] if known is None else [f"{known:.7f}", f"{state.energy - known:+.1e}"]
+            body.append((item.label, [*cells, f"{item.count}", *compared]))
+        out.text(f"\n{TITLES[name].format(starts=starts)}\n{size} points\n\n{table(head, body)}")
         out.text("\n".join(f"  {item.label}: {item.state.message}" for item in items if not item.state.converged))
     for text, value, ours, matched in checks(found):
         out.check(f"{text} {value:.10g}, ours {ours:.10g}", matched, known=value, ours=ours)
@@ -182,11 +178,9 @@ def _content(gpe: GrossPitaevskii) -> dict[str, Any]:
     return {"lower": gpe.grid.lower, "upper": gpe.grid.upper, "Omega": gpe.Omega, "beta": gpe.beta, "V": gpe.V}
 
 
-@contextmanager
-def searching(out: Output) -> Iterator[Update]:
-    """Show the elapsed time of a search and its subject, which the function that is yielded sets."""
-    with out.bar(bar_format="{desc} [{elapsed}]") as bar:
-        yield bar.set_description_str
+def searching(out: Output) -> Any:
+    """Make a bar that shows the elapsed time of a search and, by its `set_description_str`, the subject."""
+    return out.bar(bar_format="{desc} [{elapsed}]")
 
 
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
