@@ -75,7 +75,7 @@ def test_line_search_and_thomas_fermi_density():
     for e in np.random.default_rng(3).standard_normal((20, 5)):
         values, least = (
             sum(a * np.cos(x) ** (4 - k) * np.sin(x) ** k for k, a in enumerate(e))
-            for x in (angles, np.arctan(_least_energy(tuple(e))))
+            for x in (angles, np.arctan(_least_energy(*e)))
         )
         assert least <= values.min() + 1e-12
     gpe = trap(points=256)

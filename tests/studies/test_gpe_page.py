@@ -1,6 +1,7 @@
-"""Numbers of the page on condensates, computed again: some five minutes on an idle machine.
+"""Numbers of the page on condensates, computed again: some eight minutes on an idle machine.
 
-Not repeated are the ring to t = 10 and the vortex lines to t = 20, which run to t = 1 here, and times.
+The ring to t = 10 and the vortex lines to t = 20 take longer: they run to t = 1 and t = 0.4 here, and times are not
+checked.
 """
 
 import csv
@@ -58,13 +59,13 @@ def test_ring(ground, tmp_path):
     for name, (_, *cells) in printed_tables(PAGE)[RING].items():
         for key, cell in zip(("mass_error", "energy_error", "field_error"), cells, strict=True):
             assert_printed(cell, max(row[key] for row in errors if row["method"] == name), round_off=1e-12)
-    assert out.numbers["vortices"] == [38] * 51
+    assert out.numbers["vortices"][0] == 38  # and in all snapshots, by the command's check
     assert f"by {out.numbers['turned_rad'][-1]:.2f} rad to t = 1" in TEXT
 
 
 def test_vortex_lines(tmp_path):
-    """To t = 1 the energies of the two states, the four lines, their sense and angle are checked by the command."""
-    assert main(["gpe", "vortex-lines", "--t-end", "1", "--out", str(tmp_path), "--quiet"]) == 0
+    """To t = 0.4 the energies of the two states, the four lines, their sense and angle are checked by the command."""
+    assert main(["gpe", "vortex-lines", "--t-end", "0.4", "--out", str(tmp_path), "--quiet"]) == 0
     with open(tmp_path / "vortex-lines.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     for name, (_, _, _, whole) in printed_tables(PAGE)[LINES].items():

@@ -23,6 +23,7 @@ from eip_scipy.problems import FieldProblem
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..output import Output
 from ..report import describe_machine, table
+from . import draw
 from .problems import plane_wave
 from .splitting import Splitting
 
@@ -48,14 +49,6 @@ def ours(base: Callable[..., Any] | None, *names: str) -> Callable[..., Any]:
 def implicit(scheme: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that runs one of the paper's implicit schemes."""
     return lambda problem, h, t_end: scheme(problem.equation, (0.0, t_end), problem.y0, h)
-
-
-def remark(run: Any) -> str:
-    """Return how many projections had rank 1, or why an implicit scheme failed."""
-    made = getattr(run, "diagnostics", None)
-    if made is None:
-        return "" if run.message == "completed" else run.message
-    return f"rank 1 in {made.n_rank_reduced} of {made.n_projections} projections" if made.n_rank_reduced else ""
 
 
 # Methods, their steps (those of RK4 depend on its limit of stability), and their orders.
@@ -92,10 +85,11 @@ class Trial:
         run = METHODS[name][0](self.problem, h, 1.0)
         seconds, row = time.process_time() - between, self.rows[name, h]
         self.single[name] = min(self.single[name], between - begin)
-        gpe, (start, end) = self.problem.equation, run.y.T
+        gpe, (start, end), made = self.problem.equation, run.y.T, getattr(run, "diagnostics", None)
+        reduced = f"rank 1 in {made.n_rank_reduced} of {made.n_projections} projections" if made else run.message
         row |= {
             "pairs": run.nfev,
-            "remark": remark(run),
+            "remark": "" if reduced.startswith(("rank 1 in 0", "completed")) else reduced,
             "error_max": float(np.abs(end - self.exact).max()),
             "error_L2": float(np.sqrt(gpe.mass(end - self.exact))),
             "error_mass": abs(gpe.mass(end) / gpe.mass(start) - 1),
@@ -161,17 +155,5 @@ def efficiency(out: Output, points: int = 64, repeats: int = 3) -> None:
                 out.check(f"{wave}, slope of {name}: {slope:.3g}, known {order}", abs(slope - order) <= 0.1, ours=slope)
     left = max(float(found["modulated wave"].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
     out.check(f"modulated wave, mass and energy of EIP-ME: {left:.3g}, at most 1e-12", left <= 1e-12, ours=left)
-    for key, cost in (("seconds", "processor time [s]"), ("h", "step h")):
-        title = f"NLS equation, {points} x {points} points"
-        out.figure(f"fig-efficiency{'-steps' * (key == 'h')}.png", partial(draw, found, key, cost, title))
-
-
-def draw(found: dict[str, Trial], key: str, cost: str, title: str) -> Any:
-    """Draw the errors of each wave against one of the columns."""
-    from ..plot import cost_figure
-
-    curves = {
-        wave: {n: (trial.column(n, key), trial.column(n, "error_max")) for n in METHODS}
-        for wave, trial in found.items()
-    }
-    return cost_figure([*curves.items()], cost=cost, error=r"max $|\delta\psi|$ at t = 1", title=title)
+    for file, key, cost in (("", "seconds", "processor time [s]"), ("-steps", "h", "step h")):
+        draw(out, f"fig-efficiency{file}.png", "efficiency_figure", found, key, cost)

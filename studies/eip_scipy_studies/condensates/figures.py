@@ -1,4 +1,4 @@
-"""Figures of condensates: densities with vortices, surfaces in space, and errors in time."""
+"""Figures of condensates: densities with vortices, surfaces in space, errors in time, error against cost."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from eip_scipy.problems import Grid
 
-from ..plot import blank_figure, envelope, legend_below
+from ..plot import blank_figure, cost_figure, envelope, legend_below
 from .vortices import density_surface, vortices
 
 if TYPE_CHECKING:
+    from .efficiency import Trial
     from .quench import Quench
     from .states import Found
 
@@ -30,47 +31,39 @@ DENSITY = r"density $|\psi|^2$"
 VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the margin around it
 ROOM, VIEW = ((-4, 4), (-4, 4), (-6, 6)), (28.0, -62.0)  # ends of x, y and z, and view point of surfaces [degrees]
 LEVEL, VEIL = 1e-3, 0.13  # density on the paper's surfaces, and opacity of their outside
-FRAMES_PER_SECOND = 8
 
 
 class Panel(NamedTuple):
-    """A density in a plane, its ends along both axes, their names, positions to mark, and the index of one of them."""
+    """A density in a plane, its ends along x and y, positions to mark, and the index of one of them."""
 
     density: np.ndarray
     ends: tuple[float, float, float, float]
-    axes: str
     vortices: np.ndarray
     followed: int | None = None
 
 
-def cropped(
-    density: np.ndarray, grid: Grid, axes: tuple[int, int] = (0, 1), half: float | None = None
-) -> tuple[Any, Any]:
-    """Return the middle part of a density in the plane of two axes, to `half` or its visible end, and its ends."""
+def cropped(density: np.ndarray, grid: Grid, half: float | None = None) -> tuple[Any, Any]:
+    """Return the middle part of a density in the plane of x and y, to `half` or its visible end, and its ends."""
     if half is None:
         seen = (np.any(density > VISIBLE * density.max(), axis=1 - k) for k in (0, 1))
-        half = MARGIN * max(float(np.abs(grid.points(a)[there]).max()) for a, there in zip(axes, seen, strict=True))
-    keep = [np.flatnonzero(np.abs(grid.points(axis)) <= half) for axis in axes]
+        half = MARGIN * max(float(np.abs(grid.points(axis)[there]).max()) for axis, there in enumerate(seen))
+    keep = [np.flatnonzero(np.abs(grid.points(axis)) <= half) for axis in (0, 1)]
     ends = tuple(
         float(grid.points(axis)[k[edge]] + shift * grid.spacing[axis])
-        for axis, k in zip(axes, keep, strict=True)
+        for axis, k in enumerate(keep)
         for edge, shift in ((0, -0.5), (-1, 0.5))
     )
     return density[np.ix_(*keep)], ends
 
 
 def states_figure(found: Sequence[Found], title: str) -> Figure:
-    """Draw densities; those in three dimensions are shown in the plane z = 0, the lowest state also in x = 0."""
+    """Draw densities; those in three dimensions are shown in the plane z = 0."""
     shown, volume = {}, found[0].equation.grid.dim == 3
     for item in found:
         grid, density = item.equation.grid, np.abs(item.state.psi) ** 2
         plane = density[:, :, grid.shape[2] // 2] if volume else density
         name = f"{item.label}\nE = {item.state.energy:.6f}, {'lines' if volume else 'vortices'}: {item.count}"
-        shown[name] = Panel(*cropped(plane, grid), "xy", vortices(item.equation, item.state.psi).positions)
-    if volume:
-        psi = min(found, key=lambda item: item.state.energy).state.psi
-        side = cropped(np.abs(psi[psi.shape[0] // 2]) ** 2, grid, (1, 2))
-        shown["the lowest, x = 0"] = Panel(*side, "yz", np.zeros((0, 2)))
+        shown[name] = Panel(*cropped(plane, grid), vortices(item.equation, item.state.psi).positions)
     return fields_figure(shown, title)
 
 
@@ -81,7 +74,7 @@ def moving_panels(quench: Quench, densities: np.ndarray, half: float | None = No
     if half is None:
         half = cropped(densities.max(axis=0), grid)[1][1] - 0.5 * float(grid.spacing[0]) + 1e-9
     return [
-        Panel(*cropped(density, grid, half=half), "xy", moved.vortices[k].positions, moved.followed(k))
+        Panel(*cropped(density, grid, half), moved.vortices[k].positions, moved.followed(k))
         for k, density in enumerate(densities)
     ]
 
@@ -105,7 +98,7 @@ def movie(quench: Quench, densities: np.ndarray) -> Callable[[Path], None]:
         return _draw(axis, f"t = {times[k]:.2f}", panels[k], top)
 
     figure.colorbar(frame(0), ax=axis, shrink=0.84, pad=0.02, label=DENSITY)
-    film, writer = FuncAnimation(figure, frame, frames=len(panels)), PillowWriter(fps=FRAMES_PER_SECOND)
+    film, writer = FuncAnimation(figure, frame, frames=len(panels)), PillowWriter(fps=8)
     return lambda path: film.save(path, writer=writer)
 
 
@@ -126,7 +119,7 @@ def fields_figure(panels: Mapping[str, Panel], title: str) -> Figure:
 
 def _draw(axis: Any, title: str, panel: Panel, top: float) -> Any:
     """Draw one density and its vortices, with colours up to `top`, and return the image, for a colour scale."""
-    density, ends, names, where, followed = panel
+    density, ends, where, followed = panel
     image = axis.imshow(
         density.T, origin="lower", extent=ends, cmap="viridis", vmin=0.0, vmax=top, interpolation="bilinear"
     )
@@ -135,7 +128,7 @@ def _draw(axis: Any, title: str, panel: Panel, top: float) -> Any:
     if followed is not None:
         axis.plot(*where[followed], ls="", marker="o", mfc=PALETTE[2], mec="white", mew=0.9, ms=7)
     axis.set_title(typeset(title), fontsize="medium")
-    axis.set(xlabel=names[0], ylabel=names[1])
+    axis.set(xlabel="x", ylabel="y")
     for side in (axis.xaxis, axis.yaxis):
         side.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
     return image
@@ -186,3 +179,12 @@ def errors_figure(quench: Quench) -> Figure:
         log_errors(axis, "t", label)
     legend_below(figure, axes[0])
     return figure
+
+
+def efficiency_figure(found: Mapping[str, Trial], key: str, cost: str) -> Figure:
+    """Draw the errors of each wave against one of the columns."""
+    panels = [
+        (wave, {name: (trial.column(name, key), trial.column(name, "error_max")) for name in trial.single})
+        for wave, trial in found.items()
+    ]
+    return cost_figure(panels, cost=cost, error=r"max $|\delta\psi|$ at t = 1", title="NLS equation: accuracy and cost")

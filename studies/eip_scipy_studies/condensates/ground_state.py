@@ -143,7 +143,7 @@ class _Descent:
         a, b = self.inner(self.psi, self.image), self.inner(self.p, self.image) / norm
         c = self.inner(self.p, self.p_image) / norm**2
         slope = 2 * self.inner(r, self.p) / norm
-        tangent = _least_energy((a + nn, slope, a + c + 2 * nq + 4 * mm, 2 * b + 4 * mq, c + qq))
+        tangent = _least_energy(a + nn, slope, a + c + 2 * nq + 4 * mm, 2 * b + 4 * mq, c + qq)
         cosine = 1 / hypot(1.0, tangent)
         sine = tangent * cosine / norm
         rotate(self.psi, self.p, cosine, sine)
@@ -151,9 +151,8 @@ class _Descent:
         return tangent != 0.0
 
 
-def _least_energy(e: tuple[float, float, float, float, float]) -> float:
+def _least_energy(e0: float, e1: float, e2: float, e3: float, e4: float) -> float:
     """Return t = tan(a) for the angle a at which sum_k e_k cos(a)^(4 - k) sin(a)^k is smallest; e_1 < 0."""
-    e0, e1, e2, e3, e4 = e
     roots = np.roots([-e3, 4 * e4 - 2 * e2, 3 * (e3 - e1), 2 * e2 - 4 * e0, e1])
     t = roots[np.abs(roots.imag) <= 1e-6 * np.abs(roots)].real
     values = (e0 + t * (e1 + t * (e2 + t * (e3 + t * e4)))) / (1 + t * t) ** 2
@@ -217,10 +216,7 @@ def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -
 
 
 def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[np.ndarray]:
-    """Yield fields with triangular lattices of vortices, turned, shifted and stretched at random, with some noise.
-
-    The lattices have 0.6 to 1.2 times as many vortices as a condensate that turns as a rigid body.
-    """
+    """Yield fields with triangular lattices of 0.6 to 1.2 times a rigid body's vortices, at random, with some noise."""
     rng = np.random.default_rng(seed)
     density = thomas_fermi(gpe)
     for _ in range(count):
@@ -242,8 +238,8 @@ def _lattice(gpe: GrossPitaevskii, density: np.ndarray, rng: np.random.Generator
 
 def lowest_ring(
     gpe: GrossPitaevskii, *, tol: float = 1e-8, seed: int = 0, report: Callable[[int, int, float], Any]
-) -> GroundState:
-    """Search for the lowest state of a condensate in two dimensions with a hole, and one row of vortices around it.
+) -> tuple[GroundState, tuple[int, int]]:
+    """Search for the lowest state of a two-dimensional condensate with a row of vortices around a hole, and its pair.
 
     No descent leads from a state to one with another winding of the phase around the hole. Therefore short searches are
     made from starts with pairs (count of vortices, winding), and ``report(count, winding, energy)`` is called for each:
@@ -267,4 +263,4 @@ def lowest_ring(
         here = best
         best = min([here, *((here[0] + a, here[1] + b) for a, b in NEIGHBOURS)], key=energy)
     start = with_noise(found[best].psi, np.random.default_rng(seed), BREAK_SYMMETRY)
-    return ground_state(gpe, start, tol=tol)
+    return ground_state(gpe, start, tol=tol), best

@@ -144,9 +144,7 @@ def ring(
     out: Output, *, start: Path | None = None, t_end: float = 1.0, movie: bool = False, seed: int = 0,
     checkpoint: Path | None = None, resume: bool = False,
 ) -> None:  # fmt: skip
-    """Run the paper's ring of vortices after its trap is tightened.
-
-    The ring contracts, keeps its angular momentum, and so turns faster than the rotating frame.
+    """Run the paper's ring of vortices after its trap is tightened: it contracts, and turns faster than the frame.
 
     Parameters
     ----------
@@ -190,10 +188,7 @@ def vortex_lines(
     out: Output, *, t_end: float = 20.0, points: int = states.LINE_POINTS, seed: int = 0,
     checkpoint: Path | None = None, resume: bool = False,
 ) -> None:  # fmt: skip
-    """Run the paper's condensate in 3D after its rotation is made faster.
-
-    The state is stationary, but a saddle of the energy, as the descent from it with some noise shows. In the round trap
-    it keeps its slower rotation, and lags behind.
+    """Run the paper's condensate in 3D, a saddle of the energy, after its rotation is made faster: it lags behind.
 
     Parameters
     ----------

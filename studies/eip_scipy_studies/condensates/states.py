@@ -72,14 +72,8 @@ def trap(starts: int, seed: int, update: Update, points: int = 128) -> list[Foun
 def search_ring(seed: int, update: Update) -> Found:
     """Search over numbers of vortices and windings for the ground state of the paper's ring; see `lowest_ring`."""
     gpe = ring_condensate()
-    tried: list[tuple[float, int, int]] = []
-
-    def report(count: int, winding: int, energy: float) -> None:
-        tried.append((energy, count, winding))
-        update(f"ring, {count} vortices around a winding of {winding}")
-
-    state = lowest_ring(gpe, seed=seed, report=report)
-    _, count, winding = min(tried)
+    report = lambda count, winding, energy: update(f"ring, {count} vortices around a winding of {winding}")  # noqa: E731
+    state, (count, winding) = lowest_ring(gpe, seed=seed, report=report)
     return Found(f"{count} around {winding}", gpe, state)
 
 
@@ -169,9 +163,8 @@ def checks(found: Mapping[str, list[Found]]) -> Iterator[tuple[str, float, float
 
 def _save(item: Found, path: Path) -> None:
     """Write a state and its equation as an npz file without pickled objects."""
-    state = item.state
-    numbers: dict[str, Any] = {"energy": state.energy, "mu": state.mu, "residual": state.residual}
-    np.savez_compressed(path, psi=state.psi, **_content(item.equation), **numbers)
+    numbers: dict[str, Any] = {name: getattr(item.state, name) for name in ("psi", "energy", "mu", "residual")}
+    np.savez_compressed(path, **numbers, **_content(item.equation))
 
 
 def _content(gpe: GrossPitaevskii) -> dict[str, Any]:

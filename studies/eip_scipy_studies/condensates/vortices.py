@@ -83,7 +83,7 @@ class Motion:
         turned, step = [0.0], 0.0
         for old, new in pairwise(np.arctan2(*each.positions.T[::-1]) for each in self.vortices):
             if old.size and new.size:
-                off = _wrapped(new[None, :] - old[:, None] - step)
+                off = np.angle(np.exp(1j * (new[None, :] - old[:, None] - step)))
                 nearest = np.abs(off).argmin(axis=1)
                 step += float(np.median(off[np.arange(old.size), nearest]))
             turned.append(turned[-1] + step)
@@ -92,17 +92,13 @@ class Motion:
     def off(self, k: int, x: Any, y: Any) -> Any:
         """Return polar angles of points in the k-th state, relative to the first vortex with the largest x, turned."""
         a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
-        return _wrapped(np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])
+        return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
 
     def followed(self, k: int) -> int | None:
         """Return the index of the vortex closest to the reference of `off` in the k-th state; None without vortices."""
         if not (self.vortices[0].charges.size and self.vortices[k].charges.size):
             return None
         return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
-
-
-def _wrapped(angle: Any) -> Any:
-    return np.angle(np.exp(1j * angle))
 
 
 def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> tuple[np.ndarray, np.ndarray]:
