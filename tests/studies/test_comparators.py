@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 from systems import pericentre
 
-from eip_scipy.problems import Grid, GrossPitaevskii, solar_system, tokamak
+from eip_scipy.problems import Grid, GrossPitaevskii, solar_system
 from eip_scipy_studies.comparators import (
     boris,
     crank_nicolson,
@@ -107,32 +107,16 @@ def test_closed_forms_of_steps():
     np.testing.assert_allclose(newton(0.0, q, problem.params), problem.acc(0.0, q, problem.params), rtol=1e-13)
 
 
-def test_midpoint_is_symplectic_and_reports_where_it_does_not_converge():
-    problem, y = tokamak(), np.array([1.05, 0.1, 0.05, 0.2, 0.3, -0.4])
-    step = lambda y: implicit_midpoint(problem.rhs, (0.0, 0.3), y, 0.3, params=problem.params).y[:, -1]  # noqa: E731
-    jacobian = np.transpose([(step(y + d) - step(y - d)) / 2e-5 for d in 1e-5 * np.eye(6)])
-    symplectic = np.kron([[0, 1], [-1, 0]], np.eye(3))
-    np.testing.assert_allclose(jacobian.T @ symplectic @ jacobian, symplectic, atol=1e-8)
-
+def test_failures_and_wrong_arguments():
     def stiff(t, y, out):
         out[0] = -(1.0 if t < 1.0 else 100.0) * y[0]
 
     run = implicit_midpoint(stiff, (0.0, 2.0), [1.0], 0.1, save_every=1)
     assert np.isfinite(run.y[0]).tolist() == [True] * 11 + [False] * 10
     assert "are not finite" in run.message
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"h": 0.0}, "positive"), ({"h": 2.0}, "exceeds"), ({"t_span": (0, np.inf)}, "finite"),
-        ({"y0": [1.0, 0.0, 2.0]}, "even"), ({"y0": [1j, 0.0]}, "real"), ({"form": "kick"}, "form"),
-        ({"acc": lambda t, q: 1.0}, "acc"),
-    ],
-)  # fmt: skip
-def test_wrong_arguments(change, words):
-    with pytest.raises((ValueError, TypeError), match=words):
-        stormer_verlet(**{"acc": lambda t, q: -q, "t_span": (0.0, 1.0), "y0": [1.0, 0.0], "h": 0.1} | change)
+    for change, words in (({"h": 2.0}, "exceeds"), ({"y0": [1.0, 0.0, 2.0]}, "even"), ({"form": "kick"}, "form")):
+        with pytest.raises(ValueError, match=words):
+            stormer_verlet(**{"acc": kepler, "t_span": (0.0, 1.0), "y0": ORBIT, "h": 0.1} | change)
 
 
 # The schemes for the Gross-Pitaevskii equation.
@@ -199,7 +183,7 @@ def test_invariants_of_the_schemes():
     assert run.nfev == 201  # the first step twice
 
 
-def test_failures_are_reported():
+def test_failures_of_fields_are_reported():
     grid = Grid((16, 16), -4, 4)
     gpe = GrossPitaevskii(grid, harmonic_trap(9, 9), beta=100.0)
     x, y = grid.mesh()
@@ -210,11 +194,7 @@ def test_failures_are_reported():
     gpe, psi0 = modulated((32,), beta=-4.0)
     energy = gpe.grid.cell * np.sum(abs(psi0) ** 2 * (gpe.V - 2.0 * abs(psi0) ** 2))
     assert "take a larger shift" in sav_crank_nicolson(gpe, (0, 2), psi0, 0.01, shift=0.1 - energy).message
-    with pytest.raises(ValueError, match="shift"):
-        sav_crank_nicolson(gpe, (0, 2), psi0, 0.01, shift=-0.1 - energy)
     with pytest.raises(ValueError, match="Omega = 0"):
         sav_crank_nicolson(GrossPitaevskii(Grid((8, 8), 0, 1), Omega=0.5), (0, 1), np.ones(64), 0.1)
-    with pytest.raises(ValueError, match="tol"):
-        crank_nicolson(gpe, (0, 1), psi0, 0.1, tol=0.0)
     with pytest.raises(TypeError, match=r"problem\.equation"):
         crank_nicolson(plane_wave((8, 8)), (0, 1), np.ones(64), 0.1)

@@ -159,25 +159,20 @@ def test_vortices_are_followed_by_where_they_were_going(monkeypatch):
     np.testing.assert_allclose(moved.angle, [0, *turns], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda content: content.pop("psi"), "cannot read a state"),
-        (lambda content: content.update(V=np.zeros((4, 4))), "its V is not"),
-        (lambda content: content.update(psi=np.full((32, 32), np.nan + 0j)), "finite complex field"),
-        (lambda content: content.update(psi=np.array([None])), "cannot read a state"),
-    ],
-)
-def test_states_that_do_not_belong(start, tmp_path, damage, message):
+def test_states_that_do_not_belong(start, tmp_path):
     file, gpe = tmp_path / "state.npz", small_ring()
     states._save(states.Found("", gpe, start), file)
     np.testing.assert_array_equal(states.load_state(file, gpe), start.psi)
     with np.load(file) as stored:
         content = dict(stored)
-    damage(content)
-    np.savez(file, **content)
-    with pytest.raises(UsageError, match=message):
-        states.load_state(file, gpe)
+    for change, message in (
+        ({"V": np.zeros((4, 4))}, "its V is not"),
+        ({"psi": np.full((32, 32), np.nan + 0j)}, "finite complex field"),
+        ({"psi": np.array([None])}, "cannot read a state"),
+    ):
+        np.savez(file, **content | change)
+        with pytest.raises(UsageError, match=message):
+            states.load_state(file, gpe)
     file.write_bytes(b"PK\x03\x04 torn")
     assert main(["gpe", "ring", "--start", str(file), "--out", str(tmp_path), "--quiet"]) == 2
 
