@@ -93,9 +93,8 @@ def test_command_in_small(tmp_path, monkeypatch, capsys):
         rows = list(csv.DictReader(stream))
     assert len(rows) == 2 * 8 * (STEPS + 1)
     for scene, problem in (("uniform", uniform_field()), ("tokamak-banana", tokamak("banana"))):
-        exact = solve_ivp(problem.fun, (0, STEPS * problem.h), problem.y0, method="DOP853", rtol=1e-12, atol=1e-14).y[
-            :3, -1
-        ]
+        tight = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
+        exact = solve_ivp(problem.fun, (0, STEPS * problem.h), problem.y0, **tight).y[:3, -1]
         last = {row["method"]: row for row in rows if row["scene"] == scene}
         error = {name: np.linalg.norm([float(row[x]) for x in "xyz"] - exact) for name, row in last.items()}
         assert error["reference"] < 1e-9 < error["EIP-HL, RK5"] < error["EIP-HL"] < error["implicit midpoint"]
