@@ -106,6 +106,9 @@ def test_command_in_small(tmp_path, monkeypatch, capsys):
         numbers = content["scenes"][scene]
         assert numbers["EIP-HL"]["nfev"] == 1 + 5 * STEPS  # four stages, and f at the raw result for the gradient of H
         assert numbers["Boris"]["nfev"] == STEPS
+    study.paper_figure(out := Output(tmp_path / "paper", quiet=True), "fig-tokamak")
+    assert list(out.numbers["scenes"]["tokamak-transit"]) == list(study.PAPER)
+    assert {path.name for path in out.folder.iterdir()} == {"fig-tokamak.csv", "fig-tokamak.png"}
 
 
 # Numbers of the page, by their columns.
