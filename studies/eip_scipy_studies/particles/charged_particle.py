@@ -156,7 +156,7 @@ class Experiment:
         ]
         steps = f"{self.truth.t.size - 1} steps, h = {self.problem.h:.5g}"
         made = table([column[:2] for column in columns.values()], body)
-        return f"Charged particle, {self.scene}: {steps}\n\n{made}\n\n{LEGEND}\n"
+        return f"\nCharged particle, {self.scene}: {steps}\n\n{made}\n\n{LEGEND}\n"
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yield the lines of the CSV file, about a thousand for each method."""
@@ -228,7 +228,6 @@ def compare(out: Output, stem: str, scenes: Sequence[str], only: Sequence[str] =
     for each in found:
         out.text(each.text())
         each.check(out)
-        out.text()
     for field in dict.fromkeys(scene.partition("-")[0] for scene in scenes):
         own = {each.scene: each for each in found if each.scene.startswith(field)}
         names = [name for name in found[0].orbits if name != "reference" and (name, stem) != ("EIP-H", "fig-tokamak")]

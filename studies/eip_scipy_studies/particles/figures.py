@@ -28,8 +28,7 @@ def particle_figure(found: Mapping[str, Experiment], names: Sequence[str]) -> Fi
         for axis, (panel, path) in zip(line, orbits.items(), strict=False):
             axis.plot(*path, color=PALETTE[0], lw=0.35, rasterized=True)
             axis.set_title(f"{name}\n{panel}", fontsize="medium")
-            axis.set(xlabel="x" if uniform else "R", ylabel="y" if uniform else "z")
-            axis.set_aspect("equal", adjustable="box")
+            axis.set(xlabel="x" if uniform else "R", ylabel="y" if uniform else "z", aspect="equal")
             axis.grid(alpha=0.2)
         _errors(line[-2], _invariants(found, name), "relative error")
         _errors(line[-1], error, "error of angle [rad]" if uniform else "error of guiding centre")

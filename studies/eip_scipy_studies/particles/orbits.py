@@ -14,8 +14,7 @@ from eip_scipy.problems import ParticleProblem
 class ParticleOrbit:
     """States y (6, m) of a charged particle at the times t (m,), and the quantities that are computed from them.
 
-    Guiding centre and magnetic moment are those of lowest order, computed from each state alone. They oscillate with
-    the gyration by about the gyroradius divided by the field's length; `averaged` removes this.
+    Guiding centre and magnetic moment, of lowest order, oscillate with the gyration, which `averaged` removes.
     """
 
     def __init__(self, problem: ParticleProblem, t: np.ndarray, y: np.ndarray) -> None:
