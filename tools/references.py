@@ -17,12 +17,28 @@ import numpy as np
 
 from eip_scipy.problems import Problem, comet, figure_eight, pythagorean, tokamak, uniform_field
 from eip_scipy.problems.particles.charged_particle import ORBITS
-from eip_scipy_studies.measurements.charged_particle import particle_equations
 
 PARTICLE_BITS, SCENE_BITS, POINTS = 113, 160, 100
 
 # Charged particles. heyoka integrates the form (x, v) with B written out; therefore the states test the canonical
 # equations and A and do not use them. The first momentum is that of the problem, rounded to double precision as there.
+
+
+def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
+    """Return pairs (variable, rate) of the equations of motion in (x, v) in the field `name`, as expressions of heyoka.
+
+    `potential` is the factor of 1/r in the electric potential of the field "uniform"; other fields do not use it.
+    """
+    x, y, z, u, v, w = state = heyoka.make_vars("x", "y", "z", "u", "v", "w")
+    r2 = x * x + y * y
+    if name == "uniform":
+        field = potential * r2 ** (-1.5)
+        acceleration = (field * x + v, field * y - u, 0.0 * z)
+    else:
+        half = 0.5 / r2
+        b = (-half * (2.0 * y + x * z), half * (2.0 * x - y * z), half * (r2 - heyoka.sqrt(r2)))
+        acceleration = (v * b[2] - w * b[1], w * b[0] - u * b[2], u * b[1] - v * b[0])
+    return list(zip(state, (u, v, w, *acceleration), strict=True))
 
 
 def vector_potential(name: str, x: Any, number: Any) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Styles for all figures. Only this package and `eip_scipy_studies.plotting` import matplotlib.
+"""Styles for all figures. Only this package and the figures of `eip_scipy_studies` import matplotlib.
 
 Needs ``pip install "eip_scipy[plot]"``. The figures of runs and ensembles are drawn by ``run.plot()``.
 """

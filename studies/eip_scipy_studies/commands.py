@@ -23,18 +23,16 @@ COMMANDS = {
         "solar.command:solar_system", "run the solar system and compare with other methods (the paper's Experiment II)"
     ),
     "charged-particle": Entry(
-        "particles.charged_particle:ChargedParticle",
+        "particles.charged_particle:charged_particle",
         "charged particles in two fields by several methods (the paper's Experiment III)",
     ),
-    "charged-particle uniform": Entry("particles.charged_particle:Uniform", "the uniform field alone"),
-    "charged-particle tokamak": Entry("particles.charged_particle:Tokamak", "the tokamak alone, or one orbit of it"),
     "hard-cases": Entry("hard.command:hard_cases", "run 35 hard cases with and without projection"),
     "gpe ground-state": Entry(
-        "condensates.states:GroundStates", "ground states of the rotating Gross-Pitaevskii equation (Experiment IV)"
+        "condensates.states:ground_states", "ground states of the rotating Gross-Pitaevskii equation (Experiment IV)"
     ),
-    "gpe ring": Entry("condensates.ring:Ring", "run the paper's ring of vortices after its trap is tightened"),
+    "gpe ring": Entry("condensates.quench:ring", "run the paper's ring of vortices after its trap is tightened"),
     "gpe vortex-lines": Entry(
-        "condensates.lines:VortexLines", "run the paper's condensate in 3D after its rotation is made faster"
+        "condensates.quench:vortex_lines", "run the paper's condensate in 3D after its rotation is made faster"
     ),
     "bench": Entry(
         "bench.command:bench", "compare this package with SciPy, REBOUND, heyoka and others, on this machine"
@@ -42,8 +40,4 @@ COMMANDS = {
     "bench metric": Entry("bench.metric:metric", "the default metric against none and euclidean, case by case"),
     "reproduce": Entry("paper.reproduce:reproduce", "recompute the paper's tables and figures"),
     "trust": Entry("trust.command:trust", "whether faulty runs are reported, and correct ones are not"),
-    "study charged-particle": Entry(
-        "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
-    ),
-    "study gpe-efficiency": Entry("condensates.efficiency:AllRuns", "the paper's test of efficiency with all its runs"),
 }

@@ -6,38 +6,29 @@ show them in a notebook.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 # Imported first, because its error says how matplotlib is installed.
 from eip_scipy.plotting import FLOOR, MARKERS, PALETTE, log_errors, method_styles, typeset  # isort: skip
-from matplotlib.animation import FuncAnimation, PillowWriter
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize, to_rgba
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
     "CostPanel",
-    "Curves",
     "ErrorSeries",
-    "FieldPanel",
     "Linkage",
     "Orbits",
-    "ParticleRow",
-    "SurfacePanel",
     "blank_figure",
     "cost_figure",
     "errors_figure",
-    "fields_figure",
-    "fields_movie",
     "gains_figure",
     "linkage_figure",
     "linkages_figure",
@@ -46,8 +37,6 @@ __all__ = [
     "orbit_in_time_figure",
     "orbits_figure",
     "paper_kepler_figure",
-    "particle_figure",
-    "surfaces_figure",
 ]
 
 WIDTH, HEIGHT = 6.4, 7.4
@@ -58,8 +47,6 @@ DPI = 160
 WIDEST = 9.0  # inches
 POINTS = 250
 LONG_LABEL = 24
-DENSITY = r"density $|\psi|^2$"
-VEIL = 0.13  # opacity of the outside
 
 
 class ErrorSeries(NamedTuple):
@@ -269,89 +256,6 @@ def paper_kepler_figure(runs: Mapping[str, Any], *, title: str = "") -> Figure:
             low, high = np.log10(row[1 + k].get_ylim())
             row[1 + k].set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # at least two labelled ticks
     return figure
-
-
-class Curves(NamedTuple):
-    """Curves in one plane.
-
-    Attributes
-    ----------
-    x, y : str
-        Labels of the axes.
-    paths : mapping of str to array_like, shape (2, k)
-        The x and y of the points of each curve; the keys are not drawn.
-    """
-
-    x: str
-    y: str
-    paths: Mapping[str, Any]
-
-
-class ParticleRow(NamedTuple):
-    """Orbits and errors of one method for a charged particle.
-
-    Attributes
-    ----------
-    orbits : mapping of str to Curves
-        Curves by the panels' titles.
-    invariants : mapping of str to (array_like, array_like)
-        Times and relative errors of each invariant, by label in the legend.
-    trajectory : str
-        Label of the trajectory's errors, with unit.
-    errors : mapping of str to (array_like, array_like)
-        Times and errors of each trajectory, by label in the legend.
-    """
-
-    orbits: Mapping[str, Curves]
-    invariants: Mapping[str, tuple[Any, Any]]
-    trajectory: str
-    errors: Mapping[str, tuple[Any, Any]]
-
-
-def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figure:
-    """Draw orbits, errors of the invariants and of the trajectory, a row for each method.
-
-    Parameters
-    ----------
-    rows : mapping of str to ParticleRow
-        Rows by method; all have the same number of orbits.
-    title : str, optional
-
-    Returns
-    -------
-    Figure
-    """
-    orbits = len(next(iter(rows.values())).orbits)
-    figure = blank_figure(3.4 * (orbits + 2), 2.9 * len(rows) + 0.6, title)
-    axes = figure.subplots(len(rows), orbits + 2, squeeze=False)
-    for line, (name, row) in zip(axes, rows.items(), strict=True):
-        for axis, (panel, curves) in zip(line, row.orbits.items(), strict=False):
-            for path in curves.paths.values():
-                axis.plot(*np.asarray(path), color=PALETTE[0], lw=0.35, rasterized=True)
-            axis.set_title(f"{name}\n{panel}", fontsize="medium")
-            axis.set_xlabel(curves.x)
-            axis.set_ylabel(curves.y)
-            axis.set_aspect("equal", adjustable="box")
-            axis.grid(alpha=0.2)
-        for axis, label, values in (
-            (line[-2], "relative error", row.invariants),
-            (line[-1], row.trajectory, row.errors),
-        ):
-            for style, (key, (t, error)) in zip(method_styles(values).values(), values.items(), strict=True):
-                _envelope(axis, t, error, {**style, "label": key})
-            log_errors(axis, "t", label)
-            axis.legend(fontsize="x-small", loc="best", handlelength=3, framealpha=0.8)
-    for column in range(orbits + 2):
-        _share_limits(axes[:, column], both=column < orbits)
-    return figure
-
-
-def _share_limits(axes: Iterable[Axes], *, both: bool) -> None:
-    """Give all axes the same limits, wide enough for the data of all: in x and y if `both`, otherwise in y."""
-    for get, put in (("get_ylim", "set_ylim"), ("get_xlim", "set_xlim"))[: 1 + both]:
-        limits = np.array([getattr(axis, get)() for axis in axes])
-        for axis in axes:
-            getattr(axis, put)(limits[:, 0].min(), limits[:, 1].max())
 
 
 def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title: str = "", labels: int = 6) -> Figure:
@@ -613,192 +517,6 @@ def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> N
     start = float(ends[0]), float(line[0])
     text = axis.annotate(f"slope {slope:.2f}", start, (4, -2), textcoords="offset points", va="top", fontsize="small")
     text.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5})
-
-
-class FieldPanel(NamedTuple):
-    """A density in a plane.
-
-    Attributes
-    ----------
-    density : array_like, shape (m, n)
-        Density by the first coordinate, then by the second.
-    ends : tuple of float
-        Lower and upper end of the first coordinate, then of the second.
-    axes : tuple of str
-        Names of the coordinates.
-    vortices : array_like, shape (k, 2)
-        Positions to mark.
-    followed : int, optional
-        Index of a vortex that is marked differently, so that it can be followed from panel to panel.
-    """
-
-    density: Any
-    ends: tuple[float, float, float, float]
-    axes: tuple[str, str]
-    vortices: Any
-    followed: int | None = None
-
-
-def fields_figure(
-    panels: Mapping[str, FieldPanel], *, title: str = "", columns: int = 3, shared: bool = False
-) -> Figure:
-    """Draw densities in planes with their vortices, one panel for each.
-
-    Parameters
-    ----------
-    panels : mapping of str to FieldPanel
-        Densities by the panels' titles.
-    title : str, optional
-    columns : int, optional
-        Number of panels in a row.
-    shared : bool, optional
-        Use one colour scale for all.
-
-    Returns
-    -------
-    Figure
-    """
-    columns = min(columns, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = blank_figure(4.1 * columns if columns > 1 else 5.6, 3.9 * rows + 0.4, title)
-    if columns == 1:
-        figure.suptitle(typeset(title), fontsize="medium")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    top = max(float(np.max(panel[0])) for panel in panels.values()) if shared else None
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
-    for axis, (name, panel) in zip(axes.flat, panels.items(), strict=False):
-        image = field_panel(axis, name, panel, top)
-        if not shared:
-            figure.colorbar(image, cax=axis.inset_axes((1.03, 0.0, 0.05, 1.0)), label=DENSITY)
-    if shared:
-        figure.colorbar(image, ax=list(axes.flat), shrink=0.8, pad=0.02, label=DENSITY)
-    return figure
-
-
-def fields_movie(path: Any, panels: Sequence[FieldPanel], titles: Sequence[str], *, per_second: int) -> None:
-    """Write an animated GIF with a frame for each panel, on one colour scale.
-
-    Parameters
-    ----------
-    path : str or Path
-        Path that ends in ".gif".
-    panels : sequence of FieldPanel
-        Panels of the same shape.
-    titles : sequence of str
-    per_second : int
-        Frames per second.
-    """
-    top = max(float(np.max(panel.density)) for panel in panels)
-    figure = Figure(figsize=(5.2, 4.6), dpi=90, layout="constrained")
-    FigureCanvasAgg(figure)
-    axis = figure.subplots()
-    image = field_panel(axis, titles[0], panels[0], top)
-    figure.colorbar(image, ax=axis, shrink=0.84, pad=0.02, label=DENSITY)
-
-    def frame(k: int) -> None:
-        axis.clear()
-        field_panel(axis, titles[k], panels[k], top)
-
-    movie = FuncAnimation(figure, frame, frames=len(panels))
-    movie.save(path, writer=PillowWriter(fps=per_second))
-
-
-class SurfacePanel(NamedTuple):
-    """A surface in space.
-
-    Attributes
-    ----------
-    corners : array_like, shape (m, 3, 3)
-        x, y and z of the three corners of each triangle.
-    part : array_like of int, shape (m,)
-        Part of the surface to which each triangle belongs: 0 outer, 1 inner, 2 an inner part in another colour.
-    """
-
-    corners: Any
-    part: Any
-
-
-def surfaces_figure(
-    panels: Mapping[str, Any],
-    ends: Sequence[tuple[float, float]],
-    *,
-    title: str = "",
-    columns: int = 3,
-    view: tuple[float, float] = (28.0, -62.0),
-) -> Figure:
-    """Draw surfaces in space, one panel for each: outer surfaces are transparent, inner ones opaque.
-
-    Parameters
-    ----------
-    panels : mapping of str to SurfacePanel
-        Surfaces by the panels' titles.
-    ends : sequence of (float, float)
-        Lower and upper end of x, y and z.
-    title : str, optional
-    columns : int, optional
-        Number of panels in a row.
-    view : (float, float), optional
-        View point: degrees above the plane of x and y, and degrees from the x axis.
-
-    Returns
-    -------
-    Figure
-    """
-    columns = min(columns, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = blank_figure(3.4 * columns, 4.1 * rows + 0.4, title)
-    for k, (name, surface) in enumerate(panels.items()):
-        axis: Any = figure.add_subplot(rows, columns, k + 1, projection="3d", proj_type="ortho")
-        corners = np.asarray(surface.corners)
-        colours = _shaded(corners, np.asarray(surface.part), view)
-        axis.add_collection3d(Poly3DCollection(corners, facecolors=colours, lw=0))
-        axis.view_init(*view)
-        axis.set(xlim=ends[0], ylim=ends[1], zlim=ends[2], xlabel="x", ylabel="y", zlabel="z")
-        axis.set_box_aspect([high - low for low, high in ends], zoom=0.98)
-        axis.set_title(name, fontsize="medium")
-        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
-            side.set_major_locator(MaxNLocator(4, steps=(2, 5, 10)))
-    return figure
-
-
-def _shaded(corners: np.ndarray, part: np.ndarray, view: tuple[float, float]) -> np.ndarray:
-    """Return colours (m, 4) of triangles in a light that comes from the viewer's side.
-
-    `corners` and `part` are those of a `SurfacePanel`, and `view` is that of `surfaces_figure`.
-    """
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal /= np.where(length > 0, length, 1.0)
-    high, around = np.radians([view[0] + 15, view[1] - 30])
-    light = np.array([np.cos(high) * np.cos(around), np.cos(high) * np.sin(around), np.sin(high)])
-    # Both sides are lit, because the far side of the surface is seen from behind through the transparent one.
-    shade = 0.45 + 0.55 * np.abs(normal @ light)
-    colour = np.array([to_rgba(PALETTE[5], VEIL), to_rgba(PALETTE[0]), to_rgba(PALETTE[2])])[part]
-    colour[:, :3] *= shade[:, None]
-    return colour
-
-
-def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) -> Any:
-    """Draw one density and its vortices, and return the image, for a colour scale.
-
-    `top` is the upper end of the colours; None stands for the largest density of the panel.
-    """
-    density, ends, names, where, followed = panel
-    image = axis.imshow(
-        np.asarray(density).T, origin="lower", extent=ends, cmap="viridis", vmin=0.0, vmax=top, interpolation="bilinear"
-    )
-    where = np.asarray(where)
-    if where.size:
-        axis.plot(*where.T, ls="", marker="o", mfc="none", mec=PALETTE[1], mew=0.9, ms=5)
-    if followed is not None:
-        axis.plot(*where[followed], ls="", marker="o", mfc=PALETTE[2], mec="white", mew=0.9, ms=7)
-    axis.set_title(typeset(title), fontsize="medium")
-    axis.set_xlabel(names[0])
-    axis.set_ylabel(names[1])
-    axis.xaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
-    axis.yaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
-    return image
 
 
 def blank_figure(width: float, height: float, title: str = "") -> Figure:

@@ -20,8 +20,6 @@ from eip_scipy_studies.timing import least
 
 RUNS = [
     ("bench metric", "--only gear", ()),
-    ("study charged-particle", "--quick", ()),
-    ("study gpe-efficiency", "--points 16 --repeats 1", ()),
 ]
 
 

@@ -31,10 +31,7 @@ def multiply_modes(modes, factor):
 
 @loop
 def right_side(start, mean, rotation, W, w, c, out):
-    """Write start - i c ((W - w) mean + rotation) to `out`, and return the norm of its change.
-
-    `rotation` may be empty.
-    """
+    """Write start - i c ((W - w) mean + rotation) to `out`, and return the norm of its change; no `rotation`: empty."""
     total = 0.0
     rotates = rotation.size > 0
     for i in range(out.size):

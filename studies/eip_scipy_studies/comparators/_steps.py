@@ -15,15 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 try:
-    from numba import njit
+    from numba import njit as njit
 except ImportError:  # everything then runs as Python
 
     def njit(function: Any = None, **_: Any) -> Any:
         """Return the function itself."""
         return (lambda given: given) if function is None else function
 
-
-__all__ = ["FixedStepResult", "FixedSteps", "add", "check_state", "drive", "inlined", "njit"]
 
 inlined = njit(forceinline=True, error_model="numpy")
 """Decorator of the parts of a step."""
@@ -32,21 +30,12 @@ FEWEST_STEPS, PAUSE = 64, 0.02  # steps, and seconds, after which an interrupt b
 
 
 @dataclass(frozen=True)
-class FixedStepResult:
-    """Result of a method with fixed steps.
+class Result:
+    """Result of a method: saved times t (m,) and states y (n, m), which are nan after a failure.
 
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-        Saved times, including start and end of the interval.
-    y : ndarray, shape (n, m)
-        States at `t`.
-    nfev : int
-        Number of evaluations of the user's function.
-    wall_time : float
-        Time of the integration in seconds, without compilation.
-    message : str
-        "compiled" or "interpreted". If saved states are not finite, the first such time is added.
+    `nfev` counts evaluations of the user's function, or pairs of transforms of a field. `wall_time` [s] is without
+    compilation and without planning transforms. `message` is "compiled", "interpreted" or, for fields, "completed", or
+    says where and why the method failed. `modified_energy` (m,) is the one that `sav_crank_nicolson` keeps.
     """
 
     t: np.ndarray
@@ -54,14 +43,11 @@ class FixedStepResult:
     nfev: int
     wall_time: float
     message: str
+    modified_energy: Any = None
 
 
 class FixedSteps(NamedTuple):
-    """The steps of a run and the states that it saves.
-
-    `h` and `last` are the lengths of a step and of the last step, with their sign; `saved` holds the numbers of the
-    steps after which the state is saved, starting with 0 for the start.
-    """
+    """Steps of a run: signed lengths `h` and `last`, and numbers of the steps after which a state is saved, 0 first."""
 
     t0: float
     t_bound: float
@@ -113,41 +99,21 @@ def check_state(y0: Any, name: str = "y0") -> np.ndarray:
 def drive(
     step: Callable[..., int], fun: Callable[..., Any], steps: FixedSteps, y: np.ndarray, params: Any,
     *, takes: int, fills: int, returns: bool = False, constant: float = 0.0, start: bool = False,
-) -> FixedStepResult:  # fmt: skip
+) -> Result:  # fmt: skip
     """Make all steps of a scheme with a user's function.
 
-    Parameters
-    ----------
-    step : callable
-        ``step(fun, t, h, x, v, params, constant, f, work) -> evaluations``, `inlined`, advances the state in place. x
-        (takes,) and v (n - takes,) are its parts. A negative number of evaluations is a failure, after which the states
-        are nan. `f` is a buffer for the values of ``fun(t, x, f, params)``, and `work` (3, n) is 0 at the start; both
-        are kept between steps.
-    fun : callable
-        ``fun(t, x, out[, params])`` or, if `returns` is set, ``fun(t, x[, params])``.
-    steps : FixedSteps
-    y : ndarray, shape (n,)
-        The state at the start, which is overwritten.
-    params : array_like or None
-        Last argument of `fun`; None if it has none.
-    takes, fills : int
-        Sizes of x, the first components of the state, and of `f`.
-    constant : float, optional
-        A number that the scheme uses, such as the charge per mass.
-    start : bool, optional
-        Whether `f` holds the value at the start before the first step.
-
-    Returns
-    -------
-    FixedStepResult
+    ``step(fun, t, h, x, v, params, constant, f, work) -> evaluations``, `inlined`, advances the state in place, whose
+    parts are x (takes,) and v (n - takes,). A negative number of evaluations is a failure. `f` (fills,) is a buffer for
+    the values of ``fun(t, x, f, *params)``, with the value at the start if `start` is set; `work` (3, n) is 0 at the
+    start. Both are kept between steps. If `returns` is set, the user's function is ``fun(t, x[, params])``.
     """
     if not callable(fun):
         raise TypeError(f"{fun!r} is not callable")
-    given = np.empty(0) if params is None else check_state(params, "params")
+    given: tuple[np.ndarray, ...] = () if params is None else (check_state(params, "params"),)
     compiled = hasattr(fun, "py_func")
-    called = _called(fun, params is not None, returns, compiled)
-    march = _march if compiled else getattr(_march, "py_func", _march)
-    own = step if compiled else getattr(step, "py_func", step)
+    called = _filling(fun, compiled) if returns else fun
+    parts: list[Any] = [part if compiled else getattr(part, "py_func", part) for part in (_march, step)]
+    march, own = parts
     ys = np.full((steps.saved.size, y.size), np.nan)
     ys[0], f, work = y, np.zeros(fills), np.zeros((3, y.size))
     x, v = y[:takes], y[takes:]
@@ -155,7 +121,7 @@ def drive(
     march(*arguments, 0, 0, 1)  # compiles
     begin = perf_counter()
     if start and steps.saved[-1]:
-        called(steps.t0, x, f, given)
+        called(steps.t0, x, f, *given)
     k, row, evaluations, size, failed = 0, 1, int(start), FEWEST_STEPS, False
     while k < steps.saved[-1] and not failed:
         before, end = perf_counter(), min(k + size, int(steps.saved[-1]))
@@ -167,7 +133,7 @@ def drive(
     message, finite = "compiled" if compiled else "interpreted", np.isfinite(ys).all(axis=1)
     if not finite.all():
         message += f"; the saved states from t={steps.t[np.argmin(finite)].item()!r} on are not finite"
-    return FixedStepResult(steps.t, ys.T, evaluations, wall_time, message)
+    return Result(steps.t, ys.T, evaluations, wall_time, message)
 
 
 @inlined
@@ -202,26 +168,10 @@ def _march(step, fun, t0, h, last, saved, rows, x, v, params, constant, f, work,
 
 
 @lru_cache(maxsize=64)
-def _called(fun: Any, with_params: bool, returns: bool, compiled: bool) -> Any:
-    """Return ``called(t, x, out, params)``, which writes the value of the user's function to `out`."""
-    if returns and with_params:
+def _filling(fun: Any, compiled: bool) -> Any:
+    """Return ``filling(t, x, out, *params)``, which writes the value of ``fun(t, x, *params)`` to `out`."""
 
-        def called(t, x, out, params):  # type: ignore[no-untyped-def]
-            copy(fun(t, x, params), out)
+    def filling(t, x, out, *params):  # type: ignore[no-untyped-def]
+        copy(fun(t, x, *params), out)
 
-    elif returns:
-
-        def called(t, x, out, params):  # type: ignore[no-untyped-def]
-            copy(fun(t, x), out)
-
-    elif with_params:
-
-        def called(t, x, out, params):  # type: ignore[no-untyped-def]
-            fun(t, x, out, params)
-
-    else:
-
-        def called(t, x, out, params):  # type: ignore[no-untyped-def]
-            fun(t, x, out)
-
-    return inlined(called) if compiled else called
+    return inlined(filling) if compiled else filling

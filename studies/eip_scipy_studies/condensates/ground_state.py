@@ -52,14 +52,21 @@ def ground_state(gpe: GrossPitaevskii, start: Any, *, tol: float = 1e-8, max_ite
 
 
 class _Descent:
-    """State of the search: psi, the direction p, and their images under the linear part plus the potential."""
+    """State of the search: psi, the direction p, and their images under the linear part plus the potential.
+
+    The preconditioner is D (a - Laplace / 2)^(-1) D, D = (a + W)^(-1/2), W = V - min V + ``|beta| |psi|^2``, where the
+    typical energy a is that of psi every `REFRESH` iterations.
+    """
 
     def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray) -> None:
         self.gpe, self.psi = gpe, psi
         self.residual, self.old_residual = np.empty_like(psi), np.zeros_like(psi)
         self.p, self.image, self.p_image = np.zeros_like(psi), np.empty_like(psi), np.empty_like(psi)
         self.slope = 0.0  # <residual, preconditioned residual> of the last iteration
-        self.preconditioner = _Preconditioner(gpe)
+        self.axes, self.V, self.zero = tuple(range(gpe.grid.dim)), gpe.V - gpe.V.min(), np.zeros(gpe.grid.shape)
+        self.kinetic: Any = sum(gpe.kinetic_factor(axis) for axis in self.axes)
+        self.energy = Multiplier(gpe.grid, self.axes, self.kinetic)
+        self.scaled, self.out = np.empty_like(psi), np.empty_like(psi)
 
     def inner(self, a: np.ndarray, b: np.ndarray) -> float:
         """Return Re <a, b>, with the size of a cell as weight."""
@@ -74,8 +81,10 @@ class _Descent:
         """Iterate, and return the result once it converged or no direction descends."""
         message, iteration = "", 0
         while not message:
-            if iteration % REFRESH == 0:
-                self.refresh()
+            if iteration % REFRESH == 0:  # removes rounding errors of what is carried along
+                self.psi /= sqrt(self.inner(self.psi, self.psi))
+                self.apply(self.psi, self.image)
+                self.fit()
             mu, norm = self.gradient()
             if norm <= tol:
                 message = "converged"
@@ -87,17 +96,26 @@ class _Descent:
                 iteration += 1
         return GroundState(self.psi, self.gpe.energy(self.psi), mu, norm, iteration, norm <= tol, message)
 
-    def refresh(self) -> None:
-        """Normalise psi, recompute its `image` by `apply` to remove rounding errors, and adapt the preconditioner."""
-        self.psi /= sqrt(self.inner(self.psi, self.psi))
-        self.apply(self.psi, self.image)
-        self.preconditioner.fit(self.psi)
+    def fit(self) -> None:
+        """Compute a: the kinetic energy plus the sum of W ``|psi|^2`` times the size of a cell."""
+        density = np.abs(self.psi) ** 2
+        local = float(np.vdot(density, self.V + abs(self.gpe.beta) * density))
+        self.a = self.gpe.grid.cell * (self.energy.expectation(self.gpe.transforms, self.psi, self.scaled) + local)
+        self.inverse = Multiplier(self.gpe.grid, self.axes, 1 / (self.a + self.kinetic))
+
+    def preconditioned(self, r: np.ndarray) -> np.ndarray:
+        """Return the preconditioned residual `r` in a buffer, which the next call overwrites."""
+        local = (self.psi, self.V, abs(self.gpe.beta), self.a)
+        divide_by_root(r, *local, self.scaled)
+        self.inverse.apply(self.gpe.transforms, self.scaled, self.out)
+        divide_by_root(self.out, *local, self.out)
+        return self.out
 
     def gradient(self) -> tuple[float, float]:
         """Compute the residual H psi - mu psi; return mu and the norm of the residual."""
         r = self.residual
         np.copyto(r, self.image)
-        add_potential(self.psi, self.preconditioner.zero, self.gpe.beta, r)
+        add_potential(self.psi, self.zero, self.gpe.beta, r)
         mu = self.inner(self.psi, r)
         rotate(r, self.psi, 1.0, -mu)
         return mu, sqrt(self.inner(r, r))
@@ -105,7 +123,7 @@ class _Descent:
     def conjugate_direction(self) -> bool:
         """Choose the next direction: conjugate, or steepest if that does not descend; return False if neither does."""
         r, old = self.residual, self.old_residual
-        d = self.preconditioner(r, self.psi)
+        d = self.preconditioned(r)
         slope = self.inner(r, d)
         factor = max((slope - self.inner(old, d)) / self.slope, 0.0) if self.slope > 0 else 0.0
         self.slope, self.residual, self.old_residual = slope, old, r
@@ -125,7 +143,7 @@ class _Descent:
         a, b = self.inner(self.psi, self.image), self.inner(self.p, self.image) / norm
         c = self.inner(self.p, self.p_image) / norm**2
         slope = 2 * self.inner(r, self.p) / norm
-        tangent = _least_energy((a + nn, slope, a + c + 2 * nq + 4 * mm, 2 * b + 4 * mq, c + qq))
+        tangent = _least_energy(a + nn, slope, a + c + 2 * nq + 4 * mm, 2 * b + 4 * mq, c + qq)
         cosine = 1 / hypot(1.0, tangent)
         sine = tangent * cosine / norm
         rotate(self.psi, self.p, cosine, sine)
@@ -133,45 +151,17 @@ class _Descent:
         return tangent != 0.0
 
 
-def _least_energy(e: tuple[float, float, float, float, float]) -> float:
+def _least_energy(e0: float, e1: float, e2: float, e3: float, e4: float) -> float:
     """Return t = tan(a) for the angle a at which sum_k e_k cos(a)^(4 - k) sin(a)^k is smallest; e_1 < 0."""
-    e0, e1, e2, e3, e4 = e
     roots = np.roots([-e3, 4 * e4 - 2 * e2, 3 * (e3 - e1), 2 * e2 - 4 * e0, e1])
     t = roots[np.abs(roots.imag) <= 1e-6 * np.abs(roots)].real
     values = (e0 + t * (e1 + t * (e2 + t * (e3 + t * e4)))) / (1 + t * t) ** 2
     return float(t[np.argmin(values)]) if t.size else 0.0
 
 
-class _Preconditioner:
-    """Operator D (a - Laplace / 2)^(-1) D, D = (a + W)^(-1/2), W = V - min V + ``|beta| |psi|^2``, typical energy a."""
-
-    def __init__(self, gpe: GrossPitaevskii) -> None:
-        self._gpe = gpe
-        self._axes = tuple(range(gpe.grid.dim))
-        self._kinetic: Any = sum(gpe.kinetic_factor(axis) for axis in self._axes)
-        self._V = gpe.V - gpe.V.min()
-        self._energy = Multiplier(gpe.grid, self._axes, self._kinetic)
-        self._scaled, self._out = np.empty(gpe.grid.shape, complex), np.empty(gpe.grid.shape, complex)
-        self.zero = np.zeros(gpe.grid.shape)
-
-    def fit(self, psi: np.ndarray) -> None:
-        """Compute a from a field: its kinetic energy plus the sum of W ``|psi|^2`` times the size of a cell."""
-        gpe = self._gpe
-        density = np.abs(psi) ** 2
-        local = float(np.vdot(density, self._V + abs(gpe.beta) * density))
-        self._a = gpe.grid.cell * (self._energy.expectation(gpe.transforms, psi, self._scaled) + local)
-        self._inverse = Multiplier(gpe.grid, self._axes, 1 / (self._a + self._kinetic))
-
-    def __call__(self, r: np.ndarray, psi: np.ndarray) -> np.ndarray:
-        """Return the preconditioned residual `r` in a buffer, which the next call overwrites."""
-        local = (psi, self._V, abs(self._gpe.beta), self._a)
-        divide_by_root(r, *local, self._scaled)
-        self._inverse.apply(self._gpe.transforms, self._scaled, self._out)
-        divide_by_root(self._out, *local, self._out)
-        return self._out
-
-
-# Starts.
+def _square(gpe: GrossPitaevskii) -> Any:
+    """Return r^2 = x^2 + y^2, of the grid's dimension."""
+    return sum(a**2 for a in gpe.grid.mesh()[:2])
 
 
 def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
@@ -179,15 +169,10 @@ def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
 
     A ValueError is raised if the density reaches the ends of the box.
     """
-    r2 = sum(a**2 for a in gpe.grid.mesh()[:2]) if gpe.Omega else 0.0
-    well = gpe.V - 0.5 * gpe.Omega**2 * r2
+    well = gpe.V - 0.5 * gpe.Omega**2 * (_square(gpe) if gpe.Omega else 0.0)
     cell, low = gpe.grid.cell, float(well.min())
-
-    def excess(mu: float) -> float:
-        return cell * float(np.maximum(mu - well, 0.0).sum()) / gpe.beta - 1.0
-
-    volume = cell * gpe.grid.size
-    mu = brentq(excess, low, float(well.max()) + gpe.beta / volume, xtol=1e-12)
+    excess = lambda mu: cell * float(np.maximum(mu - well, 0.0).sum()) / gpe.beta - 1.0  # noqa: E731
+    mu = brentq(excess, low, float(well.max()) + gpe.beta / (cell * gpe.grid.size), xtol=1e-12)
     density = np.maximum(mu - well, 0.0) / gpe.beta
     if any(np.any(np.take(density, 0, axis=axis)) for axis in range(gpe.grid.dim)):
         raise ValueError("the condensate does not fit into the box of the grid: enlarge the box, or lower Omega.")
@@ -221,8 +206,7 @@ def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
 
 def _mean_square_radius(gpe: GrossPitaevskii) -> float:
     density = thomas_fermi(gpe)
-    x, y, *_ = gpe.grid.mesh()
-    return float(((x**2 + y**2) * density).sum() / density.sum())
+    return float((_square(gpe) * density).sum() / density.sum())
 
 
 def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -> np.ndarray:
@@ -232,23 +216,17 @@ def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -
 
 
 def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[np.ndarray]:
-    """Yield fields with triangular lattices of vortices, turned, shifted and stretched at random, with some noise.
-
-    The lattices have 0.6 to 1.2 times as many vortices as a condensate that turns as a rigid body.
-    """
+    """Yield fields with triangular lattices of 0.6 to 1.2 times a rigid body's vortices, at random, with some noise."""
     rng = np.random.default_rng(seed)
-    amplitude = np.sqrt(thomas_fermi(gpe))
+    density = thomas_fermi(gpe)
     for _ in range(count):
-        psi = amplitude.astype(complex)
-        if gpe.Omega:
-            psi = imprint(gpe, _lattice(gpe, amplitude, rng))
+        psi = imprint(gpe, _lattice(gpe, density, rng)) if gpe.Omega else np.sqrt(density).astype(complex)
         yield with_noise(psi, rng)
 
 
-def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _lattice(gpe: GrossPitaevskii, density: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the points (k, 2) of a random triangular lattice within the outer radius of the condensate."""
-    x, y, *_ = gpe.grid.mesh()
-    radius = sqrt(float(np.max((x**2 + y**2) * (amplitude > 0))))
+    radius = sqrt(float(np.max(_square(gpe) * (density > 0))))
     area = pi / abs(gpe.Omega) / rng.uniform(0.6, 1.2)
     side, angle = sqrt(2 * area / sqrt(3.0)), rng.uniform(0, pi / 3)
     reach = int(2 * radius / side) + 2
@@ -260,18 +238,17 @@ def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generat
 
 def lowest_ring(
     gpe: GrossPitaevskii, *, tol: float = 1e-8, seed: int = 0, report: Callable[[int, int, float], Any]
-) -> GroundState:
-    """Search for the lowest state of a condensate in two dimensions with a hole, and one row of vortices around it.
+) -> tuple[GroundState, tuple[int, int]]:
+    """Search for the lowest state of a two-dimensional condensate with a row of vortices around a hole, and its pair.
 
     No descent leads from a state to one with another winding of the phase around the hole. Therefore short searches are
     made from starts with pairs (count of vortices, winding), and ``report(count, winding, energy)`` is called for each:
     from each pair the search goes on to its neighbour of lowest energy, until no neighbour is lower. The last search
     starts from the best state with noise, to break its symmetry.
     """
-    x, y = gpe.grid.mesh()
-    r2 = (x**2 + y**2)[thomas_fermi(gpe) > 0]
+    r2 = _square(gpe)[thomas_fermi(gpe) > 0]
     count = round(ROW * abs(gpe.Omega) * (r2.max() - r2.min()))
-    here = count, round(abs(gpe.Omega) * _mean_square_radius(gpe) - count / 2)
+    best = count, round(abs(gpe.Omega) * _mean_square_radius(gpe) - count / 2)
     found: dict[tuple[int, int], GroundState] = {}
 
     def energy(pair: tuple[int, int]) -> float:
@@ -281,10 +258,9 @@ def lowest_ring(
             report(*pair, found[pair].energy)
         return found[pair].energy
 
-    while True:
-        best = min([here, *((here[0] + a, here[1] + b) for a, b in NEIGHBOURS)], key=energy)
-        if best == here:
-            break
+    here = None
+    while here != best:
         here = best
-    start = with_noise(found[here].psi, np.random.default_rng(seed), BREAK_SYMMETRY)
-    return ground_state(gpe, start, tol=tol)
+        best = min([here, *((here[0] + a, here[1] + b) for a, b in NEIGHBOURS)], key=energy)
+    start = with_noise(found[best].psi, np.random.default_rng(seed), BREAK_SYMMETRY)
+    return ground_state(gpe, start, tol=tol), best

@@ -55,20 +55,13 @@ class LinearFlow:
         return psi, work
 
 
-def _palindrome(half: tuple[float, ...], *, odd: bool) -> tuple[float, ...]:
-    """Return symmetric coefficients with the sum 1 from the first ones; those in the middle follow from it."""
-    rest = 1.0 - 2 * sum(half)
-    return (*half, rest, *half[::-1]) if odd else (*half, rest / 2, rest / 2, *half[::-1])
-
-
+# Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313, table 3, SRKN6b of order 4: coefficients are symmetric, sum 1.
+A = (0.0829844064174052, 0.396309801498368, -0.0390563049223486)
+B = (0.245298957184271, 0.604872665711080)
 # Order, and fractions of the step for the flows of V + beta |psi|^2 and, between them, of the linear part.
-SCHEMES = {
+SCHEMES: dict[str, tuple[int, tuple[float, ...], tuple[float, ...]]] = {
     "strang": (2, (0.5, 0.5), (1.0,)),  # Strang, SIAM J. Numer. Anal. 5 (1968) 506
-    "rkn6": (  # Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313, table 3, SRKN6b of order 4
-        4,
-        _palindrome((0.0829844064174052, 0.396309801498368, -0.0390563049223486), odd=True),
-        _palindrome((0.245298957184271, 0.604872665711080), odd=False),
-    ),
+    "rkn6": (4, (*A, 1 - 2 * sum(A), *A[::-1]), (*B, 0.5 - sum(B), 0.5 - sum(B), *B[::-1])),
 }
 
 

@@ -1,7 +1,8 @@
-"""Vortices of a field, around which the phase winds, and surfaces of equal density that show them as tubes."""
+"""Vortices of a field, around which the phase winds, their motion, and surfaces of equal density around them."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import ceil, sqrt
 from typing import Any, NamedTuple
 
@@ -25,10 +26,9 @@ class Vortices(NamedTuple):
 def vortices(gpe: GrossPitaevskii, psi: Any) -> Vortices:
     """Return the vortices of a field inside the condensate; in three dimensions those in the middle plane.
 
-    Places where the density is below `THRESHOLD` are outside, after cores have been filled by a grey closing. From the
-    phase differences along the edges of a cell those of the rigid rotation are subtracted, because the phase of a fast
-    rotating field may turn by more than pi between two points. The sum of the rests, reduced to (-pi, pi], plus the
-    circulation 2 Omega dx dy of the rotation, is 2 pi times the charge.
+    Places where the density is below `THRESHOLD`, after cores have been filled by a grey closing, are outside. The
+    phase differences along the edges of a cell are those beyond the rigid rotation, by which the phase may turn by more
+    than pi between two points. Their sum, plus the circulation 2 Omega dx dy of the rotation, is 2 pi times the charge.
     """
     psi = gpe.as_field(psi)
     top = float((np.abs(psi) ** 2).max())
@@ -72,25 +72,45 @@ def _zero(corners: np.ndarray, Omega: float, x: float, y: float, dx: float, dy: 
     return middle[0] + a * dx, middle[1] + b * dy
 
 
-class Surface(NamedTuple):
-    """Triangles: their corners (m, 3, 3), and whether they lie inside the condensate (m,), around a vortex line."""
+class Motion:
+    """Vortices in the states `fields` (n, m) at the times `t` (m,), and the `angle` (m,) by which they have turned.
 
-    corners: np.ndarray
-    inside: np.ndarray
+    From one state to the next, the angle of each vortex about the centre is extrapolated and matched with the nearest.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> None:
+        self.t, self.vortices = t, [vortices(gpe, y) for y in fields.T]
+        turned, step = [0.0], 0.0
+        for old, new in pairwise(np.arctan2(*each.positions.T[::-1]) for each in self.vortices):
+            if old.size and new.size:
+                off = np.angle(np.exp(1j * (new[None, :] - old[:, None] - step)))
+                nearest = np.abs(off).argmin(axis=1)
+                step += float(np.median(off[np.arange(old.size), nearest]))
+            turned.append(turned[-1] + step)
+        self.angle = np.array(turned)
+
+    def off(self, k: int, x: Any, y: Any) -> Any:
+        """Return polar angles of points in the k-th state, relative to the first vortex with the largest x, turned."""
+        a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
+        return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
+
+    def followed(self, k: int) -> int | None:
+        """Return the index of the vortex closest to the reference of `off` in the k-th state; None without vortices."""
+        if not (self.vortices[0].charges.size and self.vortices[k].charges.size):
+            return None
+        return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
 
 
-def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
+def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the surface on which ``|psi|^2`` has a value `level`, by marching cubes (Lewiner et al. 2003).
 
-    The field, 0 at the ends of the box, is interpolated to twice as many points on each axis.
+    These are corners (m, 3, 3) of triangles, and whether they lie inside the condensate (m,), around a vortex line. The
+    field, 0 at the ends of the box, is interpolated to twice as many points on each axis.
     """
+    from skimage.measure import marching_cubes
+
     psi = gpe.as_field(psi)
     top = float((np.abs(psi) ** 2).max())
-    try:
-        from skimage.measure import marching_cubes
-    except ModuleNotFoundError as error:
-        message = 'surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"'
-        raise ImportError(message, name="skimage") from error
     for axis, n in enumerate(gpe.grid.shape):
         psi = scipy.signal.resample(psi, 2 * n, axis=axis)
     density = np.abs(psi) ** 2
@@ -98,4 +118,4 @@ def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
     closed = scipy.ndimage.grey_closing(density, size=[*(2 * n + 1 for n in _core_size(gpe, top)), 1])
     filled = scipy.ndimage.gaussian_filter(closed, SMOOTH)
     around = scipy.ndimage.map_coordinates(filled, points[triangles].mean(axis=1).T, order=1)
-    return Surface((gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level)
+    return (gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level

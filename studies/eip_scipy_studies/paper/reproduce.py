@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
-from ..condensates.efficiency import Efficiency
+from ..condensates.efficiency import efficiency
 from ..output import Output
-from ..particles.charged_particle import ChargedParticle
+from ..particles.charged_particle import paper_figure
 from ..solar.command import solar_system
-from ..study import Session, perform
 from .figures import kepler_figures
 from .tables import table
 
@@ -21,9 +20,9 @@ Name = Literal[
 FIGURES: dict[str, Callable[[Output], None]] = {
     "fig-kepler": kepler_figures,
     "fig-solar": partial(solar_system, cost=True),
-    "fig-particle": lambda out: _particle(out, "fig-particle", "uniform"),
-    "fig-tokamak": lambda out: _particle(out, "fig-tokamak", "tokamak-banana", "tokamak-transit"),
-    "fig-efficiency": lambda out: _class(out, "fig-efficiency", Efficiency()),
+    "fig-particle": partial(paper_figure, name="fig-particle"),
+    "fig-tokamak": partial(paper_figure, name="fig-tokamak"),
+    "fig-efficiency": efficiency,
 }
 PARTS: dict[str, Callable[[Output], None]] = {
     **{f"table{number}": partial(table, number=number) for number in range(1, 6)},
@@ -53,12 +52,3 @@ def reproduce(out: Output, what: tuple[Name, ...]) -> None:
         else:
             PARTS[name](out)
     out.numbers["passed"] = out.passed
-
-
-def _particle(out: Output, stem: str, *scenes: str) -> None:
-    _class(out, stem, ChargedParticle(scenes=scenes, paper_only=True, stem=stem))
-
-
-def _class(out: Output, name: str, study: Any) -> None:
-    status, out.numbers = perform(study, Session(name, out.folder, None, out.quiet))
-    out.passed = status == 0

@@ -1,0 +1,148 @@
+"""Charged particles: orbits in closed form, the command in small, and the numbers of its page."""
+
+import csv
+import json
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+from pages import assert_printed, printed_tables
+from scipy.integrate import solve_ivp
+
+import eip_scipy
+from eip_scipy import EIPDOP853, EIPRK4, integrate
+from eip_scipy.problems import ParticleField, charged_particle, tokamak, uniform_field
+from eip_scipy_studies.cli import main
+from eip_scipy_studies.output import Output
+from eip_scipy_studies.particles import charged_particle as study
+from eip_scipy_studies.particles.orbits import ParticleOrbit
+
+STEPS = 60
+PAGE = "results/charged-particles.md"
+
+
+def test_gyration_in_a_constant_field():
+    """B = 2 e_z, m = 1.5: frequency |q| B / m, and the E x B drift (0.15, 0, 0)."""
+    field = ParticleField(
+        lambda x, y, z: (-y, x, 0.0),
+        magnetic=lambda x, y, z: (0.0, 0.0, 2.0),
+        electric=lambda x, y, z: (0.0, 0.3, 0.0),
+        potential=lambda x, y, z: -0.3 * y,
+    )
+    mass, v, charge = 1.5, np.array([0.15 + 0.4, 0.0, 0.25]), -3.0
+    problem = charged_particle(field, [0.5, 1.0, 0.0], v, mass=mass, charge=charge, t_span=(0.0, 4.0), h=0.01)
+    run = integrate(problem, method=EIPRK4, save_every=1)
+    orbit = ParticleOrbit(problem, run.t, run.y)
+    np.testing.assert_allclose(orbit.magnetic_moment, 0.5 * mass * 0.4**2 / 2.0, rtol=1e-7)
+    np.testing.assert_allclose(orbit.parallel_velocity, 0.25, rtol=1e-7)
+    # The guiding centre drifts with 0.15 along x and 0.25 along z; averaged, its gyration is gone.
+    drift = np.diff(orbit.averaged(orbit.guiding_centre)[:, [0, -1]], axis=1)[:, 0]
+    expected = np.array([0.15, 0.0, 0.25]) * (orbit.averaged(run.t)[-1] - orbit.averaged(run.t)[0])
+    np.testing.assert_allclose(drift, expected, atol=2e-4)
+    np.testing.assert_allclose(orbit.energy, problem.invariants[0].fun(0.0, problem.y0, problem.params), rtol=1e-11)
+    # Anticlockwise for a negative charge, seen along B; relative to the direction away from the axis.
+    angle = orbit.gyrophase + np.unwrap(np.arctan2(run.y[1], run.y[0]))
+    np.testing.assert_allclose(angle - angle[0], 2 * abs(charge) / mass * run.t, atol=1e-5)
+
+
+def test_drift_turns_and_banana_tip():
+    problem, banana, transit = (
+        uniform_field(t_end=270 * math.pi), tokamak("banana", t_end=16_000), tokamak("transit", t_end=60_000)
+    )  # fmt: skip
+    runs = [integrate(each, method=EIPDOP853, h=2 * each.h, save_every=1) for each in (problem, banana, transit)]
+    uniform, trapped, passing = map(
+        ParticleOrbit, (problem, banana, transit), *zip(*((r.t, r.y) for r in runs), strict=True)
+    )
+    # Drift of the guiding centre at R = 1.1: E / B = 1e-2 / R^2, an angle of t 1e-2 / R^3, 2 % less by the gyroradius.
+    assert np.ptp(uniform.guiding_angle[[0, -1]]) == pytest.approx(uniform.t[-1] * 1e-2 / 1.1**3, rel=0.02)
+    assert uniform.radial_range(1.0) == pytest.approx(0.10954, abs=2e-4)
+    assert math.isnan(uniform.radial_range(2.0))
+    np.testing.assert_allclose(trapped.bounce_points(), [1.00953], atol=2e-5)
+    first, second = passing.poloidal_turns()
+    assert first.stop == second.start
+    assert passing.z[first].max() == pytest.approx(0.0614, abs=2e-4)
+
+
+def test_averages_take_out_what_has_the_gyrations_period():
+    problem, t = uniform_field(t_end=10.0), np.arange(100) * math.pi / 10
+    orbit = ParticleOrbit(problem, t, np.tile(problem.y0[:, None], 100))
+    np.testing.assert_allclose(orbit.averaged(3.0 + np.cos(t)), 3.0, rtol=1e-13)
+    np.testing.assert_allclose(orbit.averaged(t), t[:81] + 9.5 * math.pi / 10, rtol=1e-13)
+    t = np.sort(np.random.default_rng(1).uniform(0, 20 * math.pi, 1600))
+    uneven = ParticleOrbit(problem, t, np.tile(problem.y0[:, None], t.size))
+    assert np.abs(uneven.averaged(np.cos(t))).max() < 4e-3
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_command_in_small(tmp_path, monkeypatch, capsys):
+    """The runs are too short for what the methods do to the orbits, so that these checks fail; H and L are kept."""
+    monkeypatch.setattr(study, "Experiment", partial(study.Experiment, t_end=STEPS * math.pi / 10))
+    file = tmp_path / "run.json"
+    command = ["charged-particle", "uniform", "tokamak-banana", "--out", str(tmp_path), "--json", str(file)]
+    assert main(command) == 1
+    names = {"charged-particle.csv", "charged-particle-uniform.png", "charged-particle-tokamak.png", "run.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    content = json.loads(file.read_text())
+    failed = [check["text"] for check in content["checks"] if not check["passed"]]
+    assert failed
+    assert capsys.readouterr().out.count("FAILED ") == len(failed)
+    assert not any("relative error" in text for text in failed)
+    with open(tmp_path / "charged-particle.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 2 * 8 * (STEPS + 1)
+    for scene, problem in (("uniform", uniform_field()), ("tokamak-banana", tokamak("banana"))):
+        tight = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
+        exact = solve_ivp(problem.fun, (0, STEPS * problem.h), problem.y0, **tight).y[:3, -1]
+        last = {row["method"]: row for row in rows if row["scene"] == scene}
+        error = {name: np.linalg.norm([float(row[x]) for x in "xyz"] - exact) for name, row in last.items()}
+        assert error["reference"] < 1e-9 < error["EIP-HL, RK5"] < error["EIP-HL"] < error["implicit midpoint"]
+        for name, row in last.items():
+            keeps = {"EIP-H": "H", "implicit midpoint": "L", "reference": "HL"}.get(name, "HL" * ("HL" in name))
+            kept_by_boris = name == "Boris" and scene != "uniform"
+            assert (float(row["energy_error"]) < 1e-9) == ("H" in keeps or kept_by_boris)
+            assert (float(row["momentum_error"]) < 1e-9) == ("L" in keeps)
+        numbers = content["scenes"][scene]
+        assert numbers["EIP-HL"]["nfev"] == 1 + 5 * STEPS  # four stages, and f at the raw result for the gradient of H
+        assert numbers["Boris"]["nfev"] == STEPS
+    study.paper_figure(out := Output(tmp_path / "paper", quiet=True), "fig-tokamak")
+    assert list(out.numbers["scenes"]["tokamak-transit"]) == list(study.PAPER)
+    assert {path.name for path in out.folder.iterdir()} == {"fig-tokamak.csv", "fig-tokamak.png"}
+
+
+# Numbers of the page, by their columns.
+UNIFORM = ("gyroradius_first", "gyroradius_last", "angle_error", "phase_error", "energy_error", "momentum_error")
+BANANA = ("tips", ("tip_nearest", "tip_farthest"), "extrema_error", "moment_change", "phase_error", "position_error")
+COLUMNS = {"uniform": UNIFORM, "tokamak-banana": BANANA, "tokamak-transit": BANANA[2:]}
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("scene", study.SCENES)
+def test_numbers_of_the_page(scene):
+    """The paper's intervals, a minute: all checks of the command hold, and the page's table has its numbers."""
+    found, out = study.Experiment(scene), Output(quiet=True)
+    found.check(out)
+    assert out.passed, out.numbers["checks"]
+    rows = printed_tables(PAGE)[1 + list(study.SCENES).index(scene)]
+    for method, cells in rows.items():
+        for keys, cell in zip(COLUMNS[scene], cells, strict=True):
+            if cell:
+                values = (found.numbers[method][key] for key in ((keys,) if isinstance(keys, str) else keys))
+                assert_printed(cell, *(abs(x) if "phase" in keys else x for x in values), round_off=1e-10)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_numbers_of_longer_steps_on_the_page():
+    problem = tokamak("transit")
+    exact = integrate(problem, method=EIPDOP853, h=problem.h / 4, compensated=True, invariants=()).y[:3, -1]
+    for label, (evaluations, error) in printed_tables(PAGE)[4].items():
+        *names, step = label.split(", ")
+        kept, method = problem.invariants if "EIP-HL" in names else (), getattr(eip_scipy, f"EIP{names[-1]}")
+        run = integrate(problem, method=method, h=float(step.split()[0]) * problem.h, invariants=kept)
+        assert_printed(evaluations, run.nfev)
+        assert_printed(error, np.linalg.norm(run.y[:3, -1] - exact))
