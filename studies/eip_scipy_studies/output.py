@@ -140,7 +140,7 @@ def parser(name: str, study: Callable[..., None]) -> argparse.ArgumentParser:
     for item in list(inspect.signature(study, eval_str=True).parameters.values())[1:]:
         positional = item.kind is not item.KEYWORD_ONLY
         flag = item.name if positional else f"--{item.name.replace('_', '-')}"
-        settings = option(item.annotation, item.default)
+        settings = option(item.annotation, item.default) | ({"metavar": item.name.upper()} if positional else {})
         made.add_argument(flag, default=item.default, help=said[item.name].replace("%", "%%"), **settings)
     made.add_argument("--out", type=Path, default=Path("eip_results"), metavar="DIR",
                       help="folder of figures and CSV files (default: ./%(default)s)")  # fmt: skip

@@ -8,19 +8,15 @@ import math
 import os
 import platform
 import sys
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
 from eip_scipy import show_config
-
-_untrusted: list[str] = []  # messages about unreliable runs since `listening` began
 
 
 class UsageError(Exception):
@@ -86,14 +82,12 @@ def versions() -> dict[str, str | None]:
 def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """Return a command's numbers for `write_json`, with the options, the date, the versions and the machine.
 
-    The result also says whether all runs since `listening` began are reliable. `arguments` are the options of the
-    command, and `content` its numbers, both by the names that they have in the file.
+    `arguments` are the options of the command, and `content` its numbers, both by the names that they have in the file.
     """
     return {
         "command": command,
         "arguments": dict(arguments),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "trusted": not _untrusted,
         "versions": versions(),
         "machine": machine(),
         **content,
@@ -157,35 +151,6 @@ def say(text: str = "") -> None:
 def warn(message: str) -> None:
     """Print one line for the user on stderr."""
     print(f"eip-scipy: {message}", file=sys.stderr, flush=True)
-
-
-@contextmanager
-def listening(kind: type[Warning]) -> Iterator[list[str]]:
-    """Collect warnings of the class `kind` (`ProjectionWarning`), each text once, instead of showing them.
-
-    Other warnings are not affected. The texts are added to the list that is yielded as they come; `document` reads this
-    list, too.
-    """
-    _untrusted.clear()
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", kind)
-        show = warnings.showwarning
-
-        def listen(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
-            if not issubclass(category, kind):
-                show(message, category, filename, lineno, file, line)
-            elif str(message) not in _untrusted:
-                _untrusted.append(str(message))
-
-        warnings.showwarning = listen
-        yield _untrusted
 
 
 def write_file(path: Path, write: Callable[[Path], Any]) -> Path:

@@ -1,26 +1,19 @@
-"""The command line and the runner of all commands: exit statuses, files, and small runs of each measurement."""
+"""The command line and what all studies share: exit statuses, options, files."""
 
+import inspect
 import json
-import os
-import shlex
-import subprocess
-import sys
-from dataclasses import dataclass
+import warnings
 from importlib import import_module
+from typing import Literal
 
 import numpy as np
 import pytest
 
 import eip_scipy
+from eip_scipy import ProjectionWarning
 from eip_scipy_studies import report
-from eip_scipy_studies.cli import main
-from eip_scipy_studies.commands import COMMANDS
-from eip_scipy_studies.study import Check, PartlyDone, Session, Study, option
-from eip_scipy_studies.timing import least
-
-RUNS = [
-    ("bench metric", "--only gear", ()),
-]
+from eip_scipy_studies.cli import COMMANDS, main
+from eip_scipy_studies.output import Output, parser, run
 
 
 class Figure:
@@ -30,52 +23,56 @@ class Figure:
         path.write_text("drawn")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sums(Study):
-    """Add numbers, and fail on request."""
+def sums(out: Output, *, upto: int = 3, then: Literal["pass", "fail", "stop", "warn"] = "pass") -> None:
+    """Add numbers, and fail on request.
 
-    upto: int = option(3, "the last number", type=int)
-    fails: BaseException | None = None
-    passed: bool = True
-
-    def measure(self, session):
-        if self.fails:
-            raise self.fails
-        return list(range(self.upto + 1))
-
-    def text(self, found):
-        return f"sum: {sum(found)}"
-
-    def tables(self, found):
-        return {"sums.csv": [{"number": number} for number in found]}
-
-    def numbers(self, found):
-        return {"sum": sum(found)}
-
-    def checks(self, found):
-        return [Check("all", self.passed)]
-
-    def figures(self, found):
-        yield "first.png", Figure()
+    Parameters
+    ----------
+    upto : int
+        the last number
+    then : str
+        what happens after the first number
+    """
+    rows = []
+    with out.keep():
+        for number in out.bar(range(upto + 1)):
+            rows.append({"number": number})
+            if then == "stop":
+                raise KeyboardInterrupt
+            if then == "warn":
+                warnings.warn("not reliable", ProjectionWarning, stacklevel=1)
+    total = sum(row["number"] for row in rows)
+    out.numbers["sum"] = total
+    out.rows("sums.csv", rows)
+    out.figure("first.png", Figure)
+    out.text(f"sum: {total}")
+    out.check("all", then != "fail")
 
 
 @pytest.mark.parametrize(
-    ("settings", "status", "files"),
-    [
-        ({}, 0, ["first.png", "sums.csv", "sums.json"]),
-        ({"passed": False}, 1, ["first.png", "sums.csv", "sums.json"]),
-        ({"fails": KeyboardInterrupt()}, 130, []),
-        ({"fails": PartlyDone([1, 2])}, 130, ["sums.csv", "sums.json"]),
-    ],
+    ("then", "status", "err"), [("pass", 0, ""), ("fail", 1, ""), ("stop", 130, "interrupted"), ("warn", 1, "reliable")]
 )
-def test_status_and_files(settings, status, files, tmp_path, capsys):
-    assert Sums(**settings).run(Session("sums", tmp_path, tmp_path / "sums.json")) == status
-    assert sorted(path.name for path in tmp_path.iterdir()) == files
-    if not status:
-        content = json.loads((tmp_path / "sums.json").read_text())
-        assert (content["command"], content["arguments"], content["sum"]) == ("sums", {"upto": 3}, 6)
-        assert content["versions"]["numpy"] == np.__version__
-        assert capsys.readouterr().out.startswith("sum: 6\n")
+def test_status_and_files(then, status, err, tmp_path, capsys):
+    words = ["--then", then, "--out", str(tmp_path), "--json", str(tmp_path / "sums.json")]
+    assert run("sums", sums, words) == status
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["first.png", "sums.csv", "sums.json"]
+    content, printed = json.loads((tmp_path / "sums.json").read_text()), capsys.readouterr()
+    assert content["command"] == "sums"
+    assert content["arguments"] == {"upto": 3, "then": then}
+    assert content["sum"] == (0 if then == "stop" else 6)
+    assert content["trusted"] == (then != "warn")
+    assert content["versions"]["eip_scipy"] == eip_scipy.__version__
+    assert content["checks"] == [{"text": "all", "passed": then != "fail"}]
+    assert f"sum: {content['sum']}\n" in printed.out
+    assert err in printed.err
+
+
+@pytest.mark.parametrize("words", ["--upto two", "--then else", "--many"])
+def test_wrong_options(words, capsys):
+    with pytest.raises(SystemExit) as left:
+        run("sums", sums, words.split())
+    assert left.value.code == 2
+    assert "sums" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -98,36 +95,32 @@ def test_status_of_words(words, status, capsys):
     assert bool(printed.err) == (status == 2)
 
 
-def test_every_command_is_found_and_every_measurement_run():
-    for entry in COMMANDS.values():
-        module, kind = entry.where.split(":")
-        assert hasattr(import_module(f"eip_scipy_studies.{module}"), kind)
-    assert {name for name, *_ in RUNS} >= {name for name in COMMANDS if name.startswith("study ")}
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_is_a_function_whose_options_are_described(name):
+    module, _, function = COMMANDS[name][0].partition(":")
+    study = getattr(import_module(f"eip_scipy_studies.{module}"), function)
+    described = parser(name, study).format_help()
+    for option in list(inspect.signature(study).parameters)[1:]:
+        assert option.replace("_", "-") in described.lower()
+    assert "eip_results" in described
+
+
+def test_commands_are_at_most_twelve():
+    assert len(COMMANDS) <= 12
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.parametrize(("name", "arguments", "modules"), RUNS, ids=[f"{name} {words}" for name, words, _ in RUNS])
-def test_small_run(name, arguments, modules, tmp_path):
-    for module in modules:
-        pytest.importorskip(module)
-    words = [*name.split(), *shlex.split(arguments), "--json", "run.json"]
-    command = [sys.executable, "-m", "eip_scipy", *words]
-    run = subprocess.run(command, cwd=tmp_path, env={**os.environ, "MPLBACKEND": "Agg"}, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    assert run.stdout
-    assert json.loads((tmp_path / "run.json").read_text())["versions"]["eip_scipy"] == eip_scipy.__version__
+def test_small_run_of_the_metric(tmp_path):
+    assert main(["bench", "metric", "--only", "gear", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "metric.csv").exists()
 
 
-def test_numbers_and_times():
+def test_numbers_as_text():
     numbers = [0.0, 71.2, -0.8939, 0.0011, -3.6e-9, 123456.0, 9.96, 0.0996, 999.0, np.nan, None]
     expected = ["0", "71", "-0.89", "1.1e-3", "-3.6e-9", "1.2e5", "10", "0.10", "1.0e3", "-", "-"]
     assert [report.compact(number) for number in numbers] == expected
-    order = []
-    actions = {name: lambda name=name: order.append(name) or float(len(order)) for name in "ab"}
-    assert least(actions, turns=3) == {"a": 1.0, "b": 2.0}
-    assert order == list("ababab")
 
 
 def test_json_has_no_nan_and_no_numpy(tmp_path):

@@ -24,7 +24,6 @@ from eip_scipy.problems import nbody, solar_system
 
 from ..output import Output
 from ..report import compact, needed, table
-from ..work_precision import known_end
 from .mechanisms import EXAMPLES
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
@@ -244,7 +243,8 @@ def mechanism(name: str, end: float, energy: bool) -> Case:
 def planets(turned: np.ndarray, name: str) -> Case:
     """Return ten bodies over 100 years in rotated axes, without blocks; the error is that of Mercury's position."""
     plain = solar_system(years=100.0)
-    y0, known = ((y.reshape(20, 3) @ turned.T).ravel() for y in (plain.y0, known_end(plain)))
+    assert plain.reference is not None
+    y0, known = ((y.reshape(20, 3) @ turned.T).ravel() for y in (plain.y0, np.array(plain.reference(100.0))))
     problem = nbody(plain.params, *y0.reshape(2, 10, 3), t_span=(0.0, 100.0))
     steps, more = (0.002,), {"options": {"blocks": None}, "known": known, "seen": slice(3, 6)}
     return Case("planets", name, problem, tuple(problem.invariants), y0, 100.0, steps, (EIPRK4,), **more)
