@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -65,14 +66,18 @@ class Output:
         """Write the lines of a CSV file, each with its columns' names."""
         self._wrote(write_csv(self.folder / name, rows))
 
-    def figure(self, name: str, draw: Callable[[], Any]) -> None:
-        """Write the figure that `draw` makes with matplotlib, or what it returns writes; without matplotlib, say so."""
+    def figure(self, name: str, where: str, *arguments: Any) -> None:
+        """Write the figure or what else the function `where`, "module:function", makes of the arguments.
+
+        Its module is imported here, because it needs matplotlib. Without matplotlib, say so.
+        """
         try:
             import matplotlib  # noqa: F401
         except ImportError:
             self.missing('no figures without matplotlib: pip install "eip_scipy[plot]"')
             return
-        made = draw()
+        module, _, function = where.partition(":")
+        made = getattr(import_module(f".{module}", __package__), function)(*arguments)
         self.file(name, getattr(made, "savefig", made))
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:

@@ -23,7 +23,6 @@ from eip_scipy.problems import FieldProblem
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..output import Output
 from ..report import describe_machine, table
-from . import draw
 from .problems import plane_wave
 from .splitting import Splitting
 
@@ -156,4 +155,4 @@ def efficiency(out: Output, points: int = 64, repeats: int = 3) -> None:
     left = max(float(found["modulated wave"].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
     out.check(f"modulated wave, mass and energy of EIP-ME: {left:.3g}, at most 1e-12", left <= 1e-12, ours=left)
     for file, key, cost in (("", "seconds", "processor time [s]"), ("-steps", "h", "step h")):
-        draw(out, f"fig-efficiency{file}.png", "efficiency_figure", found, key, cost)
+        out.figure(f"fig-efficiency{file}.png", "condensates.figures:efficiency_figure", found, key, cost)

@@ -14,7 +14,7 @@ from eip_scipy.problems import GrossPitaevskii
 
 from ..output import Output, checkpoint_options, require_positive
 from ..report import UsageError, compact, describe_machine, table, warn
-from . import draw, states
+from . import states
 from .ground_state import ground_state, with_noise
 from .problems import line_condensate, ring_condensate
 from .splitting import rotated
@@ -178,10 +178,10 @@ def run_ring(out: Output, quench: Quench, movie: bool, checkpoint: Path | None, 
     quench.report(out)
     if not out.interrupted:
         densities = np.abs(quench.equation.grid.field(quench.runs[SHOWN].y)) ** 2
-        draw(out, "ring-errors.png", "errors_figure", quench)
-        draw(out, "ring-snapshots.png", "snapshots_figure", quench, densities, None)
+        out.figure("ring-errors.png", "condensates.figures:errors_figure", quench)
+        out.figure("ring-snapshots.png", "condensates.figures:snapshots_figure", quench, densities, None)
         if movie:
-            draw(out, "ring.gif", "movie", quench, densities)
+            out.figure("ring.gif", "condensates.figures:movie", quench, densities)
 
 
 def vortex_lines(
@@ -229,10 +229,10 @@ def vortex_lines(
         off = float(np.abs(moved.angle - SLOWER * moved.t).max())  # at most 0.1 of the distance between two points
         checked(out, f"angle off {SLOWER:.1f} t by less than {finest:.2g} rad", off, off < finest)
         planes = np.abs(after.grid.field(quench.runs[SHOWN].y)[..., points // 2]) ** 2
-        draw(out, "vortex-lines-errors.png", "errors_figure", quench)
-        draw(out, "vortex-lines-slices.png", "snapshots_figure", quench, planes, 5.0)
+        out.figure("vortex-lines-errors.png", "condensates.figures:errors_figure", quench)
+        out.figure("vortex-lines-slices.png", "condensates.figures:snapshots_figure", quench, planes, 5.0)
         if find_spec("skimage"):
-            draw(out, "vortex-lines-surfaces.png", "surfaces_figure", quench)
+            out.figure("vortex-lines-surfaces.png", "condensates.figures:surfaces_figure", quench)
         else:
             out.missing('no surfaces of equal density without scikit-image: pip install "eip_scipy[surfaces]"')
 

@@ -15,7 +15,6 @@ from eip_scipy.problems import Grid, GrossPitaevskii
 
 from ..output import Output, require_positive
 from ..report import UsageError, compact, describe_machine, table
-from . import draw
 from .ground_state import GroundState, ground_state, imprint, lowest_ring, polygon, vortex_starts, with_noise
 from .problems import harmonic_trap, line_condensate, ring_condensate
 from .vortices import vortices
@@ -141,7 +140,7 @@ def report(out: Output, found: Mapping[str, list[Found]], starts: int) -> None:
     for name in found.keys() & {"ring", "lines"}:
         out.file(f"{name}.npz", partial(_save, min(found[name], key=lambda item: item.state.energy)))
     for name, items in found.items():
-        draw(out, f"ground-state-{name}.png", "states_figure", items, TITLES[name].split(";")[0])
+        out.figure(f"ground-state-{name}.png", "condensates.figures:states_figure", items, TITLES[name].split(";")[0])
 
 
 def checks(found: Mapping[str, list[Found]]) -> Iterator[tuple[str, float, float, bool]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fnmatch import filter as matching
 from functools import cached_property, partial
 from importlib.util import find_spec
@@ -231,11 +231,4 @@ def compare(out: Output, stem: str, scenes: Sequence[str], only: Sequence[str] =
     for field in dict.fromkeys(scene.partition("-")[0] for scene in scenes):
         own = {each.scene: each for each in found if each.scene.startswith(field)}
         names = [name for name in found[0].orbits if name != "reference" and (name, stem) != ("EIP-H", "fig-tokamak")]
-        out.figure(f"{stem}.png" if only else f"{stem}-{field}.png", partial(draw, own, names))
-
-
-def draw(found: Mapping[str, Experiment], names: Sequence[str]) -> Any:
-    """Draw orbits and errors of some methods in one field; matplotlib is imported here."""
-    from .figures import particle_figure
-
-    return particle_figure(found, names)
+        out.figure(f"{stem}.png" if only else f"{stem}-{field}.png", "particles.figures:particle_figure", own, names)

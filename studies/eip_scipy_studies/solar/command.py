@@ -13,7 +13,7 @@ from ..report import UsageError
 from .comparison import Comparison, text
 from .cost import cost_methods, show_costs
 from .epoch import kernels, one_line, parse_epoch
-from .runs import Rebound, Run, drawing, make_scene, methods, tableaux
+from .runs import Rebound, Run, make_scene, methods, tableaux
 from .truth import compare_forces
 
 COST_YEARS = 100.0
@@ -122,4 +122,4 @@ def show(out: Output, found: Comparison, order: int, asked: float) -> None:
     for line, passed in found.checks(order):
         out.check(line, passed)
     for name in FIGURES if found.tight else ():
-        out.figure(f"{name}.png", drawing(name, found))
+        out.figure(f"{name}.png", f"solar.figures:{name.replace('-', '_')}", found)

@@ -13,7 +13,7 @@ from eip_scipy.solvers import EIPSolver
 
 from ..output import Output
 from ..report import compact, describe_machine, table
-from .runs import KEPT, Rebound, Scene, by_rebound, by_us, by_verlet, drawing, metric_of, tightest, whole_number
+from .runs import KEPT, Rebound, Scene, by_rebound, by_us, by_verlet, metric_of, tightest, whole_number
 
 REPEATS, ENOUGH_SECONDS = 3, 0.2  # a longer run is not repeated: disturbances of it are invisible on log axes
 MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first number would be unstable
@@ -70,7 +70,7 @@ def show_costs(out: Output, scene: Scene, methods: Methods, rebound: Rebound | N
         body.append((run.method, [step, *map(compact, (run.wall_time, run.error, run.error_others))]))
     out.text(f"\nError of position after {scene.years:g} yr; {describe_machine()}, one thread, least of {REPEATS}\n")
     out.text(table([["step [d]"], ["wall [s]"], ["Mercury [AU]"], ["others [AU]"]], body))
-    out.figure("error-against-cost.png", drawing("error-against-cost", scene.data.name, runs))
+    out.figure("error-against-cost.png", "solar.figures:error_against_cost", scene.data.name, runs)
 
 
 def timed(scene: Scene, methods: Methods, rebound: Rebound | None, progress: Callable[[], Any]) -> list[TimedRun]:

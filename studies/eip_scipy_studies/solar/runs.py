@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -162,11 +161,6 @@ def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
 def metric_of(method: type[EIPSolver], metric: str) -> str:
     """Return `metric`, or "euclidean" if the method has no error estimate."""
     return metric if method.TABLEAU.has_estimate else "euclidean"
-
-
-def drawing(name: str, *arguments: Any) -> Callable[[], Any]:
-    """Return a function that draws a figure; the module of the figures, which needs matplotlib, is imported then."""
-    return lambda: getattr(import_module(f"{__package__}.figures"), name.replace("-", "_"))(*arguments)
 
 
 def methods(scene: Scene, method: type[EIPSolver], metric: str, rebound: Rebound | None) -> list[Method]:

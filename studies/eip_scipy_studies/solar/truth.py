@@ -17,7 +17,7 @@ from eip_scipy.problems.gravity.solar_data import AU_KM, YEAR_D
 from ..output import Output
 from ..report import UsageError, compact, table
 from .epoch import kernels, one_line, parse_epoch
-from .runs import drawing, named, whole_number
+from .runs import named, whole_number
 
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 STEP = 0.001
@@ -79,7 +79,7 @@ def compare_forces(
         if moved > STEP_KM + STEP_SHARE * error:
             moves = f"{model}: halving the step moves {body} by {moved:.2g} km, its error is {error:.2g} km"
             out.check(f"{moves}; take a smaller --h", False)
-    out.figure("solar-truth.png", drawing("solar-truth", times, runs, begin))
+    out.figure("solar-truth.png", "solar.figures:solar_truth", times, runs, begin)
 
 
 def models(forces: Sequence[str]) -> list[tuple[str, ...]]:
