@@ -11,7 +11,7 @@ from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, integrate
 from eip_scipy.problems import kepler
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.output import Output
-from eip_scipy_studies.paper import kepler, tables
+from eip_scipy_studies.paper import orbits, tables
 
 EPS = np.finfo(float).eps
 SERIES = tables.DATA["series"]
@@ -170,10 +170,10 @@ def test_a_wrong_number_fails_the_command(tmp_path, monkeypatch, capsys):
 
 def test_short_runs_of_figures_1_and_2(tmp_path, monkeypatch):
     """Each run keeps what it is named after; known values are those at t = 2000, and most are not met."""
-    monkeypatch.setattr(kepler, "T_END", 1.5)
+    monkeypatch.setattr(orbits, "T_END", 1.5)
     out = Output(tmp_path, quiet=True)
-    kepler.kepler_figures(out)
-    assert {path.name for path in tmp_path.iterdir()} == {"fig-kepler.csv", *figures.FIGURES}
+    orbits.kepler_figures(out)
+    assert {path.name for path in tmp_path.iterdir()} == {"fig-kepler.csv", *orbits.FIGURES}
     assert [check["passed"] for check in out.numbers["checks"]] == [False, False, False, True]
     last = {row["method"]: row for row in read(tmp_path / "fig-kepler.csv")}
     energy, momentum, position = (

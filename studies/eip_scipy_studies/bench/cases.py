@@ -350,6 +350,35 @@ def ten_bodies(years: float) -> Case:
     )  # fmt: skip
 
 
+def gravity(name: str, title: str, ready: Callable[[], problems.Problem], steps: Mapping[str, int]) -> Case:
+    """Return a problem of the library with N bodies under Newton's gravitation."""
+    problem = ready()
+    assert problem.params is not None
+    gm = problem.params[: problem.y0.size // 6].copy()
+    return Case(
+        name, title, lambda m: bodies(m, gm), problem.y0, problem.t_span[1],
+        scalar=False, steps=steps, ready=ready, gm=gm,
+    )  # fmt: skip
+
+
+def resonant_chain() -> problems.Problem:
+    """Return seven planets with the periods, masses and transits of TRAPPIST-1's, on circles at the start.
+
+    The periods' ratios are near 8:5, 5:3, 3:2, 3:2, 4:3 and 3:2. The units are AU and years.
+    """
+    solar = 4 * np.pi**2
+    days = np.array([1.510826, 2.421937, 4.049219, 6.101013, 9.207540, 12.352446, 18.772866])
+    transits = np.array([7.55044, 8.58728, 7.06768, 7.82771, 7.07426, 7.71462, -0.39324])
+    masses = np.array([0.0898, *(3.003e-6 * np.array([1.374, 1.308, 0.388, 0.692, 1.039, 1.321, 0.326]))])
+    axes, phases = (masses[0] * (days / 365.25) ** 2) ** (1 / 3), 2 * np.pi * (7.93 - transits) / days
+    q, v = np.zeros((8, 3)), np.zeros((8, 3))
+    q[1:, 0], q[1:, 1] = axes * np.cos(phases), axes * np.sin(phases)
+    speeds = np.sqrt(solar * (masses[0] + masses[1:]) / axes)
+    v[1:, 0], v[1:, 1] = -speeds * np.sin(phases), speeds * np.cos(phases)
+    shares = masses / masses.sum()
+    return problems.nbody(solar * masses, q - shares @ q, v - shares @ v, t_span=(0.0, 3.0))
+
+
 def _crystal() -> np.ndarray:
     side = np.arange(4.0) * 2 ** (1 / 6)
     positions = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
@@ -394,6 +423,11 @@ def _made() -> tuple[Case, ...]:
         ),
         Case("rigid body", "t = 1000", rigid_body, np.array([0.6, 0.0, 0.8]), 1000.0),
         *(ten_bodies(years) for years in YEARS),
+        gravity(
+            "resonant chain", "Seven exoplanets like TRAPPIST-1's, 725 revolutions", resonant_chain,
+            {"EIPRKN12": 8700, "EIPGJ14": 72_500, "WHFast": 14_500},
+        ),
+        gravity("close encounter", "A comet past Jupiter at 3 radii, 20 years", problems.comet, {"WHFast": 1600}),
         Case(
             "Lennard-Jones", "64 atoms, t = 3", atoms, _crystal(), 3.0, scalar=False,
             steps={"EIPRKN12": 40, "EIPGJ14": 800},

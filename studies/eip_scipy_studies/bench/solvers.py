@@ -378,17 +378,18 @@ def rebound(integrator: str, case: Case) -> Solve:
 
 
 def _ours() -> Iterator[Solver]:
-    second = lambda case: "EIPRKN12" in case.steps and not case.members  # noqa: E731
+    stepped = lambda method: lambda case: method in case.steps and not case.members  # noqa: E731
+    second = lambda case: plain(case) and case.plain.acceleration is not None  # noqa: E731
     for kind, prepare, fits, label in (
         (USER, ours, plain, ""),
         (USER, expression, lambda case: case.hamiltonian is not None, ", hamiltonian"),
         (READY, ready, lambda case: case.ready is not None, ", ready"),
     ):
-        both = lambda case, fits=fits: fits(case) and second(case)  # noqa: E731
+        both = lambda other, fits=fits: lambda case: fits(case) and other(case)  # noqa: E731
         yield Solver(f"EIPDOP853{label}", "eip_scipy", kind, partial(prepare, "EIPDOP853"), fits)
-        yield Solver(f"EIPRKN12{label}", "eip_scipy", kind, partial(prepare, "EIPRKN12"), both, "EIPRKN12")
-        yield Solver(f"EIPRKN12 adaptive{label}", "eip_scipy", kind, partial(prepare, "EIPRKN12"), both)
-        yield Solver(f"EIPGJ14{label}", "eip_scipy", kind, partial(prepare, "EIPGJ14"), both, "EIPGJ14")
+        for method in ("EIPRKN12", "EIPGJ14"):
+            yield Solver(f"{method}{label}", "eip_scipy", kind, partial(prepare, method), both(stepped(method)), method)
+        yield Solver(f"EIPRKN12 adaptive{label}", "eip_scipy", kind, partial(prepare, "EIPRKN12"), both(second))
     yield Solver("EIPDOP853 in solve_ivp", "eip_scipy", USER, in_solve_ivp, plain)
     for method in ("EIPRadau", "EIPBDF"):
         yield Solver(method, "eip_scipy", USER, partial(ours, method), lambda case: case.stiff)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from eip_scipy.plotting import FLOOR, PALETTE, log_errors
 
-from .kepler import ORBIT_END, POINTS, KeplerRun
+from .orbits import ORBIT_END, POINTS, KeplerRun
 
 
 def errors_figure(found: dict[str, KeplerRun], title: str) -> Any:

@@ -10,7 +10,7 @@ from ..condensates.efficiency import efficiency
 from ..output import Output
 from ..particles.charged_particle import paper_figure
 from ..solar.command import solar_system
-from .kepler import kepler_figures
+from .orbits import kepler_figures
 from .tables import table
 
 Name = Literal[
