@@ -56,8 +56,9 @@ SLOW, FAST = 1.0, 0.03
 
 
 def leaves_slow_out(config: pytest.Config) -> bool:
-    """Return True unless the command names tests or marks: the whole suite without its slow tests is the default."""
-    return not config.option.markexpr and not any("::" in name for name in config.invocation_params.args)
+    """Return True unless the command chooses tests, by name or mark: by default all but the slow ones run."""
+    chosen = config.option.markexpr or config.option.keyword
+    return not chosen and not any("::" in word or word == "-m" for word in config.invocation_params.args)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

@@ -60,8 +60,8 @@ NIGHTLY = (
 )
 def test_page(page, capsys, tmp_path, monkeypatch):
     """Run all blocks of a page in turn, in one namespace; a block of text is the output of the code before it."""
-    for package in NEEDED.get(page, ()):
-        pytest.importorskip(package)
+    if missing := [name for name in NEEDED.get(page, ()) if find_spec(name) is None]:
+        pytest.skip(f"needs {', '.join(missing)}")
     monkeypatch.chdir(tmp_path)  # where pages write their files
     path = ROOT / page
     text = path.read_text(encoding="utf-8")
