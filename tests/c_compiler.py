@@ -32,7 +32,7 @@ def shared_library(path, *sources):
 
 
 def low_level(library, name, arrays=3):
-    """The function `name` of a library, by its path, which takes a double and pointers to so many arrays of doubles."""
+    """Return the function `name` of a library (a path) that takes a double and pointers to arrays of doubles."""
     function = ctypes.CDLL(str(library))[name]
     function.argtypes = [ctypes.c_double, *[ctypes.POINTER(ctypes.c_double)] * arrays]
     return LowLevelCallable(function)

@@ -8,6 +8,8 @@ from numba import njit
 
 from eip_scipy import Invariant
 
+AU_KM, DAY_S, YEAR_D = 149597870.7, 86400.0, 365.25  # IAU 2012 Resolution B2, and the Julian year
+
 
 def oscillator(t, y):
     return np.array([y[1], -y[0]])

@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPRK4, integrate
-from eip_scipy.problems import nbody, solar_system
-from eip_scipy.problems.gravity.solar_data import load
+from eip_scipy.problems import nbody, solar_data, solar_system
 
 pytestmark = pytest.mark.needs_jit
 
@@ -57,7 +56,7 @@ def test_two_thousand_years():
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))])
 def test_mercury_gains_a_hundredfold_in_any_orientation(seed):
-    data = load("de440")
+    data = solar_data.load("de440")
     turn = Rotation.random(rng=seed).as_matrix()
     problem = nbody(
         data.gm * 365.25**2, data.position @ turn.T, data.velocity @ turn.T * 365.25, t_span=(0.0, 100.0), h=0.002

@@ -31,7 +31,6 @@ from eip_scipy import (
     integrate,
     project,
 )
-from eip_scipy.ensembles import tasks
 from eip_scipy.problems import kepler, nbody
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.output import Output
@@ -392,9 +391,10 @@ def test_examinations_stay_in_the_interval_and_refuse_nothing():
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("method", [EIPRK2, EIPRK4, EIPRK5])
 @pytest.mark.parametrize("together", [False, True], ids=["one by one", "in vectors"])
-def test_each_member_is_judged_by_its_own_checks(method, together, monkeypatch):
+def test_each_member_is_judged_by_its_own_checks(method, together, request):
     """Members 1 to 7 have friction of 1e-4 to 0.1; the others, some of them in a vector with these, have none."""
-    monkeypatch.setattr(tasks, "LEAST_WORK", 0.0 if together else np.inf)
+    if together:
+        request.getfixturevalue("in_vectors")
     friction = np.zeros((17, 1))
     friction[1:8, 0] = np.geomspace(1e-4, 0.1, 7)
     problem = compiled_pendulum(end=10.0, members=True)

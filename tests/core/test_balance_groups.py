@@ -18,9 +18,7 @@ from eip_scipy import (
     project,
 )
 from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.problems import nbody
-from eip_scipy.problems.gravity.orbits import orbital_balances
-from eip_scipy.run import resume
+from eip_scipy.problems import nbody, orbital_balances
 
 EPS = np.finfo(float).eps
 DRAG = 1e-6
@@ -182,9 +180,8 @@ class StoppedError(Exception):
 
 
 @pytest.mark.parametrize("options", RUNS)
-def test_a_resumed_run_has_the_same_bits(tmp_path, monkeypatch, options):
-    monkeypatch.setattr(resume, "SNAPSHOT_SECONDS", 0.0)
-    monkeypatch.setattr(resume, "LEAST_RATIO", 0.0)
+@pytest.mark.usefixtures("snapshots")
+def test_a_resumed_run_has_the_same_bits(tmp_path, options):
     rows = iter(range(4))
 
     def stop(t, y, defects):

@@ -15,6 +15,7 @@ from eip_scipy import (
     EIPGJ12,
     EIPGJ14,
     EIPRK4,
+    EIPRK5,
     EIPRK23,
     EIPRK45,
     EIPRKN8,
@@ -23,11 +24,9 @@ from eip_scipy import (
     Invariant,
     eip_method,
 )
-from eip_scipy.methods.nystrom import RKN86
-from eip_scipy.methods.runge_kutta import DOP853 as DOP853_TABLEAU
-from eip_scipy.methods.runge_kutta import RK5
 
 Y0 = [1.0, 0.3]
+RK5, RKN86, DOP853_TABLEAU = (method.TABLEAU for method in (EIPRK5, EIPRKN8, EIPDOP853))
 PAIRS = ((EIPRK45, RK45), (EIPRK23, RK23), (EIPDOP853, DOP853))
 
 

@@ -23,7 +23,6 @@ from eip_scipy import (
     load,
     solve_ivp,
 )
-from eip_scipy.core import driven
 from eip_scipy.problems import Problem, kepler
 from eip_scipy.results import save
 
@@ -242,18 +241,6 @@ def test_what_is_no_invariant_is_reported(method):
     ):
         sol = solve_ivp(relaxing, (0, 0.01), exact(0.5), method, invariants=wrong, **TIGHT)
     assert not sol.trusted
-
-
-@both
-def test_private_names_of_scipy(method, monkeypatch):
-    """All used attributes exist, and a version of SciPy that lacks one is named."""
-    inner = method.TABLEAU.solver
-    solver = inner(relaxing, 0.0, START, 1.0)
-    solver.step()
-    assert all(hasattr(solver, name) for name in (*driven.PRIVATE[inner], "jac_factor", "max_step"))
-    monkeypatch.setitem(driven.PRIVATE, inner, ("D", "f", "lost"))
-    with pytest.raises(NotImplementedError, match=rf"EIP{inner.__name__} uses .*not have: .*lost\. Use another"):
-        ivp(method)
 
 
 def test_classes_of_scipy_by_eip_method():

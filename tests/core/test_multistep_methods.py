@@ -19,8 +19,7 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.methods import GaussJackson
-from eip_scipy.problems import nbody, solar_system
-from eip_scipy.problems.gravity import solar_data
+from eip_scipy.problems import nbody, solar_data, solar_system
 
 both = pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
 Y0 = pericentre(0.2)

@@ -25,9 +25,7 @@ from systems import (
     same_fields,
 )
 
-from eip_scipy import EIPRK4, Invariant, ensemble, integrate
-from eip_scipy.methods.nystrom import RKN1210
-from eip_scipy.methods.runge_kutta import RK5
+from eip_scipy import EIPRK4, EIPRK5, EIPRKN12, Invariant, ensemble, integrate
 from eip_scipy.problems import Problem, kepler
 from eip_scipy.results import EnsembleResult
 
@@ -75,7 +73,7 @@ def test_one_number_for_each_member_of_a_problem_with_one_parameter():
         ensemble(problem, (0, 1), np.ones((2, 2)), params=k)
 
 
-@pytest.mark.parametrize("own", [RK5, RKN1210], ids=str)
+@pytest.mark.parametrize("own", [EIPRK5.TABLEAU, EIPRKN12.TABLEAU], ids=str)
 def test_the_method_of_a_problem(own):
     """Without `method` the problem's own steps the members, as in `integrate`; a problem without one has EIPRK4."""
     problem, y0s = replace(kepler(), method=own), starts(3)

@@ -209,8 +209,8 @@ def test_the_energy_that_comes_with_the_accelerations_has_the_bits_of_the_energy
     np.testing.assert_array_equal(found.diagnostics.max_defect, expected.diagnostics.max_defect)
 
 
-def test_members_of_an_ensemble_get_the_bits_of_single_runs(monkeypatch):
-    monkeypatch.setattr("eip_scipy.ensembles.tasks.LEAST_WORK", 0)
+@pytest.mark.usefixtures("in_vectors")
+def test_members_of_an_ensemble_get_the_bits_of_single_runs():
     gm, y = bodies(MANY + 3)
     problem = nbody(gm, *y.reshape(2, -1, 3), t_span=(0, 2e-3), h=1e-3)
     starts = problem.y0 * (1 + 1e-3 * np.random.default_rng(1).standard_normal((9, y.size)))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
+from systems import AU_KM, DAY_S, YEAR_D
 
 from eip_scipy.integrations import jpl
 from eip_scipy.problems import solar_data, solar_system
-from eip_scipy.problems.gravity.solar_data import AU_KM, DAY_S, YEAR_D
 
 EPS = np.finfo(float).eps
 NAMES = ("de440", "de440-j2000", "paper", "de440-moon")

@@ -21,7 +21,6 @@ from eip_scipy import (
     EIPDOP853,
     EIPGJ12,
     EIPRK4,
-    EIPRK45,
     EIPRKN12,
     check_gradient,
     ensemble,
@@ -451,27 +450,6 @@ def test_cube_roots_are_real():
             assert out[3] == pytest.approx(-(1 + 4 / 3 * two) / 3 / root**2, rel=1e-14)
 
 
-def test_without_numba(monkeypatch):
-    from eip_scipy.core import jitted as module
-    from eip_scipy.problems.symbolic import system
-
-    H = "(px**2 + py**2)/2 + log(x) + atan2(y, x) + sqrt(1 + y**2) + abs(y) + max(x, y) + cbrt(x) + y*cbrt(y)"
-    y = np.array([1.2, -0.4, 0.3, 0.1])
-    compiled = hamiltonian(H, name="one")
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    system._functions.cache_clear()
-    plain = hamiltonian(H, name="one")
-    system._functions.cache_clear()
-    assert "plain Python" in repr(plain)
-    assert plain.fun(0.0, y) == pytest.approx(compiled.fun(0.0, y), rel=1e-14)
-    assert plain.invariants[0].fun(0.0, y) == pytest.approx(compiled.invariants[0].fun(0.0, y), rel=1e-14)
-    run = integrate(plain, (0, 0.5), y, method=EIPRK45, rtol=1e-9)
-    assert run.success
-    assert not run.compiled
-    with np.errstate(all="ignore"):  # where a step reaches too far there is no exception
-        assert np.isnan(plain.invariants[0].fun(0.0, np.array([-1.0, 0.1, 0.0, 0.0])))
-
-
 def test_problems_share_functions_pickle_and_copy(orbit):
     two = [hamiltonian(RELATIVISTIC_KEPLER, params={"eps": eps}, invariants=MOMENTUM) for eps in (0.1, 0.2)]
     assert two[0].rhs is two[1].rhs
@@ -485,8 +463,8 @@ def test_problems_share_functions_pickle_and_copy(orbit):
             np.testing.assert_array_equal(integrate(again, method=EIPRK4, h=0.03).y, run.y)
 
 
-def test_members_are_single_runs(orbit, monkeypatch):
-    monkeypatch.setattr("eip_scipy.ensembles.tasks.LEAST_WORK", 0.0)
+@pytest.mark.usefixtures("in_vectors")
+def test_members_are_single_runs(orbit):
     y0s = kepler().y0 * np.linspace(0.99, 1.01, 64)[:, None]
     found = ensemble(orbit, (0, 10), y0s, method=EIPRK4, h=0.01)
     assert found.one_by_one == ""
@@ -510,14 +488,3 @@ def test_code_is_the_same_in_every_process():
     here = getattr(rhs, "py_func", rhs).__code__
     # The code, not what becomes of it.
     assert printed(code, PYTHONHASHSEED="1", NUMBA_DISABLE_JIT="1") == f"{here.co_code.hex()} {here.co_consts}\n"
-
-
-def test_sympy_is_loaded_by_its_callers_alone(monkeypatch):
-    from eip_scipy.problems import symbolic
-
-    code = "import sys; from eip_scipy import hamiltonian, equations, problems; print('sympy' in sys.modules)"
-    assert printed(code) == "False\n"
-    monkeypatch.setattr(symbolic, "find_spec", lambda name: None)
-    for call in (lambda: hamiltonian("p**2"), lambda: equations(["x"], "x")):
-        with pytest.raises(ImportError, match=r'needs SymPy: python -m pip install "eip_scipy\[sympy\]"'):
-            call()

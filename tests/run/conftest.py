@@ -5,6 +5,7 @@ import contextlib
 import numpy as np
 import pytest
 
+from eip_scipy import checkpoint
 from eip_scipy.run import integrate as longrun
 from eip_scipy.run import resume
 
@@ -49,3 +50,29 @@ def stopped(monkeypatch):
             yield
 
     return at
+
+
+@pytest.fixture
+def times_written(monkeypatch):
+    """Return a function that notes when a run writes checkpoints, with 200 chunks of 10 ms of a simulated clock."""
+
+    def times(run, path, every, seconds=0.0):
+        now, written, advance, write = [0.0], [], longrun.Driver.advance, checkpoint.write
+
+        def tick(driver, k_end):
+            now[0] += 0.01
+            return advance(driver, min(k_end, driver.step + 1))
+
+        def note(path, header, arrays):
+            now[0] += seconds
+            written.append((now[0], header["step"], header["status"]))
+            write(path, header, arrays)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(longrun.Driver, "advance", tick)
+            patch.setattr(resume.time, "perf_counter", lambda: now[0])
+            patch.setattr(checkpoint, "write", note)
+            run(checkpoint=path, checkpoint_every=every)
+        return written
+
+    return times

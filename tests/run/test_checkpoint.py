@@ -29,8 +29,6 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.run import integrate as longrun
-from eip_scipy.run import resume
 
 Y0 = pericentre(0.6)
 
@@ -139,35 +137,14 @@ def test_a_failed_run_fails_again(tmp_path):
 # When checkpoints are written.
 
 
-def times_written(monkeypatch, path, every, seconds=0.0, **options):
-    """Return the times of writing in a run of 200 chunks of 10 ms of a simulated clock, with `seconds` for each."""
-    now, written, advance, write = [0.0], [], longrun.Driver.advance, checkpoint.write
-
-    def tick(driver, k_end):
-        now[0] += 0.01
-        return advance(driver, min(k_end, driver.step + 1))
-
-    def note(path, header, arrays):
-        now[0] += seconds
-        written.append((now[0], header["step"], header["status"]))
-        write(path, header, arrays)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(longrun.Driver, "advance", tick)
-        patch.setattr(resume.time, "perf_counter", lambda: now[0])
-        patch.setattr(checkpoint, "write", note)
-        run(checkpoint=path, checkpoint_every=every, **options)
-    return written
-
-
-def test_checkpoint_every(tmp_path, monkeypatch):
-    written = times_written(monkeypatch, tmp_path / "a", 0.5)
+def test_checkpoint_every(tmp_path, times_written):
+    written = times_written(run, tmp_path / "a", 0.5)
     np.testing.assert_allclose([t for t, _, _ in written], [0.0, 0.5, 1.0, 1.5, 2.0], atol=0.025)
     assert [status for _, _, status in written] == [None] * 4 + [0]
     assert written[1][1] == pytest.approx(50, abs=1)
-    assert [step for _, step, _ in times_written(monkeypatch, tmp_path / "b", np.inf)] == [0, 200]
+    assert [step for _, step, _ in times_written(run, tmp_path / "b", np.inf)] == [0, 200]
     # Writing takes at most a twentieth of the time.
-    gaps = np.diff([t for t, _, _ in times_written(monkeypatch, tmp_path / "c", 0.01, seconds=0.02)])[:-1]
+    gaps = np.diff([t for t, _, _ in times_written(run, tmp_path / "c", 0.01, seconds=0.02)])[:-1]
     assert gaps.size > 3
     np.testing.assert_allclose(gaps, 0.425, atol=0.026)
 

@@ -9,7 +9,6 @@ from numba import njit
 
 from eip_scipy import EIPDOP853, ensemble, integrate
 from eip_scipy.core import jitted_columns
-from eip_scipy.ensembles import tasks
 
 pytestmark = pytest.mark.needs_jit
 SPAN, START = (0.0, 3.0), [1.0, 0.3]
@@ -84,8 +83,8 @@ def test_functions_that_depend_on_the_memory_of_arrays_are_refused(fun, reason):
         np.testing.assert_allclose(run.stm[-1], right.stm[-1], rtol=0, atol=1e-13)
 
 
-def test_members_are_not_compiled_for_eight_whose_arrays_they_would_misread(monkeypatch):
-    monkeypatch.setattr(tasks, "LEAST_WORK", 0)  # functions are compiled for eight members if they can be
+@pytest.mark.usefixtures("in_vectors")
+def test_members_are_not_compiled_for_eight_whose_arrays_they_would_misread():
     starts, options = np.array(START) * np.linspace(1, 1.1, 16)[:, None], OPTIONS | {"in_place": True}
     found = ensemble(by_pointer_in_place, SPAN, starts, executor=1, **options)
     assert not found.side_by_side.any()

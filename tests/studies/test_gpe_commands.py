@@ -10,7 +10,6 @@ import pytest
 
 from eip_scipy import integrate
 from eip_scipy.problems import Grid, GrossPitaevskii
-from eip_scipy.run import resume
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.condensates import efficiency, quench, states, vortices
 from eip_scipy_studies.condensates.ground_state import GroundState, ground_state, imprint
@@ -93,6 +92,7 @@ def test_ring(tmp_path, start, capsys):
 
 @pytest.mark.nightly
 @pytest.mark.slow
+@pytest.mark.usefixtures("snapshots")
 @pytest.mark.parametrize(("broken", "evaluation", "done"), [(0, 207, set()), (2, 93, {"EIP-M"})])
 def test_an_interrupted_command_goes_on(broken, evaluation, done, tmp_path, start, capsys, monkeypatch):
     """The interruption is in the reference or a method's run; the numbers are those of an uninterrupted command."""
@@ -111,7 +111,6 @@ def test_an_interrupted_command_goes_on(broken, evaluation, done, tmp_path, star
 
     with monkeypatch.context() as patch:
         patch.setattr(quench, "integrate", breaking)
-        patch.setattr(resume, "SNAPSHOT_SECONDS", 0.0)
         run(out := Output(tmp_path / "first"), start, checkpoint=folder)
     assert out.interrupted
     assert "the same command with --resume goes on from the checkpoints" in capsys.readouterr().err

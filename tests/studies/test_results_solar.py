@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from systems import YEAR_D
 
 import eip_scipy
 from eip_scipy import EIPDOP853, EIPGJ14, EIPRK4, EIPRKN12, integrate
 from eip_scipy.problems import comet, figure_eight, kepler, pythagorean, solar_system
-from eip_scipy.problems.gravity.solar_data import YEAR_D
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.solar import comparison, runs
 

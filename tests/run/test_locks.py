@@ -1,0 +1,37 @@
+"""The lock of a checkpoint has one holder at any time."""
+
+import threading
+import time
+
+import pytest
+
+from eip_scipy.checkpoint import CheckpointError
+from eip_scipy.checkpoint.locks import Lock
+
+
+@pytest.mark.slow
+def test_one_holder_at_any_time(tmp_path):
+    """Each run removes the lock's file when it ends: others that have it open detect that."""
+    inside, most, taken, end = [0], [0], [0], time.monotonic() + 2.0
+
+    def compete():
+        while time.monotonic() < end:
+            try:
+                lock = Lock(tmp_path / "kept")
+            except CheckpointError:
+                continue
+            inside[0] += 1
+            most[0] = max(most[0], inside[0])
+            taken[0] += 1
+            time.sleep(0)
+            inside[0] -= 1
+            lock.close()
+
+    threads = [threading.Thread(target=compete) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1]
+    assert taken[0] > 10
+    assert list(tmp_path.iterdir()) == []
