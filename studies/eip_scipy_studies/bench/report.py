@@ -59,7 +59,7 @@ def losses(found: list[Measured]) -> Iterator[tuple[float, str]]:
             mine = ours(table, k)
             if best and not best.seconds[k] >= mine:
                 ratio = mine / best.seconds[k]
-                told = f"{ratio:.2g} times faster" if ratio > 0 else "the only one that arrives"
+                told = f"{float(f'{ratio:.2g}'):g} times faster" if ratio > 0 else "the only one that arrives"
                 yield ratio, f"{case}, error {level:.0e}: {best.solver} is {told}"
 
 
