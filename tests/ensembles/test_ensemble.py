@@ -56,7 +56,6 @@ def same_members(run, single):
 
 # A member is the single run.
 
-
 TARGET = [Invariant(jit_energy, jit_energy_gradient, target=-0.5, name="H")]
 
 

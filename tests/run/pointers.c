@@ -31,7 +31,6 @@ int momentum_gradient(double t, const double *y, const double *f, double *out, c
     return 0;
 }
 
-
 /* An oscillator, with y^2. After the time params[0] the k-th function returns params[k] where that is not 0; for 99 it
    returns 0, but fills nothing. */
 static int ended(double t, const double *params, int k)
@@ -90,11 +89,3 @@ int decay(double t, const double *y, double *out, const double *params)
     out[0] = -50.0 * y[0];
     return 0;
 }
-
-int reads_f(double t, const double *y, const double *f, double *out, const double *params)
-{
-    out[0] = f[0];
-    out[1] = f[1];
-    return 0;
-}
-

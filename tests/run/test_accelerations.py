@@ -50,6 +50,7 @@ def exact(t):
     return np.append(q * np.cos(2 * t) + v / 2 * np.sin(2 * t), v * np.cos(2 * t) - 2 * q * np.sin(2 * t))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", SECOND_ORDER)
 def test_accelerations_and_fields_of_second_order_methods(method):
     ways = [{"fun": field}, {"fun": JITTED[field]}]

@@ -89,6 +89,7 @@ def exact(end):
     return scipy.integrate.solve_ivp(fun, (0, end), START, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", RUNS)
 def test_compiled_runs_have_the_bits_of_interpreted_ones(options):
     times, end = np.linspace(0, 20, 33), exact(20.0)

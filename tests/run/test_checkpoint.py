@@ -333,6 +333,7 @@ def outcome(path):
     return header, {name: (a.dtype, a.tolist()) for name, a in arrays.items()}
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_mutations(data, tmp_path):

@@ -159,6 +159,7 @@ def pulse(m):
     return np.concatenate([np.exp(-(np.linspace(-4, 4, m) ** 2)), np.zeros(m)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiled", [False, True])
 def test_gradients_of_a_large_grid_by_its_values_are_told(compiled):
     """The warning appears once, with a correct line of code that fixes it; a small state is not reported."""

@@ -10,11 +10,9 @@ from numba import njit
 from eip_scipy import EIPDOP853, ensemble, integrate
 from eip_scipy.core import jitted_columns
 
-pytestmark = pytest.mark.needs_jit
+pytestmark = [pytest.mark.needs_jit, pytest.mark.slow]
 SPAN, START = (0.0, 3.0), [1.0, 0.3]
 OPTIONS = {"method": EIPDOP853, "h": 0.02}
-
-
 TWO = ctypes.c_double * 2
 
 

@@ -79,13 +79,6 @@ def test_an_autonomous_system_does_not_see_the_time(method, how):
         np.testing.assert_array_equal(members.y[3], far.y[:, -1])
 
 
-def test_a_span_of_zero_has_a_solution():
-    result = run((3.0, 3.0), dense_output=True)
-    np.testing.assert_array_equal(result.sol(3.0), Y0)
-    np.testing.assert_array_equal(result.sol([3.0, 3.0]), np.column_stack([Y0, Y0]))
-    assert (result.sol.t_min, result.sol.t_max) == (3.0, 3.0)
-
-
 def test_fields():
     result = run(invariants=[SQUARE, PAIR], save_every=2)
     assert isinstance(result, IntegrationResult)
@@ -295,13 +288,6 @@ def test_diagnostics_are_filled():
     assert len(text.splitlines()) == 5
     assert repr(Diagnostics()) == "Diagnostics: no invariants"
     assert math.isnan(Diagnostics().max_correction)
-
-
-def test_diagnostics_read_during_the_run():
-    diagnostics, counts = Diagnostics(), []
-    options = {"invariants": SQUARE, "diagnostics": diagnostics, "save_every": 5}
-    run(callback=lambda *_: counts.append(diagnostics.n_projections), **options)
-    assert counts == [0, 5, 10]
 
 
 def test_max_defect_is_that_of_the_steps():

@@ -23,8 +23,6 @@ KEPLER = HERE.parents[1] / "examples" / "c-functions" / "kepler.c"
 NUMBERS = ctypes.POINTER(ctypes.c_double)
 VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBERS)
 Y0, MU = np.array([1.6, 0.0, 0.0, 0.5]), [1.0]
-
-
 GRADIENT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
 
 
@@ -47,7 +45,7 @@ def c(library):
     class Functions:
         def __getattr__(self, name):
             function = found[name]  # a new one each time, without attributes of another test
-            arrays = 4 if name.endswith("gradient") or name == "reads_f" else 3
+            arrays = 4 if name.endswith("gradient") else 3
             function.argtypes = [ctypes.c_double, *[NUMBERS] * arrays]
             return LowLevelCallable(function)
 
@@ -108,6 +106,7 @@ BOTH = [{"h": 0.05, "save_every": 7}, {"rtol": 1e-8, "atol": 1e-8, "t_eval": np.
 both = pytest.mark.parametrize("options", BOTH, ids=["fixed", "adaptive"])
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @both
 def test_the_bits_are_those_of_python_and_of_numba(c, options):
@@ -287,12 +286,6 @@ def test_a_shorter_step_may_have_a_value(c, compiled):
     assert run.t[1] < 0.1
     np.testing.assert_allclose(run.y[0], np.exp(-50 * run.t), atol=1e-5)
     same(run, integrate(c.decay, (0, 1), [1.0], **options | {"compiled": not compiled}))
-
-
-def test_a_gradient_without_uses_f_has_no_f(c):
-    options = {"method": EIPRK4, "h": 0.1, "params": np.zeros(5)}
-    with pytest.raises(ValueError, match="gradient of invariant 'S' is not finite at y0"):
-        integrate(c.ending, (0, 1), [1, 2], invariants=Invariant(c.ending_square, c.reads_f, name="S"), **options)
 
 
 # Refused functions.

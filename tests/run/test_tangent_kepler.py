@@ -4,6 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 from closed_forms import kepler_flow
+from numba import njit
 from systems import jit_energy as energy
 from systems import jit_momentum as momentum
 from systems import jit_orbit as kepler
@@ -14,6 +15,11 @@ from eip_scipy import EIPDOP853, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12, Invariant, 
 E = 0.6
 START = pericentre(E)
 END = 10 * np.pi  # five revolutions
+
+
+@njit
+def acceleration(t, q):
+    return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
 
 
 KEPT = [Invariant(energy, name="H"), Invariant(momentum, name="L")]
@@ -34,6 +40,7 @@ def distance(found, matrix):
     return np.linalg.norm(found - matrix) / np.linalg.norm(matrix)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "steps", "worst", "gain"),
     [(EIPRK4, 400, 2e-6, 100), (EIPDOP853, 50, 2e-6, 50), (EIPRKN8, 60, 5e-8, 300), (EIPRKN12, 40, 2e-9, 100)],
@@ -79,6 +86,18 @@ def test_states_are_those_of_the_run_without(method, options):
     ]
     np.testing.assert_allclose(both[1].y, both[0].y, rtol=0, atol=1e-12)
     assert both[1].diagnostics.n_projections == both[0].diagnostics.n_projections
+
+
+@pytest.mark.slow
+def test_an_acceleration_and_a_run_that_goes_on(matrix):
+    options = {"method": EIPRKN8, "h": np.pi / 30, "invariants": KEPT, "variations": "state"}
+    whole = integrate(acceleration=acceleration, t_span=(0, END), y0=START, **options)
+    parts = integrate(acceleration=acceleration, t_span=(0, END / 2), y0=START, **options).continue_to(END)
+    assert whole.compiled
+    assert whole.trusted
+    assert parts.trusted
+    assert distance(whole.stm[-1], matrix) < 1e-7
+    assert distance(parts.stm[-1], whole.stm[-1]) < 1e-10
 
 
 @pytest.mark.parametrize("method", [EIPDOP853, EIPRKN8])

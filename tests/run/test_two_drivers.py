@@ -28,7 +28,6 @@ from eip_scipy import (
     ensemble,
     integrate,
 )
-from eip_scipy.problems import nbody
 
 pytestmark = pytest.mark.needs_jit
 
@@ -228,17 +227,6 @@ def test_compiled_and_interpreted(name):
         np.testing.assert_allclose(compiled[key], interpreted[key], rtol=1e-11, atol=1e-12)
     for key in ("status", "nfev", "njev", "nlu"):
         assert compiled[key] == interpreted[key]
-
-
-def test_n_bodies():
-    """Return a vector-valued invariant in place, blocks and a frame."""
-    rng = np.random.default_rng(1)
-    gm, q = np.array([1.0, 1e-3, 2e-4]), np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0.1]])
-    v = np.array([[0.0, 0, 0], [0, 1.0, 0.1], [-0.7, 0, 0]]) + 1e-3 * rng.standard_normal((3, 3))
-    problem = nbody(gm, q, v, t_span=(0.0, 20.0), h=0.05)
-    for options in ({}, {"every": 5, "compensated": True}):
-        one, other = (integrate(problem, method=EIPRK4, save_every=1, compiled=c, **options) for c in (True, False))
-        np.testing.assert_allclose(one.y, other.y, rtol=1e-11, atol=1e-12)
 
 
 @names

@@ -182,6 +182,7 @@ def test_dense_output_is_that_of_the_states(every):
         np.testing.assert_allclose(energy(0, run.sol(t)), energy(0, np.array(START)), rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [{"every": 4, "save_every": 1}, {"t_eval": [0.13, 1.42, 2.9]}])
 @pytest.mark.parametrize("jit", [pytest.param(True, marks=pytest.mark.needs_jit), False])
 def test_rows_without_a_projection_of_their_own_are_projected(rows, jit):
