@@ -77,7 +77,7 @@ def orbits(found: Comparison) -> Any:
     """Draw where the planets were at the saved times, by Stoermer-Verlet, the chosen method and the reference."""
     assert found.tight is not None
     shown = dict.fromkeys(["SV", found.runs[0].name, found.tight.name])
-    figure = blank_figure(4.1 * len(shown), 9.0, f"Heliocentric positions during {found.span}, plane of the ecliptic")
+    figure = blank_figure(4.1 * len(shown), 9.0, f"Heliocentric positions at saved times, {found.span}, ecliptic plane")
     axes = figure.subplots(2, len(shown), sharex="row", sharey="row", squeeze=False)
     for column, name in zip(axes.T, shown, strict=True):
         (run,) = (run for run in found.runs if run.name == name)
