@@ -44,6 +44,11 @@ class Output:
         self.passed, self.interrupted = True, False
         self._absent: dict[str, None] = {}
 
+    @property
+    def shows_progress(self) -> bool:
+        """Return True on a terminal, unless the study is quiet."""
+        return not self.quiet and sys.stderr is not None and sys.stderr.isatty()
+
     def text(self, text: str = "") -> None:
         """Print `text`, unless the study is quiet."""
         if not self.quiet:
@@ -53,8 +58,7 @@ class Output:
         """Make a progress bar of tqdm, which iterates over `items`; it is shown on a terminal only."""
         from tqdm import tqdm
 
-        shown = not self.quiet and sys.stderr is not None and sys.stderr.isatty()
-        return tqdm(items, desc=what, disable=not shown, **{"leave": False, **settings})
+        return tqdm(items, desc=what, disable=not self.shows_progress, **{"leave": False, **settings})
 
     def check(self, text: str, passed: bool, **record: Any) -> None:
         """Print a check, which decides on the exit status, and keep it with `record` for the JSON file."""
@@ -89,13 +93,18 @@ class Output:
         self._absent[line] = None
 
     @contextmanager
-    def keep(self) -> Iterator[None]:
-        """Let Ctrl-C end the block instead of the study, so that what was computed so far is written."""
+    def keep(self, checkpoint: Path | None = None) -> Iterator[None]:
+        """Let Ctrl-C end the block instead of the study, so that what was computed so far is written.
+
+        `checkpoint` is the folder from which the same command can resume, if there is one.
+        """
         try:
             yield
         except KeyboardInterrupt:
             self.interrupted = True
             warn("interrupted; what was computed before is in the table and the files")
+            if checkpoint is not None:
+                warn(f"the same command with --resume goes on from the checkpoints in {str(checkpoint)!r}")
 
     def end(self) -> None:
         """Print what is missing."""

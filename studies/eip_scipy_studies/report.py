@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from eip_scipy import show_config
+from eip_scipy.solvers import EIPSolver
 
 
 class UsageError(Exception):
@@ -71,6 +72,11 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
+    """Return a subclass of the method with this name, which bars and messages show."""
+    return type(name, (method,), {"__doc__": method.__doc__})
 
 
 def versions() -> dict[str, str | None]:

@@ -96,7 +96,9 @@ def made_up(error=1e-8, drift=1e-13, failure=None, others=(1e-8, 1e-13)):
     ],
 )
 def test_each_bar_can_fail(method, rtol, metric, results, missed):
-    found = [text for text, passed in command.bars(results, method, rtol, metric) if not passed]
+    found = [
+        text for text, passed in command.bars(results, command.summary(results), method, rtol, metric) if not passed
+    ]
     assert len(found) == len(missed)
     assert all(text.startswith(start) for text, start in zip(found, missed, strict=True))
 

@@ -338,18 +338,6 @@ def _arrays(functions: Functions, case: Case, jit: Callable[..., Any]) -> Functi
     return Functions(fun, acceleration, {name: jit(item) for name, item in functions.invariants.items()})
 
 
-def ten_bodies(years: float) -> Case:
-    """Return the Sun, the planets' systems and Pluto, from DE440, for some years."""
-    ready = problems.solar_system(years=years)
-    assert ready.params is not None
-    gm = ready.params[:10].copy()
-    return Case(
-        f"ten bodies, {years:g} years", "Sun, planets and Pluto (DE440)", lambda m: bodies(m, gm), ready.y0, years,
-        scalar=False, steps={"EIPRKN12": round(40 * years), "EIPGJ14": round(400 * years), "WHFast": round(40 * years)},
-        ready=lambda: problems.solar_system(years=years), gm=gm,
-    )  # fmt: skip
-
-
 def gravity(name: str, title: str, ready: Callable[[], problems.Problem], steps: Mapping[str, int]) -> Case:
     """Return a problem of the library with N bodies under Newton's gravitation."""
     problem = ready()
@@ -359,6 +347,13 @@ def gravity(name: str, title: str, ready: Callable[[], problems.Problem], steps:
         name, title, lambda m: bodies(m, gm), problem.y0, problem.t_span[1],
         scalar=False, steps=steps, ready=ready, gm=gm,
     )  # fmt: skip
+
+
+def ten_bodies(years: float) -> Case:
+    """Return the Sun, the planets' systems and Pluto, from DE440, for some years."""
+    steps = {"EIPRKN12": round(40 * years), "EIPGJ14": round(400 * years), "WHFast": round(40 * years)}
+    ready = lambda: problems.solar_system(years=years)  # noqa: E731
+    return gravity(f"ten bodies, {years:g} years", "Sun, planets and Pluto (DE440)", ready, steps)
 
 
 def resonant_chain() -> problems.Problem:

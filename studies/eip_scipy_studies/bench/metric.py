@@ -23,7 +23,7 @@ from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, Invariant, integrate
 from eip_scipy.problems import nbody, solar_system
 
 from ..output import Output
-from ..report import compact, needed, table
+from ..report import UsageError, compact, needed, table
 from .mechanisms import EXAMPLES
 
 njit = needed("numba", '"eip_scipy[numba]"').njit
@@ -273,6 +273,8 @@ def metric(out: Output, *, only: str = "") -> None:
         run only cases whose group or name contains this text
     """
     chosen, rows = [case for case in cases() if only in f"{case.group} {case.name}"], []
+    if not chosen:
+        raise UsageError(f"--only: no case has {only!r} in its group or name")
     with out.keep(), warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         for case in out.bar(chosen, "metric", unit="case"):
@@ -282,6 +284,8 @@ def metric(out: Output, *, only: str = "") -> None:
                     errors = {name: case.run(method, step, metric) for name, metric in METRICS.items()}
                     best = max(min(errors["none"], errors["euclidean"]), TOLERANCE)
                     rows.append(row | errors | {"ratio": max(errors["default"], TOLERANCE) / best})
+    if not rows:
+        return
     out.numbers["runs"] = rows
     out.rows("metric.csv", rows)
     out.text(summary(rows))

@@ -69,21 +69,21 @@ def moving(case: Case) -> bool:
 # This package.
 
 
-def control(method: str, case: Case, setting: Any) -> dict[str, Any]:
+def control(case: Case, setting: Any) -> dict[str, Any]:
     """Return the arguments of `integrate` for a number of steps or a tolerance."""
     return {"h": case.t_end / setting} if isinstance(setting, int) else {**tolerances(setting), "h": None}
 
 
-def ours(method: str, case: Case, python: bool = False) -> Solve:
+def ours(method: str, case: Case) -> Solve:
     """Return whole calls of `integrate` with functions as a user of SciPy writes them."""
     eip = import_module("eip_scipy")
-    functions = case.plain if python else case.jitted
+    functions = case.jitted
     second = method.startswith(("EIPRKN", "EIPGJ"))
     equations = {"acceleration": functions.acceleration} if second else {"fun": functions.fun}
 
     def solve(setting: Any) -> np.ndarray:
         kept = [eip.Invariant(item, name=name) for name, item in functions.invariants.items()]
-        options = {"method": getattr(eip, method), "invariants": kept, **control(method, case, setting)}
+        options = {"method": getattr(eip, method), "invariants": kept, **control(case, setting)}
         return checked(eip.integrate(**equations, t_span=(0.0, case.t_end), y0=case.y0, **options))
 
     return solve
@@ -108,7 +108,7 @@ def our_members(method: str, case: Case) -> Solve:
 
     def solve(setting: Any) -> np.ndarray:
         kept = [eip.Invariant(item, name=name) for name, item in functions.invariants.items()]
-        options = {"method": getattr(eip, method), "invariants": kept, "executor": 1, **control(method, case, setting)}
+        options = {"method": getattr(eip, method), "invariants": kept, "executor": 1, **control(case, setting)}
         return eip.ensemble(**equations, t_span=(0.0, case.t_end), y0s=case.y0, **options).y
 
     return solve
@@ -120,9 +120,7 @@ def expression(method: str, case: Case) -> Solve:
     assert case.hamiltonian is not None
     problem = eip.hamiltonian(*case.hamiltonian)
     return lambda setting: checked(
-        eip.integrate(
-            problem, (0.0, case.t_end), case.y0, method=getattr(eip, method), **control(method, case, setting)
-        )
+        eip.integrate(problem, (0.0, case.t_end), case.y0, method=getattr(eip, method), **control(case, setting))
     )
 
 
@@ -132,20 +130,18 @@ def ready(method: str, case: Case) -> Solve:
     assert case.ready is not None
     problem = case.ready()
     return lambda setting: case.to_own(
-        checked(
-            eip.integrate(problem, (0.0, case.t_end), method=getattr(eip, method), **control(method, case, setting))
-        )
+        checked(eip.integrate(problem, (0.0, case.t_end), method=getattr(eip, method), **control(case, setting)))
     )
 
 
 # Mechanisms: all packages get the right-hand side that `mechanism` or `mechanics` makes.
 
 
-def ours_mechanism(method: str, kept: str, case: Case) -> Solve:
+def ours_mechanism(kept: str, case: Case) -> Solve:
     """Return whole calls of `integrate` with the invariants in the problem's attribute `kept`."""
     eip, problem = import_module("eip_scipy"), _problem(case)
-    options = {"method": getattr(eip, method), "invariants": getattr(problem, kept)}
-    return lambda setting: checked(eip.integrate(problem, **options, **control(method, case, setting)))
+    options = {"method": eip.EIPDOP853, "invariants": getattr(problem, kept)}
+    return lambda setting: checked(eip.integrate(problem, **options, **control(case, setting)))
 
 
 def scipy_mechanism(method: str, factor: float, case: Case) -> Solve:
@@ -395,7 +391,7 @@ def _ours() -> Iterator[Solver]:
         yield Solver(method, "eip_scipy", USER, partial(ours, method), lambda case: case.stiff)
     members = lambda case: case.members  # noqa: E731
     for kept in ("invariants", "constraints"):
-        yield Solver(f"EIPDOP853, {kept}", "eip_scipy", USER, partial(ours_mechanism, "EIPDOP853", kept), moving)
+        yield Solver(f"EIPDOP853, {kept}", "eip_scipy", USER, partial(ours_mechanism, kept), moving)
     yield Solver("ensemble, EIPDOP853", "eip_scipy", USER, partial(our_members, "EIPDOP853"), members)
     yield Solver("ensemble, EIPRKN12", "eip_scipy", USER, partial(our_members, "EIPRKN12"), members, "EIPRKN12")
 

@@ -13,7 +13,7 @@ from eip_scipy import EIPDOP853, EIPRK4, integrate
 from eip_scipy.problems import GrossPitaevskii
 
 from ..output import Output, checkpoint_options, require_positive
-from ..report import UsageError, compact, describe_machine, table, warn
+from ..report import UsageError, compact, describe_machine, named, table
 from . import states
 from .ground_state import ground_state, with_noise
 from .problems import line_condensate, ring_condensate
@@ -51,13 +51,13 @@ class Quench:
     def run(self, out: Output, checkpoint: Path | None, resume: bool) -> None:
         """Run the reference and each of `METHODS`, and follow the vortices in the run of `SHOWN`."""
         gpe, problem = self.equation, self.equation.problem(self.start, self.t_end, self.h, name=self.stem)
-        with out.keep():
+        with out.keep(checkpoint):
             for name, kept in {REFERENCE: METHODS[SHOWN], **METHODS}.items():
                 base, h = (EIPDOP853, self.reference_h) if name == REFERENCE else (EIPRK4, self.h)
-                method: Any = type(name, (base,), {"__doc__": base.__doc__})  # shown by the bar and in messages
                 run = integrate(
-                    problem, method=method, h=h, invariants=gpe.invariants(kept), save_every=round(self.saved / h),
-                    progress=not out.bar().disable, **checkpoint_options(checkpoint, resume, name),
+                    problem, method=named(base, name), h=h, invariants=gpe.invariants(kept),
+                    save_every=round(self.saved / h), progress=out.shows_progress,
+                    **checkpoint_options(checkpoint, resume, name),
                 )  # fmt: skip
                 if not run.success:
                     raise RuntimeError(f"{name} failed: {run.message}")
@@ -68,8 +68,6 @@ class Quench:
                 self.errors[name] = {**changes, "field_error": np.sqrt(apart)}
                 if name == SHOWN:
                     self.moved = Motion(gpe, run.t, run.y)
-        if out.interrupted and checkpoint is not None:
-            warn(f"the same command with --resume goes on from the checkpoints in {str(checkpoint)!r}")
 
     def shown(self) -> dict[str, int]:
         """Return the indices of the snapshots that the run has reached, by titles."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from textwrap import fill
 from typing import Any, Literal, NamedTuple
 
@@ -95,8 +95,8 @@ def hard_cases(
     stem, title = f"hard-cases-{method}-{metric}", f"{method}, metric {metric!r}, rtol = {rtol:g}"
     out.rows(f"{stem}.csv", out.numbers["cases"])
     out.figure(f"{stem}.png", "hard.figures:gains_figure", results, rtol, title)
-    out.text(text(results, f"Hard cases: {title}, atol = {rtol / 1000:g}", rtol))
-    for line, passed in bars(results, method, rtol, metric):
+    out.text(text(results, known, f"Hard cases: {title}, atol = {rtol / 1000:g}", rtol))
+    for line, passed in bars(results, known, method, rtol, metric):
         out.check(line, passed)
 
 
@@ -154,9 +154,11 @@ def summary(results: Sequence[Comparison]) -> dict[str, Any]:
     }
 
 
-def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -> list[tuple[str, bool]]:
-    """Compare the results with bounds on failures, drift and errors; return texts, and whether the bounds are met."""
-    known, least = summary(results), len(results) - MAY_EXCEED
+def bars(
+    results: Sequence[Comparison], known: Mapping[str, Any], method: str, rtol: float, metric: str
+) -> list[tuple[str, bool]]:
+    """Compare results and their `summary` with bounds; return texts, and whether the bounds are met."""
+    least = len(results) - MAY_EXCEED
     failed, small, median = known["n_failed"], known["n_small_drift"], known["median_drift"]
     mean, worst = known["geometric_mean_gain"], known["worst_gain"]
     found = [(f"every run with projection reaches its end: {failed} did not", failed == 0)]
@@ -186,9 +188,8 @@ def times(gain: float) -> str:
     return f"{factor:.2f} times {word}" if factor < 1.095 else f"{compact(factor)} times {word}"
 
 
-def text(results: Sequence[Comparison], title: str, rtol: float) -> str:
+def text(results: Sequence[Comparison], known: Mapping[str, Any], title: str, rtol: float) -> str:
     """Return table, summary and the cases that projection makes worse as text of at most 79 columns."""
-    known = summary(results)
     columns = [["error", "plain"], ["", "EIP"], ["gain"]]
     columns += [lines for what in ("drift", "steps", "nfev") for lines in ([what, "plain"], ["", "EIP"])]
     kinds = [(r.case.name, kind, o.failure) for r in results for kind, o in (("plain", r.plain), ("EIP", r.projected))]

@@ -89,12 +89,10 @@ def solar_system(
     chosen, rebound = tableaux()[method], rebound_or_none(out)
     runs: list[Run] = []
     tasks = methods(scene, chosen, metric, rebound)
-    with out.keep(), out.bar(tasks, "solar system") as bar:
+    with out.keep(checkpoint), out.bar(tasks, "solar system") as bar:
         for task in bar:
             bar.set_postfix_str(task.name)
             runs.append(task.run(scene, **checkpoint_options(checkpoint, resume, task.name)))
-    if out.interrupted and checkpoint is not None:
-        out.missing(f"the same command with --resume goes on from the checkpoints in {str(checkpoint)!r}")
     if runs:
         found = Comparison(scene, runs, runs[-1] if len(runs) == len(tasks) else None)
         show(out, found, chosen.TABLEAU.order, longest)

@@ -15,6 +15,7 @@ from eip_scipy.problems.gravity.solar_data import YEAR_D, load
 from eip_scipy.solvers import EIPSolver
 
 from ..comparators import FixedSteps, newton, stormer_verlet
+from ..report import named
 
 Solve = Callable[..., Any]
 """``solve(label, step, save_every=None, **checkpoint)`` returns a result with `t`, `y` and `wall_time`."""
@@ -151,11 +152,6 @@ def tableaux() -> dict[str, type[EIPSolver]]:
     """Return the solver classes of `eip_scipy` that have a tableau of coefficients, by their names."""
     found = {name: getattr(eip_scipy, name) for name in eip_scipy.__all__ if name.startswith("EIP")}
     return {name: value for name, value in found.items() if hasattr(value, "TABLEAU")}
-
-
-def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
-    """Return a subclass of the method with this name, which messages show."""
-    return type(name, (method,), {"__doc__": method.__doc__})
 
 
 def metric_of(method: type[EIPSolver], metric: str) -> str:

@@ -15,9 +15,9 @@ from eip_scipy.problems.gravity.forces import FORCES
 from eip_scipy.problems.gravity.solar_data import AU_KM, YEAR_D
 
 from ..output import Output
-from ..report import UsageError, compact, table
+from ..report import UsageError, compact, named, table
 from .epoch import kernels, one_line, parse_epoch
-from .runs import named, whole_number
+from .runs import whole_number
 
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 STEP = 0.001
