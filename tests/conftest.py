@@ -61,7 +61,7 @@ def snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def no_plotting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
 
 
 # Seconds that tests take, roughly.

@@ -379,7 +379,7 @@ def test_rates_of_the_same_pass_and_of_a_pass_of_their_own_have_the_same_bits(n)
 
 @pytest.mark.parametrize("quantities", ["kepler", ALL])
 def test_other_orders_of_bodies_and_of_directions_change_nothing(quantities):
-    """By the functions for planets, and with the Sun in the middle of the list by those for orbits."""
+    """With the Sun first the functions for planets are used, with the Sun in the middle those for orbits."""
     problem, order = solar_system(years=5.0, h=1 / 256, balances=quantities), np.r_[1:4, 0, 4:10]
     q, v = problem.y0.reshape(2, 10, 3)[:, order]
     moved = nbody(problem.params[order], q, v, t_span=problem.t_span, h=problem.h, balances=quantities)

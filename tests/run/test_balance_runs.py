@@ -105,7 +105,7 @@ def test_compiled_runs_have_the_bits_of_interpreted_ones(options):
 
 
 def test_args_reach_the_rate():
-    """Those of the run, and before them those of the balance."""
+    """The arguments of the balance come first, then those of the run."""
 
     def swing(t, y, a, w):
         return swinging(t, y, np.array([a, w]))

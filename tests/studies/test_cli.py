@@ -60,6 +60,13 @@ def test_status_and_files(then, status, err, tmp_path, capsys):
     assert err in printed.err
 
 
+@pytest.mark.usefixtures("no_plotting")
+def test_without_matplotlib_the_rest_is_done(tmp_path, capsys):
+    assert run("sums", sums, ["--out", str(tmp_path)]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["sums.csv"]
+    assert 'no figures without matplotlib: pip install "eip_scipy[plot]"' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", ["--upto two", "--then else", "--many"])
 def test_wrong_options(words, capsys):
     with pytest.raises(SystemExit) as left:

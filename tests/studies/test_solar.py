@@ -31,9 +31,8 @@ def solar(folder, *words):
 
 
 @pytest.fixture
-def few_methods(monkeypatch):
+def few_methods(no_rebound, monkeypatch):
     """Run less than the command would: no REBOUND, no figures."""
-    monkeypatch.setattr(command, "rebound_or_none", lambda out: None)
     monkeypatch.setattr(command, "FIGURES", ())
 
 
@@ -98,7 +97,9 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, monkeypatch):
         patch.setattr(runs, "by_verlet", interrupted)
         status, rows = solar(tmp_path / "first", *words)
     assert (status, len(rows["solar-system"])) == (130, 3)
-    assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in said
+    assert "no comparison with WHFast and IAS15" in said
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(before) == {"EIPRK4-error.npz", "EIPRK4-euclidean.npz", "RK4.npz"}
     assert solar(tmp_path / "again", *words)[0] == 2
