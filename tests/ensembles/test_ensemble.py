@@ -25,7 +25,7 @@ from systems import (
     same_fields,
 )
 
-from eip_scipy import EIPRK4, EIPRK5, EIPRKN12, Invariant, ensemble, integrate
+from eip_scipy import EIPRK4, EIPRK5, EIPRKN12, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.problems import Problem, kepler
 from eip_scipy.results import EnsembleResult
 
@@ -119,6 +119,25 @@ def test_bits_do_not_depend_on_the_number_of_threads(more):
 
 
 # Failures.
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=[needs_jit, pytest.mark.slow])])
+def test_members_that_lose_what_they_keep_are_named(compiled):
+    """Friction acts on the second of nine members alone, whose energy is projected all the same."""
+
+    def fun(t, y, params):
+        return np.array([y[1], -y[0] - params[0] * y[1]])
+
+    kept = Invariant(lambda t, y, params: y[0] ** 2 + y[1] ** 2, name="E")
+    friction = np.where(np.arange(9) == 1, 0.2, 0.0)
+    if compiled:
+        fun, kept = njit(fun), Invariant(njit(kept.fun), name="E")
+    with pytest.warns(ProjectionWarning, match="1 of 9 members are not to be trusted"):
+        run = ensemble(
+            fun, (0, 10), np.tile([1.0, 0.0], (9, 1)), params=friction[:, None], method=EIPRK4, h=0.1, invariants=kept
+        )
+    np.testing.assert_array_equal(run.trusted, friction == 0)
+    assert "'E'" in run.message[1]
 
 
 def broken(t, y):

@@ -12,9 +12,9 @@ from scipy.integrate import solve_ivp
 
 import eip_scipy
 from eip_scipy import Invariant
+from eip_scipy_studies.bench.families import Array, Quantity, System, random_system
 
 from . import jitted
-from .families import Array, Quantity, System, random_system
 
 METHODS = {  # least and largest h times the fastest rate of the system; least rtol
     "EIPRK1": (0.002, 0.02, None),

@@ -10,8 +10,7 @@ import numpy as np
 from numba import njit
 
 from eip_scipy import Invariant
-
-from .families import System
+from eip_scipy_studies.bench.families import System
 
 
 @njit

@@ -21,8 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, Invariant, checkpoint, ensemble, integrate
-
-from . import families
+from eip_scipy_studies.bench import families
 
 # Exit statuses after a signal: SIGTERM raises KeyboardInterrupt where a checkpoint is written, and kills elsewhere.
 SIGNALS = {signal.SIGKILL: (0, -9), signal.SIGINT: (0, 1), signal.SIGTERM: (0, 1, -15)}
@@ -133,7 +132,7 @@ def main(arguments=None):
     parser.add_argument("--seed", type=int, default=0, help="the number of the first chain of kills")
     given = parser.parse_args(arguments)
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["eip_scipy", "tests.fuzz.families"])
+    context.set_forkserver_preload(["eip_scipy", "eip_scipy_studies.bench.families"])
     killed, seed, violations = Counter(), given.seed, 0
     while (left := given.kills - sum(killed.values())) > 0:
         with tempfile.TemporaryDirectory() as folder:

@@ -285,6 +285,7 @@ def moving(field, balances=None, t_end=20.0, **options):
     ("field", "balances", "names"),
     [
         (ring(), None, "L"),
+        (ring(potential=ring_phi), None, "L"),
         (ring(), "energy", "TL"),
         (ring(potential=ring_phi), "energy", "HL"),
         (ring(potential=ring_phi), "kinetic", "TL"),

@@ -267,6 +267,14 @@ def errors_and_runs(problem, **options):
     return [float(np.abs(run.y[:, -1] - exact).max()) for run in runs], runs
 
 
+def test_the_stable_step_knows_the_interaction():
+    """The largest frequency is the free one plus 2 beta |psi|^2, of the field that is linearised."""
+    equation = soliton(points=64, length=20.0, t_end=0.1).equation
+    psi = np.full(64, 0.3 + 0.4j)
+    free = 1 / equation.largest_step(0 * psi, 1.0)
+    assert 1 / equation.largest_step(2 * psi, 1.0) - free == pytest.approx(2 * abs(equation.beta), rel=1e-12)
+
+
 @pytest.mark.needs_jit  # plain Python adds one number after the other, which rounds more
 def test_soliton_travels_at_order_four_with_mass_and_energy_kept(travelling):
     """One evaluation of f serves grad E and the next first stage: the error is the same to 5 %."""

@@ -319,6 +319,12 @@ def test_momenta_of_cyclic_coordinates_are_kept():
     assert "momenta     p_phi" in repr(problem)
 
 
+def test_a_momentum_that_an_input_may_change_later_is_not_kept():
+    for given, names in ((0, ["p_x"]), (lambda t, y: 1.0 if t > 5 else 0.0, [])):
+        problem = mechanics(on_a_line(push), {}, [0], [1], t_span=(0, 2), inputs={push: given})
+        assert [item.name for item in problem.momenta] == names
+
+
 def test_momenta_of_speeds_that_are_combinations_of_rates():
     # Two particles on a line, at x and x + y: the momentum of x is that of both.
     P, Q = moving(u * FRAME.x), moving(v * FRAME.x)

@@ -221,6 +221,18 @@ def test_moons_of_moons_and_a_passing_body():
         assert abs(sum(gm[k] * along[k] for k in along)) < 1e-15  # the centre of mass stays
 
 
+@pytest.mark.parametrize(
+    ("distance", "speed", "bound"), [(0.9, 0.0, True), (1.1, 0.0, False), (0.5, 0.95, True), (0.5, 1.05, False)]
+)
+def test_a_moon_is_inside_the_hill_sphere_and_slower_than_escape(distance, speed, bound):
+    """In units of a (m / 3 M)^(1/3) of the planet and of the moon's speed of escape."""
+    gm, hill = np.array([1.0, 1e-3, 1e-9]), (1e-3 / 3) ** (1 / 3)
+    q, v = np.zeros((2, 3, 3))
+    q[1:, 0] = 1.0, 1.0 + distance * hill
+    v[1:, 1] = 1.0, 1.0 + speed * np.sqrt(2e-3 / (distance * hill))
+    assert centres(gm, np.concatenate([q.ravel(), v.ravel()])).tolist() == [-1, 0, 1 if bound else 0]
+
+
 def test_quantities_and_bodies_of_the_same_mass():
     gm, y = system(4)
     for given, names in [("kepler", ["energy"]), (["laplace", "energy", "kepler"], ["energy", "laplace"]), ((), [])]:

@@ -26,6 +26,8 @@ def test_problems_print_in_five_lines_and_pickle():
         t, y = problem.t_span[0], problem.y0
         np.testing.assert_array_equal(again.y0, y)
         np.testing.assert_array_equal(again.fun(t, y), problem.fun(t, y))
+        if problem.reference is not None and (known := problem.reference(t)) is not None:
+            np.testing.assert_allclose(known, y, rtol=0, atol=1e-14)
         for one, other in zip(problem.invariants, again.invariants, strict=True):
             np.testing.assert_array_equal(one.fun(t, y, *one.args), other.fun(t, y, *other.args))
         if problem.reference is not None:
@@ -63,6 +65,8 @@ def test_component_names():
     assert replace(kepler(), component_names="a b c d").component_names == ("a", "b", "c", "d")
     with pytest.raises(ValueError, match="2 names for 4 components"):
         replace(kepler(), component_names=["a", "b"])
+    with pytest.raises(ValueError, match="'a' names two components"):
+        replace(kepler(), component_names="a b a c")
 
 
 def test_solve_ivp():
@@ -75,6 +79,8 @@ def test_solve_ivp():
     adaptive = problem.solve_ivp((0, 3), method=EIPRK45, rtol=1e-9, t_eval=[1.0, 3.0])
     assert np.all(np.abs(adaptive.y[:, -1] - sol.y[:, -1]) < 1e-4)
     assert adaptive.t.tolist() == [1.0, 3.0]
+    short = problem.solve_ivp((0, 3), method=EIPRK45, max_step=0.01)
+    assert 0 < np.diff(short.t).max() <= 0.01 + 1e-15
     with pytest.raises(TypeError, match="no y0"):
         replace(problem, y0=None).solve_ivp(method=EIPRK4)
     # A method of SciPy gets no options of ours.

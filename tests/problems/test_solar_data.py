@@ -119,6 +119,12 @@ def test_default_equals_start_of_reference():
         assert_allclose(data.velocity[i], v, rtol=rtol, atol=0)
 
 
+def test_the_exact_epoch_is_that_of_the_calendar():
+    data = solar_data.load()
+    whole = Fraction(2456690) + Fraction(1, 2) + Fraction(20 * 60 + 18, 24 * 60)
+    assert abs(Fraction(data.epoch_jd_tdb) + Fraction(data.epoch_rest) - whole) < 1e-15
+
+
 # The reference states.
 
 

@@ -79,6 +79,13 @@ def test_numbers_keep_their_types():
     assert result.compiled
 
 
+def test_an_integer_that_no_float_holds_is_passed_by_python():
+    fun = njit(lambda t, y, k: np.array([1.0 * (k % 2)]))
+    for k, compiled in ((2**53 - 1, True), (2**53 + 1, False)):
+        result = integrate(fun, (0, 1), [0.0], method=EIPRK4, h=0.5, args=(k,))
+        assert (result.y[0, -1], result.compiled) == (pytest.approx(1.0), compiled)
+
+
 def test_one_array_is_params():
     fun = njit(lambda t, y, p: oscillator_of(t, y, p))
     by_args = integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(np.array([K, M]),))

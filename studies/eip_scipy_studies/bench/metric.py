@@ -1,267 +1,26 @@
 """``eip-scipy bench metric``: the projection's metric on problems whose error estimates mislead it.
 
 Contacts and springs whose forces have kinks or jumps, discs with a truncated Lennard-Jones force, charged particles in
-SI units, mechanisms with adaptive steps, and the solar system in rotated axes. Each case is run by its methods and
-steps without projection, with the euclidean metric and with the default one. The table has the geometric means of the
-errors at the end, relative to the largest component of the reference, and the largest ratio of the default metric's
-error to the smaller of the two others. A run is "worse" if that ratio exceeds 1.5; errors
-below 1e-9 count as 1e-9.
+SI units, mechanisms with adaptive steps, the solar system in rotated axes, and the systems of `metric_systems`. Each
+case is run by its methods and steps without projection, with the euclidean metric and with the default one. The table
+has the geometric means of the errors at the end, relative to the largest component of the reference, and the largest
+ratio of the default metric's error to the smaller of the two others; the two last columns count the runs in which that
+ratio exceeds 1.5 and 5. Errors below 1e-9 count as 1e-9.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, Invariant, integrate
-from eip_scipy.problems import nbody, solar_system
 
 from ..output import Output
-from ..report import UsageError, compact, needed, table
-from .mechanisms import EXAMPLES
+from ..report import UsageError, compact, table
+from . import metric_cases, metric_systems
+from .metric_cases import METRICS
 
-njit = needed("numba", '"eip_scipy[numba]"').njit
-METRICS: dict[str, dict[str, Any]] = {"none": {"invariants": ()}, "euclidean": {"metric": "euclidean"}, "default": {}}
-METHODS, LARGEST_RATIO, TOLERANCE = (EIPRK4, EIPRK5, EIPRK45, EIPDOP853), 1.5, 1e-9
-LONG, SHORT = (0.01, 0.02, 0.05), (0.005, 0.01, 0.02)
-
-
-@dataclass
-class Case:
-    """A problem with its invariants, its methods, and the steps or (if `adaptive`) tolerances with which it is run."""
-
-    group: str
-    name: str
-    fun: Any
-    kept: tuple[Any, ...]
-    y0: np.ndarray
-    end: float
-    steps: tuple[float, ...]
-    methods: tuple[Any, ...] = METHODS
-    adaptive: bool = False
-    options: dict[str, Any] = field(default_factory=dict)
-    exact: dict[str, Any] = field(default_factory=lambda: {"rtol": 1e-12, "atol": 1e-13})
-    known: np.ndarray | None = None
-    seen: Any = ...  # components whose errors count
-
-    @cached_property
-    def reference(self) -> np.ndarray:
-        """Return the state at the end: `known`, or the result of EIPDOP853 with the options `exact`."""
-        if self.known is not None:
-            return self.known
-        options = {"method": EIPDOP853, "invariants": (), **self.options, **self.exact}
-        return integrate(self.fun, (0, self.end), self.y0, **options).y[:, -1]
-
-    def run(self, method: Any, step: float, metric: Mapping[str, Any]) -> float:
-        """Return the error of the last state; inf if the run failed."""
-        control = {"rtol": step, "atol": step} if self.adaptive else {"h": step}
-        options = {"invariants": self.kept, **self.options, **control, **metric}
-        run = integrate(self.fun, (0, self.end), self.y0, method=method, **options)
-        exact = self.reference[self.seen]
-        error = float(np.abs(run.y[self.seen, -1] - exact).max() / np.abs(exact).max())
-        return error if run.success else np.inf
-
-
-# Bonds: y = (q, p), q' = p / mass, and the potential sum_k law(d_k). The elongation d_k is B_k q, or the distance
-# |(B_k q, C_k q)| if C_k is not 0. `params` has the number of bonds and the mass, then for each bond its kind, three
-# numbers, B_k and C_k.
-EVEN, ONE_SIDED, HUBER, WEIGHT, LENNARD_JONES = 0.0, 1.0, 2.0, 3.0, 4.0
-
-
-@njit
-def law(kind, a, b, p, d):  # type: ignore[no-untyped-def]
-    """Return the energy and the force -dV/dd of a bond with the elongation d."""
-    if kind == LENNARD_JONES:  # it ends at a
-        s = d**-6.0
-        return (4 * (s * s - s - a**-12 + a**-6), 24 * (2 * s * s - s) / d) if d < a else (0.0, 0.0)
-    if kind == HUBER:
-        return (0.5 * d * d, -d) if abs(d) < a else (a * (abs(d) - 0.5 * a), -a * np.sign(d))
-    if kind == WEIGHT:
-        return b * d, -b
-    depth, side = (abs(d) - a, np.sign(d)) if kind == EVEN else (d - a, 1.0)
-    return (b * depth ** (p + 1) / (p + 1), -b * depth**p * side) if depth > 0 else (0.0, 0.0)
-
-
-@njit
-def forces(q, out, params):  # type: ignore[no-untyped-def]
-    """Write the forces to `out`, and return the potential energy."""
-    n, total = q.size, 0.0
-    out[:] = 0.0
-    for k in range(int(params[0])):
-        row = params[2 + k * (4 + 2 * n) : 2 + (k + 1) * (4 + 2 * n)]
-        x = y = 0.0
-        for i in range(n):
-            x, y = x + row[4 + i] * q[i], y + row[4 + n + i] * q[i]
-        d = x if y == 0 and not row[4 + n :].any() else np.sqrt(x * x + y * y)
-        value, force = law(row[0], row[1], row[2], row[3], d)
-        total += value
-        if force != 0:
-            for i in range(n):
-                out[i] += force / d * (row[4 + i] * x + row[4 + n + i] * y) if d != 0 else force * row[4 + i]
-    return total
-
-
-@njit
-def bonded(t, y, out, params):  # type: ignore[no-untyped-def]
-    """Write the derivative of y = (q, p) to `out`."""
-    n = y.size // 2
-    out[:n] = y[n:] / params[1]
-    forces(y[:n], out[n:], params)
-
-
-@njit
-def bonded_energy(t, y, params):  # type: ignore[no-untyped-def]
-    """Return the energy."""
-    n = y.size // 2
-    return 0.5 * (y[n:] ** 2).sum() / params[1] + forces(y[:n], np.empty(n), params)
-
-
-@njit
-def bonded_slope(t, y, out, params):  # type: ignore[no-untyped-def]
-    """Write the gradient of the energy to `out`."""
-    n = y.size // 2
-    forces(y[:n], out[:n], params)
-    out[:n] *= -1.0
-    out[n:] = y[n:] / params[1]
-
-
-TURNING = Invariant(njit(lambda t, y, params: y[0] * y[3] - y[1] * y[2]), name="L")
-ENERGY = Invariant(bonded_energy, grad=bonded_slope, in_place=True, name="energy")
-
-
-def bonds(
-    group: str, name: str, rows: Any, y0: Any, end: float, steps: Any, *also: Any, mass: float = 1.0, **more: Any
-) -> Case:
-    """Return a system of bonds, each a row (kind, a, b, p, B, C), without C where it is 0."""
-    n = len(y0) // 2
-    padded = [[*row, *[0.0] * (4 + 2 * n - len(row))] for row in rows]
-    options = {"in_place": True, "params": np.array([len(rows), mass, *np.ravel(padded)])}
-    return Case(group, name, bonded, (ENERGY, *also), np.array(y0), end, steps, options=options, **more)
-
-
-def chain(count: int, *law: float) -> list[list[float]]:
-    """Return bonds between walls and neighbours of `count` bodies on a line; elongations are positive in contact."""
-    return [[*law, *row] for row in np.eye(count + 1, count, -1) - np.eye(count + 1, count)]
-
-
-def contacts() -> Iterator[Case]:
-    """Yield dead zones, soft walls, Hertz contacts, and springs of constant force beyond an elongation."""
-    for start in ((1.2, 0.0), (0.0, 1.0), (0.7, -0.3)):
-        for k in (1.0, 10.0, 100.0):
-            yield bonds("backlash", f"k = {k:g}, start {start}", [[EVEN, 0.5, k, 1, 1]], start, 40.0, LONG)
-    for k in (10.0, 100.0):
-        rows = [[EVEN, 0, 1, 1, 1, 0], [EVEN, 0.5, k, 1, 1, -1]]
-        yield bonds("backlash", f"gear, k = {k:g}", rows, [1.0, 0.3, 0.0, 0.5], 30.0, LONG)
-    for power in (1, 2, 3):
-        for k in (100.0, 1.0):
-            yield bonds("wall", f"power {power}, k = {k:g}", [[EVEN, 1, k, power, 1]], [0.1, 1.0], 20.0, LONG)
-        rows = [[EVEN, 1, 100, power, 1, 0, 0, 1]]
-        yield bonds("wall", f"round, power {power}", rows, [0.2, 0.1, 0.9, 0.5], 20.0, LONG, TURNING)
-    for k in (1e3, 1e4):
-        rows = [[ONE_SIDED, 0, k, 1.5, -1], [WEIGHT, 0, 1, 0, 1]]
-        yield bonds("Hertz", f"ball, k = {k:g}", rows, [1.0, 0.0], 20.0, SHORT)
-    for count in (6, 2):
-        y0 = np.zeros(2 * count)
-        y0[count] = 1.0
-        yield bonds("Hertz", f"{count} beads", chain(count, ONE_SIDED, 0, 100, 1.5), y0, 3.0, SHORT)
-    for width in (0.1, 0.5):
-        for count in (1, 5):
-            y0 = np.zeros(2 * count)
-            y0[0], y0[count] = 1.0, 0.3
-            rows = chain(count, HUBER, width, 0, 0) if count > 1 else [[HUBER, width, 0, 0, 1]]
-            yield bonds("Huber", f"width {width:g}, {count} bodies", rows, y0, 20.0, LONG)
-
-
-def discs(seed: int, cut: float = 2.5) -> Case:
-    """Return nine discs, at first at random (`seed`), with a Lennard-Jones force that ends at the distance `cut`."""
-    rng = np.random.default_rng(seed)
-    grid = np.array([[x, y] for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]) * (1.6 if cut > 1.5 else 1.3)
-    q, v = grid + 0.1 * rng.standard_normal((9, 2)), rng.standard_normal((9, 2))
-    pairs = [np.eye(18)[2 * i : 2 * i + 2] - np.eye(18)[2 * j : 2 * j + 2] for i in range(9) for j in range(i)]
-    rows = [[LENNARD_JONES, cut, 0, 0, *pair.ravel()] for pair in pairs]
-    y0 = np.concatenate([q.ravel(), (v - v.mean(axis=0)).ravel()])
-    return bonds("discs", f"cut-off {cut:.3g}, start {seed}", rows, y0, 3.0, (0.002, 0.005, 0.01))
-
-
-CHARGE, MASSES, SIZE = 1.602176634e-19, {"electron": 9.1093837e-31, "proton": 1.67262192e-27, "ion": 6.64e-26}, 1e-3
-
-
-def in_si_units(name: str, kind: str) -> Case:
-    """Return a particle in a field of 1 T and a Penning trap's potential, with states (x, p) or (x, v)."""
-    mass, unit = MASSES[name], MASSES[name] if kind == "momenta" else 1.0
-    turning = CHARGE / mass
-    k, period = mass * (0.1 * turning) ** 2, 2 * np.pi / turning
-
-    @njit
-    def fun(t, y, out):  # type: ignore[no-untyped-def]
-        out[0], out[1], out[2] = y[3] / unit, y[4] / unit, y[5] / unit
-        out[3] = unit / mass * (CHARGE * y[4] / unit + 0.5 * k * y[0])
-        out[4] = unit / mass * (-CHARGE * y[3] / unit + 0.5 * k * y[1])
-        out[5] = unit / mass * -k * y[2]
-
-    @njit
-    def energy(t, y):  # type: ignore[no-untyped-def]
-        square = (y[3] ** 2 + y[4] ** 2 + y[5] ** 2) / unit**2
-        return 0.5 * mass * square + 0.5 * k * (y[2] ** 2 - 0.5 * (y[0] ** 2 + y[1] ** 2))
-
-    @njit
-    def slope(t, y, out):  # type: ignore[no-untyped-def]
-        out[0], out[1], out[2] = -0.5 * k * y[0], -0.5 * k * y[1], k * y[2]
-        out[3], out[4], out[5] = mass * y[3] / unit**2, mass * y[4] / unit**2, mass * y[5] / unit**2
-
-    speed, kept = 0.1 * SIZE * turning * unit, (Invariant(energy, grad=slope, in_place=True, name="energy"),)
-    y0, steps = np.array([SIZE, 0.0, 0.3 * SIZE, 0.0, speed, 0.1 * speed]), tuple(period / n for n in (20, 40, 80))
-    more: dict[str, Any] = {"options": {"in_place": True}, "exact": {"h": period / 400}, "seen": slice(3)}
-    return Case("SI units", f"{name}, {kind}", fun, kept, y0, 20 * period, steps, **more)
-
-
-def trapped(name: str, exponent: int) -> Case:
-    """Return a particle in SI units on a line, (x, p), in a trap whose potential grows as x^`exponent`."""
-    mass, turning = MASSES[name], 0.1 * CHARGE / MASSES[name]
-    rows = [[EVEN, 0.0, mass * turning**2 * SIZE ** (2 - exponent), exponent - 1, 1.0]]
-    period = 2 * np.pi / turning
-    steps, more = tuple(period / n for n in (20, 40, 80)), {"exact": {"h": period / 400}, "seen": slice(1)}
-    return bonds("SI units", f"{name}, trap x^{exponent}", rows, [SIZE, 0.0], 20 * period, steps, mass=mass, **more)
-
-
-def mechanism(name: str, end: float, energy: bool) -> Case:
-    """Return a mechanism with its constraints kept, and its energy if asked for; each component has its own weight."""
-    problem = replace(EXAMPLES[name](), blocks=None)
-    known = None if problem.reference is None else problem.reference(end)
-    kept = (*problem.constraints, problem.energy) if energy else problem.constraints
-    seen = slice(None if known is None else known.size)
-    label, steps = f"{name}, c{' + E' * energy}", (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
-    return Case("mechanisms", label, problem, kept, problem.y0, end, steps, (EIPDOP853,), True, known=known, seen=seen)
-
-
-def planets(turned: np.ndarray, name: str) -> Case:
-    """Return ten bodies over 100 years in rotated axes, without blocks; the error is that of Mercury's position."""
-    plain = solar_system(years=100.0)
-    assert plain.reference is not None
-    y0, known = ((y.reshape(20, 3) @ turned.T).ravel() for y in (plain.y0, np.array(plain.reference(100.0))))
-    problem = nbody(plain.params, *y0.reshape(2, 10, 3), t_span=(0.0, 100.0))
-    steps, more = (0.002,), {"options": {"blocks": None}, "known": known, "seen": slice(3, 6)}
-    return Case("planets", name, problem, tuple(problem.invariants), y0, 100.0, steps, (EIPRK4,), **more)
-
-
-def cases() -> Iterator[Case]:
-    """Yield all cases."""
-    for seed, cut in ((0, 2.5), (1, 2.5), (2, 2.5), (3, 2 ** (1 / 6)), (4, 1.5)):
-        yield discs(seed, cut)
-    yield from contacts()
-    for name in MASSES:
-        yield from (in_si_units(name, kind) for kind in ("momenta", "velocities"))
-        yield from (trapped(name, exponent) for exponent in (2, 4))
-    for name, end in (("andrews", 0.03), ("wobbling disc", 5.0), ("knife edge", 10.0), ("1-four-bar", 10.0)):
-        yield from (mechanism(name, end, energy) for energy in (False, True))
-    for k, turned in enumerate([np.eye(3), *Rotation.random(3, rng=1).as_matrix()]):
-        yield planets(turned, f"axes {k}")
+WORSE, FAR_WORSE, TOLERANCE = 1.5, 5.0, 1e-9
 
 
 def metric(out: Output, *, only: str = "") -> None:
@@ -272,7 +31,8 @@ def metric(out: Output, *, only: str = "") -> None:
     only : str
         run only cases whose group or name contains this text
     """
-    chosen, rows = [case for case in cases() if only in f"{case.group} {case.name}"], []
+    every = [*metric_cases.cases(), *metric_systems.cases()]
+    chosen, rows = [case for case in every if only in f"{case.group} {case.name}"], []
     if not chosen:
         raise UsageError(f"--only: no case has {only!r} in its group or name")
     with out.keep(), warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -292,13 +52,15 @@ def metric(out: Output, *, only: str = "") -> None:
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """Return the table of cases and groups."""
-    heads, body = [["runs"], *([name] for name in METRICS), ["worst", "ratio"], ["worse"]], []
-    for key in ("case", "group"):
-        for group, name in dict.fromkeys((row["group"], row[key]) for row in rows):
-            own = [row for row in rows if (row["group"], row[key]) == (group, name)]
+    """Return the table of cases and groups, and of all."""
+    heads = [["runs"], *([name] for name in METRICS), ["worst", "ratio"], ["worse"], ["far", "worse"]]
+    body = []
+    for key in ("case", "group", "all"):
+        for group, name in dict.fromkeys((row["group"], row[key]) if key != "all" else ("", "") for row in rows):
+            own = [row for row in rows if key == "all" or (row["group"], row[key]) == (group, name)]
             means = [compact(float(np.exp(np.mean(np.log([row[m] + 1e-16 for row in own]))))) for m in METRICS]
-            worst, worse = max(row["ratio"] for row in own), sum(row["ratio"] > LARGEST_RATIO for row in own)
-            label = f"{group}: {name}" if key == "case" else f"all {group}"
-            body.append((label, [str(len(own)), *means, f"{worst:.3g}", str(worse)]))
+            ratios = np.array([row["ratio"] for row in own])
+            label = {"case": f"{group}: {name}", "group": f"all {group}", "all": "all"}[key]
+            counts = [str(int((ratios > bar).sum())) for bar in (WORSE, FAR_WORSE)]
+            body.append((label, [str(len(own)), *means, f"{ratios.max():.3g}", *counts]))
     return table(heads, body)

@@ -166,7 +166,7 @@ def toda(rng: np.random.Generator) -> System:
     def pull(q: Array) -> Array:
         return np.exp(q - np.roll(q, -1))
 
-    def dV(q: Array) -> Array:
+    def slope(q: Array) -> Array:
         e = pull(q)
         return e - np.roll(e, 1)
 
@@ -182,11 +182,11 @@ def toda(rng: np.random.Generator) -> System:
     q, v = 0.5 * rng.standard_normal((2, n))
     C = np.kron(np.eye(2), np.ones((1, n)))  # the sums of positions and of velocities
     kept = (
-        mechanical("H", lambda q: float(pull(q).sum()), dV),
+        mechanical("H", lambda q: float(pull(q).sum()), slope),
         Quantity("P", lambda t, y: float(y[n:].sum()), lambda t, y: np.array([*np.zeros(n), *np.ones(n)])),
         Quantity("third", third, third_gradient),
     )
-    return second_order("toda", lambda t, x: -dV(x), q, v, kept, frame=(C, C.T.copy()))
+    return second_order("toda", lambda t, x: -slope(x), q, v, kept, frame=(C, C.T.copy()))
 
 
 MOMENTUM = Quantity("L", lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]))
@@ -198,7 +198,7 @@ def kepler(rng: np.random.Generator) -> System:
     angle = rng.uniform(0, 2 * np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
-    def dV(q: Array) -> Array:
+    def slope(q: Array) -> Array:
         return q / (q @ q) ** 1.5
 
     def lenz(t: float, y: Array) -> Array:
@@ -211,9 +211,9 @@ def kepler(rng: np.random.Generator) -> System:
         by_q = (v @ v - 1 / r) * np.eye(2) - np.outer(v, v) + np.outer(q, q) / r**3
         return np.hstack([by_q, 2 * np.outer(q, v) - np.outer(v, q) - (q @ v) * np.eye(2)])
 
-    kept = (mechanical("H", lambda q: -1 / math.sqrt(q @ q), dV), MOMENTUM, Quantity("lenz", lenz, lenz_gradient))
+    kept = (mechanical("H", lambda q: -1 / math.sqrt(q @ q), slope), MOMENTUM, Quantity("lenz", lenz, lenz_gradient))
     start = turn @ np.array([1 - e, 0.0]), turn @ np.array([0.0, math.sqrt((1 + e) / (1 - e))])
-    return second_order("kepler", lambda t, x: -dV(x), *start, kept)
+    return second_order("kepler", lambda t, x: -slope(x), *start, kept)
 
 
 def spins(rng: np.random.Generator) -> System:
@@ -263,53 +263,42 @@ def random_system(rng: np.random.Generator) -> System:
     """Return one of them; some begin at another time, some have a different unit for each component."""
     system = FAMILIES[rng.integers(len(FAMILIES))](rng)
     if rng.random() < 0.3:
-        system = begun_at(system, float(rng.choice([1.0, -7.3, 250.0])))
+        system = described(system, t0=float(rng.choice([1.0, -7.3, 250.0])))
     if rng.random() < 0.15:
-        system = in_units(system, 10 ** rng.uniform(-9, 9, system.y0.size))
+        system = described(system, unit=10 ** rng.uniform(-9, 9, system.y0.size))
     return system
 
 
-def begun_at(system: System, t0: float) -> System:
-    """Return the same motion with its clock set to t0."""
-    kept = tuple(
-        Quantity(k.name, lambda t, y, k=k: k.fun(t - t0, y), lambda t, y, k=k: k.grad(t - t0, y),
-                 k.by_f and (lambda t, y, f, k=k: k.by_f(t - t0, y, f)))
-        for k in system.kept
-    )  # fmt: skip
-    fun, acc, exact = system.fun, system.acc, system.exact
+def described(system: System, t0: float = 0.0, unit: Array | None = None) -> System:
+    """Return the same motion with its clock set to t0, or with y = unit z; velocities keep their positions' unit."""
+    fun, acc, exact, frame = system.fun, system.acc, system.exact, system.frame
+    scale = np.ones(system.y0.size) if unit is None else unit
+    if acc is not None:
+        scale = np.tile(scale[: scale.size // 2], 2)
+
+    def quantity(item: Quantity) -> Quantity:
+        by_f = item.by_f
+        return Quantity(
+            item.name,
+            lambda t, z: item.fun(t - t0, z * scale),
+            lambda t, z: item.grad(t - t0, z * scale) * scale,
+            None if by_f is None else lambda t, z, f: by_f(t - t0, z * scale, f * scale) * scale,
+        )
+
+    def acceleration(t: float, q: Array) -> Array:
+        assert acc is not None
+        return acc(t - t0, q * scale[: q.size]) / scale[: q.size]
+
+    note = f"t0 = {t0:g}" if unit is None else "units of its own for each component"
     return replace(
         system,
-        fun=lambda t, y: fun(t - t0, y),
-        acc=acc and (lambda t, q: acc(t - t0, q)),
-        exact=exact and (lambda t: exact(t - t0)),
-        kept=kept,
-        t0=t0,
-        notes=(*system.notes, f"t0 = {t0:g}"),
-    )
-
-
-def in_units(system: System, unit: Array) -> System:
-    """Return the same motion with y = unit z; velocities keep the unit of their positions."""
-    if system.acc is not None:
-        unit = np.tile(unit[: unit.size // 2], 2)
-    kept = tuple(
-        Quantity(k.name, lambda t, z, k=k: k.fun(t, z * unit), lambda t, z, k=k: k.grad(t, z * unit) * unit,
-                 k.by_f and (lambda t, z, f, k=k: k.by_f(t, z * unit, f * unit) * unit))
-        for k in system.kept
-    )  # fmt: skip
-    old, old_acc, exact, frame = system.fun, system.acc, system.exact, system.frame
-
-    def acc(t: float, q: Array) -> Array:
-        return old_acc(t, q * unit[: q.size]) / unit[: q.size]
-
-    return replace(
-        system,
-        fun=first_order(acc) if old_acc else lambda t, z: old(t, z * unit) / unit,
-        acc=acc if old_acc else None,
-        exact=exact and (lambda t: exact(t) / unit),
-        y0=system.y0 / unit,
-        kept=kept,
-        frame=frame and (frame[0] * unit, frame[1] / unit[:, None]),
-        unit=unit,
-        notes=(*system.notes, "units of its own for each component"),
+        fun=(lambda t, z: fun(t - t0, z * scale) / scale) if acc is None else first_order(acceleration),
+        acc=acc and acceleration,
+        exact=exact and (lambda t: exact(t - t0) / scale),
+        y0=system.y0 / scale,
+        kept=tuple(map(quantity, system.kept)),
+        frame=frame and (frame[0] * scale, frame[1] / scale[:, None]),
+        t0=system.t0 + t0,
+        unit=system.unit if unit is None else scale,
+        notes=(*system.notes, note),
     )
