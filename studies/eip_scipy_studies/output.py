@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import multiprocessing
+import os
 import re
 import signal
 import sys
@@ -28,6 +29,7 @@ from eip_scipy.checkpoint.signals import sigterm_as_ctrl_c
 
 from .report import UsageError, document, say, warn, write_csv, write_file, write_json
 
+OUT = Path("eip_results")
 DONE, CHECK_FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 """Exit statuses of a command."""
 
@@ -38,7 +40,7 @@ class Output:
     `numbers` is what the study wants in the JSON file.
     """
 
-    def __init__(self, folder: Path = Path("eip_results"), *, quiet: bool = False) -> None:
+    def __init__(self, folder: Path = OUT, *, quiet: bool = False) -> None:
         self.folder, self.quiet = folder, quiet
         self.numbers: dict[str, Any] = {}
         self.passed, self.interrupted = True, False
@@ -122,6 +124,9 @@ def run(name: str, study: Callable[..., None], argv: Sequence[str]) -> int:
     target = given.pop("json")
     untrusted: list[str] = []
     try:
+        for folder in (out.folder if out.folder != OUT else None, target and target.parent):
+            if folder is not None:
+                check_folder(folder)
         with sigterm_as_ctrl_c(), listening(untrusted):
             study(out, **given)
     except (UsageError, OSError, MemoryError, CheckpointError) as error:
@@ -142,6 +147,15 @@ def run(name: str, study: Callable[..., None], argv: Sequence[str]) -> int:
     return INTERRUPTED if out.interrupted else DONE if out.passed and not untrusted else CHECK_FAILED
 
 
+def check_folder(folder: Path) -> None:
+    """Raise an OSError before the work if no file could be written to `folder` after it."""
+    nearest = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    if not nearest.is_dir():
+        raise NotADirectoryError(f"{str(folder)!r} cannot be made: {str(nearest)!r} is not a folder")
+    if not os.access(nearest, os.W_OK):
+        raise PermissionError(f"{str(nearest)!r} cannot be written to; choose another folder")
+
+
 def parser(name: str, study: Callable[..., None]) -> argparse.ArgumentParser:
     """Make the parser of a command: arguments before the ``*`` of the study are positional, those after it options."""
     text = inspect.getdoc(study) or ""
@@ -156,7 +170,7 @@ def parser(name: str, study: Callable[..., None]) -> argparse.ArgumentParser:
         flag = item.name if positional else f"--{item.name.replace('_', '-')}"
         settings = option(item.annotation, item.default) | ({"metavar": item.name.upper()} if positional else {})
         made.add_argument(flag, default=item.default, help=said[item.name].replace("%", "%%"), **settings)
-    made.add_argument("--out", type=Path, default=Path("eip_results"), metavar="DIR",
+    made.add_argument("--out", type=Path, default=OUT, metavar="DIR",
                       help="folder of figures and CSV files (default: ./%(default)s)")  # fmt: skip
     made.add_argument("--json", type=Path, metavar="FILE", help="write the numbers as JSON, with versions and machine")
     made.add_argument("--quiet", action="store_true", help="print nothing but errors")

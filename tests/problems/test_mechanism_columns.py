@@ -111,7 +111,7 @@ def flow_differences(problem, directions, step=1e-4):
     return np.array(found).T
 
 
-GATE = ("2, circle twice",)
+GATE = ("1, free",)
 
 
 @pytest.mark.needs_jit
