@@ -9,6 +9,7 @@ from importlib.util import find_spec
 import mpmath
 import numpy as np
 import pytest
+from pages import printed_tables
 from scipy.integrate import solve_ivp
 
 from eip_scipy_studies.bench.cases import CASES, INERTIA
@@ -143,3 +144,26 @@ def test_command_writes_runs_and_page(tmp_path):
     assert errors[0] > 1e-6
     assert errors[-1] < 1e-9
     assert "SciPy DOP853" in (tmp_path / "bench.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize("group", ["eigenstates", "Hénon-Heiles", "Huber"])
+def test_metric_on_the_page(group, tmp_path):
+    (printed,) = (table[group] for table in printed_tables("explanation/metric.md") if group in table)
+    assert main(["bench", "metric", "--only", group, "--out", str(tmp_path), "--quiet"]) == 0
+    rows = list(csv.DictReader((tmp_path / "metric.csv").read_text(encoding="utf-8").splitlines()))
+    own = [
+        {key: float(row[key]) for key in ("none", "euclidean", "default", "ratio")}
+        for row in rows
+        if row["group"] == group
+    ]
+    assert int(printed[0]) == len(own)
+    for key, cell in zip(("none", "euclidean", "default"), printed[1:4], strict=True):
+        assert float(cell) == pytest.approx(math.exp(np.mean([math.log(row[key]) for row in own])), rel=0.1)
+    ratios = np.array([row["ratio"] for row in own])
+    assert float(printed[4]) == pytest.approx(ratios.max(), rel=0.3)
+    assert [abs(int(cell) - (ratios > bar).sum()) <= 2 for cell, bar in zip(printed[5:], (1.5, 5), strict=True)] == [
+        True,
+        True,
+    ]
