@@ -19,4 +19,4 @@ def test_random_systems(seed, capsys):
 @pytest.mark.slow
 def test_runs_are_killed(capsys):
     """Some of each of the five kinds."""
-    assert kills.main(["--kills", "12"]) == 0, capsys.readouterr().out
+    assert kills.main(["--kills", "6"]) == 0, capsys.readouterr().out

@@ -111,11 +111,10 @@ def flow_differences(problem, directions, step=1e-4):
     return np.array(found).T
 
 
-GATE = ("1, free",)
-
-
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("name", [name if name in GATE else pytest.param(name, marks=LATER) for name in SYSTEMS])
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_columns_are_differences_of_the_flow(name):
     """The flow is that of functions that are not jitted, whose compilation would take as long again."""
     problem = system(name, plain)

@@ -61,7 +61,9 @@ def by_complex_numbers(t, y):
 @pytest.mark.parametrize(
     ("fun", "reason"),
     [
-        (by_address, "Cannot give C code the address of an array of dual numbers"),
+        pytest.param(
+            by_address, "Cannot give C code the address of an array of dual numbers", marks=pytest.mark.nightly
+        ),
         (by_pointer_in_place, "it does not compile for dual numbers: .*Pointer"),
         (by_floats, "component 0 of its derivative .* near the start, but .* with dual numbers"),
         (by_complex_numbers, "it raises ValueError with dual numbers"),
@@ -170,7 +172,7 @@ FAR = [1e8 - 0.5, 1e8, 1e8 + 0.5, 1e8, 0, -0.5, 0, 0.5]
         (with_many_digits, [1.0, 0.0]),
         (at_the_end_of_its_domain, [1.0, 0.0]),
         (constant, [0.0, 0.0]),
-        (two_bodies, FAR),
+        pytest.param(two_bodies, FAR, marks=pytest.mark.nightly),
     ],
 )
 def test_right_derivatives_are_not_refused(fun, start):

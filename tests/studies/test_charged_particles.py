@@ -74,6 +74,7 @@ def test_averages_take_out_what_has_the_gyrations_period():
     assert np.abs(uneven.averaged(np.cos(t))).max() < 4e-3
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_command_in_small(tmp_path, monkeypatch, capsys):
