@@ -27,11 +27,12 @@ PYTEST = ("-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", "not nightly", 
 
 
 def copied(tests: Path, to: Path) -> Path:
-    """Copy the checkout, with the tests of `tests`, and return the copy's path."""
+    """Copy the checkout, with the tests and studies of `tests`, and return the copy's path."""
     ignored = shutil.ignore_patterns(".git", ".venv*", "build", "docs", "*_cache", "__pycache__")
     shutil.copytree(ROOT, to, ignore=ignored)
-    shutil.rmtree(to / "tests")
-    shutil.copytree(tests / "tests", to / "tests", ignore=ignored)
+    for folder in ("tests", "studies"):
+        shutil.rmtree(to / folder)
+        shutil.copytree(tests / folder, to / folder, ignore=ignored)
     return to
 
 
@@ -45,7 +46,10 @@ def found(fault: dict[str, Any], tree: Path) -> str:
     path.write_text(text.replace(fault["old"], fault["new"]), encoding="utf-8")
     try:
         command = [sys.executable, "-m", "pytest", *PYTEST, *(tests or [str(Path(fault["tests"][0]).parent)])]
-        environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = os.environ | {
+            "PYTHONPATH": f"{tree}{os.pathsep}{tree / 'studies'}",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
         ran = subprocess.run(
             command, cwd=tree, env=environment, capture_output=True, text=True, timeout=SECONDS, check=False
         )

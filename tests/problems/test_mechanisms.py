@@ -368,8 +368,6 @@ def interpreted(problem):
     return problem.motion_at, Invariant(*functions, **options)
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
 def test_no_step_ends_next_to_a_singular_position():
     problem = examples.n_four_bar(1, t_end=3.0)
     fun, constraints = interpreted(problem)
