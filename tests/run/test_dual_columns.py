@@ -61,9 +61,7 @@ def by_complex_numbers(t, y):
 @pytest.mark.parametrize(
     ("fun", "reason"),
     [
-        pytest.param(
-            by_address, "Cannot give C code the address of an array of dual numbers", marks=pytest.mark.nightly
-        ),
+        (by_address, "Cannot give C code the address of an array of dual numbers"),
         (by_pointer_in_place, "it does not compile for dual numbers: .*Pointer"),
         (by_floats, "component 0 of its derivative .* near the start, but .* with dual numbers"),
         (by_complex_numbers, "it raises ValueError with dual numbers"),
