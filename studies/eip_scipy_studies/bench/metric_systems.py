@@ -10,6 +10,7 @@ import numpy as np
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, EIPRadau, Invariant
 from eip_scipy.problems import uniform_field
+from eip_scipy.problems.gravity.nbody import common_shift
 
 from .cases import CASES
 from .families import FAMILIES, System
@@ -142,8 +143,7 @@ def molecules() -> Iterator[Case]:
             out += np.array([q[1] * p[2] - q[2] * p[1], q[2] * p[0] - q[0] * p[2], q[0] * p[1] - q[1] * p[0]])
         return out
 
-    rows = np.kron(np.eye(2), np.kron(MASSES[::3], np.eye(3)))
-    frame = rows, np.kron(np.eye(2), np.kron(np.ones((3, 1)), np.eye(3)))
+    frame = common_shift(MASSES[::3])
     for seed in range(5):
         v = np.random.default_rng(seed).standard_normal(9) * 0.3
         y0 = np.array([0, 0, 0, 1.05, 0, 0, -0.25, 0.95, 0, *v])
@@ -174,12 +174,7 @@ def of_users() -> Iterator[Case]:
     yield of("charged particle", (np.pi / 10,), (EIPRK4,), known=known, measured=lambda run: centre(run.y[:, -1]))
     yield of("Robertson", (1e-3, 1e-5), (EIPRadau,), True, options={"atol": 1e-6})
     bodies = CASES["ten bodies, 100 years"]
-    gm, n = np.asarray(bodies.gm), len(bodies.gm)
-    frame = (
-        np.kron(np.eye(2), np.kron(gm / gm.sum(), np.eye(3))),
-        np.kron(np.eye(2), np.kron(np.ones((n, 1)), np.eye(3))),
-    )
-    options: dict[str, Any] = {"every": 10, "blocks": 3, "frame": frame}
+    options: dict[str, Any] = {"every": 10, "blocks": 3, "frame": common_shift(bodies.gm)}
     seen: dict[str, Any] = {"known": bodies.end[3:6], "measured": at(slice(3, 6))}
     yield of(bodies.name, (0.02,), (EIPRKN12,), options=options, **seen)
     for name in ("perturbed Kepler", "Hénon-Heiles", "double pendulum", "halo orbit", "rigid body"):
