@@ -14,7 +14,9 @@ import numpy as np
 
 EPS = np.finfo(float).eps
 FLOOR = 1e-7
-MEMORY = 0.9
+MEMORY, LONG_MEMORY = 0.8, 0.999
+# A shift in time whose tangent part, squared, is a smaller share is rounding.
+LEAST_SHIFT = 1e-12
 # The share of its terms that a given target may be missed by without a further Newton step, and their largest number.
 MOST_LEFT, FURTHER = 1e-9, 3
 
@@ -26,8 +28,8 @@ class Step:
     """Ingredients of a step.
 
     `fun` is f(t, y), `values` I(t, y) and `gradients` G(t, y) (l, n) of all invariants. `blocks` are lists of
-    components; `frame` is (C, S); the metric is "error", "euclidean" or n weights. `remembered` holds the blocks'
-    relative errors, in units of the largest one, that the error metric remembers of the steps made so far.
+    components; `frame` is (C, S); the metric is "error", "euclidean" or n weights. `remembered` holds what the error
+    metric remembers by block: the scale, the error in units of the largest relative one, the lasting share.
     """
 
     tableau: Any
@@ -42,32 +44,45 @@ class Step:
     frame: tuple[Array, Array] | None = None
     direction: str = "new"
     iterations: int = 1
-    remembered: Any = 0.0
+    remembered: Any = (0.0, 0.0, 0.0)
 
     def __call__(self, t: float, y: Array, h: float) -> Array:
         """The state at t + h."""
         if hasattr(self.tableau, "b_prime"):
-            return self.projected(t, y, t + h, *nystrom(self.tableau, self.fun, t, y, h))
-        y_hat, K = runge_kutta(self.tableau, self.fun, t, y, h)
-        return self.projected(t, y, t + h, y_hat, local_error(self.tableau, K, h))
+            y_hat, err, f = nystrom(self.tableau, self.fun, t, y, h)
+        else:
+            y_hat, K = runge_kutta(self.tableau, self.fun, t, y, h)
+            err, f = local_error(self.tableau, K, h), flow(self.tableau, K)
+        return self.projected(t, y, t + h, y_hat, err, f)
 
-    def projected(self, t_old: float, y: Array, t: float, y_hat: Array, err: Array | None) -> Array:
-        """y_hat on the invariants' targets."""
+    def projected(self, t_old: float, y: Array, t: float, y_hat: Array, err: Array | None, f: Array) -> Array:
+        """y_hat on the invariants' targets; `f` is the derivative there, or nearly so."""
         g = self.defects(t, y_hat)
-        sigma = self.weights(y, y_hat, err)
+        sigma, shares, units = self.weights(y, y_hat, err)
         if not g.any():
             return y_hat
         # Newton's matrix has the gradients at the residuals' state; corrections go along those of the direction.
         along = {"new": (t, y_hat), "old": (t_old, y), "midpoint": ((t_old + t) / 2, (y + y_hat) / 2)}[self.direction]
         Q = sigma * self.neutral(floats(self.gradients(*along)))
-        mu, now = np.zeros(len(g)), y_hat
+        mu, now, shift = np.zeros(len(g)), y_hat, 0.0
         for k in range(self.iterations + FURTHER):
             if k >= self.iterations and self.shares(t, now).max() <= MOST_LEFT:
                 break
             B = sigma * self.neutral(floats(self.gradients(t, now)))
             mu += np.linalg.lstsq(B @ Q.T, -self.defects(t, now), rcond=None)[0]
-            now = states(floats(y_hat) + self.kept(sigma * (Q.T @ mu)), y)
+            move = self.kept(sigma * (Q.T @ mu))
+            if k == 0 and shares is not None and self.direction == "new":
+                shift = self.shift(move, shares * floats(f) / sigma, B, sigma, units)
+            now = states(floats(y_hat) + move - shift, y)
         return now
+
+    def shift(self, move: Array, flow: Array, B: Array, sigma: Array, units: Array) -> Array:
+        """The part of a correction that shifts the time, with the `flow` of each block in units of sigma."""
+        tangent = flow - np.linalg.lstsq(B, B @ flow, rcond=None)[0]
+        if tangent @ tangent <= LEAST_SHIFT * (flow @ flow):
+            return np.zeros(len(move))
+        shift = self.kept(sigma * tangent)
+        return (move @ (units * shift)) / (shift @ (units * shift)) * shift
 
     def defects(self, t: float, y: Array) -> Array:
         """I - target, which is given; 0 where all of it is the rounding of four of the invariants' terms."""
@@ -79,37 +94,46 @@ class Step:
         terms = np.abs(floats(self.gradients(t, y)) * floats(y)).sum(axis=1)
         return np.abs(values - self.target) / np.max([np.abs(values), np.abs(self.target), terms], axis=0)
 
-    def weights(self, y: Array, y_hat: Array, err: Array | None) -> Array:
-        """Sigma: how far each float may move, the largest 1. By blocks, scale_b (e_b^kappa + floor).
+    def weights(self, y: Array, y_hat: Array, err: Array | None) -> tuple[Array, Array | None, Array | None]:
+        """Sigma: how far each float may move. By blocks, scale_b (e_b^kappa + floor).
 
-        e_b is the block's relative error in units of the largest one, or what is remembered of it. For a block that the
-        step leaves as it was, without an error, what is remembered does not count.
+        e_b is what is remembered of the block's relative error, in units of the largest one. For a block that the step
+        leaves as it was, without an error, what is remembered does not count. Then the squared shares of the floats in
+        the lasting errors, and the weights of the square of a correction; None for other metrics.
         """
         width = floats(y).size // y.size
         if not isinstance(self.metric, str):
-            return np.repeat(self.metric / np.max(self.metric), width)
+            return np.repeat(self.metric / np.max(self.metric), width), None, None
         if self.metric == "euclidean" or err is None:
-            return np.ones(floats(y).size)
+            return np.ones(floats(y).size), None, None
         blocks = self.blocks if self.blocks is not None else [[k] for k in range(y.size)]
         places = [np.concatenate([np.arange(width) + width * k for k in block]) for block in blocks]
 
         def norms(a: Array) -> Array:
             return np.array([np.linalg.norm(floats(a)[place]) for place in places])
 
+        def spread(a: Array) -> Array:
+            out = np.zeros(floats(y).size)
+            for place, value in zip(places, a, strict=True):
+                out[place] = value
+            return out
+
         old, new, error = norms(y), norms(y_hat), norms(err)
+        known = norms(np.maximum(np.abs(floats(err)), EPS * np.abs(floats(y_hat))).view(y.dtype))
         scale = self.atol * np.sqrt([len(block) for block in blocks]) + self.rtol * np.maximum(old, new)
-        ratio = np.divide(np.hypot(error, EPS * new), scale, where=scale > 0, out=np.zeros(len(scale)))
-        now = ratio / (ratio.max() or 1.0)
-        self.remembered = np.maximum(now, MEMORY * self.remembered)
+        scale = np.maximum(scale, MEMORY * self.remembered[0])
+        inverse = np.divide(1.0, scale, where=scale > 0, out=np.zeros(len(scale)))
+        now = known * inverse
+        now = now / (now.max() or 1.0)
+        size, lasting = np.maximum(now * scale, MEMORY * self.remembered[1]), LONG_MEMORY * self.remembered[2]
+        self.remembered = scale, size, np.maximum(now, lasting)
         constant = (error == 0.0) & (norms(y_hat - y) == 0.0)
-        errors = np.where(constant, now, self.remembered)
-        if not errors.any():
-            return np.ones(floats(y).size)
-        by_block = scale * (errors**self.tableau.kappa + FLOOR)
-        sigma = np.empty(floats(y).size)
-        for place, weight in zip(places, by_block / by_block.max(), strict=True):
-            sigma[place] = weight
-        return sigma
+        errors = np.where(constant, now, size * inverse)
+        sigma = scale * (errors**self.tableau.kappa + FLOOR) if errors.any() else np.ones(len(scale))
+        shares = self.remembered[2] ** 2
+        alone = len(blocks) == y.size
+        units = inverse**2 if alone else inverse**2 / (shares + FLOOR**2)
+        return spread(sigma), spread(shares), spread(units)
 
     def neutral(self, G: Array) -> Array:
         """Rows G without what the frame's C y sees of them: G (1 - M C), M = S (C S)^-1."""
@@ -137,10 +161,17 @@ def runge_kutta(
     return y_hat, np.array([*K, fun(t + h, y_hat)])
 
 
+def flow(tableau: Any, K: Sequence[Array]) -> Array:
+    """f at the raw result: the last of K if the estimate takes it, else what two stages make of it."""
+    if tableau.fsal or tableau.c[-1] == 0:
+        return K[-1]
+    return K[-2] + (1 / tableau.c[-1] - 1) * (K[-2] - K[0])
+
+
 def nystrom(
     tableau: Any, fun: Callable[[float, Array], Array], t: float, y: Array, h: float
-) -> tuple[Array, Array | None]:
-    """For y = (q, v) and q'' = a(t, q): the raw result, and its estimated error."""
+) -> tuple[Array, Array | None, Array]:
+    """For y = (q, v) and q'' = a(t, q): the raw result, its estimated error, and its derivative by the last stage."""
     q, v = np.split(y, 2)
     accelerations: list[Array] = []
     for row, c in zip(tableau.A, tableau.c, strict=True):
@@ -148,9 +179,10 @@ def nystrom(
         accelerations.append(np.split(fun(t + c * h, np.concatenate([q + c * h * v + h * h * pulled, v])), 2)[1])
     a = np.array(accelerations).T
     y_hat = np.concatenate([q + h * v + h * h * (a @ tableau.b), v + h * (a @ tableau.b_prime)])
+    f = np.concatenate([np.split(y_hat, 2)[1], flow(tableau, [*accelerations, accelerations[-1]])])
     if tableau.error_estimator_order is None:
-        return y_hat, None
-    return y_hat, np.concatenate([h * h * (a @ tableau.e), h * (a @ tableau.e_prime)])
+        return y_hat, None, f
+    return y_hat, np.concatenate([h * h * (a @ tableau.e), h * (a @ tableau.e_prime)]), f
 
 
 def local_error(tableau: Any, K: Array, h: float) -> Array | None:

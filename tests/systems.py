@@ -161,7 +161,7 @@ def same(one, *others):
             assert (one[key] is None) == (other[key] is None)
             for a, b in zip(one[key] or (), other[key] or (), strict=True):
                 np.testing.assert_array_equal(a, b, err_msg=key)
-        for key in ("names", "n_projections", "n_skipped", "n_rank_reduced", "n_softened", "n_rejected_projections"):
+        for key in ("names", "n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections"):
             assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
         for key in ("last_defect", "max_defect", "max_correction"):
             np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)

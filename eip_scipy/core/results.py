@@ -25,9 +25,6 @@ class Diagnostics:
         Number of projections made, and of projections omitted because every invariant error was round-off.
     n_rank_reduced : int
         Number of projections in which gradients were (nearly) dependent or zero, so that the rank was reduced.
-    n_softened : int
-        Number of projections in which the weights of the error metric were made more equal, because the correction
-        would otherwise have been much larger than any error of the step, or would have failed.
     n_rejected_projections : int
         Number of projections that failed.
     max_correction : float
@@ -105,11 +102,6 @@ class Diagnostics:
         return int(self._counters[data.RANK_REDUCED])
 
     @property
-    def n_softened(self) -> int:
-        """Number of projections with weights that are more equal than those of the error metric."""
-        return int(self._counters[data.SOFTENED])
-
-    @property
     def n_rejected_projections(self) -> int:
         """Number of projections that failed."""
         return int(self._counters[data.REJECTED])
@@ -154,8 +146,8 @@ class Diagnostics:
         if not self.names:
             return "Diagnostics: no invariants"
         lines = [
-            f"Diagnostics: {self.n_projections} projections ({self.n_rank_reduced} of reduced rank, {self.n_softened} "
-            f"softened), {self.n_skipped} skipped (round-off), {self.n_rejected_projections} rejected"
+            f"Diagnostics: {self.n_projections} projections ({self.n_rank_reduced} of reduced rank), "
+            f"{self.n_skipped} skipped (round-off), {self.n_rejected_projections} rejected"
         ]
         width = max(len(name) for name in self.names)
         for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):

@@ -41,16 +41,15 @@ RANK_REDUCED: int = 5
 REJECTED: int = 6
 LAST_RANK: int = 7
 HAVE_F: int = 8
-SOFTENED: int = 9
-HAVE_ERROR: int = 10
-BEGUN: int = 11
-WAITED: int = 12
-FOUND: int = 13
-F_AT_RAW: int = 14
-INDEPENDENT: int = 15
-TRIED_INDEPENDENT: int = 16
-STUCK: int = 17
-N_COUNTERS: int = 18
+HAVE_ERROR: int = 9
+BEGUN: int = 10
+WAITED: int = 11
+FOUND: int = 12
+F_AT_RAW: int = 13
+INDEPENDENT: int = 14
+TRIED_INDEPENDENT: int = 15
+STUCK: int = 16
+N_COUNTERS: int = 17
 TIME: int = 0
 TIME_NEW: int = 1
 LENGTH: int = 2
@@ -167,6 +166,15 @@ class Work:
     def move(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
+    def shift(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def share(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def unit(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
     def carry(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
@@ -176,7 +184,13 @@ class Work:
     def scale(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
+    def inverse(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
     def ratio(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def remembered(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
     def memory(self, /) -> numpy.typing.NDArray[numpy.float64]: ...

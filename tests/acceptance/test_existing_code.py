@@ -26,5 +26,5 @@ def test_lotka_volterra():
     kept, end = run(EIPRK45, invariants=Invariant(value, lambda t, z: np.array([d - c / z[0], b - a / z[1]])))
     _, exact = run("DOP853", rtol=1e-12, atol=1e-12)
     assert same == plain > 0.1
-    assert kept < 2e-3
-    assert np.linalg.norm(end - exact) < 0.2 * np.linalg.norm(plain_end - exact)
+    assert kept < 5e-3
+    assert np.linalg.norm(end - exact) < 0.05 * np.linalg.norm(plain_end - exact)

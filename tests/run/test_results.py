@@ -346,7 +346,7 @@ def test_from_the_last_state_though_it_was_not_saved():
     first = integrate(kepler(), (0, 3), method=EIPRK4, t_eval=[1.0])
     joined = first.continue_to(6.0, t_eval=[4.0, 5.0])
     np.testing.assert_array_equal(joined.t, whole.t)
-    np.testing.assert_allclose(joined.y, whole.y, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(joined.y, whole.y, rtol=0, atol=1e-9)  # the metric's memory of errors starts anew
     np.testing.assert_array_equal(first.continue_to(6.0).t, [1.0, 3.0, 6.0])
     np.testing.assert_array_equal(kepler_run().continue_to(6.0, t_eval=[5.0]).t[-2:], [3.0, 5.0])
     np.testing.assert_array_equal(integrate(oscillator, (0, -1), Y0, method=EIPRK4).continue_to(-2.0).t[-1], -2.0)

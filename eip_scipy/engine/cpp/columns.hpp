@@ -75,6 +75,29 @@ inline void find_corrections(const Options &o, const W &w, int64_t rank, const M
     }
 }
 
+// Removes the shift in time from these corrections like `remove_shift` from that of the state; they make the shift tangent.
+template <class W>
+inline void remove_shifts(const Options &o, const W &w, const double *f) {
+    const int64_t n = o.columns.size;
+    double *shift = w.shift, *measure = w.f_point;
+    lasting_errors<double>(o, w);
+    for (int64_t j = 0; j < w.m; ++j) w.move[j] = w.share[j] * f[j];
+    if (o.frame.rows > 0) remove_sparse(o.frame, 0, w.products, w.move);
+    take_column(o.columns, -1, w.move, shift);
+    for (int64_t i = 0; i < w.l; ++i) w.g[i] = dot(w.gradient(i), shift, n);
+    for (int64_t i = 0; i < w.l; ++i)
+        for (int64_t j = 0; j < n; ++j) shift[j] += w.g[i] * w.B[i * w.m + j];
+    take_column(o.columns, -1, w.unit, measure);
+    for (int64_t j = 0; j < n; ++j) measure[j] *= shift[j];
+    const double size = dot(shift, measure, n);
+    if (!(size > 0.0)) return;
+    for (int64_t i = 0; i < w.l; ++i) {
+        double *correction = w.B + i * w.m;
+        const double factor = dot(correction, measure, n) / size;
+        for (int64_t j = 0; j < n; ++j) correction[j] -= factor * shift[j];
+    }
+}
+
 // The columns M (count, size) moved onto G M = kept by these corrections.
 template <class W>
 inline void project_each(const Columns &columns, const W &w, double *M) {
@@ -138,6 +161,7 @@ template <class AnyRun>
     ++w.counters[NLU];
     if (rank > 0) {
         find_corrections(o, w, rank, rows, scratch);
+        if (o.metric == BY_ERROR) remove_shifts(o, w, flow_at_raw(run, step));
         project_each(columns, w, M);
     }
     if (columns.symplectic) restore_symplectic(n, M, scratch, w.move);

@@ -9,8 +9,7 @@
 
 namespace eip {
 
-constexpr double HEALTHY = 5.0;
-constexpr int MAX_SOFTENED = 3, MAX_FURTHER = 3;
+constexpr int MAX_FURTHER = 3;
 
 // A Newton step: its rank, -1 where gradients are not finite, the largest relative error, and its size in local errors.
 struct Moved {
@@ -54,31 +53,115 @@ template <class W>
     return w.Q;
 }
 
+// Call take(j, x) with x = entry j of sigma * (Q^T mu), for all j, vector by vector.
+template <class Value, class W, class Take>
+[[gnu::always_inline]] inline void combine_rows(const W &w, const Value *mu, const Value *__restrict Q,
+                                                const Take &take) {
+    in_blocks(Q, w.m, [&]<class Part, int COUNT>(int64_t first) {
+        constexpr int64_t LENGTH = sizeof(Part) / sizeof(Value);
+        Part sums[COUNT];
+        for (int c = 0; c < COUNT; ++c) sums[c] = spread<Part>(mu[0]) * load_as<Part>(Q + first + c * LENGTH);
+        for (int64_t k = 1; k < w.l; ++k) {
+            const Part factor = spread<Part>(mu[k]);
+            for (int c = 0; c < COUNT; ++c)
+                sums[c] = sums[c] + factor * load_as<Part>(Q + k * w.m + first + c * LENGTH);
+        }
+        for (int c = 0; c < COUNT; ++c) {
+            const int64_t j = first + c * LENGTH;
+            take(j, load_as<Part>(w.sigma + j) * sums[c]);
+        }
+    });
+}
+
 // w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction along rows Q, neutral to the frame; out = y_hat + move. In one
 // pass, which writes in vectors what the next step reads in vectors.
 template <class Value, class W>
 [[gnu::always_inline]] inline void move_along(const auto &o, const W &w, const Value *__restrict Q,
                                               Value *__restrict out) {
-    const int64_t m = w.m;
-    const bool framed = o.frame.rows > 0;
-    in_blocks(out, m, [&]<class Part, int COUNT>(int64_t first) {
-        constexpr int64_t LENGTH = sizeof(Part) / sizeof(Value);
-        Part sums[COUNT];
-        for (int c = 0; c < COUNT; ++c) sums[c] = spread<Part>(w.mu[0]) * load_as<Part>(Q + first + c * LENGTH);
-        for (int64_t k = 1; k < w.l; ++k) {
-            const Part mu = spread<Part>(w.mu[k]);
-            for (int c = 0; c < COUNT; ++c) sums[c] = sums[c] + mu * load_as<Part>(Q + k * m + first + c * LENGTH);
-        }
-        for (int c = 0; c < COUNT; ++c) {
-            const int64_t j = first + c * LENGTH;
-            const Part x = load_as<Part>(w.sigma + j) * sums[c];
-            store_as(x, framed ? out + j : w.move + j);
-            if (!framed) store_as(load_as<Part>(w.y_hat + j) + x, out + j);
-        }
-    });
-    if (!framed) return;
+    if (o.frame.rows == 0)
+        return combine_rows(w, w.mu, Q, [&]<class Part>(int64_t j, const Part &x) {
+            store_as(x, w.move + j);
+            store_as(load_as<Part>(w.y_hat + j) + x, out + j);
+        });
+    combine_rows(w, w.mu, Q, [&](int64_t j, const auto &x) { store_as(x, out + j); });
     keep_frame(o.frame, w, out, w.move);
-    for (int64_t j = 0; j < m; ++j) out[j] = w.y_hat[j] + w.move[j];
+    for (int64_t j = 0; j < w.m; ++j) out[j] = w.y_hat[j] + w.move[j];
+}
+
+// Return f at the raw result, or nearly so: what the stages make of it where the step does not evaluate it.
+template <class AnyRun>
+inline auto *flow_at_raw(const AnyRun &run, const Step &step) {
+    const auto &m = run.method;
+    const auto &w = run.work;
+    const bool in_python = run.hooks && run.hooks->raw;
+    if (in_python && !w.counters[F_AT_RAW]) {
+        run.system.rhs(w, step.t_new, as_floats(w.y_hat), as_floats(w.last()));
+        ++w.counters[NFEV];
+    }
+    if (in_python || m.multistep || w.counters[HAVE_F]) return w.last();
+    const auto *first = w.row(0), *last = w.row(m.stages - 1);
+    const double beyond = 1.0 / m.c[m.stages - 1] - 1.0;
+    for (int64_t j = 0; j < w.m; ++j) w.f_point[j] = last[j] + beyond * (last[j] - first[j]);
+    if (m.nystrom) copy(w.y_hat + w.m / 2, w.f_point, w.m / 2);
+    return w.f_point;
+}
+
+// Coefficients of `rank` orthonormal rows of Q in what makes w.shift tangent; w.mu is needed for further Newton steps.
+template <class W>
+inline const double *along_orthonormal_rows(int64_t rank, const W &w) {
+    double *mu = w.inner_mu;
+    fill(mu, 0.0, w.l);
+    for (int64_t k = 0; k < rank; ++k) {
+        const double *row = w.Q + w.pivots[k] * w.m;
+        for (int64_t j = 0; j < w.m; ++j)
+            if (w.sigma[j] > 0.0) mu[w.pivots[k]] -= row[j] * w.shift[j] / w.sigma[j];
+    }
+    return mu;
+}
+
+// Removes from w.move its part along a shift in time, which is left in w.shift; out = y_hat + move.
+//
+// A multiple of the flow f changes no invariant: the weights alone decide how much of it a correction contains, and where
+// the error estimate of a component vanishes for a moment, they decide badly. Each block is shifted in proportion to its
+// squared share in the errors; the rows of Q, of which `rank` are orthonormal (-1: those of `solve_gram`), make that tangent.
+// Of all corrections that differ by a multiple of it the result is the smallest one in units of the lasting errors.
+template <class Value, class W>
+[[gnu::always_inline]] inline void remove_shift(const auto &o, const W &w, const Value *f, int64_t rank, Value *out) {
+    const int64_t m = w.m;
+    Value *__restrict shift = w.shift;
+    const bool framed = o.frame.rows > 0;
+    lasting_errors<Value>(o, w);
+    for (int64_t j = 0; j < m; ++j) shift[j] = w.share[j] * f[j];
+    const auto size_of = [&](const Value *a) {
+        return sum_of(shift, m, [=, &w]<class Part>(int64_t j) {
+            return load_alone<Part>(a + j) * (load_alone<Part>(shift + j) * load_alone<Part>(w.unit + j));
+        });
+    };
+    const Value whole = size_of(shift);
+    if (framed) {
+        keep_frame(o.frame, w, shift, out);
+        copy(out, shift, m);
+    }
+    const Value *mu = w.mu;
+    if constexpr (std::is_same_v<Value, double>)
+        if (rank >= 0) mu = along_orthonormal_rows(rank, w);
+    if (mu == w.mu) {
+        for (int64_t i = 0; i < w.l; ++i) w.values[i] = dot(w.gradient(i), shift, m);
+        substitute_gram(corner(w.R, w.l, w), w.values, w.mu);
+    }
+    combine_rows(w, mu, w.Q, [&](int64_t j, const auto &x) { store_as(x, out + j); });
+    if (framed) {
+        copy(out, w.share, m);
+        keep_frame(o.frame, w, w.share, out);
+    }
+    for (int64_t j = 0; j < m; ++j) shift[j] += out[j];
+    const Value size = size_of(shift), factor = size_of(w.move) / positive(size);
+    const auto known = (size > LEAST_SHIFT * whole) & (abs(factor) < ENDLESS);
+    for (int64_t j = 0; j < m; ++j) {
+        shift[j] = where(known, factor * shift[j], 0.0);
+        w.move[j] -= shift[j];
+        out[j] = w.y_hat[j] + w.move[j];
+    }
 }
 
 // Coefficients w.mu of the rows of B in their least-norm solution, and its rank. One row, the usual case, by itself.
@@ -160,28 +243,31 @@ inline auto *limits(const auto &o, const W &w) {
 // The first Newton step by `factor`. Gradients that are nearly parallel are given their whole defects, also those inside the dead
 // bands: 0 in the place of one would disagree with the other.
 template <class W>
-[[gnu::noinline]] inline int64_t factored_move(const Options &o, const W &w, double *out) {
+[[gnu::noinline]] inline int64_t factored_move(const Options &o, const W &w, const double *f, double *out) {
     const Matrix R = corner(w.R, w.l, w);
     const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     w.counters[TRIED_INDEPENDENT] = clearly_independent(R, w.pivots, rank);
     least_norm(w.before, w.inverse_norms, R, w.pivots, rank, w.mu, w.band, EPS * o.per_band);
-    if (rank >= 0) move_along(o, w, w.Q, out);
+    if (rank < 0) return rank;
+    move_along(o, w, w.Q, out);
+    if (f) remove_shift(o, w, f, rank, out);
     return rank;
 }
 
-// The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
+// The first Newton step along the gradients at y_hat; with f there, without a shift in time. `more`: others follow, for which Q must be orthonormal.
 template <class W>
-[[gnu::always_inline]] inline int64_t first_move(const auto &o, const W &w, double *out, bool more) {
+[[gnu::always_inline]] inline int64_t first_move(const auto &o, const W &w, const double *f, double *out, bool more) {
     if (o.balance_groups.count > 0) [[unlikely]]
         return move_in_groups(o, w, out);
     double *rows = more ? nullptr : weighed_gradients(o, w);
     if (rows && solve_gram(rows_of(rows, w), w.g, corner(w.R, w.l, w), w.mu)) {
         move_along(o, w, rows, out);
+        if (f) remove_shift(o, w, f, -1, out);
         w.counters[TRIED_INDEPENDENT] = w.l;
         return w.l;
     }
     if (rows != w.Q) weigh_rows(o.frame, w, w.Q);
-    return factored_move(o, w, out);
+    return factored_move(o, w, f, out);
 }
 
 // Computes the gradients w.G at the state y, and f there if they take it.
@@ -229,18 +315,24 @@ inline void newton_matrix_solve(int64_t rank, const Work &w) {
     return rank;
 }
 
-// The first Newton step; `largest_error` >= 0: by the weights that stand, for this one.
+// The first Newton step.
 template <class AnyRun>
-inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1.0) {
+inline Moved move(const AnyRun &run, const Step &step) {
     const auto &o = run.options;
     const auto &w = run.work;
     ++w.counters[NLU];
-    if (largest_error < 0.0) {
-        largest_error = o.metric == BY_ERROR ? relative_errors(step.y, run) : 0.0;
-        if (o.metric == BY_ERROR) weights_from_errors(step.y, o, w);
+    double largest_error = 0.0;
+    if (o.metric == BY_ERROR) {
+        largest_error = relative_errors(step.y, run);
+        weights_from_errors(step.y, o, w);
     }
-    const int64_t rank = o.direction == NEW ? first_move(o, w, step.y_new, o.iterations > 1)
-                                            : other_directions(of_any_length(run), step);
+    int64_t rank;
+    if (o.direction == NEW) {
+        const double *f = o.metric == BY_ERROR ? flow_at_raw(run, step) : nullptr;
+        rank = first_move(o, w, f, step.y_new, o.iterations > 1);
+    } else {
+        rank = other_directions(of_any_length(run), step);
+    }
     return {rank, largest_error, correction_in_local_errors(largest_error, o, w)};
 }
 
@@ -254,6 +346,11 @@ inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);
     move_along(o, w, w.Q, step.y_new);
+    if (o.metric != BY_ERROR || o.direction != NEW) return true;
+    for (int64_t j = 0; j < w.m; ++j) {
+        w.move[j] -= w.shift[j];
+        step.y_new[j] = w.y_hat[j] + w.move[j];
+    }
     return true;
 }
 
@@ -279,7 +376,8 @@ inline auto missed_targets(const Options &o, const W &w) {
     const Work &w = run.work;
     const auto evaluate = [&] { run.system.inv(w, step.t_new, step.y_new, w.values); };
     double missed = missed_targets(o, w);
-    if (o.direction == NEW && o.iterations == 1) rank = first_move(o, w, step.y_new, true);
+    if (o.direction == NEW && o.iterations == 1)
+        rank = first_move(o, w, o.metric == BY_ERROR ? flow_at_raw(run, step) : nullptr, step.y_new, true);
     for (int k = 0; rank >= 0 && k < MAX_FURTHER && missed > 1.0; ++k) {
         copy(step.y_new, w.stage, w.m);
         if (!newton_iteration(run, step, rank)) break;
@@ -342,19 +440,23 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     defects<double>(nullptr, w.y_hat, o, w, w.before);
 }
 
-// Further tries with weights ever nearer to equal relative errors; at most MAX_SOFTENED.
-//
-// An estimate can vanish in a component, by symmetry, where the error does not; the others then carry a correction far
-// larger than any error of the step. Components that stand alone are prone to it; a block's length is not.
-[[gnu::cold, gnu::noinline]] inline Code correct_softly(const Run &run, const Step &step, bool alone, Moved &moved) {
-    ++run.work.counters[SOFTENED];
+// Further tries: with the shift in time, whose square may be large, then with weights ever nearer to equal relative errors,
+// for which an estimate that vanishes in some component counts less. Constants keep their weights.
+[[gnu::cold, gnu::noinline]] inline Code correct_evenly(const Run &run, const Step &step, Moved &moved) {
+    const Options &o = run.options;
+    const Work &w = run.work;
     Code status = FAILED_PROJECTION;
-    for (int k = 0; k < MAX_SOFTENED; ++k) {
-        soften(step.y, run.options, run.work);
+    for (int k = 0; k <= MAX_FURTHER && status != OK; ++k) {
+        each_float(o.blocks, w.m, [&](int64_t i, int64_t b) {
+            if (k > 0 && !is_constant_block(step.y, b, o.blocks, w))
+                w.sigma[i] = std::sqrt(w.sigma[i]) * std::sqrt(w.scale[b]);
+        });
         start_again(run, step);
-        moved = move(run, step, moved.largest_error);
+        fill(w.shift, 0.0, w.m);
+        moved.rank =
+            o.direction == NEW ? first_move(o, w, nullptr, step.y_new, o.iterations > 1) : other_directions(run, step);
+        moved.correction = correction_in_local_errors(moved.largest_error, o, w);
         status = correct(run, step, moved.rank);
-        if (status == OK && !(alone && moved.correction > HEALTHY)) break;
     }
     return status;
 }
@@ -438,18 +540,13 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     if (step.avoids_singular && w.counters[TRIED_INDEPENDENT] < w.counters[INDEPENDENT]) [[unlikely]]
         return NEAR_SINGULAR;
     Code status = correct(run, step, moved.rank);
-    // With other options only steps that would fail are softened, and no projections of a state by itself.
     const bool plain = o.direction == NEW && o.iterations == 1 && !o.compensated;
-    const bool in_step = !run.method.multistep && origin(step, w);
-    if (o.balance_groups.count == 0 && (plain || (status != OK && in_step))) {
-        const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.m;
-        const bool alone = o.blocks.count * o.blocks.width == seen;
-        const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;
-        if (moved.largest_error > 0.0 && doubtful) status = correct_softly(of_any_length(run), step, alone, moved);
-        if (status != OK && moved.rank > 1) {
-            --moved.rank;
-            status = correct_with_fewer(of_any_length(run), step, moved.rank);
-        }
+    const bool again = o.balance_groups.count == 0 && (plain || (!run.method.multistep && origin(step, w)));
+    if (status != OK && again && moved.largest_error > 0.0 && all_finite(w.defect, w.l)) [[unlikely]]
+        status = correct_evenly(of_any_length(run), step, moved);
+    if (status != OK && again && moved.rank > 1) {
+        --moved.rank;
+        status = correct_with_fewer(of_any_length(run), step, moved.rank);
     }
     w.counters[LAST_RANK] = std::max<int64_t>(moved.rank, 0);
     if (moved.rank >= 0) {

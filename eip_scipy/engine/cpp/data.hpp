@@ -27,8 +27,8 @@ constexpr int64_t AUTO = 0;  // the option `every`
 // many figures stood out; whether the last row of K holds f at the raw result; and how many gradients of the last
 // accepted projection, and of the last one that was tried, are clearly independent; and the failed projections of steps so
 // short that shorter ones do not help, less the steps without one. HAVE_F may also be OF_STATE, see columns.hpp.
-EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED,
-         HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, STUCK, N_COUNTERS);
+EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, HAVE_ERROR, BEGUN,
+         WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, STUCK, N_COUNTERS);
 constexpr int64_t OF_STATE = 2;
 // Indices of the clock of a run: the current time, the time at the end of the step tried last and its length, and the
 // length to try next.
@@ -324,6 +324,8 @@ void fields(Options &o, Visit &visit) {
     visit.in_python("joint", "typing.Any", true);
 }
 
+constexpr int64_t MEMORIES = 3;  // of the metric, see `MetricMemory`
+
 // Buffers of a run of m values (floats, or those of eight members), l invariants, some of which are balances, and
 // `stages` + 1 rows of K. For each balance: rows of rates at the stages, its value at the current state and what rounding
 // took from it, the same of the step that is tried, its value before the last step, and sums of its rates and of their terms
@@ -335,10 +337,11 @@ struct WorkOf {
     using Method = eip::Method;
     using Options = eip::Options;
     int64_t n, m, l, stages, balances;
-    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *memory, *memory_new,
-        *move, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect,
-        *max_defect, *max_correction, *trust, *flow, *rates, *level, *level_old, *level_carry, *level_carry_new, *slow,
-        *target, *products;  // the last two: the invariants' targets; scratch of the frame
+    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *inverse, *ratio, *remembered,
+        *memory, *memory_new, *move, *shift, *share, *unit, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu,
+        *values, *g, *band, *before, *worth, *defect, *max_defect, *max_correction, *trust, *flow, *rates, *level,
+        *level_old, *level_carry, *level_carry_new, *slow, *target,
+        *products;  // the last two: the invariants' targets; scratch of the frame
     double *norm, *suspect;
     int64_t *pivots, *counters;
     double *inner_matrix, *inner_g, *inner_inverse_norms, *inner_R, *inner_mu;  // scratch of the small Newton systems
@@ -366,8 +369,9 @@ void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
     visit.states("f_point", w.f_point, {n});
     visit.states("G", w.G, {l, n});
     each(visit, {m}, "err", w.err, "err_low", w.err_low, "err_sum", w.err_sum, "sigma", w.sigma, "move", w.move,
-         "carry", w.carry, "carry_hat", w.carry_hat);
-    each(visit, {blocks}, "scale", w.scale, "ratio", w.ratio, "memory", w.memory, "memory_new", w.memory_new);
+         "shift", w.shift, "share", w.share, "unit", w.unit, "carry", w.carry, "carry_hat", w.carry_hat);
+    each(visit, {blocks}, "scale", w.scale, "inverse", w.inverse, "ratio", w.ratio, "remembered", w.remembered);
+    each(visit, {MEMORIES, blocks}, "memory", w.memory, "memory_new", w.memory_new);
     each(visit, {l, m}, "B", w.B, "Q", w.Q);
     visit("R", w.R, {l, l});
     each(visit, {l}, "inverse_norms", w.inverse_norms, "mu", w.mu, "values", w.values, "g", w.g, "band", w.band,

@@ -352,7 +352,7 @@ inline bool project_sample(const Run &run, double t, double *out) {
             copy(w.y_hat, out, w.m);
             return all_finite(out, w.m);
         }
-        const int64_t rank = first_move(o, w, out, false);
+        const int64_t rank = first_move(o, w, nullptr, out, false);
         if (rank < 0) return false;
         bool sure = rank == w.l, met = true;
         for (int64_t i = 0; i < w.l; ++i) sure &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];

@@ -110,14 +110,13 @@ inline void least_norm(const double *g, const double *inverse_norms, const Matri
     }
 }
 
-// Coefficients mu of rows in the least-norm x with rows . x = -g, if they are far from dependent, from their Gram matrix
-// in the lower half of R, which is overwritten.
+// Factors the Gram matrix of rows in the lower half of R, which is overwritten, if the rows are far from dependent.
 //
-// Uses its factorisation L D L^T, which costs 0.33 of `factor` and squares the condition number: whether it will do
+// The factorisation is L D L^T, which costs 0.33 of `factor` and squares the condition number: whether it will do
 // shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The diagonal of R then holds 1/D.
-// Two rows, the usual case, by Cramer's rule: one division to wait for.
+// Two rows, the usual case, by Cramer's rule: one division to wait for, the result of which is kept above the diagonal.
 template <class Value>
-[[gnu::always_inline]] inline Truth<Value> gram_solution(const MatrixOf<Value> &R, const Value *g, Value *mu) {
+[[gnu::always_inline]] inline Truth<Value> factor_gram(const MatrixOf<Value> &R) {
     const int64_t rows = R.rows;
     constexpr double LEAST = REORTHOGONALISE * REORTHOGONALISE;
     Truth<Value> bad{};
@@ -128,9 +127,7 @@ template <class Value>
     if (!any(!bad)) return !bad;
     if (rows == 2) {
         const Value determinant = R(0, 0) * R(1, 1) - R(1, 0) * R(1, 0);
-        const Value inverse = 1.0 / positive(determinant);
-        mu[0] = (R(1, 0) * g[1] - R(1, 1) * g[0]) * inverse;
-        mu[1] = (R(1, 0) * g[0] - R(0, 0) * g[1]) * inverse;
+        R(0, 1) = 1.0 / positive(determinant);
         return (!bad) & (determinant > LEAST * (R(0, 0) * R(1, 1)));
     }
     for (int64_t i = 0; i < rows; ++i) {
@@ -138,22 +135,42 @@ template <class Value>
             for (int64_t k = 0; k < j; ++k) R(i, j) -= R(i, k) * R(j, k);
         Value square = R(i, i);
         const Value least = LEAST * square;
-        mu[i] = -g[i];
         for (int64_t j = 0; j < i; ++j) {
             const Value x = R(i, j) * R(j, j);
             square -= x * R(i, j);
-            mu[i] -= x * mu[j];
             R(i, j) = x;
         }
         bad = bad | !(square > least);
         if (!any(!bad)) return !bad;
         R(i, i) = 1.0 / square;
     }
+    return !bad;
+}
+
+// Coefficients mu of the rows in the least-norm x with rows . x = -g, from what `factor_gram` has left in R.
+template <class Value>
+[[gnu::always_inline]] inline void substitute_gram(const MatrixOf<Value> &R, const Value *g, Value *mu) {
+    const int64_t rows = R.rows;
+    if (rows == 2) {
+        mu[0] = (R(1, 0) * g[1] - R(1, 1) * g[0]) * R(0, 1);
+        mu[1] = (R(1, 0) * g[0] - R(0, 0) * g[1]) * R(0, 1);
+        return;
+    }
+    for (int64_t i = 0; i < rows; ++i) {
+        mu[i] = -g[i];
+        for (int64_t j = 0; j < i; ++j) mu[i] -= R(i, j) * mu[j];
+    }
     for (int64_t i = rows - 1; i >= 0; --i) {
         mu[i] *= R(i, i);
         for (int64_t j = i + 1; j < rows; ++j) mu[i] -= R(j, i) * mu[j];
     }
-    return !bad;
+}
+
+template <class Value>
+[[gnu::always_inline]] inline Truth<Value> gram_solution(const MatrixOf<Value> &R, const Value *g, Value *mu) {
+    const Truth<Value> solved = factor_gram(R);
+    if (any(solved)) substitute_gram(R, g, mu);
+    return solved;
 }
 
 template <class Value>

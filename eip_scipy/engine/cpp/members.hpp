@@ -43,7 +43,7 @@ void fields(Members &m, Visit &visit) {
 // Resets one member or eight: nothing is recorded or counted except the evaluations at the start.
 template <class W>
 inline void clear_notes(const Members &members, const Options &o, const W &w) {
-    fill(w.memory, 0.0, o.blocks.count);
+    fill(w.memory, 0.0, MEMORIES * o.blocks.count);
     fill(w.err_sum, 0.0, w.m);
     fill(w.max_defect, 0.0, w.l);
     w.max_correction[0] = 0.0;

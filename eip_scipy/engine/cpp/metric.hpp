@@ -6,8 +6,32 @@
 namespace eip {
 
 constexpr double METRIC_FLOOR = 1e-7, TINY = 1e-290;
-// The share of a relative error that the metric still remembers one step later.
-constexpr double ERROR_MEMORY = 0.9;
+// The shares that are left one step later of the errors and the scales of the weights, and of the errors that a shift in
+// time is measured by.
+constexpr double SHORT_MEMORY = 0.8, LONG_MEMORY = 0.999;
+// A shift in time of which less than this share, squared, changes no invariant is rounding.
+constexpr double LEAST_SHIFT = 1e-12;
+
+inline int64_t blocks_of(const Options &o, int64_t m) { return o.blocks.size == 1 ? m : o.blocks.count; }
+
+// Call set(i, b) for each float i of each block b.
+template <class Set>
+[[gnu::always_inline]] inline void each_float(const Blocks &blocks, int64_t m, const Set &set) {
+    const auto adjacent = [&](auto size) {
+        for (int64_t b = 0; b < blocks.count; ++b)
+            for (int64_t c = 0; c < size; ++c) set(size * b + c, b);
+    };
+    if (blocks.size == 1) {
+        for (int64_t i = 0; i < m; ++i) set(i, i);
+    } else if (blocks.size == 3) {
+        adjacent(std::integral_constant<int64_t, 3>());
+    } else if (blocks.size == 2) {
+        adjacent(std::integral_constant<int64_t, 2>());
+    } else {
+        for (int64_t b = 0; b < blocks.count; ++b)
+            for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) set(blocks.member[p], b);
+    }
+}
 
 // x <- x^exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow.
 template <class Value>
@@ -71,21 +95,17 @@ inline Truth<Value> is_extreme(const Value &square) {
     return !((square > 1e-280) & (square < 1e280));
 }
 
-// Does what `block_sizes` does if each component is a block.
+// Does what `block_sizes` does if each component is a block; no size is too extreme.
 template <class Value, class W>
-inline Truth<Value> component_sizes(const Value *__restrict y, double rounding, const Options &o, const W &w) {
+inline void component_sizes(const Value *__restrict y, double rounding, const Options &o, const W &w) {
     const double *__restrict rtol = o.rtol;
     const Value *__restrict y_hat = w.y_hat, *__restrict err = w.err;
     Value *__restrict scale = w.scale, *__restrict ratio = w.ratio;
-    Truth<Value> extreme{};
     for (int64_t i = 0; i < w.m; ++i) {
-        const Value before = rtol[i] * y[i], after = rtol[i] * y_hat[i], x = rounding * y_hat[i];
-        const Value square = max(after * after, before * before);
-        extreme = extreme | is_extreme(square);
-        scale[i] = sqrt(square);
-        ratio[i] = sqrt(err[i] * err[i] + x * x);
+        const Value size = abs(y_hat[i]);
+        scale[i] = rtol[i] * max(abs(y[i]), size);
+        ratio[i] = max(abs(err[i]), rounding * size);
     }
-    return extreme;
 }
 
 // Replaces squares by their roots. A few that have just been written float by float are not read in vectors, which would wait
@@ -100,11 +120,14 @@ inline void take_roots(Value *squares, int64_t n) {
     for (int64_t b = 0; b < n; ++b) squares[b] = sqrt(squares[b]);
 }
 
-// Computes for each block w.scale = max(|rtol y|, |rtol y_hat|) and w.ratio = |(err, rounding y_hat)|; returns whether
+// Computes for each block w.scale = max(|rtol y|, |rtol y_hat|) and w.ratio = |max(err, rounding y_hat)|; returns whether
 // some sizes are too extreme for squares.
 template <class Value, class W>
 inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &o, const W &w) {
-    if (o.blocks.size == 1) return component_sizes(y, rounding, o, w);
+    if (o.blocks.size == 1) {
+        component_sizes(y, rounding, o, w);
+        return {};
+    }
     Value *scratch = w.move, *sizes = w.scale, *errors = w.ratio;
     weighted_squares(o.rtol, y, scratch, w.m);
     block_sums(scratch, o.blocks, errors);
@@ -117,8 +140,8 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
     }
     take_roots(sizes, o.blocks.count);
     for (int64_t i = 0; i < w.m; ++i) {
-        const Value x = rounding * w.y_hat[i];
-        scratch[i] = w.err[i] * w.err[i] + x * x;
+        const Value x = max(abs(w.err[i]), rounding * abs(w.y_hat[i]));
+        scratch[i] = x * x;
     }
     block_sums(scratch, o.blocks, errors);
     take_roots(errors, o.blocks.count);
@@ -146,9 +169,7 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
             before += x * x;
             x = weight * w.y_hat[i];
             after += x * x;
-            x = w.err[i] * unit;
-            error += x * x;
-            x = rounding * unit * w.y_hat[i];
+            x = unit * std::max(std::abs(w.err[i]), rounding * std::abs(w.y_hat[i]));
             error += x * x;
         }
         w.scale[b] = std::sqrt(std::max(before, after)) / unit;
@@ -156,22 +177,48 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
     }
 }
 
-// Compute, from the sizes of n blocks and of their errors, the relative errors in units of the largest one: `ratio` of
-// this step, `memory_new` with what is remembered of earlier steps, of which the share `kept` is left. Returns the
-// largest relative error of this step.
+// What is left of the memories after the steps since the last projection.
+struct Kept {
+    double brief, lasting;
+};
+template <class AnyRun>
+inline Kept memory_kept(const AnyRun &run) {
+    const int64_t waited = run.work.counters[WAITED];
+    const double steps = static_cast<double>(1 + waited);
+    const Kept kept = waited == 0 ? Kept{SHORT_MEMORY, LONG_MEMORY}
+                                  : Kept{std::pow(SHORT_MEMORY, steps), std::pow(LONG_MEMORY, steps)};
+    // The estimates of a multistep method have a memory of their own.
+    return {run.method.multistep ? 0.0 : kept.brief, kept.lasting};
+}
+
+// The memory of the metric by block: the scale, the error in units of the step's largest relative one, and the largest
+// relative error, in these units too, of a long time.
 template <class Value>
-inline Value remembered_errors(Value *__restrict scale, Value *__restrict ratio, const Value *__restrict memory,
-                               Value *__restrict memory_new, double kept, const Options &o, int64_t n) {
-    const double *__restrict atol = o.block_atol;
+struct MetricMemory {
+    Value *scale, *error, *lasting;
+
+    MetricMemory(Value *rows, int64_t n) : scale(rows), error(rows + n), lasting(rows + 2 * n) {}
+};
+
+// Compute, from the sizes of the blocks and of their errors, w.scale, its reciprocals w.inverse (0 for 0: over a scale of
+// 0 there is no error to speak of), the relative errors w.ratio of this step and those that are remembered, w.remembered,
+// in units of the largest one of this step, which is returned.
+template <class Value, class W>
+inline Value remembered_errors(const Kept &kept, const Options &o, const W &w) {
+    const int64_t n = blocks_of(o, w.m);
+    const MetricMemory<Value> old(w.memory, n), now(w.memory_new, n);
+    Value *__restrict scale = w.scale, *__restrict inverse = w.inverse, *__restrict ratio = w.ratio;
     for (int64_t b = 0; b < n; ++b) {
-        scale[b] += atol[b];
-        // Over a scale of 0 there is no error to speak of.
-        ratio[b] = where(scale[b] > 0.0, ratio[b], 0.0) / max(scale[b], Value(TINY));
+        scale[b] = now.scale[b] = max(scale[b] + o.block_atol[b], kept.brief * old.scale[b]);
+        inverse[b] = where(scale[b] > 0.0, 1.0 / positive(scale[b]), 0.0);
+        ratio[b] *= inverse[b];
     }
-    const Value largest_ratio = largest(ratio, n), inverse = 1.0 / positive(largest_ratio);
+    const Value largest_ratio = largest(ratio, n), unit = 1.0 / positive(largest_ratio);
     for (int64_t b = 0; b < n; ++b) {
-        ratio[b] = min(Value(1.0), ratio[b] * inverse);
-        memory_new[b] = max(ratio[b], kept * memory[b]);
+        ratio[b] = min(Value(1.0), ratio[b] * unit);
+        now.error[b] = max(ratio[b] * scale[b], kept.brief * old.error[b]);
+        now.lasting[b] = max(ratio[b], kept.lasting * old.lasting[b]);
+        w.remembered[b] = now.error[b] * inverse[b];
     }
     return largest_ratio;
 }
@@ -181,9 +228,10 @@ template <class Value>
 inline void block_weights(const Value *__restrict scale, Value *__restrict weights, const Options &o, int64_t n) {
     const auto known = largest(weights, n) > 0.0;
     powers(weights, o.kappa, n);
-    for (int64_t b = 0; b < n; ++b) weights[b] = scale[b] * (weights[b] + METRIC_FLOOR);
-    const Value inverse = 1.0 / positive(largest(weights, n));
-    for (int64_t b = 0; b < n; ++b) weights[b] = where(known, weights[b] * inverse, 1.0);
+    for (int64_t b = 0; b < n; ++b) weights[b] = where(known, scale[b] * (weights[b] + METRIC_FLOOR), 1.0);
+    const Value top = largest(weights, n);
+    const auto extreme = !((top > 1e-100) & (top < 1e100));
+    for (int64_t b = 0; any(extreme) && b < n; ++b) weights[b] = where(extreme, weights[b] / positive(top), weights[b]);
 }
 
 // Return whether a step from y has neither changed component i nor seen an error there. A component that is constant for
@@ -207,47 +255,50 @@ template <class Value, class W>
 inline void weights_from_errors(const Value *y, const Options &o, const W &w) {
     const Blocks &blocks = o.blocks;
     if (blocks.size == 1) {
-        for (int64_t i = 0; i < w.m; ++i) w.sigma[i] = where(is_constant(y, i, w), w.ratio[i], w.memory_new[i]);
+        for (int64_t i = 0; i < w.m; ++i) w.sigma[i] = where(is_constant(y, i, w), w.ratio[i], w.remembered[i]);
         return block_weights(w.scale, w.sigma, o, w.m);
     }
     for (int64_t b = 0; b < blocks.count; ++b)
-        w.ratio[b] = where(is_constant_block(y, b, blocks, w), w.ratio[b], w.memory_new[b]);
+        w.ratio[b] = where(is_constant_block(y, b, blocks, w), w.ratio[b], w.remembered[b]);
     block_weights(w.scale, w.ratio, o, blocks.count);
-    for (int64_t b = 0; b < blocks.count; ++b) {
-        if (blocks.size == 3)
-            w.sigma[3 * b] = w.sigma[3 * b + 1] = w.sigma[3 * b + 2] = w.ratio[b];
-        else if (blocks.size == 2)
-            w.sigma[2 * b] = w.sigma[2 * b + 1] = w.ratio[b];
-        else
-            for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) w.sigma[blocks.member[p]] = w.ratio[b];
-    }
-}
-
-// Return the share of a remembered error that is left after the steps since the last projection. The estimates of a
-// multistep method have a memory of their own.
-template <class AnyRun>
-inline double memory_kept(const AnyRun &run) {
-    if (run.method.multistep) return 0.0;
-    const int64_t waited = run.work.counters[WAITED];
-    return waited == 0 ? ERROR_MEMORY : std::pow(ERROR_MEMORY, static_cast<double>(1 + waited));
+    each_float(blocks, w.m, [&](int64_t i, int64_t b) { w.sigma[i] = w.ratio[b]; });
 }
 
 // Compute the blocks' relative errors and scales, and return the largest relative error of the step. An error is the
-// estimate and, unless it is carried along, the rounding of the state, in quadrature.
+// estimate, and unless it is carried along at least the rounding of the state.
 template <class AnyRun>
 inline double relative_errors(const double *y, const AnyRun &run) {
     const auto &o = run.options;
     const auto &w = run.work;
     const double rounding = o.compensated ? 0.0 : EPS;
     if (block_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
-    return remembered_errors(w.scale, w.ratio, w.memory, w.memory_new, memory_kept(run), o,
-                             o.blocks.size == 1 ? w.m : o.blocks.count);
+    return remembered_errors<double>(memory_kept(run), o, w);
 }
 
 // Remember the errors of a step that is accepted.
 template <class W>
 inline void remember_errors(const Options &o, const W &w) {
-    if (o.metric == BY_ERROR) copy(w.memory_new, w.memory, o.blocks.size == 1 ? w.m : o.blocks.count);
+    if (o.metric == BY_ERROR) copy(w.memory_new, w.memory, MEMORIES * blocks_of(o, w.m));
+}
+
+// Compute for each float, from the long memory, the square of its share in the errors, w.share, and w.unit, the weight of
+// its square in the size of a correction: by the error of its block, or if each component is a block by its scale, because
+// the error of a component may be small for long where that of a vector is not.
+template <class Value, class W>
+inline void lasting_errors(const Options &o, const W &w) {
+    const Blocks &blocks = o.blocks;
+    const int64_t n = blocks_of(o, w.m);
+    const Value *__restrict lasting = MetricMemory<Value>(w.memory_new, n).lasting;
+    Value *__restrict units = blocks.size == 1 ? w.unit : w.ratio;
+    const bool alone = blocks.members == blocks.count * blocks.width;
+    for (int64_t b = 0; b < n; ++b) units[b] = w.inverse[b] * w.inverse[b];
+    for (int64_t b = 0; !alone && b < n; ++b)
+        units[b] = units[b] / (lasting[b] * lasting[b] + METRIC_FLOOR * METRIC_FLOOR);
+    if (blocks.members < w.m) fill(w.share, 0.0, w.m), fill(w.unit, 0.0, w.m);
+    each_float(blocks, w.m, [&](int64_t i, int64_t b) {
+        w.share[i] = lasting[b] * lasting[b];
+        w.unit[i] = units[b];
+    });
 }
 
 // Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none.
@@ -255,8 +306,8 @@ template <class Value, class W>
 inline Value correction_in_local_errors(const Value &largest_error, const Options &o, const W &w) {
     if (!any(largest_error > 0.0)) return 0.0 * largest_error;
     Value top = 0.0;
-    for (int64_t b = 0; b < (o.blocks.size == 1 ? w.m : o.blocks.count); ++b) {
-        const Value unit = 1.0 / positive(w.scale[b]);
+    for (int64_t b = 0; b < blocks_of(o, w.m); ++b) {
+        const Value unit = w.inverse[b];
         Value square;
         if (o.blocks.size == 1) {
             const Value x = w.move[b] * unit;
@@ -264,21 +315,9 @@ inline Value correction_in_local_errors(const Value &largest_error, const Option
         } else {
             square = block_square(w.move, b, unit, o.blocks);
         }
-        top = where(w.scale[b] > 0.0, max(top, square), top);
+        top = max(top, square);
     }
     return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0 * largest_error);
-}
-
-// Half way, on a log scale, from the error metric to equal relative errors; constants are left out.
-inline void soften(const double *y, const Options &o, const Work &w) {
-    const double inverse = 1.0 / largest(w.scale, o.blocks.count);
-    for (int64_t b = 0; b < o.blocks.count; ++b) {
-        if (is_constant_block(y, b, o.blocks, w)) continue;
-        for (uint64_t p = o.blocks.start[b]; p < o.blocks.start[b + 1]; ++p) {
-            const uint64_t i = o.blocks.member[p];
-            w.sigma[i] = std::sqrt(w.sigma[i] * (w.scale[b] * inverse));
-        }
-    }
 }
 
 }  // namespace eip

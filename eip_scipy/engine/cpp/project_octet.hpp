@@ -7,7 +7,7 @@
 namespace eip {
 
 // The Newton step of one member, whose gradients are nearly parallel or vanish, by pivoted QR.
-[[gnu::noinline]] inline void solve_alone(Eight &eight, int64_t lane, const Options &o, const Work &w) {
+[[gnu::noinline]] inline void solve_alone(Eight &eight, int64_t lane, const Octet *f, const Options &o, const Work &w) {
     const WorkOf<Octet> &eights = eight.work;
     eight.take(eights.sigma, lane, w.sigma, w.m);
     eight.take(eights.y_hat, lane, w.y_hat, w.m);
@@ -15,7 +15,12 @@ namespace eip {
     eight.take(eights.before, lane, w.before, w.l);
     eight.take(eights.band, lane, w.band, w.l);
     weigh_rows(o.frame, w, w.Q);
-    const int64_t rank = factored_move(o, w, w.stage);
+    if (f) {
+        eight.take(eights.inverse, lane, w.inverse, o.blocks.count);
+        eight.take(eights.memory_new, lane, w.memory_new, MEMORIES * o.blocks.count);
+        eight.take(f, lane, w.f_point, w.m);
+    }
+    const int64_t rank = factored_move(o, w, f ? w.f_point : nullptr, w.stage);
     eight.rank[lane] = std::max<int64_t>(rank, 0);
     for (double *out : {w.move, w.stage})
         if (rank < 0) fill(out, NOT_A_NUMBER, w.m);
@@ -73,7 +78,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
 // known. The step begins at y, and the result is written to eight.y_new. Returns the members of `alive` that must be
 // projected alone.
 template <class W>
-[[gnu::flatten]] inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Octet *y,
+[[gnu::flatten]] inline Mask project_octet_evaluated(Eight &eight, const W &w, const Step &step, const Octet *y,
                                                      const Mask &alive, const Work &single) {
     const Options &o = eight.options;
     const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);
@@ -86,35 +91,35 @@ template <class W>
     if (o.metric == BY_ERROR) {
         if (!all_move) copy(w.sigma, w.stage, w.m);
         leave = block_sizes<Octet>(y, o.compensated ? 0.0 : EPS, o, w);
-        largest_error = remembered_errors(w.scale, w.ratio, w.memory, w.memory_new, memory_kept(run), o, blocks);
+        largest_error = remembered_errors<Octet>(memory_kept(run), o, w);
         weights_from_errors(y, o, w);
         for (int64_t j = 0; !all_move && j < w.m; ++j) w.sigma[j] = where(moved, w.sigma[j], w.stage[j]);
     }
     Octet *rows = weighed_gradients(o, w);
     const Mask dependent = moved & !solve_gram(rows_of(rows, w), w.g, corner(w.R, w.l, w), w.mu);
     move_along(o, w, rows, eight.y_new);
+    const Octet *f = o.metric == BY_ERROR ? flow_at_raw(run, step) : nullptr;
+    if (f) remove_shift(o, w, f, -1, eight.y_new);
     for (int64_t lane = 0; lane < LANES; ++lane)
         if (all_move || moved.lane(lane)) eight.rank[lane] = w.l;
     if (any(dependent))
         for (int64_t lane = 0; lane < LANES; ++lane)
-            if (dependent.lane(lane)) solve_alone(eight, lane, o, single);
+            if (dependent.lane(lane)) solve_alone(eight, lane, f, o, single);
     const Octet correction = correction_in_local_errors(largest_error, o, w);
     if (o.compensated) {
         for (int64_t j = 0; j < w.m; ++j) w.move[j] = where(outside, w.move[j], 0.0);
         copy(w.y_hat, eight.y_new, w.m);
         compensated_add(as_floats(eight.y_new), as_floats(w.carry_hat), as_floats(w.move), LANES * w.m);
-    } else if (o.blocks.count * o.blocks.width == w.m) {
-        leave = leave | (outside & (correction > HEALTHY));
     }
     for (int64_t j = 0; !all_move && j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
-    evaluate_invariants(run, t, eight.y_new);
+    evaluate_invariants(run, step.t_new, eight.y_new);
     const Mask held = defects_held<Octet>(w.before, o, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
     if (o.has_limits) leave = leave | (missed_targets(o, w) > 1.0);
     Mask done = alive & held & !leave;
-    if (o.watched) done = done & !note_octet(t, done, o, w);
+    if (o.watched) done = done & !note_octet(step.t_new, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)
         w.max_defect[i] = where(done, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
-    for (int64_t b = 0; o.metric == BY_ERROR && b < blocks; ++b)
+    for (int64_t b = 0; o.metric == BY_ERROR && b < MEMORIES * blocks; ++b)
         w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
     const Mask corrected = done & outside;
     *w.max_correction = where(corrected, max(*w.max_correction, correction), *w.max_correction);
@@ -136,7 +141,7 @@ inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask
         quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);
     const Mask noticed = o.watched && w.counters[F_AT_RAW] ? alive & rates_stand_out(w, LEAST_RATE) : Mask{};
     eight.system.inv(w, step.t_new, w.y_hat, w.values);
-    return noticed | project_octet_evaluated(eight, w, step.t_new, eight.y, alive & !noticed, single);
+    return noticed | project_octet_evaluated(eight, w, step, eight.y, alive & !noticed, single);
 }
 
 // Projects eight members of a multistep method as `project_nodes` projects one. Members whose steps are not stable are
@@ -165,7 +170,9 @@ inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
     w.counters[NJEV] = counted;
     soften_defects(ms, o, w);
     const Octet before = *eight.projections;
-    const Mask leave = project_octet_evaluated(eight, w, t, w.y_hat, those, single), done = those & !leave;
+    const Mask leave = project_octet_evaluated(eight, w, Step{t, t, ms.h, nullptr, nullptr, true, true}, w.y_hat, those,
+                                               single),
+               done = those & !leave;
     note_what_is_left(ms, done, w);
     move_sums(ms, *eight.projections > before, w);
     for (int lane = 0; lane < LANES; ++lane) {

@@ -43,6 +43,7 @@ inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
+    eight.take(eights.memory, lane, w.memory, MEMORIES * run.options.blocks.count);
     copy(eight.suspect(lane), w.suspect, w.suspect_size());
     w.max_correction[0] = eight.at(eights.max_correction, lane);
     take_params(eight, lane, run.system);
@@ -57,7 +58,6 @@ inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     take_member(run, eight, lane);
     eight.take(eight.y, lane, y, w.m);
     eight.take(eights.K, lane, w.K, w.m);
-    eight.take(eights.memory, lane, w.memory, run.options.blocks.count);
     count_of(eight, lane, shared, w.counters);
     s.clock[NEXT_LENGTH] = std::abs(s.span.h);
     try {
@@ -67,7 +67,7 @@ inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     }
     eight.give(y_new, lane, eight.y_new, w.m);
     eight.give(w.sigma, lane, eights.sigma, w.m);
-    eight.give(w.memory, lane, eights.memory, run.options.blocks.count);
+    eight.give(w.memory, lane, eights.memory, MEMORIES * run.options.blocks.count);
     eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
     eight.give(w.max_defect, lane, eights.max_defect, w.l);
     copy(w.suspect, eight.suspect(lane), w.suspect_size());
@@ -110,6 +110,7 @@ inline void give_history(const Run &run, Eight &eight, int64_t lane) {
     eight.projected[lane] = eight.multistep.place[SINCE];
     for (int64_t j = 0; j < 4; ++j) eight.give(one.sums + j * one.pitch, lane, eight.sums + j * one.half, one.half);
     eight.give(w.sigma, lane, eights.sigma, w.m);
+    eight.give(w.memory, lane, eights.memory, MEMORIES * run.options.blocks.count);
     eight.give(w.max_defect, lane, eights.max_defect, w.l);
     eight.at(eights.max_correction, lane) = w.max_correction[0];
 }

@@ -301,11 +301,10 @@ inline void note_share(double share, double t, double *figures, Figure largest_s
     if (o.metric != BY_ERROR || w.counters[WAITED] > 0) return 0.0;
     double largest_error = 0.0, worth = 0.0;
     for (int64_t b = 0; b < o.blocks.count; ++b)
-        if (w.scale[b] > 0.0)
-            largest_error = std::max(largest_error, std::sqrt(block_square(w.err, b, 1.0, o.blocks)) / w.scale[b]);
+        largest_error = std::max(largest_error, std::sqrt(block_square(w.err, b, w.inverse[b], o.blocks)));
     for (int64_t b = 0; b < o.blocks.count; ++b)
         for (uint64_t place = o.blocks.start[b]; place < o.blocks.start[b + 1]; ++place)
-            worth += std::abs(w.gradient(i)[o.blocks.member[place]]) * w.memory_new[b] * w.scale[b];
+            worth += std::abs(w.gradient(i)[o.blocks.member[place]]) * w.remembered[b] * w.scale[b];
     return worth * largest_error;
 }
 
