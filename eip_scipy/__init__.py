@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .core.balances import Balance
     from .core.config import show_config
     from .core.invariants import Invariant, check_gradient
+    from .core.particles import particle_invariants
     from .core.project import project
     from .core.results import Diagnostics, ProjectionWarning
     from .core.solvers import (
@@ -75,6 +76,7 @@ __all__ = [
     "hamiltonian",
     "integrate",
     "load",
+    "particle_invariants",
     "project",
     "recommend",
     "show_config",
@@ -93,6 +95,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "hamiltonian": "problems.symbolic",
     "integrate": "run.integrate",
     "load": "run.saving",
+    "particle_invariants": "core.particles",
     "project": "core.project",
     "recommend": "run.recommend",
     "show_config": "core.config",

@@ -95,7 +95,7 @@ def _real_form(a: np.ndarray) -> np.ndarray:
 def _by_bodies(a: np.ndarray) -> np.ndarray:
     """Return the weights (k, b) if rows of `a` (3 k, 3 k b) sum x, y, z over b bodies of k groups, else no weights."""
     groups = a.shape[0] // 3
-    if groups == 0 or a.shape[1] % (3 * groups):
+    if groups == 0 or a.shape[0] % 3 or a.shape[1] % (3 * groups):
         return np.zeros((0, 0))
     entries = a.reshape(groups, 3, groups, -1, 3)
     weights = np.array([entries[k, 0, k, :, 0] for k in range(groups)])

@@ -16,10 +16,11 @@ from ..engine.native import BUILD, Call, LibraryFunction, Rates, call
 from .arguments import names, scalars
 from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
-from .gradients import NumericalGradient, difference_gradient, typical_sizes
+from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
 from .inputs import count, filled, flag, numbers, reals, require_arguments, shown
 from .invariant_checks import complaints, listed, reported, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
+from .linear import LinearInvariants
 from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import states
 
@@ -35,6 +36,9 @@ TARGET_ROUNDINGS = 64.0
 # the steps of EIPRK4 on a chain of 64, 256 and 4096 components 5, 66 and 640 times longer in Python; if the functions
 # are jitted, those of 128, 256 and 4096 components 3, 12 and 110 times longer.
 LARGE = 200
+# If times are more than FAR_TIMES steps long, invariants are compared with their values at the start after these shares
+# of the interval, to see whether they depend on time.
+FAR_TIMES, TIMES = 1e5, (0.382, 1.0)
 
 
 class OwnArguments:
@@ -93,8 +97,8 @@ class Invariant:
 
     Notes
     -----
-    Every Runge-Kutta method keeps linear invariants. Do not list them as invariants, but pass them as the option
-    ``frame``, so that the corrections do not change them.
+    Every Runge-Kutta method keeps linear invariants. Do not list them as invariants. `integrate` finds them in compiled
+    functions, and the option ``linear_invariants`` takes them, so that the corrections do not change them.
 
     C functions are given as `scipy.LowLevelCallable`, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
@@ -110,6 +114,8 @@ class Invariant:
     # These are attributes of balances, see `Balance`.
     is_balance = False
     of_state: Any = None  # of a state with columns of derivatives behind it, see `variations.OfState`
+    # The linear invariants that corrections leave unchanged in runs with this one, see `particle_invariants`.
+    linear: LinearInvariants | None = None
     rate_function: Callable[..., Any] | None = None
     rate_uses_f = False
     # Components and weights (s, k) of the s directions along which all values are projected, or one such pair for every
@@ -538,6 +544,27 @@ class InvariantSet:
             if not BUILD.are_finite(rows.view(float)):
                 raise ValueError(f"gradient of invariant {label!r} is not finite at y0.")
         return G
+
+    def add_rounding_of_time(self, y: Array) -> bool:
+        """Raise the scales of invariants that depend on time, and return True if there are any.
+
+        The rounding of a time t, relative to t, changes such an invariant by ``abs(t dI/dt)`` times as much, which no
+        correction of the state should follow. The largest of these products at some times of the run is taken. It is
+        negligible compared with the errors of the steps unless t is very many steps long.
+        """
+        t0, t_bound = self.t_span
+        end = t_bound if math.isfinite(t_bound) else t0 + self.tau
+        if not max(abs(t0), abs(end)) > FAR_TIMES * self.tau:
+            return False
+        times = [t0 + share * (end - t0) for share in TIMES]
+        found = [unless_error(self.values, t, y) for t in times]
+        if all(here is None or np.array_equal(here, self.start_values) for here in found):
+            return False
+        for t, here in ((t0, self.start_values), *zip(times, found, strict=True)):
+            if here is not None and np.isfinite(here).all():
+                slope = time_derivative(self, t, y, self.start_gradients, here, self.tau)[0]
+                self.scales = np.maximum(self.scales, max(abs(t0), abs(end)) * np.abs(slope))
+        return True
 
     def values(self, t: float, y: Array) -> Array:
         """Return the values (l,) of all invariants at (t, y)."""

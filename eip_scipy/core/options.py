@@ -21,7 +21,7 @@ from ..methods.orders import AT_REST
 from . import steppers
 from .blocks import blocks_of, kinds_of
 from .frame import frame_rows
-from .inputs import count, flag, real_array
+from .inputs import count, flag, real_array, shown
 from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet
 from .stepping import AnyMethod, Stepping
 
@@ -42,6 +42,7 @@ Documented = TypeVar("Documented", bound=Any)
 Metric = Literal["error", "euclidean"] | Sequence[float] | np.ndarray | None
 Blocks = int | Sequence[ArrayLike] | None
 Frame = tuple[ArrayLike, ArrayLike] | None
+Linear = Literal["auto", "given"] | Frame
 
 
 class ProjectionDetails(TypedDict, total=False):
@@ -50,6 +51,7 @@ class ProjectionDetails(TypedDict, total=False):
     metric: Metric
     blocks: Blocks
     frame: Frame
+    linear_invariants: Linear
     direction: Literal["new", "old", "midpoint"]
     iterations: int
     every: int | Literal["auto"] | None
@@ -84,7 +86,15 @@ class ProjectionOptions:
     frame : (C, S), optional
         Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and S, of shape (n, k),
         whose columns are the directions in which the correction is shifted so that C y stays unchanged; C S must be
-        invertible.
+        invertible. It takes precedence over `linear_invariants`.
+    linear_invariants : {"auto", "given"}, (C, S) or None, optional
+        Linear invariants that the corrections leave unchanged. "auto": they are found at the start, from values of
+        `fun` at points near the start and a few at larger distances, whose number is not in ``nfev``: quantities c y
+        with c f = 0, as momentum, and those whose rates are such quantities, as the centre of mass. Those that the
+        `invariants` determine are left out. Nothing is found for complex states, more than 300 components, balances,
+        user-defined one-step methods, or if a value is not finite. "given": only those of `particle_invariants`. (C,
+        S): as `frame`. None: no linear invariants. `Diagnostics.remarks` has their number. Default: "auto" for the
+        compiled functions of `integrate` and `ensemble`, otherwise "given".
     direction : {"new", "old", "midpoint"}, optional
         State at which the gradients that span the correction are evaluated: the raw result of the step (default), its
         start, or the midpoint.
@@ -115,6 +125,7 @@ class ProjectionOptions:
     metric: Any = None
     blocks: Any = None
     frame: Any = None
+    linear_invariants: Any = "given"
     direction: str = "new"
     iterations: int = 1
     every: int | str | None = None
@@ -134,6 +145,16 @@ class ProjectionOptions:
         names = cls.names()
         own = {name: value for name, value in keywords.items() if name in names}
         return own, {name: value for name, value in keywords.items() if name not in own}
+
+    @property
+    def constraints(self) -> Any:
+        """Return the pair (C, S) that was given as `frame` or as `linear_invariants`; None if there is none."""
+        option = self.linear_invariants
+        is_name = isinstance(option, str)
+        is_pair = not is_name and np.iterable(option) and len(tuple(option)) == 2
+        if not (option is None or is_pair or (is_name and option in ("auto", "given"))):
+            raise ValueError(f"linear_invariants must be 'auto', 'given', a pair (C, S) or None, got {shown(option)}.")
+        return option if self.frame is None and not is_name else self.frame
 
     def settled(
         self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, f0: np.ndarray, known: InvariantSet
@@ -172,7 +193,7 @@ class ProjectionOptions:
             atol=atol,
             block_atol=block_atol,
             groups=groups,
-            frame=frame_rows(self.frame, n, width),
+            frame=frame_rows(self.constraints, n, width),
             balances=_balances(method, known),
             balance_groups=balance_groups,
             columns=data.no_columns(known.size),
@@ -217,7 +238,8 @@ class ProjectionOptions:
             "metric": {data.EUCLIDEAN: "euclidean", data.BY_ERROR: "error"}.get(o.metric, sigma),
             "blocks": (o.groups.start, o.groups.member),
             # The given value, because the one in `o` comes from LAPACK, whose last bits differ between machines.
-            "frame": None if self.frame is None else [np.asarray(a, y0.dtype) for a in self.frame],
+            "frame": None if self.constraints is None else [np.asarray(a, y0.dtype) for a in self.constraints],
+            "linear_invariants": "auto" if isinstance(self.linear_invariants, str) else None,
             "direction": self.direction,
             "iterations": o.iterations,
             "every": "auto" if o.every == data.AUTO else o.every,

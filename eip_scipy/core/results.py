@@ -38,6 +38,8 @@ class Diagnostics:
         Reason why the run is not to be trusted; "" if there is none.
     moved : str
         How far ``project_initial=True`` moved y0; "" if it did not.
+    remarks : tuple of str
+        The number of linear invariants that were found and are kept, and which invariants of particles are missing.
     worst : (str, float, float) or None
         Invariant, time and size of the largest correction, in units of the local error including round-off: below 5 in
         most correct runs. None if no correction was measured.
@@ -64,6 +66,7 @@ class Diagnostics:
         *,
         estimated: bool,
         moved: str = "",
+        remarks: tuple[str, ...] = (),
         slow: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         """Keep the buffers of a run, from which the attributes are computed when they are read.
@@ -78,7 +81,7 @@ class Diagnostics:
         self._max_correction = max_correction
         self._counters = counters
         self._estimated = estimated
-        self.moved = moved
+        self.moved, self.remarks = moved, remarks
         self._slow = (np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))) if slow is None else slow
 
     @property
@@ -155,8 +158,7 @@ class Diagnostics:
         if self.worst is not None:
             name, t, size = self.worst
             lines.append(f"  largest correction: {size:.3g} local errors, of {name} at t={t:.6g}")
-        if self.moved:
-            lines.append(f"  {self.moved}")
+        lines += [f"  {remark}" for remark in (self.moved, *self.remarks) if remark]
         if self.message:
             lines.append(f"  {self.message}")
         return "\n".join(lines)

@@ -21,9 +21,11 @@ from numpy.typing import ArrayLike
 from ..checkpoint.locks import absolute
 from ..checkpoint.signals import sigterm_as_ctrl_c
 from ..core.arguments import extra_arguments, floats, parameter_values
+from ..core.gradients import unless_error
 from ..core.inputs import count, flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
+from ..core.linear import NEAR_DISTANCE, confirmed
 from ..core.names import nearest
 from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
@@ -384,8 +386,10 @@ def ensemble(
         Bound on the memory for results in bytes; default: half of the free memory.
     **keywords
         Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
-        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step, variations,
-        jvp, symplectic. Members with derivatives run one after the other. Events are stored for each member in
+        linear_invariants, direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step,
+        max_step, variations, jvp, symplectic. Linear invariants are found at the start of the first member; they are
+        kept if they hold for the parameters of all members. Members with derivatives run one after the other, and so do
+        those with an invariant that depends on times far from 0. Events are stored for each member in
         ``.t_events`` and ``.y_events``; a terminal event ends its member. `check` examines one member.
 
     Returns
@@ -690,13 +694,44 @@ def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
             if found := ready.run.trust.message:
                 ready.run.trust.doubts.clear()
                 tried = dataclasses.replace(tried, doubt=(params[k].copy(), found))
-            return Plan(tried, ready)
+            return _with_common_constraints(Plan(tried, ready), everyone)
     assert first is not None
     # A transposed y0s fails in the user's function, whose error may not explain that; jitted code explains nothing.
     first.add_note(
         f"ensemble: the rows of y0s are members; y0s has {len(starts)} rows of {starts.shape[1]} components."
     )
     raise first
+
+
+def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
+    """Return the plan whose members all keep the linear invariants that were found for its first member.
+
+    If one of them does not hold for the parameters of some member, no member keeps any.
+    """
+    task, ready = plan.task, plan.ready
+    if ready.run.linear is None:
+        return plan
+    C, request = ready.run.linear.C, task.request
+    holds = len(C) > 0 and (request.params is None or _hold(plan, everyone))
+    projection = {**request.projection, "linear_invariants": (C, C.T) if holds else None}
+    task = dataclasses.replace(task, request=request._replace(projection=projection))
+    return Plan(task, None if len(C) and not holds else ready)
+
+
+def _hold(plan: Plan, everyone: Chunk) -> bool:
+    """Return True if the linear invariants of the first member hold for the parameters of all members."""
+    linear, system, params = plan.ready.run.linear, plan.ready.system, everyone.params
+    assert linear is not None
+    first = np.unique(params, axis=0, return_index=True)[1]
+    if len(first) == 1 or plan.ready.variations is not None:
+        return len(first) == 1
+    own, f = system.parameters.copy(), []
+    states = everyone.y0s[first] + NEAR_DISTANCE * np.abs(everyone.y0s[first]) * np.cos(np.arange(plan.size))
+    for k, y in zip(first, states, strict=True):
+        system.parameters[:] = params[k]
+        f.append(unless_error(system.derivative, plan.t0, y))
+    system.parameters[:] = own
+    return all(x is not None for x in f) and len(confirmed(states, np.array(f), linear.kept).C) == len(linear.C)
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:

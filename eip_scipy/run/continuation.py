@@ -110,6 +110,7 @@ def _diagnostics(one: Diagnostics, two: Diagnostics) -> Diagnostics:
         one._trust.followed_by(two._trust),
         estimated=one._estimated and two._estimated,
         moved=one.moved or two.moved,
+        remarks=two.remarks,
         slow=(two._slow[0], joined_sums(one._slow[1], two._slow[1])),
     )
     return both

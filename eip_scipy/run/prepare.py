@@ -16,10 +16,11 @@ from ..core.arguments import Packed, are_same, extra_arguments, floats, names, s
 from ..core.driven import Jacobian
 from ..core.inputs import count, flag, real_array, require_arguments, shown
 from ..core.invariants import as_invariants, with_args
-from ..core.jitted import NotCompilableError
+from ..core.jitted import NotCompilableError, is_compiled
 from ..core.multistep import times
 from ..core.native_functions import native_functions, with_events
 from ..core.options import ProjectionOptions
+from ..core.particles import compiled_items
 from ..core.pointers import GRADIENT, PointerFunction, by_pointer
 from ..core.problem import BROUGHT, Problem, made
 from ..core.results import Diagnostics
@@ -348,6 +349,8 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     asked, request = request, request.with_pointers()
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
     request, form = _with_problem(request)
+    if is_compiled(request.fun) or isinstance(request.fun, PointerFunction):
+        request = _with_linear_invariants(request)
     variations = _variations(asked.fun, request, form)
     if variations is not None:
         request, form, acc = _widened(request, variations), FORMS[False, True], None
@@ -378,6 +381,18 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     return Prepared(asked, request, system, schedule, run, record, variations)
 
 
+def _with_linear_invariants(request: Request) -> Request:
+    """Return the request of a run with a compiled function, which keeps linear invariants unless another is asked.
+
+    Ready problems have frames of their own.
+    """
+    own = {} if isinstance(request.fun, LibraryFunction) else {"linear_invariants": "auto"}
+    projection = own | dict(request.projection)
+    if "invariants" in projection:
+        projection["invariants"] = compiled_items(as_invariants(projection["invariants"]))
+    return request._replace(projection=projection)
+
+
 def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
     """Return the specification of the run; `given` is the function or problem as given, `calls` the right-hand side."""
     problem = given if isinstance(given, Problem) else None
@@ -395,6 +410,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         left_out=system.left_out,
         sees_velocity=system.name == "fun" and (problem is None or problem.acc is None),
         is_second_order=system.native_form[1].startswith("acceleration"),
+        uncounted=system.derivative,
     )
 
 
@@ -530,7 +546,8 @@ def _with_problem(request: Request) -> tuple[Request, str]:
         return request._replace(fun=fun, t_span=t_span, y0=y0, projection=projection), form
     if request.args is not None:
         raise TypeError("args: a Problem has params; pass params=..., or its functions instead of the Problem.")
-    own_options = {name: getattr(problem, name) for name in BROUGHT}
+    brought = BROUGHT if isinstance(projection.get("linear_invariants", ""), str) else BROUGHT[:-1]
+    own_options = {name: getattr(problem, name) for name in brought}
     if request.method.TABLEAU.drives:
         own_options["invariants"] = problem.stiff_invariants
     projection = own_options | projection

@@ -11,7 +11,7 @@ from ..core.acceleration import AccelerationField
 from ..core.inputs import flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
-from ..core.options import Blocks, Frame, Metric
+from ..core.options import Blocks, Frame, Linear, Metric
 from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
 from ..core.states import initial_state
@@ -32,6 +32,7 @@ class RecommendKeywords(TypedDict, total=False):
     metric: Metric
     blocks: Blocks
     frame: Frame
+    linear_invariants: Linear
     compiled: bool | None
 
 
@@ -67,14 +68,15 @@ def recommend(
         Wanted error of the state at the end: largest component of the difference from the exact state, relative to the
         largest component of the exact state.
     invariants : Invariant or sequence of Invariant, optional
-        Invariants to keep; default: those of the problem; for a function, none.
+        Invariants to keep; default: those of the problem; for a function, none. `particle_invariants` are added if the
+        system keeps them.
     max_nfev : int, optional
         Approximate bound on the evaluations of one trial; default: 100 000, and 500 000 for compiled functions. A
         longer run is tried on the first part of its interval, and its error is extrapolated.
     t_eval : array_like, optional
         Times at which the recommended run saves states, as for `integrate`. The comparison of methods then includes
         the evaluations for states between steps.
-    params, in_place, jacobian, metric, blocks, frame, compiled
+    params, in_place, jacobian, metric, blocks, frame, linear_invariants, compiled
         As for `integrate`, for all runs. With `jacobian`, or a problem that has one, `EIPGJ14` is tried.
 
     Returns

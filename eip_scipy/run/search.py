@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..core.invariants import as_invariants
+from ..core.particles import Particles, particle_invariants
 from ..core.problem import Problem
 from ..core.results import ProjectionWarning
 from ..core.runs import Counted
@@ -153,7 +154,12 @@ class Search:
         rtol = min(max(self.wanted, 1e-10), 1e-4)
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
         options = {**bench.common, "method": EIPDOP853, "rtol": rtol, "atol": atol}
-        velocities, native = _asked_of_the_field(Request.of(fun=problem, **options))
+        velocities, native, missing = _asked_of_the_field(Request.of(fun=problem, **options))
+        if missing is not None:
+            own = particle_invariants(missing.masses, missing.dimension)
+            known = as_invariants(bench.common.get("invariants", problem.invariants))
+            bench.common = {**bench.common, "invariants": (*known, *own)}
+            self.notes.append("Momentum and angular momentum of the particles are kept too, by particle_invariants.")
         most = MOST_NFEV[native] if max_nfev is None else max_nfev
         steps = max(most // (FIRST_PART * EIPDOP853.TABLEAU.n_stages), 10)
         every = max(1, steps * problem.y0.size // MOST_SAVED)
@@ -361,8 +367,8 @@ class Search:
         return f"{words} {min(good):.1e}" if good else self.trials[-1].trouble
 
 
-def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:
-    """Return the `velocities` of `Look`, and whether all functions are called natively, not from Python.
+def _asked_of_the_field(request: Request) -> tuple[bool | None, bool, Particles | None]:
+    """Return the `velocities` of `Look`, whether all functions are called natively, and `Run.missing`.
 
     The start is checked as for a run with the invariants: a wrong gradient raises an error, and a quantity that the
     system does not conserve causes a warning.
@@ -375,4 +381,4 @@ def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:
             velocities = depends_on_velocity(calls, start, "")
         except ValueError:
             velocities = None
-    return velocities, why_not is None
+    return velocities, why_not is None, ready.run.missing
