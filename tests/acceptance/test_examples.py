@@ -66,7 +66,7 @@ def test_with_and_without(tmp_path):
     plain, _, place, kept, energy, kept_place = printed("with_and_without", tmp_path)
     assert numbers(plain)[-1] == numbers(kept)[-1] == 9812
     assert max(numbers(energy)) < 1e-11
-    assert numbers(place)[-1] == pytest.approx(270 * numbers(kept_place)[-1], rel=0.05)
+    assert numbers(place)[-1] == pytest.approx(240 * numbers(kept_place)[-1], rel=0.05)
     assert (tmp_path / "with-and-without.png").exists()
 
 
