@@ -40,6 +40,7 @@ from eip_scipy import (
     hamiltonian,
     integrate,
     load,
+    particle_invariants,
     project,
     recommend,
     show_config,
@@ -130,6 +131,7 @@ def others() -> list[str]:
     back: ProjectionResult = project([1.0, 0.1], H, target=energy(0.0, np.array([1.0, 0.0])))
     y: Vector = back.y
     rank: int = back.rank
+    momenta: list[Invariant] = particle_invariants([1.0, 2.0], dimension=2)
     found = [item.name for item in find_invariants(fun, [1.0, 0.0])]
     oscillator = hamiltonian("p**2/2 + q**2/2")
     lotka = equations({"x": "x*(1 - y)", "y": "y*(x - 1)"}, ["x", "y"])
@@ -139,5 +141,5 @@ def others() -> list[str]:
     two = nbody([1.0, 1e-3], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 1, 0]], t_span=(0.0, 1.0), G=1.0)
     right: Callable[..., Any] | None = planets.rhs
     warning: type[RuntimeWarning] = ProjectionWarning
-    print(show_config(), y, rank, found, lotka.name, advice.reason, difference, two.h, right, warning)
+    print(show_config(), y, rank, found, momenta, lotka.name, advice.reason, difference, two.h, right, warning)
     return [name for name in found if name is not None]
