@@ -10,7 +10,9 @@ import numpy as np
 
 from .gradients import time_of_motion, unless_error
 
-__all__ = ["FoundInvariants", "LinearInvariants", "Samples", "confirmed", "found_invariants", "independent_of"]
+__all__ = [
+    "FoundInvariants", "LinearInvariants", "Samples", "confirmed", "found_invariants", "independent_of", "reduced_rows",
+]  # fmt: skip
 
 # Largest state whose linear invariants are searched for: the time grows with the cube of the number of components.
 MOST_COMPONENTS = 300
@@ -20,7 +22,7 @@ MORE, FAR, MOST_GRADIENTS = 5, 5, 12
 NEAR_DISTANCE, FAR_DISTANCE = 1e-2, 0.5
 # Singular values below NULL times the largest are zero. The search finds nothing if one is between NULL and CLEAR.
 NULL, CLEAR = 1e-12, 1e-10
-# The same for the residuals of rates of the form d y, with d y an invariant, as of the centre of mass.
+# Bounds of the residuals of rates of the form d y, where d y is an invariant, as for the centre of mass.
 NULL_RATE, CLEAR_RATE = 1e-9, 1e-6
 # Coefficients below this share of the largest one are 0; pivots are larger than LEAST_PIVOT. Others are rounded to BITS
 # bits, so that they do not depend on the points. A rate may differ from 0 by HOLDS times the sum of its terms.
@@ -127,7 +129,7 @@ def found_invariants(samples: Samples, t_bound: float) -> LinearInvariants:
     if rank == n:
         return none
     # Columns of F have the units of their components, and rows those of the largest rate at their point.
-    momenta = _reduced(V[rank:]) / units
+    momenta = _sparse(V[rank:]) / units
     momenta = _rounded(momenta / np.abs(momenta).max(axis=1, keepdims=True))
     scale = np.max(np.abs(samples.f), axis=1, keepdims=True)
     D = samples.y @ momenta.T / np.where(scale > 0, scale, 1.0)
@@ -195,27 +197,33 @@ def independent_of(given: LinearInvariants, gradients: Array, sizes: Array) -> L
     rest = V[int(np.count_nonzero(s > SPANNED * s[0])) :] @ Q.T
     if not len(rest):
         return LinearInvariants(C[:0], A[:0, :0])
-    rows = _reduced(rest) / sizes
+    rows = _sparse(rest) / sizes
     rows = _rounded(rows / np.abs(rows).max(axis=1, keepdims=True))
     # The rates of the new rows are combinations of these rows, because the rows whose rates are not kept are left out.
     rates = np.linalg.lstsq((C * sizes).T, (rows * sizes).T)[0].T @ A @ C
     return LinearInvariants(rows, np.linalg.lstsq((rows * sizes).T, (rates * sizes).T)[0].T)
 
 
-def _reduced(rows: Array) -> Array:
-    """Return the reduced row echelon form: rows that have few nonzero entries, as one for each axis of a momentum."""
+def reduced_rows(rows: Array, least: float) -> Array:
+    """Return the reduced row echelon form of independent rows; pivots are larger than `least`."""
     rows, done = rows.copy(), 0
     for column in range(rows.shape[1]):
+        if done == len(rows):
+            break
         pivot = done + int(np.argmax(np.abs(rows[done:, column])))
-        if abs(rows[pivot, column]) < LEAST_PIVOT:
+        if abs(rows[pivot, column]) < least:
             continue
         rows[[done, pivot]] = rows[[pivot, done]]
         rows[done] /= rows[done, column]
         others = np.arange(len(rows)) != done
-        rows[others] -= rows[others, column, None] * rows[done]
+        rows[others] -= np.outer(rows[others, column], rows[done])
         done += 1
-        if done == len(rows):
-            break
+    return rows
+
+
+def _sparse(rows: Array) -> Array:
+    """Return rows with the same span that have few nonzero entries, as one for each axis of a momentum."""
+    rows = reduced_rows(rows, LEAST_PIVOT)
     rows[np.abs(rows) < NEGLIGIBLE * np.abs(rows).max(axis=1, keepdims=True)] = 0.0
     return rows
 

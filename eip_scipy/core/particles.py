@@ -184,7 +184,7 @@ def _is_free(m: Array, d: int, y: Array, f: Array) -> bool:
 
 
 def _lacks(item: Invariant, y: Array, kept: Array) -> bool:
-    """Return True if momentum or angular momentum (`item`) is no combination of the gradients `kept` at the state y."""
+    """Return True if momentum or angular momentum (`item`) at the state y does not follow from the gradients `kept`."""
     assert item.linear is not None
     assert item.gradient is not None
     d = len(item.linear.C) // 2

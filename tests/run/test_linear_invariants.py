@@ -121,7 +121,7 @@ def test_momentum_and_centre_of_mass_are_found_and_kept():
 
 @pytest.mark.parametrize("kept", [(H, P), (H, *L, P)], ids=["H and P", "H, L and P"])
 def test_given_momentum_is_projected(kept):
-    """A linear invariant that is given is no constraint of the corrections, and neither is one whose rate it is."""
+    """Corrections may change a linear invariant that is given, and a quantity whose rate it is."""
     run, without = (integrate(springs, (0, 5), START, invariants=kept, **FIXED, **more) for more in ({}, OFF))
     np.testing.assert_array_equal(run.y, without.y)
     assert "4 found" in run.diagnostics.remarks[0]
@@ -149,7 +149,7 @@ def test_free_flight_has_no_constraints():
 
 
 def test_nothing_is_found():
-    """There is no search for functions in Python and with a given frame, and none succeeds if a value is not finite."""
+    """Functions in Python and runs with a given frame are not searched; a value that is not finite ends a search."""
     C = np.kron(np.eye(2), np.kron(MASSES, np.eye(2)))
     given = integrate(springs, (0, 1), START, invariants=[H, *L], frame=(C, C.T), **FIXED)
     same = integrate(springs, (0, 1), START, invariants=[H, *L], linear_invariants=(C, C.T), **FIXED)

@@ -12,6 +12,7 @@ from ...core.balances import Balance
 from ...core.gradients import difference_gradient
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like
+from ...core.linear import reduced_rows
 from .motion import plain
 from .parts import Energy, Parts
 from .start import Names, nearest_start
@@ -250,29 +251,12 @@ def _sets(products: np.ndarray) -> list[tuple[int, ...]]:
         return []
     _, values, directions = np.linalg.svd(products[:, moving])
     rank = int((values > CONSTANT * values.max(initial=0.0)).sum())
-    basis = _reduced(directions[rank:])
+    basis = reduced_rows(directions[rank:], DEPENDENT)
     chosen = np.abs(basis) > 0.5
     whole = np.abs(basis - chosen).max(axis=1, initial=0.0) < DEPENDENT
     return [
         tuple(int(k) for k in moving[row]) for row, fits in zip(chosen, whole, strict=True) if fits and row.sum() > 1
     ]
-
-
-def _reduced(rows: np.ndarray) -> np.ndarray:
-    """Return the reduced row echelon form of independent rows."""
-    rows, top = rows.copy(), 0
-    for k in range(rows.shape[1]):
-        if top == len(rows):
-            break
-        best = top + int(np.argmax(np.abs(rows[top:, k])))
-        if abs(rows[best, k]) < DEPENDENT:
-            continue
-        rows[[top, best]] = rows[[best, top]]
-        rows[top] /= rows[top, k]
-        others = np.arange(len(rows)) != top
-        rows[others] -= np.outer(rows[others, k], rows[top])
-        top += 1
-    return rows
 
 
 def _sum_of_squares(parts: Parts, names: Names, places: tuple[int, ...], args: tuple[Any, ...]) -> Invariant:
