@@ -99,7 +99,7 @@ class Step:
 
         e_b is what is remembered of the block's relative error, in units of the largest one. For a block that the step
         leaves as it was, without an error, what is remembered does not count. Then the squared shares of the floats in
-        the lasting errors, and the weights of the square of a correction; None for other metrics.
+        the lasting errors, and the weights of the square of a correction; None for other metrics and for larger blocks.
         """
         width = floats(y).size // y.size
         if not isinstance(self.metric, str):
@@ -130,10 +130,9 @@ class Step:
         constant = (error == 0.0) & (norms(y_hat - y) == 0.0)
         errors = np.where(constant, now, size * inverse)
         sigma = scale * (errors**self.tableau.kappa + FLOOR) if errors.any() else np.ones(len(scale))
-        shares = self.remembered[2] ** 2
-        alone = len(blocks) == y.size
-        units = inverse**2 if alone else inverse**2 / (shares + FLOOR**2)
-        return spread(sigma), spread(shares), spread(units)
+        if len(blocks) < y.size:
+            return spread(sigma), None, None
+        return spread(sigma), spread(self.remembered[2] ** 2), spread(inverse**2)
 
     def neutral(self, G: Array) -> Array:
         """Rows G without what the frame's C y sees of them: G (1 - M C), M = S (C S)^-1."""

@@ -169,9 +169,6 @@ class Work:
     def shift(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
-    def share(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
     def unit(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property

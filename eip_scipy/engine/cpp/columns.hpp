@@ -80,8 +80,7 @@ template <class W>
 inline void remove_shifts(const Options &o, const W &w, const double *f) {
     const int64_t n = o.columns.size;
     double *shift = w.shift, *measure = w.f_point;
-    lasting_errors<double>(o, w);
-    for (int64_t j = 0; j < w.m; ++j) w.move[j] = w.share[j] * f[j];
+    shift_by_errors(o, w, f, w.move);
     if (o.frame.rows > 0) remove_sparse(o.frame, 0, w.products, w.move);
     take_column(o.columns, -1, w.move, shift);
     for (int64_t i = 0; i < w.l; ++i) w.g[i] = dot(w.gradient(i), shift, n);
@@ -161,7 +160,7 @@ template <class AnyRun>
     ++w.counters[NLU];
     if (rank > 0) {
         find_corrections(o, w, rank, rows, scratch);
-        if (o.metric == BY_ERROR) remove_shifts(o, w, flow_at_raw(run, step));
+        if (const double *f = flow_at_raw(run, step)) remove_shifts(o, w, f);
         project_each(columns, w, M);
     }
     if (columns.symplectic) restore_symplectic(n, M, scratch, w.move);

@@ -88,11 +88,13 @@ template <class Value, class W>
     for (int64_t j = 0; j < w.m; ++j) out[j] = w.y_hat[j] + w.move[j];
 }
 
-// Return f at the raw result, or nearly so: what the stages make of it where the step does not evaluate it.
+// Return f at the raw result, or nearly so: what the stages make of it where the step does not evaluate it. Null where
+// corrections are not examined for a shift in time, see `remove_shift`.
 template <class AnyRun>
 inline auto *flow_at_raw(const AnyRun &run, const Step &step) {
     const auto &m = run.method;
     const auto &w = run.work;
+    if (run.options.metric != BY_ERROR || !each_component_alone(run.options.blocks)) return decltype(w.last())(nullptr);
     const bool in_python = run.hooks && run.hooks->raw;
     if (in_python && !w.counters[F_AT_RAW]) {
         run.system.rhs(w, step.t_new, as_floats(w.y_hat), as_floats(w.last()));
@@ -119,49 +121,49 @@ inline const double *along_orthonormal_rows(int64_t rank, const W &w) {
     return mu;
 }
 
+// w.shift *= factor, also where it is not finite and the factor 0; then w.move -= w.shift, where out = y_hat + move.
+template <class Value, class W>
+[[gnu::always_inline]] inline void subtract_shift(const W &w, const Value &factor, Value *__restrict out) {
+    Value *__restrict shift = w.shift, *__restrict move = w.move;
+    const Value *__restrict y_hat = w.y_hat;
+    for (int64_t j = 0; j < w.m; ++j) {
+        shift[j] = where(abs(factor) > 0.0, factor * shift[j], 0.0);
+        move[j] -= shift[j];
+        out[j] = y_hat[j] + move[j];
+    }
+}
+
 // Removes from w.move its part along a shift in time, which is left in w.shift; out = y_hat + move.
 //
 // A multiple of the flow f changes no invariant: the weights alone decide how much of it a correction contains, and where
-// the error estimate of a component vanishes for a moment, they decide badly. Each block is shifted in proportion to its
-// squared share in the errors; the rows of Q, of which `rank` are orthonormal (-1: those of `solve_gram`), make that tangent.
-// Of all corrections that differ by a multiple of it the result is the smallest one in units of the lasting errors.
+// the error estimate of a component vanishes for a moment, they decide badly. Each component is shifted in proportion to
+// its squared share in the errors; the rows of Q, of which `rank` are orthonormal (-1: those of `solve_gram`), make that
+// tangent. Of all corrections that differ by a multiple of it the result is the smallest one in units of the scales.
 template <class Value, class W>
 [[gnu::always_inline]] inline void remove_shift(const auto &o, const W &w, const Value *f, int64_t rank, Value *out) {
-    const int64_t m = w.m;
-    Value *__restrict shift = w.shift;
     const bool framed = o.frame.rows > 0;
-    lasting_errors<Value>(o, w);
-    for (int64_t j = 0; j < m; ++j) shift[j] = w.share[j] * f[j];
-    const auto size_of = [&](const Value *a) {
-        return sum_of(shift, m, [=, &w]<class Part>(int64_t j) {
-            return load_alone<Part>(a + j) * (load_alone<Part>(shift + j) * load_alone<Part>(w.unit + j));
+    Value *raw = framed ? out : w.shift, *shift = w.shift;
+    shift_by_errors(o, w, f, raw);
+    const auto product = [&](const Value *a, const Value *b) {
+        return sum_of(a, w.m, [=, &w]<class Part>(int64_t j) {
+            return load_alone<Part>(a + j) * (load_alone<Part>(b + j) * load_alone<Part>(w.unit + j));
         });
     };
-    const Value whole = size_of(shift);
-    if (framed) {
-        keep_frame(o.frame, w, shift, out);
-        copy(out, shift, m);
-    }
+    const Value whole = product(raw, raw);
+    if (framed) keep_frame(o.frame, w, raw, shift);
     const Value *mu = w.mu;
     if constexpr (std::is_same_v<Value, double>)
         if (rank >= 0) mu = along_orthonormal_rows(rank, w);
     if (mu == w.mu) {
-        for (int64_t i = 0; i < w.l; ++i) w.values[i] = dot(w.gradient(i), shift, m);
+        for (int64_t i = 0; i < w.l; ++i) w.values[i] = dot(w.gradient(i), shift, w.m);
         substitute_gram(corner(w.R, w.l, w), w.values, w.mu);
     }
-    combine_rows(w, mu, w.Q, [&](int64_t j, const auto &x) { store_as(x, out + j); });
-    if (framed) {
-        copy(out, w.share, m);
-        keep_frame(o.frame, w, w.share, out);
-    }
-    for (int64_t j = 0; j < m; ++j) shift[j] += out[j];
-    const Value size = size_of(shift), factor = size_of(w.move) / positive(size);
+    combine_rows(w, mu, w.Q,
+                 [&]<class Part>(int64_t j, const Part &x) { store_as(load_as<Part>(shift + j) + x, raw + j); });
+    if (framed) keep_frame(o.frame, w, raw, shift);
+    const Value size = product(shift, shift), factor = product(w.move, shift) / positive(size);
     const auto known = (size > LEAST_SHIFT * whole) & (abs(factor) < ENDLESS);
-    for (int64_t j = 0; j < m; ++j) {
-        shift[j] = where(known, factor * shift[j], 0.0);
-        w.move[j] -= shift[j];
-        out[j] = w.y_hat[j] + w.move[j];
-    }
+    subtract_shift(w, where(known, factor, Value(0.0)), out);
 }
 
 // Coefficients w.mu of the rows of B in their least-norm solution, and its rank. One row, the usual case, by itself.
@@ -254,7 +256,8 @@ template <class W>
     return rank;
 }
 
-// The first Newton step along the gradients at y_hat; with f there, without a shift in time. `more`: others follow, for which Q must be orthonormal.
+// The first Newton step along the gradients at y_hat; given f there, without a shift in time. `more`: others follow, for
+// which Q must be orthonormal.
 template <class W>
 [[gnu::always_inline]] inline int64_t first_move(const auto &o, const W &w, const double *f, double *out, bool more) {
     if (o.balance_groups.count > 0) [[unlikely]]
@@ -328,8 +331,7 @@ inline Moved move(const AnyRun &run, const Step &step) {
     }
     int64_t rank;
     if (o.direction == NEW) {
-        const double *f = o.metric == BY_ERROR ? flow_at_raw(run, step) : nullptr;
-        rank = first_move(o, w, f, step.y_new, o.iterations > 1);
+        rank = first_move(o, w, flow_at_raw(run, step), step.y_new, o.iterations > 1);
     } else {
         rank = other_directions(of_any_length(run), step);
     }
@@ -346,11 +348,8 @@ inline Moved move(const AnyRun &run, const Step &step) {
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);
     move_along(o, w, w.Q, step.y_new);
-    if (o.metric != BY_ERROR || o.direction != NEW) return true;
-    for (int64_t j = 0; j < w.m; ++j) {
-        w.move[j] -= w.shift[j];
-        step.y_new[j] = w.y_hat[j] + w.move[j];
-    }
+    if (o.metric == BY_ERROR && each_component_alone(o.blocks) && o.direction == NEW)
+        subtract_shift(w, 1.0, step.y_new);
     return true;
 }
 
@@ -376,8 +375,7 @@ inline auto missed_targets(const Options &o, const W &w) {
     const Work &w = run.work;
     const auto evaluate = [&] { run.system.inv(w, step.t_new, step.y_new, w.values); };
     double missed = missed_targets(o, w);
-    if (o.direction == NEW && o.iterations == 1)
-        rank = first_move(o, w, o.metric == BY_ERROR ? flow_at_raw(run, step) : nullptr, step.y_new, true);
+    if (o.direction == NEW && o.iterations == 1) rank = first_move(o, w, flow_at_raw(run, step), step.y_new, true);
     for (int k = 0; rank >= 0 && k < MAX_FURTHER && missed > 1.0; ++k) {
         copy(step.y_new, w.stage, w.m);
         if (!newton_iteration(run, step, rank)) break;

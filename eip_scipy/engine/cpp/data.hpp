@@ -338,9 +338,9 @@ struct WorkOf {
     using Options = eip::Options;
     int64_t n, m, l, stages, balances;
     Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *inverse, *ratio, *remembered,
-        *memory, *memory_new, *move, *shift, *share, *unit, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu,
-        *values, *g, *band, *before, *worth, *defect, *max_defect, *max_correction, *trust, *flow, *rates, *level,
-        *level_old, *level_carry, *level_carry_new, *slow, *target,
+        *memory, *memory_new, *move, *shift, *unit, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g,
+        *band, *before, *worth, *defect, *max_defect, *max_correction, *trust, *flow, *rates, *level, *level_old,
+        *level_carry, *level_carry_new, *slow, *target,
         *products;  // the last two: the invariants' targets; scratch of the frame
     double *norm, *suspect;
     int64_t *pivots, *counters;
@@ -369,7 +369,7 @@ void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
     visit.states("f_point", w.f_point, {n});
     visit.states("G", w.G, {l, n});
     each(visit, {m}, "err", w.err, "err_low", w.err_low, "err_sum", w.err_sum, "sigma", w.sigma, "move", w.move,
-         "shift", w.shift, "share", w.share, "unit", w.unit, "carry", w.carry, "carry_hat", w.carry_hat);
+         "shift", w.shift, "unit", w.unit, "carry", w.carry, "carry_hat", w.carry_hat);
     each(visit, {blocks}, "scale", w.scale, "inverse", w.inverse, "ratio", w.ratio, "remembered", w.remembered);
     each(visit, {MEMORIES, blocks}, "memory", w.memory, "memory_new", w.memory_new);
     each(visit, {l, m}, "B", w.B, "Q", w.Q);

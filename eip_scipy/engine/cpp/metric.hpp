@@ -12,6 +12,9 @@ constexpr double SHORT_MEMORY = 0.8, LONG_MEMORY = 0.999;
 // A shift in time of which less than this share, squared, changes no invariant is rounding.
 constexpr double LEAST_SHIFT = 1e-12;
 
+// Return whether each block is one component, real or complex.
+inline bool each_component_alone(const Blocks &blocks) { return blocks.members == blocks.count * blocks.width; }
+
 inline int64_t blocks_of(const Options &o, int64_t m) { return o.blocks.size == 1 ? m : o.blocks.count; }
 
 // Call set(i, b) for each float i of each block b.
@@ -192,7 +195,7 @@ inline Kept memory_kept(const AnyRun &run) {
 }
 
 // The memory of the metric by block: the scale, the error in units of the step's largest relative one, and the largest
-// relative error, in these units too, of a long time.
+// relative error, in these units too, of a long time, which is known where each component is a block.
 template <class Value>
 struct MetricMemory {
     Value *scale, *error, *lasting;
@@ -200,9 +203,9 @@ struct MetricMemory {
     MetricMemory(Value *rows, int64_t n) : scale(rows), error(rows + n), lasting(rows + 2 * n) {}
 };
 
-// Compute, from the sizes of the blocks and of their errors, w.scale, its reciprocals w.inverse (0 for 0: over a scale of
-// 0 there is no error to speak of), the relative errors w.ratio of this step and those that are remembered, w.remembered,
-// in units of the largest one of this step, which is returned.
+// Compute, from the sizes of the blocks and of their errors, w.scale, its reciprocals w.inverse (0 for 0, where no error is
+// known), the relative errors w.ratio of this step and those that are remembered, w.remembered, in units of the largest one
+// of this step, which is returned.
 template <class Value, class W>
 inline Value remembered_errors(const Kept &kept, const Options &o, const W &w) {
     const int64_t n = blocks_of(o, w.m);
@@ -217,9 +220,10 @@ inline Value remembered_errors(const Kept &kept, const Options &o, const W &w) {
     for (int64_t b = 0; b < n; ++b) {
         ratio[b] = min(Value(1.0), ratio[b] * unit);
         now.error[b] = max(ratio[b] * scale[b], kept.brief * old.error[b]);
-        now.lasting[b] = max(ratio[b], kept.lasting * old.lasting[b]);
         w.remembered[b] = now.error[b] * inverse[b];
     }
+    for (int64_t b = 0; each_component_alone(o.blocks) && b < n; ++b)
+        now.lasting[b] = max(ratio[b], kept.lasting * old.lasting[b]);
     return largest_ratio;
 }
 
@@ -228,8 +232,11 @@ template <class Value>
 inline void block_weights(const Value *__restrict scale, Value *__restrict weights, const Options &o, int64_t n) {
     const auto known = largest(weights, n) > 0.0;
     powers(weights, o.kappa, n);
-    for (int64_t b = 0; b < n; ++b) weights[b] = where(known, scale[b] * (weights[b] + METRIC_FLOOR), 1.0);
-    const Value top = largest(weights, n);
+    Value top = 0.0;
+    for (int64_t b = 0; b < n; ++b) {
+        weights[b] = where(known, scale[b] * (weights[b] + METRIC_FLOOR), 1.0);
+        top = max(top, weights[b]);
+    }
     const auto extreme = !((top > 1e-100) & (top < 1e100));
     for (int64_t b = 0; any(extreme) && b < n; ++b) weights[b] = where(extreme, weights[b] / positive(top), weights[b]);
 }
@@ -278,26 +285,21 @@ inline double relative_errors(const double *y, const AnyRun &run) {
 // Remember the errors of a step that is accepted.
 template <class W>
 inline void remember_errors(const Options &o, const W &w) {
-    if (o.metric == BY_ERROR) copy(w.memory_new, w.memory, MEMORIES * blocks_of(o, w.m));
+    if (o.metric == BY_ERROR)
+        copy(w.memory_new, w.memory, (each_component_alone(o.blocks) ? MEMORIES : 2) * blocks_of(o, w.m));
 }
 
-// Compute for each float, from the long memory, the square of its share in the errors, w.share, and w.unit, the weight of
-// its square in the size of a correction: by the error of its block, or if each component is a block by its scale, because
-// the error of a component may be small for long where that of a vector is not.
+// Compute the flow f with each component in proportion to the square of its share in the lasting errors, and w.unit, the
+// weight of the square of a component in the size of a correction. Each component is a block.
 template <class Value, class W>
-inline void lasting_errors(const Options &o, const W &w) {
-    const Blocks &blocks = o.blocks;
-    const int64_t n = blocks_of(o, w.m);
-    const Value *__restrict lasting = MetricMemory<Value>(w.memory_new, n).lasting;
-    Value *__restrict units = blocks.size == 1 ? w.unit : w.ratio;
-    const bool alone = blocks.members == blocks.count * blocks.width;
-    for (int64_t b = 0; b < n; ++b) units[b] = w.inverse[b] * w.inverse[b];
-    for (int64_t b = 0; !alone && b < n; ++b)
-        units[b] = units[b] / (lasting[b] * lasting[b] + METRIC_FLOOR * METRIC_FLOOR);
-    if (blocks.members < w.m) fill(w.share, 0.0, w.m), fill(w.unit, 0.0, w.m);
-    each_float(blocks, w.m, [&](int64_t i, int64_t b) {
-        w.share[i] = lasting[b] * lasting[b];
-        w.unit[i] = units[b];
+inline void shift_by_errors(const Options &o, const W &w, const Value *__restrict f, Value *__restrict shift) {
+    const Value *__restrict lasting = MetricMemory<Value>(w.memory_new, o.blocks.count).lasting;
+    const Value *__restrict inverse = w.inverse;
+    Value *__restrict unit = w.unit;
+    if (o.blocks.members < w.m) fill(shift, 0.0, w.m), fill(unit, 0.0, w.m);
+    each_float(o.blocks, w.m, [=](int64_t i, int64_t b) {
+        shift[i] = lasting[b] * lasting[b] * f[i];
+        unit[i] = inverse[b] * inverse[b];
     });
 }
 

@@ -98,7 +98,7 @@ template <class W>
     Octet *rows = weighed_gradients(o, w);
     const Mask dependent = moved & !solve_gram(rows_of(rows, w), w.g, corner(w.R, w.l, w), w.mu);
     move_along(o, w, rows, eight.y_new);
-    const Octet *f = o.metric == BY_ERROR ? flow_at_raw(run, step) : nullptr;
+    const Octet *f = flow_at_raw(run, step);
     if (f) remove_shift(o, w, f, -1, eight.y_new);
     for (int64_t lane = 0; lane < LANES; ++lane)
         if (all_move || moved.lane(lane)) eight.rank[lane] = w.l;
