@@ -256,8 +256,7 @@ template <class W>
     return rank;
 }
 
-// The first Newton step along the gradients at y_hat; given f there, without a shift in time. `more`: others follow, for
-// which Q must be orthonormal.
+// The first Newton step along the gradients at y_hat; given f, without a shift in time. If `more` follow, Q is orthonormal.
 template <class W>
 [[gnu::always_inline]] inline int64_t first_move(const auto &o, const W &w, const double *f, double *out, bool more) {
     if (o.balance_groups.count > 0) [[unlikely]]
