@@ -77,25 +77,22 @@ class Samples:
         if not self.y0.all():  # a component that is 0 at the start may have to stay nonnegative, as a concentration
             ways = np.where(self.y0 == 0, np.abs(ways), ways)
         y = self.y0 + ways * self.sizes
-        f = np.full(y.shape, np.nan)
+        f = np.empty_like(y)
         span = t_bound - t0 if np.isfinite(t_bound) else 0.0
         times = [t0] * self.near + [t0 + span * k / (FAR - 1) for k in range(self.far)]
+        self.calls += len(times)
         for k, t in enumerate(times):
-            found = unless_error(self._derivative, t, self._wide(y[k]))
-            if found is not None:
-                f[k] = found[self._places]
+            found = unless_error(self._rhs, t, self._wide(y[k]))
+            f[k] = np.nan if found is None else found[self._places]
         return y, f
 
     @cached_property
     def gradients(self) -> Array:
         """Return the gradients (NEAR, l, n) of the invariants at the first points."""
+        self.calls += NEAR
         states = [(self._start.t, self._wide(state)) for state in self.points[0][:NEAR]]
-        found = [self.invariants.gradients(*here, self._derivative(*here)) for here in states]
+        found = [self.invariants.gradients(*here, self._rhs(*here)) for here in states]
         return np.array(found)[:, :, self._places]
-
-    def _derivative(self, t: float, y: Array) -> Array:
-        self.calls += 1
-        return self._rhs(t, y)
 
     def _wide(self, y: Array) -> Array:
         out: Array = self._start.y.copy()

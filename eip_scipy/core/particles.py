@@ -58,8 +58,8 @@ def particle_invariants(masses: Any, dimension: int = 3, *, about: Any = None) -
     >>> import numpy as np
     >>> from eip_scipy import particle_invariants
     >>> (L,) = particle_invariants([2.0, 1.0], dimension=2)
-    >>> float(L.fun(0.0, np.array([1.0, 0, 0, 0, 0, 3.0, 0, 0])))
-    6.0
+    >>> L.fun(0.0, np.array([1.0, 0, 0, 0, 0, 3.0, 0, 0]))
+    array([6.])
     """
     m = real_array("masses", masses)
     if m.ndim != 1 or not (np.isfinite(m).all() and (m >= 0).all() and m.any()):
@@ -71,6 +71,7 @@ def particle_invariants(masses: Any, dimension: int = 3, *, about: Any = None) -
         raise ValueError(f"about must be a point with {dimension} finite coordinates, got {shown(about)}.")
     value, gradient = _functions(tuple(m.tolist()), tuple(centre.tolist()))
     item = Invariant(value, gradient, in_place=True, name="L")
+    item.value_names = () if dimension == 3 else ("L",)
     share, axes, zero = m / m.max(), np.eye(dimension), np.zeros((dimension, dimension))
     A = np.block([[zero, axes], [zero, zero]])
     item.linear = LinearInvariants(np.kron(np.eye(2), np.kron(share, axes)), A)
@@ -83,33 +84,25 @@ def _functions(masses: tuple[float, ...], about: tuple[float, ...]) -> tuple[Cal
     m, a, d = np.array(masses), np.array(about), len(about)
     half, planes = d * m.size, np.array([(0, 1)] if d == 2 else [(1, 2), (2, 0), (0, 1)])
 
-    def plane(t: float, y: Array, *params: Any) -> Any:
-        L = 0.0
+    def value(t: float, y: Array, *params: Any) -> Any:
+        L = np.zeros(len(planes))
         for b in range(m.size):
-            q, v = 2 * b, half + 2 * b
-            L += m[b] * ((y[q] - a[0]) * y[v + 1] - (y[q + 1] - a[1]) * y[v])
-        return L
-
-    def space(t: float, y: Array, *params: Any) -> Any:
-        L = np.zeros(3)
-        for b in range(m.size):
-            q, v = 3 * b, half + 3 * b
-            for k in range(3):
+            q, v = d * b, half + d * b
+            for k in range(len(planes)):
                 i, j = planes[k]
                 L[k] += m[b] * ((y[q + i] - a[i]) * y[v + j] - (y[q + j] - a[j]) * y[v + i])
         return L
 
     def gradient(t: float, y: Array, out: Array, *params: Any) -> None:
-        rows = out.reshape(-1, y.size)
-        rows[:] = 0.0
+        out[:] = 0.0
         for b in range(m.size):
             q, v = d * b, half + d * b
             for k in range(len(planes)):
                 i, j = planes[k]
-                rows[k, q + i], rows[k, q + j] = m[b] * y[v + j], -m[b] * y[v + i]
-                rows[k, v + i], rows[k, v + j] = -m[b] * (y[q + j] - a[j]), m[b] * (y[q + i] - a[i])
+                out[k, q + i], out[k, q + j] = m[b] * y[v + j], -m[b] * y[v + i]
+                out[k, v + i], out[k, v + j] = -m[b] * (y[q + j] - a[j]), m[b] * (y[q + i] - a[i])
 
-    return compilable(plane if d == 2 else space), compilable(gradient)
+    return compilable(value), compilable(gradient)
 
 
 class Particles(NamedTuple):

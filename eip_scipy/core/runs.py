@@ -173,7 +173,7 @@ class Run:
     def _warn_of_refuted_constraints(self, t: float, y: np.ndarray, rhs: Derivative) -> None:
         """Warn if linear invariants that were found at the start do not hold at the state y, as in contact."""
         linear = self.conserved.linear
-        if linear.C.shape[1] != y.size:
+        if not len(linear.C) or linear.C.shape[1] != y.size:
             return
         lost = len(linear.C) - len(linear.only(confirmed(y[None], rhs(t, y)[None], linear)).C)
         if lost:

@@ -26,7 +26,7 @@ from ..core.gradients import unless_error
 from ..core.inputs import count, flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
-from ..core.linear import LinearInvariants, confirmed
+from ..core.linear import confirmed
 from ..core.names import nearest
 from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
@@ -713,24 +713,25 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
     if found.found is None:
         return plan
     C = found.linear.C
-    holds = len(C) > 0 and (task.request.params is None or _hold(plan, everyone, found.linear))
+    holds = len(C) > 0 and (task.request.params is None or _hold(plan, everyone))
     projection = {**task.request.projection, "linear_invariants": (C, C.T) if holds else None}
     task = dataclasses.replace(task, request=task.request._replace(projection=projection))
     return Plan(task, None if len(C) and not holds else plan.ready)
 
 
-def _hold(plan: Plan, everyone: Chunk, linear: LinearInvariants) -> bool:
+def _hold(plan: Plan, everyone: Chunk) -> bool:
     """Return True if the linear invariants of the first member hold for the parameters of all members."""
-    system, y0s, f = plan.ready.system, everyone.y0s, []
+    ready, own = plan.ready, plan.ready.system.parameters.copy()
     first = np.unique(everyone.params, axis=0, return_index=True)[1]
-    if len(first) == 1 or plan.ready.variations is not None:
+    if len(first) == 1 or ready.variations is not None:
         return len(first) == 1
-    states, own = y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size))), system.parameters.copy()
-    for k, y in zip(first, states, strict=True):
-        system.parameters[:] = everyone.params[k]
-        f.append(unless_error(system.derivative, plan.t0, y))
-    system.parameters[:] = own
-    return all(x is not None for x in f) and bool(confirmed(states, np.array(f), linear).all())
+    y = everyone.y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size)))
+    f = np.full(y.shape, np.nan)
+    for k, member in enumerate(first):
+        ready.system.parameters[:] = everyone.params[member]
+        f[k] = unless_error(ready.system.derivative, plan.t0, y[k])
+    ready.system.parameters[:] = own
+    return bool(confirmed(y, f, ready.run.conserved.linear).all())
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
