@@ -80,11 +80,11 @@ def confirmed(y: Array, f: Array, given: LinearInvariants) -> Array:
 
 
 def undetermined(C: Array, gradients: Array, sizes: Array) -> Array:
-    """Return a mask (k,) of the rows of C (k, n) of which no combination of the gradients is made.
+    """Return a mask (k,) of the rows of C (k, n) that are no part of a combination of the gradients.
 
-    `gradients` (m, l, n) are those of the invariants at m states, and `sizes` (n,) those of the components. Where a
-    combination of the gradients is one of rows of C, no correction could change that combination of the invariants if
-    these rows were kept, as those of a momentum that is an invariant.
+    `gradients` (m, l, n) are those of the invariants at m states, and `sizes` (n,) those of the components. If the rows
+    were kept whose combination is a combination of the gradients, no correction could change that combination of the
+    invariants, such as a momentum that is an invariant.
     """
     rows, free = (C * sizes).T, np.ones(len(C), bool)
     rows /= np.linalg.norm(rows, axis=0)

@@ -72,9 +72,8 @@ def particle_invariants(masses: Any, dimension: int = 3, *, about: Any = None) -
     value, gradient = _functions(tuple(m.tolist()), tuple(centre.tolist()))
     item = Invariant(value, gradient, in_place=True, name="L")
     item.value_names = () if dimension == 3 else ("L",)
-    share, axes, zero = m / m.max(), np.eye(dimension), np.zeros((dimension, dimension))
-    A = np.block([[zero, axes], [zero, zero]])
-    item.linear = LinearInvariants(np.kron(np.eye(2), np.kron(share, axes)), A)
+    share, axes = m / m.max(), np.eye(dimension)
+    item.linear = LinearInvariants(np.kron(np.eye(2), np.kron(share, axes)), np.kron(np.eye(2, k=1), axes))
     return [item]
 
 
@@ -166,7 +165,8 @@ def _lacks(item: Invariant, y: Array, known: Array) -> bool:
     d = len(item.linear.C) // 2
     slope = np.empty((1 if d == 2 else 3, y.size))
     item.gradient(0.0, y, slope)
-    wanted, known = np.concatenate([item.linear.C[d:], slope]).T, known.T / np.linalg.norm(known, axis=1)
+    wanted = np.concatenate([item.linear.C[d:], slope]).T
+    known = known.T / np.maximum(np.linalg.norm(known, axis=1), np.finfo(float).tiny)
     rest = wanted - known @ np.linalg.lstsq(known, wanted, rcond=SMALL)[0]
     return bool((np.linalg.norm(rest, axis=0) > REMAINDER * np.linalg.norm(wanted, axis=0)).any())
 
