@@ -145,7 +145,7 @@ def _masses(y: Array, f: Array, slope: Array, d: int) -> Array | None:
 
     The mass of a particle at rest is unknown, NaN, and then forces and torques are not examined.
     """
-    q, v, _, a, _, p = (half.reshape(-1, d) for x in (y, f, slope) for half in np.split(x, 2))
+    (q, v), (_, a), (_, p) = (x.reshape(2, -1, d) for x in (y, f, slope))
     m: Array = (p * v).sum(axis=1) / (v * v).sum(axis=1)
     if (np.abs(p - m[:, None] * v) > SMALL * np.abs(p).max(axis=1, keepdims=True)).any() or (m <= 0).any():
         return None
