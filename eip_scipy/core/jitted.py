@@ -63,7 +63,7 @@ def compilable(fun: Callable[..., Any]) -> Callable[..., Any]:
 @cache
 def jitted(fun: Any) -> Any:
     """Return a `compilable` function jitted by Numba, if Numba is installed; return any other function unchanged."""
-    if not getattr(fun, "compilable", False) or find_spec("numba") is None:
+    if not getattr(fun, "compilable", False) or is_jitted(fun) or find_spec("numba") is None:
         return fun
     from numba import njit
 

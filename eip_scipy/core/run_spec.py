@@ -13,24 +13,14 @@ from ..engine.native import BUILD
 from ..engine.trust import Trust
 from ..methods.orders import AT_REST
 from . import steppers
+from .conserved import Conserved, Samples, conserved
 from .failures import projection_failure
 from .frame import frame_rows, spanned
 from .gradients import unless_error
 from .invariant_checks import Complaint, reported
 from .invariants import TARGET_TOLERANCE, InvariantSet
-from .linear import (
-    MORE,
-    MOST_COMPONENTS,
-    MOST_GRADIENTS,
-    FoundInvariants,
-    Samples,
-    confirmed,
-    found_invariants,
-    independent_of,
-)
 from .multistep import SecondOrder, attach_history
 from .options import ProjectionOptions
-from .particles import Particles, missing_particles
 from .runs import Run, Start
 from .stepping import AnyMethod, Stepping
 from .variations import Columns, widened
@@ -38,8 +28,6 @@ from .variations import Columns, widened
 __all__ = ["RunSpec"]
 
 START_ITERATIONS = 50
-# Number of states near the start at which the total force and torque on particles are computed.
-STATES = 3
 FRAME_DISTANCE = 1e-4
 
 Array = np.ndarray
@@ -58,7 +46,7 @@ class RunSpec(NamedTuple):
     are not of second order. `columns` of derivatives follow the state; `stepping` and `projection` are for the state
     without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with velocities too,
     on which it may come to depend; `is_second_order` that `rhs` is (v, a) by its construction. `called` and `left_out`:
-    see `Run`. `uncounted` is `rhs` without the count of its calls, to search for what the system keeps, or None.
+    see `Run`.
     """
 
     name: str
@@ -77,7 +65,6 @@ class RunSpec(NamedTuple):
     columns: Columns | None = None
     sees_velocity: bool = True
     is_second_order: bool = False
-    uncounted: Callable[[float, Array], Array] | None = None
 
     def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
         """Return the run that starts at the state y0, after a check of the options, the functions and the invariants.
@@ -146,11 +133,11 @@ class RunSpec(NamedTuple):
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
         depends_on_time = method is not AT_REST and invariants.size > 0 and invariants.add_rounding_of_time(start.y)
         options, sigma, identity = projection.settled(method, self.stepping, y, f, invariants)
-        linear = None
-        if self._may_have_frame(method, invariants):
-            linear = unless_error(self._linear_invariants, start, invariants)
-            C = np.zeros((0, 0)) if linear is None else linear.C
-            options = options._replace(frame=frame_rows((C, C.T), y.size, 1)) if len(C) else options
+        samples = Samples(self.rhs, start, invariants, slice(None) if columns is None else columns.places)
+        found = unless_error(conserved, samples, projection, method, tell and options.watched)
+        found = Conserved(calls=samples.calls) if found is None else found
+        if len(C := found.linear.C):
+            options = options._replace(frame=frame_rows((C, C.T), y.size, 1))
         if columns is not None:
             options, sigma = widened(options, sigma, columns, invariants.start_gradients)
         invariants.kinds = options.kinds
@@ -168,75 +155,9 @@ class RunSpec(NamedTuple):
             work.sigma[:] = sigma
         trust = Trust(invariants.names, work.trust)
         return Run(
-            start, start, self.stepping, method, arrays, options, work, invariants, identity, trust, self.called,
-            self.left_out, depends_on_time=depends_on_time, linear=linear,
+            start, start, self.stepping, method, arrays, options, work, invariants, identity, trust, found,
+            self.called, self.left_out, depends_on_time=depends_on_time,
         )  # fmt: skip
-
-    def _may_have_frame(self, method: AnyMethod, invariants: InvariantSet) -> bool:
-        """Return True if linear invariants are to be found for the run, and can be kept by it."""
-        option, is_known = self.projection.linear_invariants, self.projection.constraints is not None
-        by_items = option == "given" and any(item.linear is not None for item in invariants.items)
-        asked = not is_known and self.uncounted is not None and (option == "auto" or by_items)
-        # A user's step need not keep linear invariants, and fields are projected by their own functions.
-        keeps = (not method.in_python or method.drives) and not hasattr(invariants.items, "shift")
-        plain = invariants.dtype.kind == "f" and not invariants.balances.items
-        return asked and keeps and plain and invariants.size > 0
-
-    def _linear_invariants(self, start: Start, invariants: InvariantSet) -> FoundInvariants | None:
-        """Return the linear invariants that the corrections of a run from `start` leave unchanged."""
-        derivative, gradients = self._of_state(start, invariants)
-        columns = self.columns
-        y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
-        searched = self.projection.linear_invariants == "auto" and y.size <= MOST_COMPONENTS
-        given = next((item.linear for item in invariants.items if item.linear is not None), None)
-        if not searched and (given is None or given.C.shape[1] != y.size):
-            return None
-        with np.errstate(all="ignore"):
-            samples = Samples(derivative, start.t, y, f, invariants.tau, y.size if searched else MORE)
-            if searched or given is None:
-                found = found_invariants(samples, self.stepping.span.t_bound)
-            else:
-                found = confirmed(samples.y, samples.f, given)
-            if not len(found.C):
-                return FoundInvariants(found, 0, samples.calls)
-            points = list(zip(samples.t.tolist(), samples.y, samples.f, strict=True))[:MOST_GRADIENTS]
-            kept = independent_of(found, np.array([gradients(*point) for point in points]), samples.sizes)
-        return FoundInvariants(kept, len(found.C), samples.calls)
-
-    def _of_state(self, start: Start, invariants: InvariantSet) -> tuple[Any, Any]:
-        """Return the derivative and the gradients as functions of the state alone, without columns of derivatives."""
-        columns, rhs = self.columns, self.uncounted
-        assert rhs is not None
-        if columns is None:
-            return rhs, invariants.gradients
-
-        def wide(y: Array) -> Array:
-            out = start.y.copy()
-            out[columns.places] = y
-            return out
-
-        def gradients(t: float, y: Array, f: Array) -> Array:
-            return invariants.gradients(t, wide(y), rhs(t, wide(y)))[:, columns.places]
-
-        return lambda t, y: columns.own(rhs(t, wide(y))), gradients
-
-    def _missing(self, run: Run) -> Particles | None:
-        """Return the particles whose momentum and angular momentum the run does not keep, see `missing_particles`."""
-        invariants, (t, y, f, _) = run.invariants, run.begin
-        if self.uncounted is None or self.columns is not None or invariants.balances.items or y.dtype.kind == "c":
-            return None
-        if invariants.by_values.any() and y.size > MOST_COMPONENTS:
-            return None  # gradients take long
-        given = self.projection.constraints
-        C = np.zeros((0, y.size)) if given is None else np.atleast_2d(given[0])
-        C = C if run.linear is None else run.linear.C
-
-        def sample() -> Any:
-            samples = Samples(self.uncounted, t, y, f, invariants.tau, STATES)  # type: ignore[arg-type]
-            return [(x, v, invariants.gradients(t, x, v)) for x, v in zip(samples.y, samples.f, strict=True)]
-
-        with np.errstate(all="ignore"):
-            return missing_particles(y, f, run.work.G, C, sample)
 
     def _check(self, run: Run, checks: bool) -> None:
         """Project the start if that is requested, and check the invariants and the steps there if `checks`."""
@@ -256,7 +177,6 @@ class RunSpec(NamedTuple):
         if run.options.watched and checks and BUILD.are_finite(run.start.f.view(float)):
             known = (run.work.G, run.work.values) if run.start is run.begin else None
             run.trust.doubts += run.invariants.check(*run.start[:3], run.invariants.tau, known)
-            run.missing = unless_error(self._missing, run)
         if self.projection.check and checks and run.tableau.in_python:
             text = steppers.of_another_equation(run.tableau, self.rhs, run.start, self.stepping.span.sign, self.called)
             if text is not None:

@@ -16,12 +16,12 @@ from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunction
 from ..engine.trust import Trust
 from . import steppers
 from .callers import users_level
+from .conserved import Conserved
 from .examination import Derivative, Examiner, is_check_due, unresolved
 from .invariant_checks import listed
 from .invariants import InvariantSet
-from .linear import FoundInvariants, confirmed
+from .linear import confirmed
 from .options import Options
-from .particles import Particles
 from .results import Diagnostics, slowness
 from .stepping import AnyMethod, Stepping
 
@@ -48,8 +48,8 @@ class Run:
     `moved` says how far. `tableau` is the method as it was given, and `method` the form of it that the engine uses for
     the steps. `identity`: see `settled`. `called` is the argument that gave the right-hand side, and `left_out` a
     possible cause of NaN in its value, for messages. `looked` is the step at which the invariants were checked last.
-    `depends_on_time` is True if an invariant depends on time; its scale then depends on the start. `linear` are the
-    linear invariants that were found, and `missing` the particles whose momenta the run does not keep.
+    `depends_on_time` is True if an invariant depends on time; its scale then depends on the start. `conserved` is what
+    the system conserves besides the invariants.
     """
 
     begin: Start
@@ -62,20 +62,13 @@ class Run:
     invariants: InvariantSet
     identity: Callable[[], dict[str, Any]]
     trust: Trust
+    conserved: Conserved
     called: str = "fun"
     left_out: str = ""
     looked: int = -1
     moved: str = ""
     warned_of_balances: bool = False
     depends_on_time: bool = False
-    linear: FoundInvariants | None = None
-    missing: Particles | None = None
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Return sentences on linear invariants that were found, and on invariants that are missing."""
-        found = None if self.linear is None or not self.linear.found else self.linear
-        return tuple(str(item) for item in (found, self.missing) if item is not None)
 
     @property
     def y0(self) -> np.ndarray:
@@ -123,7 +116,7 @@ class Run:
             self.trust,
             estimated=self.options.metric == BY_ERROR,
             moved=self.moved,
-            remarks=self.remarks,
+            remarks=self.conserved.remarks,
             slow=(self.invariants.balances.places, w.slow),
         )
 
@@ -179,14 +172,15 @@ class Run:
 
     def _warn_of_refuted_constraints(self, t: float, y: np.ndarray, rhs: Derivative) -> None:
         """Warn if linear invariants that were found at the start do not hold at the state y, as in contact."""
-        if self.linear is None or not len(self.linear.C) or self.linear.C.shape[1] != y.size:
+        linear = self.conserved.linear
+        if not len(linear.C) or linear.C.shape[1] != y.size:
             return
-        lost = len(self.linear.C) - len(confirmed(y[None], rhs(t, y)[None], self.linear.kept).C)
+        lost = len(linear.C) - len(linear.only(confirmed(y[None], rhs(t, y)[None], linear)).C)
         if lost:
             warnings.warn(
-                f"{lost} of the {len(self.linear.C)} linear invariants that were found at the start do not hold at "
-                f"t={t:.6g}. The corrections leave them unchanged, which may make the result less accurate. Pass "
-                "linear_invariants=None.",
+                f"{lost} of the {len(linear.C)} linear invariants that were found at the start do not "
+                f"hold at t={t:.6g}. The corrections leave them unchanged, which may make the result less accurate. "
+                "Pass linear_invariants=None.",
                 UserWarning,
                 stacklevel=users_level(),
             )

@@ -232,20 +232,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             level=True,
             hint=lambda: f". If fun is the acceleration a(t, q), {BY_NAME}",
             columns=self._COLUMNS,
-            uncounted=self._uncounted,
         )
-
-    def _uncounted(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the derivative as a new array, by a call that is not counted."""
-        called = self._calls[0]
-        found = _copied(self._derivative, t, y)
-        self._calls[0] = called
-        return found
 
     def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:
         """Start a run at a state and make its buffers; the arguments are those of `RunSpec.build`."""
         run = self._spec.build(y0, f0, tau, check_start=check)
         self._run, self._work = run, run.work
+        self._calls[0] -= run.conserved.calls
         self._spec = self._spec._replace(method=run.tableau, is_known=True)
         run.attach(self.diagnostics)
         self.y, self.f = run.y0, run.start.f

@@ -21,11 +21,12 @@ from numpy.typing import ArrayLike
 from ..checkpoint.locks import absolute
 from ..checkpoint.signals import sigterm_as_ctrl_c
 from ..core.arguments import extra_arguments, floats, parameter_values
+from ..core.conserved import NEAR_DISTANCE
 from ..core.gradients import unless_error
 from ..core.inputs import count, flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
-from ..core.linear import NEAR_DISTANCE, confirmed
+from ..core.linear import confirmed
 from ..core.names import nearest
 from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
@@ -708,30 +709,29 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
 
     If one of them does not hold for the parameters of some member, no member keeps any.
     """
-    task, ready = plan.task, plan.ready
-    if ready.run.linear is None:
+    task, found = plan.task, plan.ready.run.conserved
+    if found.found is None:
         return plan
-    C, request = ready.run.linear.C, task.request
-    holds = len(C) > 0 and (request.params is None or _hold(plan, everyone))
-    projection = {**request.projection, "linear_invariants": (C, C.T) if holds else None}
-    task = dataclasses.replace(task, request=request._replace(projection=projection))
-    return Plan(task, None if len(C) and not holds else ready)
+    C = found.linear.C
+    holds = len(C) > 0 and (task.request.params is None or _hold(plan, everyone))
+    projection = {**task.request.projection, "linear_invariants": (C, C.T) if holds else None}
+    task = dataclasses.replace(task, request=task.request._replace(projection=projection))
+    return Plan(task, None if len(C) and not holds else plan.ready)
 
 
 def _hold(plan: Plan, everyone: Chunk) -> bool:
     """Return True if the linear invariants of the first member hold for the parameters of all members."""
-    linear, system, params = plan.ready.run.linear, plan.ready.system, everyone.params
-    assert linear is not None
-    first = np.unique(params, axis=0, return_index=True)[1]
-    if len(first) == 1 or plan.ready.variations is not None:
+    ready, own = plan.ready, plan.ready.system.parameters.copy()
+    first = np.unique(everyone.params, axis=0, return_index=True)[1]
+    if len(first) == 1 or ready.variations is not None:
         return len(first) == 1
-    own, f = system.parameters.copy(), []
-    states = everyone.y0s[first] + NEAR_DISTANCE * np.abs(everyone.y0s[first]) * np.cos(np.arange(plan.size))
-    for k, y in zip(first, states, strict=True):
-        system.parameters[:] = params[k]
-        f.append(unless_error(system.derivative, plan.t0, y))
-    system.parameters[:] = own
-    return all(x is not None for x in f) and len(confirmed(states, np.array(f), linear.kept).C) == len(linear.C)
+    y = everyone.y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size)))
+    f = np.full(y.shape, np.nan)
+    for k, member in enumerate(first):
+        ready.system.parameters[:] = everyone.params[member]
+        f[k] = unless_error(ready.system.derivative, plan.t0, y[k])
+    ready.system.parameters[:] = own
+    return bool(confirmed(y, f, ready.run.conserved.linear).all())
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:

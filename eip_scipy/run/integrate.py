@@ -480,7 +480,7 @@ class Loop:
                 f"the gradient of {names} is computed by differences: a function for it would be faster and exact"
             )
         run = self.driver.run
-        notes += [] if run.missing is None else [str(run.missing)]
+        notes += [str(run.conserved.missing)] if run.conserved.missing else []
         message = "; ".join(filter(None, (message, run.moved, run.trust.message)))
         return f"{message} ({'; '.join(notes)})" if notes else message
 

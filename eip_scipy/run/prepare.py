@@ -350,7 +350,9 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
     request, form = _with_problem(request)
     if is_compiled(request.fun) or isinstance(request.fun, PointerFunction):
-        request = _with_linear_invariants(request)
+        own = {} if isinstance(request.fun, LibraryFunction) else {"linear_invariants": "auto"}  # problems have frames
+        items = compiled_items(as_invariants(request.projection.get("invariants", ())))
+        request = request._replace(projection=own | dict(request.projection) | {"invariants": items})
     variations = _variations(asked.fun, request, form)
     if variations is not None:
         request, form, acc = _widened(request, variations), FORMS[False, True], None
@@ -377,20 +379,8 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     schedule.g[:] = system.events.values(t0, run.y0)
     run.work.K[0] = run.start.f
     system.events.leave(t0, run.y0, run.work.K[0], run.start.tau * schedule.span.sign, schedule.g)
-    run.work.counters[NFEV] = calls.count
+    run.work.counters[NFEV] = calls.count - run.conserved.calls
     return Prepared(asked, request, system, schedule, run, record, variations)
-
-
-def _with_linear_invariants(request: Request) -> Request:
-    """Return the request of a run with a compiled function, which keeps linear invariants unless another is asked.
-
-    Ready problems have frames of their own.
-    """
-    own = {} if isinstance(request.fun, LibraryFunction) else {"linear_invariants": "auto"}
-    projection = own | dict(request.projection)
-    if "invariants" in projection:
-        projection["invariants"] = compiled_items(as_invariants(projection["invariants"]))
-    return request._replace(projection=projection)
 
 
 def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
@@ -410,7 +400,6 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         left_out=system.left_out,
         sees_velocity=system.name == "fun" and (problem is None or problem.acc is None),
         is_second_order=system.native_form[1].startswith("acceleration"),
-        uncounted=system.derivative,
     )
 
 

@@ -368,7 +368,7 @@ class Search:
 
 
 def _asked_of_the_field(request: Request) -> tuple[bool | None, bool, Particles | None]:
-    """Return the `velocities` of `Look`, whether all functions are called natively, and `Run.missing`.
+    """Return the `velocities` of `Look`, whether all functions are called natively, and the missing `Particles`.
 
     The start is checked as for a run with the invariants: a wrong gradient raises an error, and a quantity that the
     system does not conserve causes a warning.
@@ -381,4 +381,4 @@ def _asked_of_the_field(request: Request) -> tuple[bool | None, bool, Particles 
             velocities = depends_on_velocity(calls, start, "")
         except ValueError:
             velocities = None
-    return velocities, why_not is None, ready.run.missing
+    return velocities, why_not is None, ready.run.conserved.missing

@@ -246,7 +246,7 @@ def _solve(
         _split(sol, wide)
     if sol.status == 1:  # SciPy does not inform the solver that its run has ended
         solvers[0]._watch(ended=True)
-    missing = solvers[0]._run.missing
+    missing = solvers[0]._run.conserved.missing
     message = "; ".join(map(str, filter(None, (sol.message, record.moved, missing, record.message))))
     return OdeResult(sol, message=message, trusted=bool(sol.success) and record.trusted, diagnostics=record)
 
