@@ -28,8 +28,8 @@ class Step:
     """Ingredients of a step.
 
     `fun` is f(t, y), `values` I(t, y) and `gradients` G(t, y) (l, n) of all invariants. `blocks` are lists of
-    components; `frame` is (C, S); the metric is "error", "euclidean" or n weights. `remembered` holds what the error
-    metric remembers by block: the scale, the error in units of the largest relative one, the lasting share.
+    components; `linear_invariants` is (C, S); the metric is "error", "euclidean" or n weights. `remembered` holds what
+    the error metric remembers by block: the scale, the error in units of the largest relative one, the lasting share.
     """
 
     tableau: Any
@@ -41,7 +41,7 @@ class Step:
     atol: float = 1e-6
     metric: Any = "error"
     blocks: Sequence[Sequence[int]] | None = None
-    frame: tuple[Array, Array] | None = None
+    linear_invariants: tuple[Array, Array] | None = None
     direction: str = "new"
     iterations: int = 1
     remembered: Any = (0.0, 0.0, 0.0)
@@ -57,7 +57,7 @@ class Step:
 
     def projected(self, t_old: float, y: Array, t: float, y_hat: Array, err: Array | None, f: Array) -> Array:
         """y_hat on the invariants' targets; `f` is the derivative there, or nearly so."""
-        g = self.defects(t, y_hat)
+        g = self.residuals(t, y_hat)
         sigma, shares, units = self.weights(y, y_hat, err)
         if not g.any():
             return y_hat
@@ -69,7 +69,7 @@ class Step:
             if k >= self.iterations and self.shares(t, now).max() <= MOST_LEFT:
                 break
             B = sigma * self.neutral(floats(self.gradients(t, now)))
-            mu += np.linalg.lstsq(B @ Q.T, -self.defects(t, now), rcond=None)[0]
+            mu += np.linalg.lstsq(B @ Q.T, -self.residuals(t, now), rcond=None)[0]
             move = self.kept(sigma * (Q.T @ mu))
             if k == 0 and shares is not None and self.direction == "new":
                 shift = self.shift(move, shares * floats(f) / sigma, B, sigma, units)
@@ -84,7 +84,7 @@ class Step:
         shift = self.kept(sigma * tangent)
         return (move @ (units * shift)) / (shift @ (units * shift)) * shift
 
-    def defects(self, t: float, y: Array) -> Array:
+    def residuals(self, t: float, y: Array) -> Array:
         """I - target, which is given; 0 where all of it is the rounding of four of the invariants' terms."""
         return self.values(t, y) - self.target if (self.shares(t, y) > 4 * EPS).any() else np.zeros(len(self.target))
 
@@ -135,17 +135,17 @@ class Step:
         return spread(sigma), spread(self.remembered[2] ** 2), spread(inverse**2)
 
     def neutral(self, G: Array) -> Array:
-        """Rows G without what the frame's C y sees of them: G (1 - M C), M = S (C S)^-1."""
-        if self.frame is None:
+        """Rows G without what C y sees of them: G (1 - M C), M = S (C S)^-1."""
+        if self.linear_invariants is None:
             return G
-        C, S = self.frame
+        C, S = self.linear_invariants
         return G - (G @ S) @ np.linalg.solve(C @ S, C)
 
     def kept(self, move: Array) -> Array:
         """A correction that leaves C y alone: (1 - M C) move."""
-        if self.frame is None:
+        if self.linear_invariants is None:
             return move
-        C, S = self.frame
+        C, S = self.linear_invariants
         return move - S @ np.linalg.solve(C @ S, C @ move)
 
 

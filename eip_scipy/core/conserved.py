@@ -124,7 +124,7 @@ def conserved(samples: Samples, projection: ProjectionOptions, method: AnyMethod
     names = names and not all(isinstance(item.function, LibraryFunction) for item in invariants.items)
     found, count = Conserved()[:2]
     with np.errstate(all="ignore"):
-        if may_keep and projection.linear_invariants == "auto" and n <= MOST_COMPONENTS:
+        if may_keep and projection.is_searched and n <= MOST_COMPONENTS:
             samples.near, samples.far = max(n, NEAR), FAR
             found = found_invariants(*samples.points)
             count = len(found.C)

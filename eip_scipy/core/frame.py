@@ -10,7 +10,7 @@ import numpy as np
 
 from ..engine.data import FrameRows
 from .blocks import INDEX
-from .inputs import numbers
+from .inputs import numbers, shown
 
 __all__ = ["frame_rows", "spanned"]
 
@@ -29,15 +29,18 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     if frame is None:
         return NO_FRAME
     pair = tuple(frame) if np.iterable(frame) else ()
-    matrices = [matrix for a in pair if (matrix := numbers("frame", a)) is not None]
+    matrices = [matrix for a in pair if (matrix := numbers("linear_invariants", a)) is not None]
     if len(pair) != 2 or len(matrices) != 2:
-        raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).")
+        raise ValueError(
+            "linear_invariants must be 'auto', None, or a pair (C, S) of matrices of shapes (k, n) and (n, k), "
+            f"got {shown(frame)}."
+        )
     C, S = map(np.atleast_2d, matrices)
     k = C.shape[0]
     if k == 0 or C.shape != (k, n) or S.shape != (n, k):
         raise ValueError(
-            f"frame: C has shape {C.shape} and S {S.shape}; expected real or complex numbers of shapes (k, {n}) and "
-            f"({n}, k) with k >= 1."
+            f"linear_invariants: C has shape {C.shape} and S {S.shape}; expected real or complex numbers of shapes "
+            f"(k, {n}) and ({n}, k) with k >= 1."
         )
     rows = _rows if C.size <= SMALL else _rows.__wrapped__
     found = rows((C.tobytes(), C.dtype.str), (S.tobytes(), S.dtype.str), n, width)
@@ -71,15 +74,15 @@ def _frame_matrices(C: np.ndarray, S: np.ndarray, width: int) -> tuple[np.ndarra
     if width == 2:
         C, S = _real_form(C), _real_form(S)
     elif C.dtype.kind == "c" or S.dtype.kind == "c":
-        raise ValueError("frame: C and S must be real for a real state.")
+        raise ValueError("linear_invariants: C and S must be real for a real state.")
     # Rows of C and columns of S in units of their own: only then does the condition number tell singular from scaled.
     C = C / np.maximum(np.abs(C).max(axis=1, keepdims=True), np.finfo(float).tiny)
     S = S / np.maximum(np.abs(S).max(axis=0, keepdims=True), np.finfo(float).tiny)
     shifts = C @ S
     if not np.all(np.isfinite(shifts)) or not np.linalg.cond(shifts) < 1e12:
         raise ValueError(
-            "frame: C S is singular; S must span shifts that change every row of C y, the rows of C must be linearly "
-            "independent, and C and S must be finite."
+            "linear_invariants: C S is singular; S must span shifts that change every row of C y, the rows of C must "
+            "be linearly independent, and C and S must be finite."
         )
     return C, np.ascontiguousarray(np.linalg.solve(shifts.T, S.T))
 

@@ -21,7 +21,7 @@ from ..methods.orders import AT_REST
 from . import steppers
 from .blocks import blocks_of, kinds_of
 from .frame import frame_rows
-from .inputs import count, flag, real_array, shown
+from .inputs import count, flag, real_array
 from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet
 from .stepping import AnyMethod, Stepping
 
@@ -41,8 +41,7 @@ Documented = TypeVar("Documented", bound=Any)
 
 Metric = Literal["error", "euclidean"] | Sequence[float] | np.ndarray | None
 Blocks = int | Sequence[ArrayLike] | None
-Frame = tuple[ArrayLike, ArrayLike] | None
-Linear = Literal["auto", "given"] | Frame
+LinearConstraints = Literal["auto"] | tuple[ArrayLike, ArrayLike] | None
 
 
 class ProjectionDetails(TypedDict, total=False):
@@ -50,8 +49,7 @@ class ProjectionDetails(TypedDict, total=False):
 
     metric: Metric
     blocks: Blocks
-    frame: Frame
-    linear_invariants: Linear
+    linear_invariants: LinearConstraints
     direction: Literal["new", "old", "midpoint"]
     iterations: int
     every: int | Literal["auto"] | None
@@ -83,18 +81,15 @@ class ProjectionOptions:
         Groups of components with a common weight in the error metric: the number of consecutive components in each
         group, or index arrays. For positions and velocities of bodies in 3 dimensions use ``blocks=3``. Default: each
         component has its own weight.
-    frame : (C, S), optional
-        Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and S, of shape (n, k),
-        whose columns are the directions in which the correction is shifted so that C y stays unchanged; C S must be
-        invertible. It takes precedence over `linear_invariants`.
-    linear_invariants : {"auto", "given"}, (C, S) or None, optional
-        Linear invariants that the corrections leave unchanged. "auto": they are found at the start, from values of
-        `fun` at points near the start and a few at larger distances, whose number is not in ``nfev``: quantities c y
-        with c f = 0, as momentum, and those whose rates are such quantities, as the centre of mass. Those that the
-        `invariants` determine are left out. Nothing is found for complex states, more than 300 components, balances,
-        user-defined one-step methods, or if a value is not finite. "given": only those of `particle_invariants`. (C,
-        S): as `frame`. None: no linear invariants. `Diagnostics.remarks` has their number. Default: "auto" for the
-        compiled functions of `integrate` and `ensemble`, otherwise "given".
+    linear_invariants : (C, S), "auto" or None, optional
+        Linear invariants C y, with C of shape (k, n), that the correction leaves unchanged, and S, of shape (n, k),
+        whose columns are the directions in which the correction is shifted for that; C S must be invertible. "auto":
+        they are found at the start, from values of `fun` at points near the start and a few at larger distances, whose
+        number is not in ``nfev``: quantities c y with c f = 0, as momentum, and those whose rates are such quantities,
+        as the centre of mass. Those that the `invariants` determine are left out. Nothing is found for complex states,
+        more than 300 components, balances, user-defined one-step methods, or if a value is not finite. None: only
+        those of `particle_invariants`. `Diagnostics.remarks` has their number. Default: "auto" for the compiled
+        functions of `integrate` and `ensemble`, otherwise None; a `Problem` may have its own.
     direction : {"new", "old", "midpoint"}, optional
         State at which the gradients that span the correction are evaluated: the raw result of the step (default), its
         start, or the midpoint.
@@ -117,15 +112,14 @@ class ProjectionOptions:
         these.
     project_initial : bool, optional
         Project y0 onto given targets before the first step, by the correction with the smallest 2-norm: all components
-        have equal weights, regardless of `metric` and `blocks`, and C y of a frame stays unchanged. `Diagnostics.moved`
-        says how far y0 moved. To fix components, call `project` with ``sigma=``.
+        have equal weights, regardless of `metric` and `blocks`, and linear invariants stay unchanged.
+        `Diagnostics.moved` says how far y0 moved. To fix components, call `project` with ``sigma=``.
     """
 
     invariants: Any = ()
     metric: Any = None
     blocks: Any = None
-    frame: Any = None
-    linear_invariants: Any = "given"
+    linear_invariants: Any = None
     direction: str = "new"
     iterations: int = 1
     every: int | str | None = None
@@ -148,13 +142,13 @@ class ProjectionOptions:
 
     @property
     def constraints(self) -> Any:
-        """Return the pair (C, S) that was given as `frame` or as `linear_invariants`; None if there is none."""
-        option = self.linear_invariants
-        is_name = isinstance(option, str)
-        is_pair = not is_name and np.iterable(option) and len(tuple(option)) == 2
-        if not (option is None or is_pair or (is_name and option in ("auto", "given"))):
-            raise ValueError(f"linear_invariants must be 'auto', 'given', a pair (C, S) or None, got {shown(option)}.")
-        return option if self.frame is None and not is_name else self.frame
+        """Return the pair (C, S) if one was given as `linear_invariants`, not yet checked, else None."""
+        return None if self.is_searched else self.linear_invariants
+
+    @property
+    def is_searched(self) -> bool:
+        """Return True if linear invariants are to be found."""
+        return isinstance(self.linear_invariants, str) and self.linear_invariants == "auto"
 
     def settled(
         self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, f0: np.ndarray, known: InvariantSet
@@ -238,8 +232,9 @@ class ProjectionOptions:
             "metric": {data.EUCLIDEAN: "euclidean", data.BY_ERROR: "error"}.get(o.metric, sigma),
             "blocks": (o.groups.start, o.groups.member),
             # The given value, because the one in `o` comes from LAPACK, whose last bits differ between machines.
-            "frame": None if self.constraints is None else [np.asarray(a, y0.dtype) for a in self.constraints],
-            "linear_invariants": "auto" if isinstance(self.linear_invariants, str) else None,
+            "linear_invariants": "auto"
+            if self.is_searched
+            else self.constraints and [np.asarray(a, y0.dtype) for a in self.constraints],
             "direction": self.direction,
             "iterations": o.iterations,
             "every": "auto" if o.every == data.AUTO else o.every,

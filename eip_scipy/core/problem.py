@@ -20,7 +20,7 @@ __all__ = [
 ]  # fmt: skip
 
 # Options of the projection that a problem brings.
-BROUGHT = ("invariants", "metric", "blocks", "frame")
+BROUGHT = ("invariants", "metric", "blocks", "linear_invariants")
 MOST = 12  # components that are printed
 
 
@@ -64,8 +64,8 @@ class Problem:
     t_span : tuple of float
         Start and end in the unit of time of the problem.
     invariants : tuple of Invariant
-        Invariants of the equations (linear ones are in `frame`), with ``args=(params,)``. They can be given as an
-        Invariant, a function, or a sequence of them.
+        Invariants of the equations, with ``args=(params,)``; linear ones are in `linear_invariants`. They can be given
+        as an Invariant, a function, or a sequence of them.
     rhs : callable, optional
         Compiled right-hand side in place: ``rhs(t, y, out, params)``, or a `scipy.LowLevelCallable`.
     acc : callable, optional
@@ -74,7 +74,7 @@ class Problem:
         A suitable fixed step.
     params : ndarray, optional
         Parameters of `rhs`, `acc` and the invariants' functions.
-    metric, blocks, frame
+    metric, blocks, linear_invariants
         Options of the projection that suit the problem (see `EIPSolver`).
     method : Tableau, NystromTableau, GaussJackson or OneStepMethod, optional
         Method that suits the problem, in a form that `eip_method` accepts; `integrate` uses it by default.
@@ -122,7 +122,7 @@ class Problem:
     params: np.ndarray | None = None
     metric: Any = None
     blocks: Any = None
-    frame: tuple[np.ndarray, np.ndarray] | None = None
+    linear_invariants: tuple[np.ndarray, np.ndarray] | None = None
     units: str = ""
     reference: Callable[[float], np.ndarray | None] | None = None
     source: str = ""
@@ -161,9 +161,9 @@ class Problem:
         t_span, y0 : optional
             Interval and initial state; default: those of the problem.
         method : type or str
-            An EIP method, which receives the invariants, metric, blocks and frame, and the step `h` unless rtol, atol,
-            first_step, max_step or h is given; or a method of SciPy, which receives none of these. Implicit EIP methods
-            receive `stiff_invariants` and no step. All methods receive the events.
+            An EIP method, which receives the invariants, linear ones too, metric, blocks, and the step `h` unless rtol,
+            atol, first_step, max_step or h is given; or a method of SciPy, which receives none of these. Implicit EIP
+            methods receive `stiff_invariants` and no step. All methods receive the events.
         **options
             Options of `solve_ivp` and of the method; they take precedence.
 
@@ -265,7 +265,7 @@ class Problem:
             f"{self.name}: y = ({state}), {start}",
             f"  interval    {'; '.join(filter(None, (', '.join(interval) or 'none', self.units, zero)))}",
             f"  invariants  {kept or 'none'}",
-            f"  functions   {functions}; options {', '.join(having(('metric', 'blocks', 'frame'))) or 'none'}",
+            f"  functions   {functions}; options {', '.join(having(BROUGHT[1:])) or 'none'}",
             f"  source      {self.source or 'not given'}",
         ]
         return "\n".join(lines)

@@ -31,7 +31,7 @@ def project(
     *,
     t: float = 0.0,
     sigma: Any = None,
-    frame: Any = None,
+    linear_invariants: Any = None,
     iterations: int = 1,
     target: Any = None,
     f: Any = None,
@@ -49,7 +49,7 @@ def project(
         Time at which the invariants are evaluated.
     sigma : array_like, shape (n,), optional
         Weights of the components: components with larger weights move more. Default: all 1, the euclidean metric.
-    frame : (C, S), optional
+    linear_invariants : (C, S), optional
         Linear constraints C y that the correction leaves unchanged; see `EIPSolver`.
     iterations : int, optional
         Number of Newton steps. One step leaves errors of second order in the errors of y_hat.
@@ -64,7 +64,7 @@ def project(
     Returns
     -------
     ProjectionResult
-        ``y`` (n,), ``defect`` (l,) = I(y) - target, ``rank``, ``correction`` (n,).
+        ``y`` (n,), ``residual`` (l,) = I(y) - target, ``rank``, ``correction`` (n,).
 
     Raises
     ------
@@ -79,8 +79,8 @@ def project(
 
     Notes
     -----
-    The correction is y - y_hat = sigma * x (with a frame, shifted along S), where x has the smallest 2-norm with
-    (G sigma) x = -(I(y_hat) - target), and G contains the gradients at y_hat. It is computed by column-pivoted QR, so
+    The correction is y - y_hat = sigma * x, shifted along S with linear invariants, where x has the smallest 2-norm
+    with (G sigma) x = -(I(y_hat) - target), and G contains the gradients at y_hat. A column-pivoted QR computes it, so
     that dependent gradients reduce the rank instead of failing. Errors within four rounding errors of the terms of an
     invariant are not corrected.
 
@@ -89,7 +89,7 @@ def project(
     >>> import numpy as np
     >>> from eip_scipy import Invariant, project
     >>> length = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=1.0)
-    >>> project(np.array([0.6, 0.81]), length, iterations=3).defect
+    >>> project(np.array([0.6, 0.81]), length, iterations=3).residual
     array([0.])
     """
     if not is_number(t, "t") or not math.isfinite(t):
@@ -101,7 +101,7 @@ def project(
     given = ProjectionOptions(
         invariants=invariants,
         metric=None if sigma is None else weights("sigma", sigma, n),  # None: the euclidean metric
-        frame=frame,
+        linear_invariants=linear_invariants,
         iterations=iterations,
         check=False,
     )
@@ -122,16 +122,16 @@ def project(
     out, status = run.projected(derivative, t, y)
     if status != 0:
         raise ValueError(projection_failure(known, work, t))
-    left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
+    left = np.abs(work.residual) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
     for k in np.flatnonzero(left > LARGE_SHARE):
         warnings.warn(
-            f"the projection left an error of {work.defect[k]:.3g} in {known.names[k]!r}, {left[k]:.2g} of the size of "
-            "its terms: the state was far from the target, or the gradient is wrong; increase iterations, or correct "
-            "grad",
+            f"the projection left an error of {work.residual[k]:.3g} in {known.names[k]!r}, {left[k]:.2g} of the size "
+            "of its terms: the state was far from the target, or the gradient is wrong; increase iterations, or "
+            "correct grad",
             ProjectionWarning,
             stacklevel=2,
         )
-    return ProjectionResult(out, work.defect.copy(), int(work.counters[LAST_RANK]), out - y)
+    return ProjectionResult(out, work.residual.copy(), int(work.counters[LAST_RANK]), out - y)
 
 
 def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:

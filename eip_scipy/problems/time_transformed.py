@@ -65,7 +65,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     -------
     Problem
         A problem with the state (y, t), where t = ``problem.t_span[0]`` at the start. It has the same invariants,
-        blocks and frame, which do not contain t. It has no step `h`.
+        blocks and linear invariants, which do not contain t. It has no step `h`.
 
     Raises
     ------
@@ -94,9 +94,9 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         )
     params = np.zeros(0) if problem.params is None else problem.params
     rhs = _transformed_rhs(jitted_call(problem.rhs), jitted(g))
-    n, blocks, frame = problem.y0.size, problem.blocks, problem.frame
-    if frame is not None:
-        frame = np.pad(frame[0], ((0, 0), (0, 1))), np.pad(frame[1], ((0, 1), (0, 0)))
+    n, blocks, kept = problem.y0.size, problem.blocks, problem.linear_invariants
+    if kept is not None:
+        kept = np.pad(kept[0], ((0, 0), (0, 1))), np.pad(kept[1], ((0, 1), (0, 0)))
     return Problem(
         name=f"{problem.name} in fictitious time",
         fun=bind(rhs, params),
@@ -107,7 +107,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         invariants=tuple(_transformed_invariant(item, problem) for item in problem.invariants),
         component_names=None if problem.component_names is None else (*problem.component_names, "t"),
         blocks=tuple(np.arange(n).reshape(-1, blocks)) if isinstance(blocks, int) else blocks,
-        frame=frame,
+        linear_invariants=kept,
         units=problem.units and f"state in {problem.units}",  # fictitious time has no unit
         source=problem.source,
     )

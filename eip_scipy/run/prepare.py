@@ -350,7 +350,9 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
     request, form = _with_problem(request)
     if is_compiled(request.fun) or isinstance(request.fun, PointerFunction):
-        own = {} if isinstance(request.fun, LibraryFunction) else {"linear_invariants": "auto"}  # problems have frames
+        own = (
+            {} if isinstance(request.fun, LibraryFunction) else {"linear_invariants": "auto"}
+        )  # problems have their own
         items = compiled_items(as_invariants(request.projection.get("invariants", ())))
         request = request._replace(projection=own | dict(request.projection) | {"invariants": items})
     variations = _variations(asked.fun, request, form)
@@ -488,7 +490,7 @@ def _method(method: Any) -> Any:
 def _check_choices(request: Request) -> None:
     callback, compiled = request.callback, request.compiled
     if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be a function callback(t, y, defects), got {shown(callback)}.")
+        raise TypeError(f"callback must be a function callback(t, y, residuals), got {shown(callback)}.")
     flag("progress", request.progress)
     flag("dense_output", request.dense_output)
     if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
@@ -535,8 +537,11 @@ def _with_problem(request: Request) -> tuple[Request, str]:
         return request._replace(fun=fun, t_span=t_span, y0=y0, projection=projection), form
     if request.args is not None:
         raise TypeError("args: a Problem has params; pass params=..., or its functions instead of the Problem.")
-    brought = BROUGHT if isinstance(projection.get("linear_invariants", ""), str) else BROUGHT[:-1]
-    own_options = {name: getattr(problem, name) for name in brought}
+    own_options = {name: getattr(problem, name) for name in BROUGHT}
+    if own_options["linear_invariants"] is None:
+        del own_options["linear_invariants"]  # they may be found
+    elif isinstance(projection.get("linear_invariants"), str):
+        del projection["linear_invariants"]
     if request.method.TABLEAU.drives:
         own_options["invariants"] = problem.stiff_invariants
     projection = own_options | projection

@@ -11,7 +11,7 @@ from ..core.acceleration import AccelerationField
 from ..core.inputs import flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
-from ..core.options import Blocks, Frame, Linear, Metric
+from ..core.options import Blocks, LinearConstraints, Metric
 from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
 from ..core.states import initial_state
@@ -31,8 +31,7 @@ class RecommendKeywords(TypedDict, total=False):
     jacobian: Callable[..., Any] | None
     metric: Metric
     blocks: Blocks
-    frame: Frame
-    linear_invariants: Linear
+    linear_invariants: LinearConstraints
     compiled: bool | None
 
 
@@ -76,7 +75,7 @@ def recommend(
     t_eval : array_like, optional
         Times at which the recommended run saves states, as for `integrate`. The comparison of methods then includes
         the evaluations for states between steps.
-    params, in_place, jacobian, metric, blocks, frame, linear_invariants, compiled
+    params, in_place, jacobian, metric, blocks, linear_invariants, compiled
         As for `integrate`, for all runs. With `jacobian`, or a problem that has one, `EIPGJ14` is tried.
 
     Returns

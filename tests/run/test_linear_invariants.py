@@ -163,7 +163,7 @@ def test_contact_after_the_start_is_reported():
 def test_nothing_is_found():
     """Functions in Python and runs with a given frame are not searched; a value that is not finite ends a search."""
     C = np.kron(np.eye(2), np.kron(MASSES, np.eye(2)))
-    given = integrate(springs, (0, 1), START, invariants=[H, *L], frame=(C, C.T), **FIXED)
+    given = integrate(springs, (0, 1), START, invariants=[H, *L], linear_invariants=(C, C.T), **FIXED)
     same = integrate(springs, (0, 1), START, invariants=[H, *L], linear_invariants=(C, C.T), **FIXED)
     assert given.diagnostics.remarks == same.diagnostics.remarks == ()
     np.testing.assert_array_equal(given.y, same.y)
@@ -173,7 +173,7 @@ def test_nothing_is_found():
         run = integrate(lambda t, y: np.array([1.0, -1.0]) * np.log(y[1] - 1.0), **options)
     assert run.diagnostics.remarks == ()
     for wrong in ("all", 3.0, (C,)):
-        with pytest.raises(ValueError, match="linear_invariants must be 'auto', 'given', a pair"):
+        with pytest.raises(ValueError, match="linear_invariants must be 'auto', None, or a pair"):
             integrate(springs, (0, 1), START, invariants=H, linear_invariants=wrong, **FIXED)
 
 
