@@ -6,8 +6,7 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPGJ12, EIPRKN8, EIPRKN12, Invariant, eip_method, integrate
 from eip_scipy.methods import NystromTableau
-from eip_scipy.methods.nystrom import RKN86, RKN1210
-from eip_scipy.methods.nystrom_interpolants import interpolant
+from eip_scipy.methods.nystrom import RKN86, RKN1210, interpolant
 from eip_scipy.problems import kepler
 
 both = pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12])

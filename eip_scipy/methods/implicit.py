@@ -1,4 +1,4 @@
-"""SciPy's implicit solvers as makers of the unprojected step: `EIPRadau` and `EIPBDF` drive them and project.
+"""Methods whose unprojected steps are made by SciPy's implicit solvers, Radau and BDF.
 
 A solver of SciPy controls its error and the length of its steps. The engine lets it make a step, projects the result,
 and returns the projected state to it before the next step. Some attributes that are used here are private: `PRIVATE`
@@ -12,37 +12,33 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import scipy
-from scipy.integrate import BDF, DenseOutput, OdeSolver, Radau
+import scipy.integrate
+from scipy.integrate import DenseOutput, OdeSolver
 from scipy.linalg import invpascal
 from scipy.sparse import issparse
 
-from ..engine.data import NFEV, NJEV, NLU, Work
-from ..engine.native import BUILD
-from ..methods.orders import Ordered
+from ..engine.data import NFEV, NJEV, NLU, POLYNOMIAL, Work
+from ..engine.native import BUILD, Hooks
+from .base import DenseForm, Method
 
 if TYPE_CHECKING:
-    from .stepping import Stepping
+    from ..core.run_spec import RunSpec
+    from ..core.runs import Run, Start
 
-__all__ = ["DRIVEN_BDF", "DRIVEN_RADAU", "Driven", "Jacobian", "Stepper"]
+__all__ = ["BDF", "RADAU", "Jacobian", "ScipySolverAdapter"]
 
 Array = np.ndarray
-Derivative = Callable[[float, Array], Array]
 
 # Largest relative shift of a component in SciPy's numerical Jacobian, as in MATLAB's numjac. Without it the shifts
 # of components that do not occur in the equations grow tenfold with each Jacobian until they overflow.
 LARGEST_SHIFT = 0.1
-# Exponent of the relative error estimates in the weights of the projection. On a chain with dampers the errors of Radau
-# are 0.03 of those without projection, and 0.09 with weights from the tolerances alone (exponent 0). The errors of BDF
-# are the same with both exponents there, and ten times larger with exponent 0 on the flyball governor.
-KAPPA = 1.0
 COUNTERS = {"nfev": NFEV, "njev": NJEV, "nlu": NLU}
 # Private attributes of SciPy's solvers.
 PRIVATE = {
-    Radau: ("f", "Z", "h_abs", "solve_lu", "LU_real", "LU_complex", "sol"),
-    BDF: ("D", "order", "error_const", "h_abs", "LU"),
+    scipy.integrate.Radau: ("f", "Z", "h_abs", "solve_lu", "LU_real", "LU_complex", "sol"),
+    scipy.integrate.BDF: ("D", "order", "error_const", "h_abs", "LU"),
 }
-# Coefficients of x, x^2 and x^3, in terms of Radau's stages, of the polynomial through 0 and the stages at the nodes C.
+# Nodes of the stages of Radau.
 SQRT_6 = 6**0.5
 NODES = np.array([(4 - SQRT_6) / 10, (4 + SQRT_6) / 10, 1.0])
 MOST_ORDER = 5  # of BDF
@@ -55,95 +51,89 @@ class Jacobian(NamedTuple):
     jac_sparsity: Any = None
 
 
-class Driven(Ordered):
-    """A method whose steps are made by SciPy's class `solver`; it takes the place of a tableau.
+class ScipySolverAdapter(Method):
+    """A method whose steps are made by the class `solver` of SciPy.
 
-    `stepper` is the subclass of `Stepper` that accesses the private attributes of this solver. Entry (p, j) of
-    `polynomials` (k, k) is the coefficient of x^(p + 1), x = (t - t_old) / h, in the interpolant, which multiplies the
-    j-th row that `Stepper._describe` fills.
+    Entry (p, j) of `polynomials` (k, k) is the coefficient of x^(p + 1), x = (t - t_old) / h, in the interpolant, which
+    multiplies the j-th row that `_describe` fills. The solver of a run is created in its first step. `not_finite_at` is
+    a time at which the right-hand side had a value that is not finite in the last step, or None. The engine reads `b`,
+    `c`, `exponent` and `multistep`, as those of a tableau; the array work.K has one row more than `b` has entries.
     """
 
-    in_python = True
-    drives = True
-    kappa = KAPPA
-
-    def __init__(
-        self,
-        solver: type[OdeSolver],
-        stepper: type[Stepper],
-        order: int,
-        error_estimator_order: int,
-        polynomials: Array,
-        takes_complex: bool,
-    ) -> None:
-        self.name, self.solver, self._stepper = solver.__name__, solver, stepper
-        self.order, self.error_estimator_order, self.takes_complex = order, error_estimator_order, takes_complex
-        # The first and the last row of work.K are the derivatives at both ends of a step.
-        self.weights = np.pad(polynomials, ((0, 0), (1, 1)))
-
-    def __repr__(self) -> str:
-        return f"<Driven {self.name}>"
-
-    def stepper(self) -> Stepper:
-        """Return a new `Stepper`, which makes the steps of one run."""
-        return self._stepper(self)
-
-
-class Stepper:
-    """Maker of the steps of one run, by a solver of SciPy that is created in the first step.
-
-    `solver` is the solver of SciPy, None before the first step. `not_finite_at` is a time at which the right-hand side
-    had a value that is not finite in the last step, or None. `b`, `c`, `exponent` and `multistep` are attributes of a
-    tableau that the engine reads. The array work.K has one row more than `b` has entries.
-    """
-
-    multistep = None
+    in_python = drives = True
+    # Exponent of the relative error estimates in the weights of the projection. On a chain with dampers the errors of
+    # Radau are 0.03 of those without projection, and 0.09 with weights from the tolerances alone (exponent 0). The
+    # errors of BDF are the same with both exponents there, and ten times larger with exponent 0 on a flyball governor.
+    kappa = 1.0
     exponent = 0.0
+    multistep = None
+    solver: type[OdeSolver]
+    polynomials: Array
+    takes_complex: bool
 
-    def __init__(self, method: Driven) -> None:
-        self.method = method
-        self.b = self.c = np.zeros(method.weights.shape[1] - 1)
-        self.solver: Any = None
+    def __init__(self) -> None:
+        self.name = self.solver.__name__
+        self.b = self.c = np.zeros(len(self.polynomials) + 1)
         self.not_finite_at: float | None = None
+        self._solver: Any = None  # of this run
         self._make: Callable[[], OdeSolver]
         self._before: dict[str, Any] = {}
         self._counted = dict.fromkeys(COUNTERS, 0)
 
-    def begin(self, rhs: Derivative, start: Any, stepping: Stepping, jacobian: Jacobian | None) -> None:
-        """Prepare the steps of a run; `start` consists of t, y, f and the length of the first step."""
-        (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
-        if y.dtype.kind == "c" and not self.method.takes_complex:
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}>"
+
+    def for_engine(self, sees_velocity: bool = False) -> ScipySolverAdapter:
+        """Return a new object, which makes the steps of one run."""
+        return type(self)()
+
+    def hooks(self, stepper: Any, work: Work) -> Hooks:
+        """Return the function that makes a step, see `Method.hooks`."""
+        return Hooks(one_step=partial(stepper.fill, work), estimates=True, drives=True)
+
+    def dense_form(self, stepper: Any) -> DenseForm:
+        """Return the form of the interpolants, the polynomials."""
+        # The first and the last row of work.K are the derivatives at both ends of a step.
+        return DenseForm(POLYNOMIAL, 1 + len(self.polynomials), np.pad(self.polynomials, ((0, 0), (1, 1))))
+
+    def begin(self, spec: RunSpec, run: Run, start: Start) -> None:
+        """Prepare the steps of a run, which ``run.method`` makes."""
+        run.method._begin(spec, start)
+
+    def _begin(self, spec: RunSpec, start: Start) -> None:
+        (t, y, f, length), rtol, span = start, spec.stepping.rtol, spec.stepping.span
+        if y.dtype.kind == "c" and not self.takes_complex:
             raise ValueError(
-                f"y0 is complex, but SciPy's {name} takes real states only. Use EIPBDF, or write the state in real and "
-                "imaginary parts."
+                f"y0 is complex, but SciPy's {self.name} takes real states only. Use EIPBDF, or write the state in "
+                "real and imaginary parts."
             )
         if rtol.size and np.ptp(rtol) > 0:
-            raise ValueError(f"rtol={rtol}: SciPy's {name} takes one number. Give atol by component instead.")
+            raise ValueError(f"rtol={rtol}: SciPy's {self.name} takes one number. Give atol by component instead.")
         known = [f]  # the solver's first call asks for this derivative
 
         def fun(t: float, y: Array) -> Array:
-            found = known.pop() if known else rhs(t, y)
+            found = known.pop() if known else spec.rhs(t, y)
             if not BUILD.are_finite(found.view(float)):
                 self.not_finite_at = t
             return found
 
-        make: Any = self.method.solver
-        self.solver, self._make = None, partial(
-            make, fun, t, y, stepping.span.t_bound, max_step=stepping.span.max_step,
-            rtol=float(rtol.max(initial=0.0)), atol=stepping.atol, first_step=length,
-            **(jacobian or Jacobian())._asdict(),
+        make: Any = self.solver
+        jacobian = spec.jacobian() or Jacobian()
+        self._solver, self._make = None, partial(
+            make, fun, t, y, span.t_bound, max_step=span.max_step, rtol=float(rtol.max(initial=0.0)),
+            atol=spec.stepping.atol, first_step=length, **jacobian._asdict(),
         )  # fmt: skip
 
     def _made(self) -> Any:
         """Make and return SciPy's solver, without counting the evaluations of its Jacobian at the start."""
-        solver = self._make()
+        solver: Any = self._make()
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
-        lacking = [name for name in PRIVATE[self.method.solver] if not hasattr(solver, name)]
+        lacking = [name for name in PRIVATE[self.solver] if not hasattr(solver, name)]
         if lacking:
             raise NotImplementedError(
-                f"EIP{self.method.name} uses attributes of scipy.integrate.{self.method.name} that SciPy "
-                f"{scipy.__version__} does not have: {', '.join(lacking)}. Use another version of SciPy."
+                f"EIP{self.name} uses attributes of scipy.integrate.{self.name} that SciPy {scipy.__version__} does "
+                f"not have: {', '.join(lacking)}. Use another version of SciPy."
             )
         self._keep_finite(solver)
         self._watch(solver)
@@ -172,13 +162,14 @@ class Stepper:
         fails because the step would become too short.
         """
         self.not_finite_at = None
-        if self.solver is None:
-            self.solver = self._made()
-        solver = self.solver
+        if self._solver is None:
+            self._solver = self._made()
+        solver = self._solver
         longest = solver.max_step
         if again:
-            solver.max_step = 0.5 * abs(solver.t - self._before["t"])
-            self._restore()
+            # SciPy's solver returns to the state before the last step, and must make its factorisations again.
+            half = 0.5 * abs(solver.t - self._before["t"])
+            vars(solver).update(self._before | dict.fromkeys(self._factors(), None) | {"max_step": half})
         else:
             if not np.array_equal(y, solver.y):
                 self._move(y)
@@ -187,7 +178,10 @@ class Stepper:
             solver.jac_factor = np.minimum(solver.jac_factor, LARGEST_SHIFT)
         solver.step()
         solver.max_step = longest
-        self._count(w)
+        for name, place in COUNTERS.items():
+            found = getattr(solver, name)
+            w.counters[place] += found - self._counted[name]
+            self._counted[name] = found
         if solver.status == "failed":
             return None
         h = solver.t - t
@@ -197,41 +191,29 @@ class Stepper:
         w.K[-1] = self._slope(w.K[1:-1])
         return float(solver.t), float(solver.h_abs)
 
-    def _count(self, w: Work) -> None:
-        for name, place in COUNTERS.items():
-            found = getattr(self.solver, name)
-            w.counters[place] += found - self._counted[name]
-            self._counted[name] = found
-
     def _kept(self) -> dict[str, Any]:
-        """Return the attributes of SciPy's solver that `_restore` sets to take it back to the state before a step."""
-        return {name: value for name, value in vars(self.solver).items() if name not in (*COUNTERS, "jac_factor")}
-
-    def _restore(self) -> None:
-        """Take SciPy's solver back to the state before the last step; it must compute its LU factorisations again."""
-        vars(self.solver).update(
-            self._before | dict.fromkeys(self._factors(), None) | {"max_step": self.solver.max_step}
-        )
+        """Return the attributes of SciPy's solver that take it back to the state before a step."""
+        return {name: value for name, value in vars(self._solver).items() if name not in (*COUNTERS, "jac_factor")}
 
     def _factors(self) -> list[str]:
-        return [name for name in vars(self.solver) if name.startswith("LU")]
+        return [name for name in vars(self._solver) if name.startswith("LU")]
 
     def state(self) -> dict[str, Any] | None:
-        """Return the values from which another stepper continues with the same bits; None before the first step."""
-        if self.solver is None:
+        """Return the values from which another object continues with the same bits; None before the first step."""
+        if self._solver is None:
             return None
-        own = vars(self.solver)
+        own = vars(self._solver)
         values = {name: value for name, value in own.items() if isinstance(value, DenseOutput) or not callable(value)}
         # Sparse factorisations cannot be copied; the solver makes them again.
         return values | {name: None for name in self._factors() if not isinstance(values[name], tuple)}
 
     def resume(self, values: dict[str, Any] | None) -> None:
-        """Continue from the `state` of another stepper; `begin` must have been called before."""
+        """Continue from the `state` of another object; `begin` must have been called before."""
         if values is None:
             return
-        self.solver = self._made()
-        vars(self.solver).update(values)
-        self._counted = {name: getattr(self.solver, name) for name in COUNTERS}
+        self._solver = self._made()
+        vars(self._solver).update(values)
+        self._counted = {name: getattr(self._solver, name) for name in COUNTERS}
 
     def _watch(self, solver: Any) -> None:
         """Change the solver so that it keeps values of a step that `_error` needs."""
@@ -245,7 +227,7 @@ class Stepper:
         raise NotImplementedError
 
     def _describe(self, h: float, rows: Array) -> None:
-        """Fill `rows` with the vectors that the `polynomials` of `Driven` combine into the last step's interpolant."""
+        """Fill `rows` with the vectors that the `polynomials` combine into the last step's interpolant."""
         raise NotImplementedError
 
     def _slope(self, rows: Array) -> Array:
@@ -253,13 +235,16 @@ class Stepper:
         raise NotImplementedError
 
 
-class RadauStepper(Stepper):
-    """Stepper for SciPy's Radau.
+class _Radau(ScipySolverAdapter):
+    """Adapter of SciPy's Radau.
 
     The derivative is evaluated again at a projected state, because the error estimate needs it. The predictor of the
     next step extrapolates the unprojected polynomial of the last step.
     """
 
+    solver, order, error_estimator_order, takes_complex = scipy.integrate.Radau, 5, 3, False
+    # Coefficients of x, x^2 and x^3, in terms of Radau's stages, of the polynomial through 0 and the stages.
+    polynomials = np.linalg.inv(NODES[:, None] ** np.arange(1, 4))
     _solved: Array
 
     def _watch(self, solver: Any) -> None:
@@ -272,21 +257,22 @@ class RadauStepper(Stepper):
         solver.solve_lu = solve_lu
 
     def _move(self, y: Array) -> None:
-        self.solver.y = y
-        self.solver.f = self.solver.fun(self.solver.t, y)
+        self._solver.y = y
+        self._solver.f = self._solver.fun(self._solver.t, y)
 
     def _error(self, h: float) -> Array:
         return self._solved  # an accepted step ends with the linear system whose solution is the error estimate
 
     def _describe(self, h: float, rows: Array) -> None:
-        np.divide(self.solver.Z, h, out=rows)
+        np.divide(self._solver.Z, h, out=rows)
 
     def _slope(self, rows: Array) -> Array:
-        return self.solver.f
+        slope: Array = self._solver.f
+        return slope
 
 
-class BDFStepper(Stepper):
-    """Stepper for SciPy's BDF, whose history consists of backward differences D of states at equal distances in time.
+class _BDF(ScipySolverAdapter):
+    """Adapter of SciPy's BDF, whose history consists of backward differences D of states at equal distances in time.
 
     A projection shifts all states of the history by the same vector, so that the differences stay unchanged. On a
     chain with dampers the errors are 0.23 of those without projection, with 1.33 times the evaluations. To shift only
@@ -294,19 +280,22 @@ class BDFStepper(Stepper):
     with 1.35 times the evaluations.
     """
 
+    solver, order, error_estimator_order, takes_complex = scipy.integrate.BDF, 1, 1, True
+    polynomials = np.eye(MOST_ORDER)
+
     def _kept(self) -> dict[str, Any]:
-        return super()._kept() | {"D": self.solver.D.copy()}
+        return super()._kept() | {"D": self._solver.D.copy()}
 
     def _move(self, y: Array) -> None:
-        self.solver.y = y
-        self.solver.D[0] = y
+        self._solver.y = y
+        self._solver.D[0] = y
 
     def _error(self, h: float) -> Array:
-        solver, order = self.solver, self._before["order"]
+        solver, order = self._solver, self._before["order"]
         difference = solver.D[order + 1]
         if solver.order > order:  # then this difference has been scaled to the next step's length
             difference = difference / (solver.h_abs / abs(h)) ** (order + 1)
-        return solver.error_const[order] * difference
+        return np.asarray(solver.error_const[order] * difference)
 
     def _describe(self, h: float, rows: Array) -> None:
         """Fill `rows` with the coefficients of x, x^2, ... in the interpolant, divided by h, where x = (t - t_old) / h.
@@ -314,10 +303,10 @@ class BDFStepper(Stepper):
         The solver has already changed its differences D to the length of the next step. Therefore x - 1 is scaled
         by the ratio of the two lengths.
         """
-        order = self.solver.order
-        ratio = (abs(h) / self.solver.h_abs) ** np.arange(MOST_ORDER + 1)
+        order = self._solver.order
+        ratio = (abs(h) / self._solver.h_abs) ** np.arange(MOST_ORDER + 1)
         powers = (SHIFTED * ratio) @ NEWTON[:, : order + 1]
-        np.divide(powers[1:] @ self.solver.D[: order + 1], h, out=rows)
+        np.divide(powers[1:] @ self._solver.D[: order + 1], h, out=rows)
 
     def _slope(self, rows: Array) -> Array:
         return np.arange(1, MOST_ORDER + 1) @ rows
@@ -337,5 +326,4 @@ def _newton() -> Array:
 NEWTON = _newton()
 # Column j contains the coefficients of 1, x, x^2, ... in (x - 1)^j.
 SHIFTED = invpascal(MOST_ORDER + 1, "upper").astype(float)
-DRIVEN_RADAU = Driven(Radau, RadauStepper, 5, 3, np.linalg.inv(NODES[:, None] ** np.arange(1, 4)), takes_complex=False)
-DRIVEN_BDF = Driven(BDF, BDFStepper, 1, 1, np.eye(MOST_ORDER), takes_complex=True)
+RADAU, BDF = _Radau(), _BDF()
