@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 from math import comb
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,8 +18,8 @@ import numpy as np
 from ..engine import data
 from ..engine.data import AUTO, Multistep
 from .base import DenseForm, Method
-from .nystrom import RKN1210, depends_on_velocity
-from .runge_kutta import DOP853
+from .nystrom import RKN1210, NystromTableau, depends_on_velocity
+from .runge_kutta import DOP853, Tableau
 
 if TYPE_CHECKING:
     from ..core.run_spec import RunSpec
@@ -103,12 +103,13 @@ class GaussJackson(Method):
     """
 
     of_second_order = has_history = True
+    fixed_steps_only = True  # the estimate has the shape of the errors, but no size that could control a step
 
     order: int
     corrected: bool = False
     name: str = ""
     velocities: bool = False
-    error_estimator_order: int | None = field(init=False)
+    error_estimator_order: int = field(init=False)
 
     def __post_init__(self) -> None:
         order = self.order
@@ -125,15 +126,10 @@ class GaussJackson(Method):
     @property
     def kappa(self) -> float:
         """Exponent of the error metric: (order + 2) / (order of the estimate + 2)."""
-        return (self.order + 2) / (min(ESTIMATE, self.order - 2) + 2)
+        return (self.order + 2) / (self.error_estimator_order + 2)
 
     @property
-    def fixed_steps_only(self) -> bool:
-        """True, because the estimate has the shape of the errors, but no size that could control a step."""
-        return True
-
-    @property
-    def _starter(self) -> Method:
+    def _starter(self) -> Tableau | NystromTableau:
         """Method that makes the first states."""
         return DOP853 if self.velocities else RKN1210
 
@@ -148,8 +144,7 @@ class GaussJackson(Method):
 
     def for_engine(self, sees_velocity: bool = False) -> data.Method:
         """Return the coefficients of the method that makes the first states; `begin` adds the history."""
-        found: data.Method = self._starter.for_engine(sees_velocity)
-        return found
+        return self._starter.for_engine(sees_velocity)
 
     def begin(self, spec: RunSpec, run: Run, start: Start) -> None:
         """Check the step at the start, and add the history of the method to the run.
@@ -207,8 +202,7 @@ class GaussJackson(Method):
         return DenseForm(data.QUINTIC, 3, own_slopes=True) if self.velocities else self._starter.dense_form(stepper)
 
     def rated_stages(self) -> Array:
-        """Return an empty mask, because rates are evaluated at the nodes of the history."""
-        return np.zeros(self.for_engine().b.size, np.int64)
+        return np.zeros(self.for_engine().b.size, np.int64)  # rates are evaluated at the nodes of the history
 
 
 @cache
@@ -237,30 +231,22 @@ def _ordinates(series: Series) -> Series:
     return [(-1) ** j * sum((series[k] * comb(k, j) for k in range(j, n)), Fraction(0)) for j in range(n)]
 
 
-def position_series(back: int, terms: int) -> Series:
-    """Return `terms` coefficients of the series in x of the position `back` steps before the newest node.
+def _series(power: int, back: int, terms: int) -> Series:
+    """Return `terms` coefficients of the series in x of the position or velocity `back` steps before the newest node.
 
-    The first two coefficients of the series, 1 and -1 - back, are left out, see `GaussJackson`.
+    `power` is 2 for the position and 1 for the velocity. The first `power` coefficients of the series, 1 and -1 - back,
+    are left out, see `GaussJackson`.
     """
-    return _shifted(_inverse_powers(2, terms + 2), back)[2:]
+    return _shifted(_inverse_powers(power, terms + power), back)[power:]
 
 
-def velocity_series(back: int, terms: int) -> Series:
-    """Return `terms` coefficients of the series in x of the velocity `back` steps before the newest node.
-
-    The first coefficient of the series, 1, is left out, see `GaussJackson`.
-    """
-    return _shifted(_inverse_powers(1, terms + 1), back)[1:]
+def _weights(power: int, back: int, order: int) -> Series:
+    """Return the weights of a_n, a_(n-1), ... in the position or velocity `back` steps before the newest node n."""
+    return _ordinates(_series(power, back, order))
 
 
-def position_weights(back: int, order: int) -> Series:
-    """Return the weights of a_n, a_(n-1), ... in the position `back` steps before the newest node n."""
-    return _ordinates(position_series(back, order))
-
-
-def velocity_weights(back: int, order: int) -> Series:
-    """Return the weights of a_n, a_(n-1), ... in the velocity `back` steps before the newest node n."""
-    return _ordinates(velocity_series(back, order))
+position_series, velocity_series = partial(_series, 2), partial(_series, 1)
+position_weights, velocity_weights = partial(_weights, 2), partial(_weights, 1)
 
 
 def correction_weights(order: int) -> Series:
@@ -380,6 +366,14 @@ def _growth(order: int, corrected: bool, square: float, damping: complex) -> flo
     return float(np.abs(np.roots(polynomial)).max())
 
 
+def _is_stable(order: int, corrected: bool, fast: float, damped: float = 0.0) -> bool:
+    """Return True if the solution of no mode grows; the arguments are those of `longest_stable`.
+
+    No root of the characteristic polynomial has a modulus above 1 + `GROWTH`, including the two roots of the solution.
+    """
+    return all(_growth(order, corrected, fast**2, w) <= 1.0 + GROWTH for w in {damped, 1j * damped})
+
+
 def longest_stable(order: int, corrected: bool, fast: float, damped: float) -> float:
     """Return the largest part of a step h, at most 1, with which a method is stable.
 
@@ -388,29 +382,21 @@ def longest_stable(order: int, corrected: bool, fast: float, damped: float) -> f
     """
 
     def stable(part: float) -> bool:
-        square = (part * fast) ** 2
-        return all(_growth(order, corrected, square, part * w) <= 1.0 + GROWTH for w in (damped, 1j * damped))
+        return _is_stable(order, corrected, part * fast, part * damped)
 
     return 1.0 if stable(1.0) else _largest(stable, 1.0)
 
 
 @cache
 def damping_limit(order: int) -> float:
-    """Return the largest h c for which the method is stable for q'' = -c v (friction) and q'' = i c v (rotation).
-
-    Velocities are predicted as in Adams-Bashforth methods.
-    """
-    return _largest(lambda x: max(_growth(order, False, 0.0, w) for w in (x, 1j * x)) <= 1.0 + GROWTH)
+    """Return the largest h c for which the method is stable without other forces, as an Adams-Bashforth method is."""
+    return _largest(lambda x: _is_stable(order, False, 0.0, x))
 
 
 @cache
 def stability_limit(order: int, corrected: bool) -> float:
-    """Return the largest h omega for which the method is stable for q'' = -omega^2 q.
-
-    `corrected` is that of `GaussJackson`. The method is called stable if no root of the characteristic polynomial has a
-    modulus above 1 + `GROWTH`, including the two roots of the solution.
-    """
-    return _largest(lambda x: _growth(order, corrected, x * x, 0.0) <= 1.0 + GROWTH)
+    """Return the largest h omega for which the method is stable without forces that depend on velocities."""
+    return _largest(lambda x: _is_stable(order, corrected, x))
 
 
 def _largest(stable: Callable[[float], bool], high: float = 2.0) -> float:

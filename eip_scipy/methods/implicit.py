@@ -84,20 +84,16 @@ class ScipySolverAdapter(Method):
         return f"<{type(self).__name__}>"
 
     def for_engine(self, sees_velocity: bool = False) -> ScipySolverAdapter:
-        """Return a new object, which makes the steps of one run."""
-        return type(self)()
+        return type(self)()  # whose attributes change in the run
 
     def hooks(self, stepper: Any, work: Work) -> Hooks:
-        """Return the function that makes a step, see `Method.hooks`."""
         return Hooks(one_step=partial(stepper.fill, work), estimates=True, drives=True)
 
     def dense_form(self, stepper: Any) -> DenseForm:
-        """Return the form of the interpolants, the polynomials."""
         # The first and the last row of work.K are the derivatives at both ends of a step.
         return DenseForm(POLYNOMIAL, 1 + len(self.polynomials), np.pad(self.polynomials, ((0, 0), (1, 1))))
 
     def begin(self, spec: RunSpec, run: Run, start: Start) -> None:
-        """Prepare the steps of a run, which ``run.method`` makes."""
         run.method._begin(spec, start)
 
     def _begin(self, spec: RunSpec, start: Start) -> None:
@@ -136,7 +132,6 @@ class ScipySolverAdapter(Method):
                 f"not have: {', '.join(lacking)}. Use another version of SciPy."
             )
         self._keep_finite(solver)
-        self._watch(solver)
         return solver
 
     def _keep_finite(self, solver: Any) -> None:
@@ -215,9 +210,6 @@ class ScipySolverAdapter(Method):
         vars(self._solver).update(values)
         self._counted = {name: getattr(self._solver, name) for name in COUNTERS}
 
-    def _watch(self, solver: Any) -> None:
-        """Change the solver so that it keeps values of a step that `_error` needs."""
-
     def _move(self, y: Array) -> None:
         """Set the state of SciPy's solver to the projected state y."""
         raise NotImplementedError
@@ -247,7 +239,8 @@ class _Radau(ScipySolverAdapter):
     polynomials = np.linalg.inv(NODES[:, None] ** np.arange(1, 4))
     _solved: Array
 
-    def _watch(self, solver: Any) -> None:
+    def _made(self) -> Any:
+        solver = super()._made()
         solve = solver.solve_lu
 
         def solve_lu(factors: Any, b: Array) -> Array:
@@ -255,6 +248,7 @@ class _Radau(ScipySolverAdapter):
             return self._solved
 
         solver.solve_lu = solve_lu
+        return solver
 
     def _move(self, y: Array) -> None:
         self._solver.y = y
@@ -312,18 +306,10 @@ class _BDF(ScipySolverAdapter):
         return np.arange(1, MOST_ORDER + 1) @ rows
 
 
-def _newton() -> Array:
-    """Return an array whose column k contains the coefficients of 1, s, s^2, ... in s (s + 1) ... (s + k - 1) / k!."""
-    out = np.zeros((MOST_ORDER + 1, MOST_ORDER + 1))
-    out[0, 0] = 1.0
-    for k in range(1, MOST_ORDER + 1):
-        out[1:, k] = out[:-1, k - 1]
-        out[:, k] += (k - 1) * out[:, k - 1]
-        out[:, k] /= k
-    return out
-
-
-NEWTON = _newton()
+# Column k contains the coefficients of 1, s, s^2, ... in s (s + 1) ... (s + k - 1) / k!.
+NEWTON = np.eye(MOST_ORDER + 1)
+for k in range(1, MOST_ORDER + 1):
+    NEWTON[: k + 1, k] = np.convolve(NEWTON[:k, k - 1], [k - 1, 1]) / k
 # Column j contains the coefficients of 1, x, x^2, ... in (x - 1)^j.
 SHIFTED = invpascal(MOST_ORDER + 1, "upper").astype(float)
 RADAU, BDF = _Radau(), _BDF()

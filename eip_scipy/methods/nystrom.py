@@ -12,7 +12,7 @@ from decimal import Decimal, localcontext
 from fractions import Fraction
 from functools import cache, cached_property
 from itertools import chain, product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,12 +27,9 @@ from .runge_kutta import (
     check_integer,
     density,
     forests,
-    fraction_rows,
-    fractions,
     low_parts,
+    read,
     size,
-    stage_matrix,
-    vector,
 )
 
 if TYPE_CHECKING:
@@ -177,13 +174,13 @@ class NystromTableau(Coefficients):
             raise ValueError(
                 f"{name}: give all or none of b_hat, b_prime_hat and error_estimator_order; some are missing."
             )
-        exact = {"A": stage_matrix(name, A, s), **{key: _row(name, key, row, s) for key, row in given.items()}}
+        self.name, self.order, self.n_stages, self.reference = name, order, s, reference
+        self.error_estimator_order = error_estimator_order
+        exact = {"A": self._stage_matrix(A, s), **{key: self._row(key, row) for key, row in given.items()}}
         if exact["c"][0] != 0:
             raise ValueError(
                 f"{name}: the first node is {exact['c'][0]}, expected 0: the first stage is at the start of the step."
             )
-        self.name, self.order, self.n_stages, self.reference = name, order, s, reference
-        self.error_estimator_order = error_estimator_order
         self._check_order(exact)
         # The last stage may be at the new position and time, without being used by the step.
         unused = exact["c"][-1] == 1 and exact["b"][-1] == 0 and exact["b_prime"][-1] == 0
@@ -201,6 +198,14 @@ class NystromTableau(Coefficients):
         for values in exact.values():
             values.setflags(write=False)
         self.exact: Mapping[str, Array] = exact
+
+    def _row(self, label: str, values: Sequence[Number]) -> Array:
+        if len(values) != self.n_stages:
+            raise ValueError(
+                f"{self.name}: {label} has {len(values)} entries and b has {self.n_stages}; they must have the same "
+                "number."
+            )
+        return self._vector(values)
 
     def _check_order(self, exact: Mapping[str, Array]) -> None:
         """Raise ValueError if weights miss a condition of their order.
@@ -231,7 +236,6 @@ class NystromTableau(Coefficients):
                     )
 
     def checked(self, spec: RunSpec, start: Start) -> NystromTableau:
-        """Return the method, or raise ValueError if accelerations depend on velocities."""
         if depends_on_velocity(spec.rhs, start, spec.name, spec.hint):
             raise ValueError(
                 f"{spec.name} integrates q'' = a(t, q), but the accelerations in fun depend on the velocity; use a "
@@ -253,21 +257,10 @@ class NystromTableau(Coefficients):
         )  # fmt: skip
 
     def for_engine(self, sees_velocity: bool = False) -> data.Method:
-        """Return the coefficients, see `Method.for_engine`."""
         return self._record._replace(sees_velocity=True) if sees_velocity else self._record
 
     def dense_form(self, stepper: Any) -> DenseForm:
-        """Return the form of the interpolants: that of `interpolant`, or a quintic for low orders."""
-        if self.order < LEAST_ORDER:
-            return DenseForm(data.QUINTIC, 3)
-        A, c, weights = interpolant(self)
-        return DenseForm(data.NYSTROM, (weights.shape[0] + 1) // 2 + 1, weights, A, c)
-
-
-def _row(name: str, label: str, values: Sequence[Number], s: int) -> Array:
-    if len(values) != s:
-        raise ValueError(f"{name}: {label} has {len(values)} entries and b has {s}; they must have the same number.")
-    return vector(name, values)
+        return DenseForm(data.QUINTIC, 3) if self.order < LEAST_ORDER else interpolant(self)
 
 
 def _difference(exact: Mapping[str, Array], key: str) -> Array:
@@ -317,28 +310,19 @@ def depends_on_velocity(
     return not np.array_equal(f[half:], f0[half:], equal_nan=True)
 
 
-class Interpolant(NamedTuple):
-    """Further stages of a step, and the polynomial through the accelerations at some of them.
-
-    The rows of accelerations are those of the stages of the method, the one at the end of the step, and those of the
-    further stages, in this order. `legendre` has weights over all rows of the coefficients of the polynomial of degree
-    k - 1 through the accelerations at both ends and at the last k - 2 further stages, in Legendre polynomials of
-    2 theta - 1.
-    """
-
-    A: Array  # (further, rows): weights of the position of a further stage over the preceding rows
-    c: Array  # (further,): nodes of the further stages
-    legendre: Array  # (k, rows)
-
-
 @cache
-def interpolant(tableau: NystromTableau) -> Interpolant:
-    """Return the interpolant of a tableau whose order p is at least `LEAST_ORDER`.
+def interpolant(tableau: NystromTableau) -> DenseForm:
+    """Return the form of the interpolants of a tableau whose order p is at least `LEAST_ORDER`.
 
     The velocity of a step is interpolated by the integral of the polynomial through accelerations at Gauss-Lobatto
     nodes, and the position by the integral of the velocity. If the error of the position at such a node is O(h^s), the
     velocity between the nodes has an error of O(h^(s + 1)). Groups of stages at equidistant nodes are therefore
     inserted before the stages at Gauss-Lobatto nodes, until s is at least p - 1 or no further group helps.
+
+    The rows of accelerations are those of the stages of the method, the one at the end of the step, and those of the
+    further stages, in this order. The form has the nodes `c` of the further stages, the weights `A` of their positions
+    over the preceding rows, and the `weights` (k, rows) of the coefficients of the polynomial of degree k - 1 through
+    the accelerations at both ends and at the last k - 2 further stages, in Legendre polynomials of 2 theta - 1.
     """
     s = tableau.n_stages - tableau.fsal
     A, c = np.zeros((s + 1, s + 1)), np.ones(s + 1)
@@ -358,7 +342,7 @@ def interpolant(tableau: NystromTableau) -> Interpolant:
     used = np.array([0, *range(c.size - nodes.size, c.size), s])
     legendre = np.zeros((used.size, c.size))
     legendre[:, used] = _legendre_weights(c[used])
-    return Interpolant(A[s + 1 :], c[s + 1 :], legendre)
+    return DenseForm(data.NYSTROM, (used.size + 1) // 2 + 1, legendre, A[s + 1 :], c[s + 1 :])
 
 
 def _extended(A: Array, c: Array, nodes: Array, weights: Array) -> tuple[Array, Array]:
@@ -439,21 +423,21 @@ class _Published(Published, NystromTableau):
 
 RKN86 = _Published(
     "RKN86",
-    fraction_rows("""
+    read("""
         ; 1/800; 1/600 1/300; 9/200 -9/100 9/100; -66701/197352 28325/32892 -2665/5482 2170/24669;
         227015747/304251000 -54897451/30425100 12942349/10141700 -9499/304251 539/9250;
         -1131891597/901789000 41964921/12882700 -6663147/3220675 270954/644135 -108/5875 114/1645;
         13836959/3667458 -17731450/1833729 1063919505/156478208 -33213845/39119552 13335/28544 -705/14272 1645/57088;
         223/7938 0 1175/8064 925/6048 41/448 925/14112 1175/72576
     """),
-    fractions("223/7938 0 1175/8064 925/6048 41/448 925/14112 1175/72576 0 0"),
-    fractions("223/7938 0 5875/36288 4625/21168 41/224 4625/21168 5875/36288 223/7938 0"),
-    fractions("0 1/20 1/10 3/10 1/2 7/10 9/10 1 1"),
+    read("223/7938 0 1175/8064 925/6048 41/448 925/14112 1175/72576 0 0"),
+    read("223/7938 0 5875/36288 4625/21168 41/224 4625/21168 5875/36288 223/7938 0"),
+    read("0 1/20 1/10 3/10 1/2 7/10 9/10 1 1"),
     order=8,
-    b_hat=fractions("""
+    b_hat=read("""
         7987313/109941300 0 1610737/44674560 10023263/33505920 -497221/12409600 10023263/78180480 1610737/402071040 0 0
     """),
-    b_prime_hat=fractions("""
+    b_prime_hat=read("""
         7987313/109941300 0 1610737/40207104 10023263/23454144 -497221/6204800 10023263/23454144 1610737/40207104
         -4251941/54970650 3/20
     """),
@@ -466,7 +450,7 @@ RKN86 = _Published(
 # conditions hold to 2e-54.
 RKN1210 = _Published(
     "RKN1210",
-    fraction_rows("""
+    read("""
         ; 1/5000; 1/3750 1/1875; 7/2400 -1/240 1/160; 2/1215 0 4/729 32/18225;
         152/78125 0 1408/196875 2048/703125 432/546875; 29/51200 0 341/387072 -151/345600 243/716800 -11/110592;
         37/12000 0 0 2/1125 27/10000 5/3168 224/20625;
@@ -555,26 +539,26 @@ RKN1210 = _Published(
         85608793932459282773805825 140294243355138853053241/64884622846351585391642880
         168671028523891369934964082754523881107337/24062875279623260368388427013982199424119600
     """),
-    fractions("""
+    read("""
         63818747/5262156900 0 0 0 0 0 22555300000000/261366897038247 1696514453125/6717619827072 -45359872/229764843
         19174962087/94371046000 -19310468/929468925 16089185487681/146694672924800 1592709632/41841694125
         52675701958271/4527711056573100 12540904472870916741199505796420811396/2692319557780977037279406889319526430375
         0 0
     """),
-    fractions("""
+    read("""
         63818747/5262156900 0 0 0 0 0 451106000000000/4965971043726693 8482572265625/26870479308288 -181439488/689294529
         57524886261/188742092000 -38620936/929468925 144802669389129/586778691699200 6370838528/41841694125
         368729913707897/4527711056573100 111940113324845802831946788738852162520696/
         1316544263754897771229629968877248424453375 -113178587/12362232960 1/40
     """),
-    fractions("0 1/50 1/25 1/10 2/15 4/25 1/20 1/5 1/4 1/3 1/2 5/9 3/4 6/7 8437/8926 1 1"),
+    read("0 1/50 1/25 1/10 2/15 4/25 1/20 1/5 1/4 1/3 1/2 5/9 3/4 6/7 8437/8926 1 1"),
     order=12,
-    b_hat=fractions("""
+    b_hat=read("""
         27121957/1594593000 0 0 0 0 0 4006163300000/55441463008113 9466403125/25445529648 -163199648/406149975 23359833/
         69636250 -18491714/140828625 11052304606701/58344472186000 1191129152/44377554375 2033811086741/124730332137000
         3616943474975740389660406409450169802/951830146690244407118982233597812374375 0 0
     """),
-    b_prime_hat=fractions("""
+    b_prime_hat=read("""
         27121957/1594593000 0 0 0 0 0 4217014000000/55441463008113 47332015625/101782118592 -652798592/1218449925
         70079499/139272500 -36983428/140828625 99470741460309/233377888744000 4764516608/44377554375 14236677607187/
         124730332137000 198066487470143918516004831967805004004/2855490440070733221356946700793437123125 1/50 0

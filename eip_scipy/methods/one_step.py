@@ -109,11 +109,9 @@ class OneStep(Method):
         return f"<OneStep {self.name}: order {self.order}>"
 
     def for_engine(self, sees_velocity: bool = False) -> OneStep:
-        """Return the method itself, see `Method.for_engine`."""
         return self
 
     def hooks(self, stepper: Any, work: Work) -> Hooks:
-        """Return the function that makes a step, see `Method.hooks`."""
         return Hooks(one_step=partial(self._fill, work), estimates=self.has_estimate)
 
     def _fill(self, w: Work, t: float, y: Array, h: float) -> None:

@@ -31,7 +31,6 @@ STEP = ("_step_impl", "_estimate_error", "_estimate_error_norm")
 # Names of the order of the embedded method, in SciPy and in other packages.
 EMBEDDED = ("error_estimator_order", "order_secondary")
 WANTED = "a subclass of SciPy's RungeKutta such as RK45, or a class with the same attributes"
-LEAST_ORDER = 2  # of the dense output of such a class
 
 Number = int | float | str | Fraction
 Tree = tuple["Tree", ...]
@@ -69,7 +68,7 @@ def density(tree: Tree) -> int:
 
 def _stage_weights(tree: Tree, A: np.ndarray) -> np.ndarray:
     """Return the factor of b_i in the elementary weight of `tree` (Hairer, Norsett & Wanner I, eq. II.2.15)."""
-    phi = np.full(A.shape[0], A.dtype.type(1) if A.dtype != object else Fraction(1), dtype=A.dtype)
+    phi = np.ones(len(A), A.dtype)
     for sub in tree:
         phi = phi * A.dot(_stage_weights(sub, A))
     return phi
@@ -94,6 +93,35 @@ class Coefficients(Method):
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
         super().__setattr__(name, value)
+
+    def _vector(self, values: Sequence[Number]) -> np.ndarray:
+        """Return numbers as an array of fractions, and of floats where floats are given."""
+        out = np.empty(len(values), dtype=object)
+        for k, value in enumerate(values):
+            try:
+                out[k] = value if isinstance(value, float) else Fraction(value)
+            except (TypeError, ValueError):
+                out[k] = math.nan
+            if not math.isfinite(out[k]):
+                raise ValueError(
+                    f"{self.name}: coefficients must be finite numbers or strings such as '1/3', got {value!r}."
+                )
+        return out
+
+    def _stage_matrix(self, A: Sequence[Sequence[Number]], s: int) -> np.ndarray:
+        """Return the stage matrix (s, s) as `_vector` does, after a check that it is strictly lower triangular."""
+        if len(A) != s:
+            raise ValueError(f"{self.name}: A has {len(A)} rows and b has {s} entries; they must have the same number.")
+        full = np.full((s, s), Fraction(0), dtype=object)
+        for i, row in enumerate(A):
+            entries = self._vector(row)
+            if any(entries[i:]):
+                raise ValueError(
+                    f"{self.name}: row {i} of A reaches its diagonal; an explicit method needs A strictly lower "
+                    "triangular."
+                )
+            full[i, : min(i, len(entries))] = entries[:i]
+        return full
 
     def __repr__(self) -> str:
         estimate = f", estimate of order {self.error_estimator_order}" if self.has_estimate else ""
@@ -180,12 +208,10 @@ class Tableau(Coefficients):
     ) -> None:
         order = check_integer(name, "order", order)
         s = len(b)
-        exact_A, exact_b = stage_matrix(name, A, s), vector(name, b)
-        nodes = exact_A.sum(axis=1) if s > 1 else vector(name, [0])
-        if c is not None:
-            _check_nodes(name, vector(name, c), nodes)
-            nodes = vector(name, c)
         self.name, self.order, self.n_stages, self.reference = name, order, s, reference
+        exact_A, exact_b = self._stage_matrix(A, s), self._vector(b)
+        nodes = exact_A.sum(axis=1) if s > 1 else self._vector([0])
+        nodes = nodes if c is None else self._nodes(c, nodes)
         self._check_order("b", exact_A, exact_b, order)
         weights_hat = None
         if b_hat is not None and error_estimator_order is not None:
@@ -198,11 +224,21 @@ class Tableau(Coefficients):
         self.b_hat = None if weights_hat is None else weights_hat.astype(float)
         self.error_estimator_order = error_estimator_order
         self.fsal = b_hat is not None and len(b_hat) == s + 1
-        e = np.zeros(s + 1) if weights_hat is None else vector(name, [*exact_b, 0]) - weights_hat
+        e = np.zeros(s + 1) if weights_hat is None else self._vector([*exact_b, 0]) - weights_hat
         self.e = e.astype(float)
-        self.e_low = np.zeros(s + 1) if e_low is None else vector(name, e_low).astype(float)
-        self.P = None if P is None else np.array([vector(name, row) for row in P]).astype(float)
+        self.e_low = np.zeros(s + 1) if e_low is None else self._vector(e_low).astype(float)
+        self.P = None if P is None else np.array([self._vector(row) for row in P]).astype(float)
         self.b_low = low_parts(exact_b, nodes, [Fraction(1, k + 1) for k in range(order)])
+
+    def _nodes(self, c: Sequence[Number], row_sums: np.ndarray) -> np.ndarray:
+        """Return the nodes `c` after a check that they are the row sums of the stage matrix."""
+        nodes = self._vector(c)
+        if len(c) != len(row_sums) or (np.abs((nodes - row_sums).astype(float)) > FLOAT_TOLERANCE).any():
+            raise ValueError(
+                f"{self.name}: c = {list(map(str, nodes))} differs from the row sums of A, "
+                f"{list(map(str, row_sums))}. Correct A or c, or omit c."
+            )
+        return nodes
 
     def _embedded(self, A: np.ndarray, b: np.ndarray, b_hat: Sequence[Number], order: int) -> np.ndarray:
         """Return `b_hat` with s + 1 entries after a check of its order; the row of f at the new point in A is `b`."""
@@ -211,8 +247,8 @@ class Tableau(Coefficients):
             raise ValueError(
                 f"{self.name}: b_hat has {len(b_hat)} entries; expected {s} or {s + 1} (with f at the new point)."
             )
-        weights = vector(self.name, [*b_hat, *[0] * (s + 1 - len(b_hat))])
-        self._check_order("b_hat", stage_matrix(self.name, [*A[:, :-1].tolist(), b.tolist()], s + 1), weights, order)
+        weights = self._vector([*b_hat, *[0] * (s + 1 - len(b_hat))])
+        self._check_order("b_hat", self._stage_matrix([*A[:, :-1].tolist(), b.tolist()], s + 1), weights, order)
         return weights
 
     def _check_order(self, label: str, A: np.ndarray, b: np.ndarray, order: int) -> None:
@@ -232,7 +268,6 @@ class Tableau(Coefficients):
         return bool(np.any(self.e_low))
 
     def class_attributes(self) -> dict[str, Any]:
-        """Return the attributes of solver classes, see `Method.class_attributes`."""
         found = super().class_attributes() | {"A": self.A, "B": self.b, "C": self.c}
         if self.paired:
             found |= {"E5": self.e, "E3": self.e_low}
@@ -250,15 +285,12 @@ class Tableau(Coefficients):
         )  # fmt: skip
 
     def for_engine(self, sees_velocity: bool = False) -> data.Method:
-        """Return the coefficients, see `Method.for_engine`."""
         return self._record
 
     def dense_form(self, stepper: Any) -> DenseForm:
-        """Return the form of the interpolants: the polynomial `P`, or the cubic through both ends."""
         return DenseForm(data.CUBIC, 3) if self.P is None else DenseForm(data.POLYNOMIAL, 1 + self.P.shape[1], self.P.T)
 
     def rated_stages(self) -> np.ndarray:
-        """Return the mask of the stages that the step or `P` use, see `Method.rated_stages`."""
         stages = (self.b != 0) | (self.b_low != 0)
         if self.P is not None:
             stages |= np.any(self.P[: stages.size] != 0, axis=1)
@@ -271,46 +303,6 @@ def check_integer(name: str, label: str, value: Any, least: int = 1) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise ValueError(f"{name}: {label} must be an integer >= {least}, got {value!r}.")
     return int(value)
-
-
-def _exact(name: str, value: Number) -> Fraction | float:
-    try:
-        exact = value if isinstance(value, float) else Fraction(value)
-    except (TypeError, ValueError):
-        exact = math.nan
-    if not math.isfinite(exact):
-        raise ValueError(f"{name}: coefficients must be finite numbers or strings such as '1/3', got {value!r}.")
-    return exact
-
-
-def vector(name: str, values: Sequence[Number]) -> np.ndarray:
-    """Return numbers as an array of fractions, and of floats where floats are given."""
-    out = np.empty(len(values), dtype=object)
-    out[:] = [_exact(name, v) for v in values]
-    return out
-
-
-def stage_matrix(name: str, A: Sequence[Sequence[Number]], s: int) -> np.ndarray:
-    """Return the stage matrix (s, s) in the form of `vector`, after a check that it is strictly lower triangular."""
-    if len(A) != s:
-        raise ValueError(f"{name}: A has {len(A)} rows and b has {s} entries; they must have the same number.")
-    full = np.full((s, s), Fraction(0), dtype=object)
-    for i, row in enumerate(A):
-        entries = vector(name, row)
-        if any(entries[i:]):
-            raise ValueError(
-                f"{name}: row {i} of A reaches its diagonal; an explicit method needs A strictly lower triangular."
-            )
-        full[i, : min(i, len(entries))] = entries[:i]
-    return full
-
-
-def _check_nodes(name: str, c: np.ndarray, row_sums: np.ndarray) -> None:
-    if len(c) != len(row_sums) or any(abs(float(x - y)) > FLOAT_TOLERANCE for x, y in zip(c, row_sums, strict=True)):
-        raise ValueError(
-            f"{name}: c = {list(map(str, c))} differs from the row sums of A, {list(map(str, row_sums))}. Correct A or "
-            "c, or omit c."
-        )
 
 
 def low_parts(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
@@ -373,11 +365,12 @@ def tableau_of(solver: type[OdeSolver]) -> Tableau:
         given["b_hat"] = _floats(b_hat if E[-1] != 0 else b_hat[: b.size])
         orders = (getattr(solver, attribute, None) for attribute in EMBEDDED)
         given["error_estimator_order"] = next((found for found in orders if isinstance(found, int)), None)
+    if P is not None and P.shape[0] == b.size + 1:  # other rows belong to further stages; the default is a cubic
+        given["P"] = _floats(P)
     found = Tableau(name, _floats(A), _floats(b), order, **given)
-    if P is None or P.shape[0] != b.size + 1:  # other rows belong to further stages; the default is a cubic
-        return found
-    _check_dense_output(found, P)
-    return Tableau(name, _floats(A), _floats(b), order, P=_floats(P), **given)
+    if found.P is not None:
+        _check_dense_output(found, found.P)
+    return found
 
 
 def is_same(solver: type[OdeSolver], own: type[OdeSolver]) -> bool:
@@ -427,25 +420,19 @@ def _own_functions(solver: type[OdeSolver], base: type[OdeSolver]) -> list[str]:
 
 
 def _check_dense_output(tableau: Tableau, P: np.ndarray) -> None:
-    """Raise ValueError unless `P` gives the step's result at its end, and has order `LEAST_ORDER` inside it."""
-    worst = max(_misses(tableau, P))
+    """Raise ValueError unless `P` gives the step's result at its end, and has order 2 inside it.
+
+    That is, the weights b_i(theta) = sum_j P_ij theta^(j + 1) have the sum theta, and with the nodes theta^2 / 2.
+    """
+    powers, nodes = np.eye(P.shape[1], 2), np.append(tableau.c, 1.0)
+    missed = P.sum(axis=1) - np.append(tableau.b, 0.0), P.sum(axis=0) - powers[:, 0], nodes @ P - 0.5 * powers[:, 1]
+    worst = float(np.abs(np.concatenate(missed)).max())
     if worst > np.sqrt(FLOAT_TOLERANCE):
         raise ValueError(
             f"eip_method: the dense output P of {tableau.name} does not belong to its steps. Each row of P must sum "
             "to the weight of its stage in B (0 for the last row), and inside the step P must meet the order "
             f"conditions; the largest error is {worst:.3g}. Correct P."
         )
-
-
-def _misses(tableau: Tableau, P: np.ndarray) -> Iterator[float]:
-    A = np.pad(np.vstack([tableau.A, tableau.b]), ((0, 0), (0, 1)))
-    yield float(np.abs(P.sum(axis=1) - np.append(tableau.b, 0.0)).max())
-    for theta in (0.25, 0.5, 0.75):
-        weights = P @ theta ** np.arange(1, P.shape[1] + 1)
-        for tree, residual in order_residuals(A, weights, LEAST_ORDER):
-            # sum_i b_i(theta) phi_i is to be theta^k / density for a tree of k vertices.
-            vertices = 1 + len(tree)
-            yield abs(float(residual) + (1 - theta**vertices) / vertices)
 
 
 class _Published(Published, Tableau):
@@ -477,58 +464,54 @@ def _dop853() -> Tableau:
     )
 
 
-def fractions(text: str) -> list[str]:
-    """Return the coefficients of a text; a line may be broken after a slash."""
-    return re.sub(r"/\s+", "/", text).split()
-
-
-def fraction_rows(text: str) -> list[list[str]]:
-    """Return the rows of coefficients of a text, which end with semicolons."""
-    return [fractions(row) for row in text.split(";")]
+def read(text: str) -> Any:
+    """Return the coefficients of a text, in rows if it has semicolons; a line may be broken after a slash."""
+    rows = [row.split() for row in re.sub(r"/\s+", "/", text).split(";")]
+    return rows if len(rows) > 1 else rows[0]
 
 
 _PAPER = "Cai, Gong & Wang, An explicit and practically invariants-preserving method, section 2.1"
 
 RK1 = _Published("RK1", [[]], [1], order=1, reference=f"{_PAPER} (explicit Euler)")
 RK2 = _Published(
-    "RK2", fraction_rows("; 1/2"), [0, 1], order=2, b_hat=[1, 0], error_estimator_order=1,
+    "RK2", read("; 1/2"), [0, 1], order=2, b_hat=[1, 0], error_estimator_order=1,
     reference=f"{_PAPER} (explicit midpoint); estimate: explicit Euler",
 )  # fmt: skip
 RK3 = _Published(
-    "RK3", fraction_rows("; 1/3; 0 2/3"), fractions("1/4 0 3/4"), order=3, b_hat=fractions("0 1/2 1/2"),
+    "RK3", read("; 1/3; 0 2/3"), read("1/4 0 3/4"), order=3, b_hat=read("0 1/2 1/2"),
     error_estimator_order=2,
     reference=f"{_PAPER} (Heun's third-order method); estimate: the second-order rule on its last two stages",
 )  # fmt: skip
 RK4 = _Published(
-    "RK4", fraction_rows("; 1/2; 0 1/2; 0 0 1"), fractions("1/6 1/3 1/3 1/6"), order=4,
-    b_hat=fractions("1/6 1/3 1/3 0 1/6"), error_estimator_order=3,
+    "RK4", read("; 1/2; 0 1/2; 0 0 1"), read("1/6 1/3 1/3 1/6"), order=4,
+    b_hat=read("1/6 1/3 1/3 0 1/6"), error_estimator_order=3,
     reference=f"{_PAPER} (the classical method); estimate: f at the new point instead of the fourth stage",
 )  # fmt: skip
 RK5 = _Published(
     "RK5",
-    fraction_rows("""
+    read("""
         ; 1/4; 3/32 9/32; 1932/2197 -7200/2197 7296/2197; 439/216 -8 3680/513 -845/4104;
         -8/27 2 -3544/2565 1859/4104 -11/40
     """),
-    fractions("16/135 0 6656/12825 28561/56430 -9/50 2/55"),
-    order=5, b_hat=fractions("25/216 0 1408/2565 2197/4104 -1/5 0"), error_estimator_order=4,
+    read("16/135 0 6656/12825 28561/56430 -9/50 2/55"),
+    order=5, b_hat=read("25/216 0 1408/2565 2197/4104 -1/5 0"), error_estimator_order=4,
     reference="Fehlberg's 4(5) pair: Hairer, Norsett & Wanner, Solving ODEs I, table II.5.1",
 )  # fmt: skip
 RK23 = _Published(
-    "RK23", fraction_rows("; 1/2; 0 3/4"), fractions("2/9 1/3 4/9"), order=3,
-    b_hat=fractions("7/24 1/4 1/3 1/8"), error_estimator_order=2,
-    P=fraction_rows("1 -4/3 5/9; 0 1 -2/3; 0 4/3 -8/9; 0 -1 1"),
+    "RK23", read("; 1/2; 0 3/4"), read("2/9 1/3 4/9"), order=3,
+    b_hat=read("7/24 1/4 1/3 1/8"), error_estimator_order=2,
+    P=read("1 -4/3 5/9; 0 1 -2/3; 0 4/3 -8/9; 0 -1 1"),
     reference="Bogacki & Shampine, Appl. Math. Lett. 2 (1989) 321; interpolant: cubic Hermite",
 )  # fmt: skip
 RK45 = _Published(
     "RK45",
-    fraction_rows("""
+    read("""
         ; 1/5; 3/40 9/40; 44/45 -56/15 32/9; 19372/6561 -25360/2187 64448/6561 -212/729;
         9017/3168 -355/33 46732/5247 49/176 -5103/18656
     """),
-    fractions("35/384 0 500/1113 125/192 -2187/6784 11/84"),
-    order=5, b_hat=fractions("5179/57600 0 7571/16695 393/640 -92097/339200 187/2100 1/40"), error_estimator_order=4,
-    P=fraction_rows("""
+    read("35/384 0 500/1113 125/192 -2187/6784 11/84"),
+    order=5, b_hat=read("5179/57600 0 7571/16695 393/640 -92097/339200 187/2100 1/40"), error_estimator_order=4,
+    P=read("""
         1 -8048581381/2820520608 8663915743/2820520608 -12715105075/11282082432; 0 0 0 0;
         0 131558114200/32700410799 -68118460800/10900136933 87487479700/32700410799;
         0 -1754552775/470086768 14199869525/1410260304 -10690763975/1880347072;
