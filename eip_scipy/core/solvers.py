@@ -875,7 +875,7 @@ def eip_method(method: Tableau | NystromTableau | GaussJackson | OneStepMethod |
             if is_same(given, own._SCIPY or own.TABLEAU.solver):
                 return own
         given = tableau_of(given)
-    tableau = given if isinstance(given, (Tableau, NystromTableau, GaussJackson)) else OneStep(given)
+    tableau = given if isinstance(given, Method) else OneStep(given)
     members = {"TABLEAU": tableau, "_ORIGIN": given, "__doc__": f"EIP method on {tableau!r}."}
     made: Any = SolverClass(f"EIP_{tableau.name}", (EIPSolver,), members)
     return made

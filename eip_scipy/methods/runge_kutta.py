@@ -435,82 +435,82 @@ def _check_dense_output(tableau: Tableau, P: np.ndarray) -> None:
         )
 
 
-class _Published(Published, Tableau):
-    """A tableau of this package."""
+def read(text: str) -> list[list[str]]:
+    """Return the rows of coefficients of a text, between semicolons; a line may be broken after a slash."""
+    return [row.split() for row in re.sub(r"/\s+", "/", text).split(";")]
 
 
-class _DOP853(_Published):
-    """The tableau of DOP853, whose dense output has three further stages."""
+class _DOP853(Published, Tableau):
+    """The tableau of DOP853, with the coefficients of SciPy's public class so that they are not copied."""
+
+    def __init__(self) -> None:
+        source = scipy.integrate.DOP853
+        b = [Fraction(float(x)) for x in source.B]
+        super().__init__(
+            "DOP853",
+            [[float(x) for x in row[:i]] for i, row in enumerate(source.A[: len(b), : len(b)])],
+            b,
+            order=8,
+            c=[float(x) for x in source.C[: len(b)]],
+            b_hat=[x - Fraction(float(e)) for x, e in zip([*b, Fraction(0)], source.E5, strict=True)],
+            error_estimator_order=7,
+            e_low=[float(x) for x in source.E3],
+            reference="Hairer, Norsett & Wanner, Solving ODEs I, section II.10 (DOP853)",
+        )
 
     def dense_form(self, stepper: Any) -> DenseForm:
-        source = scipy.integrate.DOP853
+        source = scipy.integrate.DOP853  # whose dense output has three further stages
         return DenseForm(data.SEVENTH, 3 + len(source.D), source.D, source.A_EXTRA, source.C_EXTRA)
 
 
-def _dop853() -> Tableau:
-    """Return the tableau of DOP853, with the coefficients of SciPy's public class so that they are not copied."""
-    source = scipy.integrate.DOP853
-    b = [Fraction(float(x)) for x in source.B]
-    return _DOP853(
-        "DOP853",
-        [[float(x) for x in row[:i]] for i, row in enumerate(source.A[: len(b), : len(b)])],
-        b,
-        order=8,
-        c=[float(x) for x in source.C[: len(b)]],
-        b_hat=[x - Fraction(float(e)) for x, e in zip([*b, Fraction(0)], source.E5, strict=True)],
-        error_estimator_order=7,
-        e_low=[float(x) for x in source.E3],
-        reference="Hairer, Norsett & Wanner, Solving ODEs I, section II.10 (DOP853)",
-    )
+class _Published(Published, Tableau):
+    """A tableau of this package, from a text with the rows of A, then b, and b_hat if it has an estimate."""
 
-
-def read(text: str) -> Any:
-    """Return the coefficients of a text, in rows if it has semicolons; a line may be broken after a slash."""
-    rows = [row.split() for row in re.sub(r"/\s+", "/", text).split(";")]
-    return rows if len(rows) > 1 else rows[0]
+    def __init__(
+        self, name: str, text: str, order: int, error_estimator_order: int | None = None, **given: Any
+    ) -> None:
+        rows = read(text)
+        b_hat = None if error_estimator_order is None else rows.pop()
+        *A, b = rows
+        super().__init__(name, A, b, order, b_hat=b_hat, error_estimator_order=error_estimator_order, **given)
 
 
 _PAPER = "Cai, Gong & Wang, An explicit and practically invariants-preserving method, section 2.1"
 
-RK1 = _Published("RK1", [[]], [1], order=1, reference=f"{_PAPER} (explicit Euler)")
-RK2 = _Published(
-    "RK2", read("; 1/2"), [0, 1], order=2, b_hat=[1, 0], error_estimator_order=1,
-    reference=f"{_PAPER} (explicit midpoint); estimate: explicit Euler",
-)  # fmt: skip
+RK1 = _Published("RK1", "; 1", 1, reference=f"{_PAPER} (explicit Euler)")
+RK2 = _Published("RK2", "; 1/2; 0 1; 1 0", 2, 1, reference=f"{_PAPER} (explicit midpoint); estimate: explicit Euler")
 RK3 = _Published(
-    "RK3", read("; 1/3; 0 2/3"), read("1/4 0 3/4"), order=3, b_hat=read("0 1/2 1/2"),
-    error_estimator_order=2,
+    "RK3", "; 1/3; 0 2/3; 1/4 0 3/4; 0 1/2 1/2", 3, 2,
     reference=f"{_PAPER} (Heun's third-order method); estimate: the second-order rule on its last two stages",
 )  # fmt: skip
 RK4 = _Published(
-    "RK4", read("; 1/2; 0 1/2; 0 0 1"), read("1/6 1/3 1/3 1/6"), order=4,
-    b_hat=read("1/6 1/3 1/3 0 1/6"), error_estimator_order=3,
+    "RK4", "; 1/2; 0 1/2; 0 0 1; 1/6 1/3 1/3 1/6; 1/6 1/3 1/3 0 1/6", 4, 3,
     reference=f"{_PAPER} (the classical method); estimate: f at the new point instead of the fourth stage",
 )  # fmt: skip
 RK5 = _Published(
     "RK5",
-    read("""
+    """
         ; 1/4; 3/32 9/32; 1932/2197 -7200/2197 7296/2197; 439/216 -8 3680/513 -845/4104;
-        -8/27 2 -3544/2565 1859/4104 -11/40
-    """),
-    read("16/135 0 6656/12825 28561/56430 -9/50 2/55"),
-    order=5, b_hat=read("25/216 0 1408/2565 2197/4104 -1/5 0"), error_estimator_order=4,
-    reference="Fehlberg's 4(5) pair: Hairer, Norsett & Wanner, Solving ODEs I, table II.5.1",
+        -8/27 2 -3544/2565 1859/4104 -11/40;
+        16/135 0 6656/12825 28561/56430 -9/50 2/55;
+        25/216 0 1408/2565 2197/4104 -1/5 0
+    """,
+    5, 4, reference="Fehlberg's 4(5) pair: Hairer, Norsett & Wanner, Solving ODEs I, table II.5.1",
 )  # fmt: skip
 RK23 = _Published(
-    "RK23", read("; 1/2; 0 3/4"), read("2/9 1/3 4/9"), order=3,
-    b_hat=read("7/24 1/4 1/3 1/8"), error_estimator_order=2,
+    "RK23", "; 1/2; 0 3/4; 2/9 1/3 4/9; 7/24 1/4 1/3 1/8", 3, 2,
     P=read("1 -4/3 5/9; 0 1 -2/3; 0 4/3 -8/9; 0 -1 1"),
     reference="Bogacki & Shampine, Appl. Math. Lett. 2 (1989) 321; interpolant: cubic Hermite",
 )  # fmt: skip
 RK45 = _Published(
     "RK45",
-    read("""
+    """
         ; 1/5; 3/40 9/40; 44/45 -56/15 32/9; 19372/6561 -25360/2187 64448/6561 -212/729;
-        9017/3168 -355/33 46732/5247 49/176 -5103/18656
-    """),
-    read("35/384 0 500/1113 125/192 -2187/6784 11/84"),
-    order=5, b_hat=read("5179/57600 0 7571/16695 393/640 -92097/339200 187/2100 1/40"), error_estimator_order=4,
+        9017/3168 -355/33 46732/5247 49/176 -5103/18656;
+        35/384 0 500/1113 125/192 -2187/6784 11/84;
+        5179/57600 0 7571/16695 393/640 -92097/339200 187/2100 1/40
+    """,
+    5, 4,
     P=read("""
         1 -8048581381/2820520608 8663915743/2820520608 -12715105075/11282082432; 0 0 0 0;
         0 131558114200/32700410799 -68118460800/10900136933 87487479700/32700410799;
@@ -521,4 +521,4 @@ RK45 = _Published(
     """),
     reference="Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19; interpolant: Shampine, Math. Comp. 46 (1986) 135",
 )  # fmt: skip
-DOP853 = _dop853()
+DOP853 = _DOP853()
