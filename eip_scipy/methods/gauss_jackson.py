@@ -389,7 +389,7 @@ def longest_stable(order: int, corrected: bool, fast: float, damped: float) -> f
 
 @cache
 def damping_limit(order: int) -> float:
-    """Return the largest h c for which the method is stable without other forces, as an Adams-Bashforth method is."""
+    """Return the largest h c for which the method is stable without other forces; see `longest_stable` for c."""
     return _largest(lambda x: _is_stable(order, False, 0.0, x))
 
 
