@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .inputs import filled
-from .one_step import as_vector
+from .inputs import as_vector, filled
 
 __all__ = ["BY_NAME", "AccelerationField"]
 

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..methods.base import Method
 from .inputs import is_number, shown
 from .states import initial_state
-from .stepping import AnyMethod, StepOptions, Stepping, fixed_steps
+from .stepping import StepOptions, Stepping, fixed_steps
 
 __all__ = ["N_LEFT", "Settings", "checked_stepping", "checked_vector", "is_state", "kept_state"]
 
@@ -58,7 +59,7 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
     return found.astype(like.dtype)
 
 
-def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: int) -> Stepping:
+def checked_stepping(solver: Any, method: Method, was: Settings, stacklevel: int) -> Stepping:
     """Return the checked step control from a solver's present attributes, which were `was` after the last step."""
     _check_kind_of_steps(solver, was)
     t, t_bound, sign = (_number(name, getattr(solver, name)) for name in ("t", "t_bound", "direction"))

@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engine.native import LibraryFunction
-from ..methods.orders import AT_REST
+from ..methods.base import PROJECTION_ONLY, Method
 from .gradients import time_of_motion, typical_sizes, unless_error
 from .invariants import InvariantSet
 from .linear import LinearInvariants, confirmed, found_invariants, undetermined
 from .options import ProjectionOptions
 from .particles import Particles, missing_particles
-from .stepping import AnyMethod
 
 __all__ = ["Conserved", "Samples", "conserved"]
 
@@ -108,7 +107,7 @@ def _directions(near: int, far: int, n: int) -> Array:
     return ways * np.repeat([NEAR_DISTANCE, FAR_DISTANCE], [near, far])[:, None]
 
 
-def conserved(samples: Samples, projection: ProjectionOptions, method: AnyMethod, names: bool) -> Conserved:
+def conserved(samples: Samples, projection: ProjectionOptions, method: Method, names: bool) -> Conserved:
     """Return what a system conserves; nothing if its runs cannot keep it.
 
     Particles are looked for if `names`, but not in ready problems.
@@ -116,7 +115,7 @@ def conserved(samples: Samples, projection: ProjectionOptions, method: AnyMethod
     invariants, n = samples.invariants, samples.y0.size
     plain = invariants.dtype.kind == "f" and not invariants.balances.items
     # Fields are projected by their own functions.
-    if not plain or invariants.size == 0 or method is AT_REST or hasattr(invariants.items, "shift"):
+    if not plain or invariants.size == 0 or method is PROJECTION_ONLY or hasattr(invariants.items, "shift"):
         return Conserved()
     given = projection.constraints
     may_keep = given is None and (not method.in_python or method.drives)  # a user's step need not keep any

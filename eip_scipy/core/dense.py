@@ -17,9 +17,9 @@ from scipy.integrate import DenseOutput, OdeSolution
 from ..engine import data
 from ..engine.data import Dense, Work
 from ..engine.native import Engine
+from ..methods.base import DenseForm
 from .inputs import reals, shown
 from .runs import Run
-from .steppers import Form, form
 
 __all__ = ["ExactEnds", "Interpolants", "ManifoldDenseOutput", "solution"]
 
@@ -50,7 +50,7 @@ class Interpolants:
         events: int = 0,
         errors: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
-        self._form = form(run.tableau, run.tableau.has_history and run.method.multistep.brief)
+        self._form = run.tableau.dense_form(run.method)
         self.record = _record(run, self._form, events)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # all threads share one buffer
@@ -121,7 +121,7 @@ class Interpolants:
             )
 
 
-def _record(run: Run, shape: Form, events: int) -> Dense:
+def _record(run: Run, shape: DenseForm, events: int) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
     kind, rows, weights, A, c, own_slopes = shape
     stages = run.method.b.size
@@ -182,7 +182,7 @@ class UnprojectedDenseOutput(AtRealTimes):
     """The interpolant of a step without its projection, which needs no functions: the content of a pickle.
 
     `parts` are the floats of the states at both ends, and of the further rows of an interpolant of this `kind`, with
-    its `weights`, see `Form`. The engine has the same formulas.
+    its `weights`, see `DenseForm`. The engine has the same formulas.
     """
 
     def __init__(self, t_old: float, t: float, kind: int, parts: Array, weights: Array, dtype: np.dtype) -> None:

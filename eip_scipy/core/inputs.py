@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "count", "filled", "flag", "is_number", "numbers", "real_array", "reals", "require_arguments", "shown",
+    "as_vector", "count", "filled", "flag", "is_number", "numbers", "real_array", "reals", "require_arguments", "shown",
 ]  # fmt: skip
 
 PLAIN = frozenset((int, float, complex, str, bool, type(None), np.float64, np.complex128))
@@ -158,6 +158,22 @@ def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool
         return False
     first = next(iter(signature.parameters), "t")
     return given[0] == "t" and not first.strip("_").startswith("t")
+
+
+def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
+    """Return the value of a user's function at t as an array (n,); `came` begins messages, as "fun returned"."""
+    if value is None:
+        raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
+    a = numbers(came.removesuffix(":"), value)
+    if a is None:
+        raise TypeError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.")
+    if n == 1 and a.shape == ():
+        a = a.reshape(1)
+    if a.shape != (n,):
+        raise ValueError(f"{came} shape {a.shape}, expected ({n},), at t={t:.10g}.")
+    if a.dtype.kind == "c" and dtype.kind != "c":
+        raise ValueError(f"{came} complex values at t={t:.10g}, but y0 is real; pass y0.astype(complex).")
+    return a
 
 
 def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any, what: str, t: float) -> np.ndarray:

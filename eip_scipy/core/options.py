@@ -17,13 +17,12 @@ from numpy.typing import ArrayLike
 from ..engine import data
 from ..engine.data import EPS, Options
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
-from ..methods.orders import AT_REST
-from . import steppers
+from ..methods.base import PROJECTION_ONLY, Method
 from .blocks import blocks_of, kinds_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
 from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet
-from .stepping import AnyMethod, Stepping
+from .stepping import Stepping
 
 __all__ = [
     "Options", "ProjectionDetails", "ProjectionKeywords", "ProjectionOptions", "takes_projection_options", "weights",
@@ -151,7 +150,7 @@ class ProjectionOptions:
         return isinstance(self.linear_invariants, str) and self.linear_invariants == "auto"
 
     def settled(
-        self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, f0: np.ndarray, known: InvariantSet
+        self, method: Method, stepping: Stepping, y0: np.ndarray, f0: np.ndarray, known: InvariantSet
     ) -> tuple[Options, np.ndarray | None, Callable[[], dict[str, Any]]]:
         """Check the options for a run with the `known` invariants, and return them in the form that the step needs.
 
@@ -252,7 +251,7 @@ class ProjectionOptions:
                 "weights and use one Newton step; omit these options."
             )
 
-    def _compensated(self, method: AnyMethod) -> bool:
+    def _compensated(self, method: Method) -> bool:
         if self.compensated is None:
             return method.has_history
         compensated = flag("compensated", self.compensated)
@@ -265,7 +264,7 @@ class ProjectionOptions:
             )
         return compensated
 
-    def _every(self, method: AnyMethod) -> int:
+    def _every(self, method: Method) -> int:
         if self.every is None:
             return data.AUTO if method.has_history else 1
         if not isinstance(self.every, str):
@@ -276,7 +275,7 @@ class ProjectionOptions:
             raise ValueError(f"every='auto' needs an error estimate, and {method.name} has none; give an integer.")
         return data.AUTO
 
-    def _metric(self, method: AnyMethod, n: int, width: int) -> tuple[int, np.ndarray | None]:
+    def _metric(self, method: Method, n: int, width: int) -> tuple[int, np.ndarray | None]:
         metric = self.metric
         if isinstance(metric, str | None):
             if metric == "euclidean":
@@ -297,11 +296,11 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
     return a / a.max()
 
 
-def _balances(method: AnyMethod, known: InvariantSet) -> data.Balances:
+def _balances(method: Method, known: InvariantSet) -> data.Balances:
     """Return the engine's record of the balances of a run; it is empty if `project` projects a single state."""
-    if not known.balances.items or method is AT_REST:
+    if not known.balances.items or method is PROJECTION_ONLY:
         return data.NO_BALANCES
-    return data.Balances(known.balances.places, steppers.rated(method))
+    return data.Balances(known.balances.places, method.rated_stages())
 
 
 def _groups(known: InvariantSet, n: int, width: int) -> data.Groups:

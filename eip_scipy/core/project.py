@@ -11,11 +11,10 @@ import numpy as np
 
 from ..engine.data import BAND, EPS, LARGE_SHARE, LAST_RANK
 from ..engine.trust import ProjectionWarning
-from ..methods.orders import AT_REST
+from ..methods.base import PROJECTION_ONLY
 from .failures import projection_failure
-from .inputs import count, is_number, reals, shown
+from .inputs import as_vector, count, is_number, reals, shown
 from .invariants import InvariantSet
-from .one_step import as_vector
 from .options import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
 from .run_spec import RunSpec
@@ -106,7 +105,7 @@ def project(
         check=False,
     )
     stepping = Stepping.at_rest(t, n)
-    run = RunSpec(name="project", method=AT_REST, rhs=derivative, stepping=stepping, projection=given).build(y)
+    run = RunSpec(name="project", method=PROJECTION_ONLY, rhs=derivative, stepping=stepping, projection=given).build(y)
     known, work = run.invariants, run.work
     if known.uses_f and f is None:
         raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")

@@ -8,21 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.data import EPS, EUCLIDEAN, NEW, Method, Work
+from ..engine.data import EPS, EUCLIDEAN, NEW, Work
 from ..engine.native import BUILD
 from ..engine.trust import Trust
-from ..methods.orders import AT_REST
-from . import steppers
+from ..methods.base import PROJECTION_ONLY, Method
 from .conserved import Conserved, Samples, conserved
 from .failures import projection_failure
 from .frame import frame_rows, spanned
 from .gradients import unless_error
 from .invariant_checks import Complaint, reported
 from .invariants import TARGET_TOLERANCE, InvariantSet
-from .multistep import SecondOrder, attach_history
 from .options import ProjectionOptions
 from .runs import Run, Start
-from .stepping import AnyMethod, Stepping
+from .stepping import Stepping
 from .variations import Columns, widened
 
 __all__ = ["RunSpec"]
@@ -40,7 +38,7 @@ class RunSpec(NamedTuple):
     equations, which are not examined again. ``rhs(t, y) -> (n,)`` is checked and returns new arrays; `extra` are
     further arguments of the invariants' functions.
 
-    ``jacobian()`` returns the Jacobian for a multistep method (see `SecondOrder`) or an implicit one, or None, and
+    ``jacobian()`` returns the Jacobian for a multistep method (see `jacobian_product`) or an implicit one, or None, and
     ``frequencies(y0, length)`` is that of `Problem`. With `level` a multistep method returns the state at the newest
     end of its history; otherwise that in the middle. ``hint()`` returns the end of a message: advice for equations that
     are not of second order. `columns` of derivatives follow the state; `stepping` and `projection` are for the state
@@ -50,7 +48,7 @@ class RunSpec(NamedTuple):
     """
 
     name: str
-    method: AnyMethod
+    method: Method
     rhs: Callable[[float, Array], Array]
     stepping: Stepping
     projection: ProjectionOptions
@@ -77,17 +75,14 @@ class RunSpec(NamedTuple):
         method, f0 = self.examined(y0, f0)
         tau = self._first_step(method, y0, f0) if tau is None else tau
         run = self._with_buffers(method, Start(t0, y0, f0, tau), check_start)
-        if method is AT_REST:
+        if method is PROJECTION_ONLY:
             return run  # the state may be far from the targets
         self._check(run, check_start)
-        if method.has_history:
-            self.attach_history(run, run.start)
-        if method.drives:
-            self.attach_solver(run, run.start)
+        method.begin(self, run, run.start)
         return run
 
-    def examined(self, y0: Array, f0: Array | None = None) -> tuple[AnyMethod, Array]:
-        """Return the method after a check of the equations, see `steppers.checked`, and the derivative (n,) at y0."""
+    def examined(self, y0: Array, f0: Array | None = None) -> tuple[Method, Array]:
+        """Return the method after a check of the equations, see `Method.checked`, and the derivative (n,) at y0."""
         t0 = self.stepping.span.t0
         try:
             f0 = self.rhs(t0, y0) if f0 is None else f0
@@ -97,21 +92,9 @@ class RunSpec(NamedTuple):
             raise
         if self.is_known or self.is_second_order:
             return self.method, f0
-        start = Start(t0, y0, f0, 0.0)
-        return steppers.checked(self.method, self.rhs, start, self.name, self.hint, self.sees_velocity), f0
+        return self.method.checked(self, Start(t0, y0, f0, 0.0)), f0
 
-    def attach_history(self, run: Run, start: Start) -> None:
-        """Give a run with a multistep method its history, which begins at `start`."""
-        span = self.stepping.span
-        frequencies = None if self.frequencies is None else self.frequencies(start.y, span.t_bound - span.t0)
-        system = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
-        attach_history(run, self.name, system, self.stepping, level=self.level)
-
-    def attach_solver(self, run: Run, start: Start) -> None:
-        """Give a run with an implicit method its solver of SciPy, which begins at `start`."""
-        run.method.begin(self.rhs, start, self.stepping, self.jacobian())
-
-    def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
+    def _first_step(self, method: Method, y0: Array, f0: Array) -> float:
         """Return the length of the first step, chosen from the state alone, without columns of derivatives."""
         columns = self.columns
         if columns is None:
@@ -124,14 +107,16 @@ class RunSpec(NamedTuple):
 
         return self.stepping.first(derivative, columns.own(y0), columns.own(f0), method)
 
-    def _with_buffers(self, method: AnyMethod, start: Start, tell: bool) -> Run:
+    def _with_buffers(self, method: Method, start: Start, tell: bool) -> Run:
         """Return a run whose invariants have been evaluated at the start; `tell`: see `InvariantSet`."""
         t_bound, projection = self.stepping.span.t_bound, self.projection
         invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
         columns = self.columns
         y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
-        depends_on_time = method is not AT_REST and invariants.size > 0 and invariants.add_rounding_of_time(start.y)
+        depends_on_time = (
+            method is not PROJECTION_ONLY and invariants.size > 0 and invariants.add_rounding_of_time(start.y)
+        )
         options, sigma, identity = projection.settled(method, self.stepping, y, f, invariants)
         samples = Samples(self.rhs, start, invariants, slice(None) if columns is None else columns.places)
         found = unless_error(conserved, samples, projection, method, tell and options.watched)
@@ -141,11 +126,9 @@ class RunSpec(NamedTuple):
         if columns is not None:
             options, sigma = widened(options, sigma, columns, invariants.start_gradients)
         invariants.kinds = options.kinds
-        arrays = steppers.arrays(method)
-        if isinstance(arrays, Method) and arrays.nystrom and self.sees_velocity:
-            arrays = arrays._replace(sees_velocity=self.sees_velocity)
+        stepper = method.for_engine(self.sees_velocity)
         carried, blocks = options.balances.place, options.groups.start.size - 1
-        work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, blocks, carried.size)
+        work = Work(start.y.size, start.y.dtype, stepper.b.size, invariants.size, blocks, carried.size)
         work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients
         del invariants.start_gradients  # which may be large
         if carried.size:
@@ -155,7 +138,7 @@ class RunSpec(NamedTuple):
             work.sigma[:] = sigma
         trust = Trust(invariants.names, work.trust)
         return Run(
-            start, start, self.stepping, method, arrays, options, work, invariants, identity, trust, found,
+            start, start, self.stepping, method, stepper, options, work, invariants, identity, trust, found,
             self.called, self.left_out, depends_on_time=depends_on_time,
         )  # fmt: skip
 
@@ -177,8 +160,8 @@ class RunSpec(NamedTuple):
         if run.options.watched and checks and BUILD.are_finite(run.start.f.view(float)):
             known = (run.work.G, run.work.values) if run.start is run.begin else None
             run.trust.doubts += run.invariants.check(*run.start[:3], run.invariants.tau, known)
-        if self.projection.check and checks and run.tableau.in_python:
-            text = steppers.of_another_equation(run.tableau, self.rhs, run.start, self.stepping.span.sign, self.called)
+        if self.projection.check and checks:
+            text = run.tableau.contradiction(self, run.start)
             if text is not None:
                 run.trust.doubts += reported([Complaint(False, text, "Make the method for the equation of this run")])
 

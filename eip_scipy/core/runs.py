@@ -14,7 +14,7 @@ import numpy as np
 from ..engine.data import BY_ERROR, EXAMINED, NO_BALANCES, NO_METHOD, NOTHING, REASON, Schedule, Work
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
-from . import steppers
+from ..methods.base import Method
 from .callers import users_level
 from .conserved import Conserved
 from .examination import Derivative, Examiner, is_check_due, unresolved
@@ -23,7 +23,7 @@ from .invariants import InvariantSet
 from .linear import confirmed
 from .options import Options
 from .results import Diagnostics, slowness
-from .stepping import AnyMethod, Stepping
+from .stepping import Stepping
 
 __all__ = ["Counted", "Run", "Start", "parts_of", "run_of"]
 
@@ -55,7 +55,7 @@ class Run:
     begin: Start
     start: Start
     stepping: Stepping
-    tableau: AnyMethod
+    tableau: Method
     method: Any
     options: Options
     work: Work
@@ -79,13 +79,8 @@ class Run:
         self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True
     ) -> Engine:
         """Return the engine of the run, which it `begins` or continues; work.K[0] must hold the derivative there."""
-        in_python = self.tableau.in_python
-        hooks = Hooks(
-            one_step=partial(self.method.fill, self.work) if in_python else None,
-            estimates=in_python and self.tableau.has_estimate,
-            drives=self.tableau.drives,
-            joint=None if functions.native else self.options.joint,
-        )
+        joint = None if functions.native else self.options.joint
+        hooks = self.tableau.hooks(self.method, self.work)._replace(joint=joint)
         needed = hooks if hooks != Hooks() else None
         engine, w = Engine(self.method, self.options, self.work, functions, schedule, needed), self.work
         if self.options.watched and begins:
@@ -233,7 +228,7 @@ def run_of(parts: dict[str, Any], invariants: InvariantSet, method: Any, *, join
     """
     values = copy.deepcopy(parts)
     if method.in_python:
-        values["method"] = steppers.arrays(method)
+        values["method"] = method.for_engine()
     if joint:
         values["options"] = values["options"]._replace(joint=invariants.items)
     invariants.target = values["options"].target  # those of balances change

@@ -17,23 +17,22 @@ from scipy.integrate import DenseOutput, OdeSolver
 from ..engine.data import FOUND, NEXT_LENGTH, NFEV, NJEV, NLU, OK, PENDING, WAITED, Work, bare_schedule
 from ..engine.native import Call, PythonFunctions, call
 from ..engine.trust import ProjectionWarning
-from ..methods.multistep import GaussJackson
+from ..methods.base import Method
+from ..methods.gauss_jackson import GaussJackson, jacobian_product
+from ..methods.implicit import BDF, RADAU, Jacobian
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
-from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
+from ..methods.one_step import OneStep, OneStepMethod
+from ..methods.runge_kutta import ATTRIBUTES, DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau, is_same, tableau_of
 from .acceleration import BY_NAME
 from .between_steps import N_LEFT, Settings, checked_stepping, checked_vector, is_state, kept_state
 from .callers import users_level
-from .coefficients import attributes_of, is_same, tableau_of
 from .dense import ExactEnds, Interpolants
-from .driven import DRIVEN_BDF, DRIVEN_RADAU, Driven, Jacobian
 from .examination import is_check_due
 from .failures import failure
 from .inputs import numbers, shown
 from .invariants import InvariantSet, as_invariants
 from .jitted import compiled_call
-from .multistep import times
 from .names import nearest
-from .one_step import OneStep, OneStepMethod
 from .options import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
 from .run_spec import RunSpec
@@ -124,7 +123,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
        systems".
     """
 
-    TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep | Driven]
+    TABLEAU: ClassVar[Method]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
     _COLUMNS: ClassVar[Columns | None] = None  # columns of derivatives behind the state
@@ -202,7 +201,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         """Give a subclass the attributes of SciPy's RungeKutta classes: order, n_stages, A, B, C, E, P ..."""
         super().__init_subclass__(**keywords)
         if "TABLEAU" in vars(cls):
-            for name, value in attributes_of(cls.TABLEAU, cls._SCIPY).items():
+            found = dict.fromkeys(ATTRIBUTES, NotImplemented) | cls.TABLEAU.class_attributes()
+            if cls._SCIPY is not None:
+                found = {name: getattr(cls._SCIPY, name, NotImplemented) for name in ATTRIBUTES}
+            for name, value in found.items():
                 if name not in vars(cls):
                     setattr(cls, name, value)
 
@@ -221,7 +223,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _specified(self, stepping: Stepping, projection: ProjectionOptions) -> RunSpec:
         """Return a `RunSpec` of the solver's present right-hand side with these options."""
-        moved = times(self._jacobian) if callable(self._jacobian) else self._jacobian
+        moved = jacobian_product(self._jacobian) if callable(self._jacobian) else self._jacobian
         return RunSpec(
             name=type(self).__name__,
             method=self.TABLEAU,
@@ -345,10 +347,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         fresh = spec.projection.settled(method, spec.stepping, run.y0, run.start.f, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
         run.stepping = spec.stepping
-        if method.has_history:
-            spec.attach_history(run, here)
-        if method.drives:
-            spec.attach_solver(run, here)
+        method.begin(spec, run, here)
         self._spec = spec._replace(method=method, is_known=True)
 
     def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -401,7 +400,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         invariants.tau = shared["tau"]
         self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
         if self.TABLEAU.drives:
-            self._spec.attach_solver(self._run, begin)
+            self._spec.method.begin(self._spec, self._run, begin)
             self._run.method.resume(copied["run"]["method"])
         self._work, self.f, self.h_abs = self._run.work, begin.f, 0.0
         self._drive(begins=False)
@@ -798,7 +797,7 @@ class EIPRadau(EIPSolver):
     (True, True)
     """
 
-    TABLEAU = DRIVEN_RADAU
+    TABLEAU = RADAU
 
 
 class EIPBDF(EIPSolver):
@@ -807,7 +806,7 @@ class EIPBDF(EIPSolver):
     Options and notes: see `EIPRadau`; complex states are possible.
     """
 
-    TABLEAU = DRIVEN_BDF
+    TABLEAU = BDF
     order: Any = NotImplemented  # it varies
     error_estimator_order: Any = NotImplemented
 
@@ -866,10 +865,10 @@ def eip_method(method: Tableau | NystromTableau | GaussJackson | OneStepMethod |
             return given
         classes: tuple[Any, ...] = EIPRK23, EIPRK45, EIPDOP853, EIPRadau, EIPBDF
         for own in classes:
-            if is_same(given, own.TABLEAU.solver if own._SCIPY is None else own._SCIPY):
+            if is_same(given, own._SCIPY or own.TABLEAU.solver):
                 return own
         given = tableau_of(given)
-    tableau = given if isinstance(given, (Tableau, NystromTableau, GaussJackson)) else OneStep(given)
+    tableau = given if isinstance(given, Method) else OneStep(given)
     members = {"TABLEAU": tableau, "_ORIGIN": given, "__doc__": f"EIP method on {tableau!r}."}
     made: Any = SolverClass(f"EIP_{tableau.name}", (EIPSolver,), members)
     return made

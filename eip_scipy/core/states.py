@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import BUILD
-from .inputs import numbers, shown
+from .inputs import as_vector, numbers, shown
 from .jitted import is_jitted
-from .one_step import as_vector
 
 __all__ = ["as_derivative", "initial_state", "own_values", "states"]
 

@@ -10,21 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engine.data import EPS, Span
-from ..methods.multistep import GaussJackson
-from ..methods.nystrom import NystromTableau
-from ..methods.orders import AtRest
-from ..methods.runge_kutta import Tableau
-from .driven import Driven
+from ..methods.base import Method
 from .gradients import time_of_motion
 from .inputs import is_number, reals, shown
-from .one_step import OneStep
 
 __all__ = [
-    "ATOL", "UNBOUNDED", "AnyMethod", "StepOptions", "Stepping", "check_fixed_step", "fixed_steps", "interval",
+    "ATOL", "UNBOUNDED", "StepOptions", "Stepping", "check_fixed_step", "fixed_steps", "interval",
     "saved_steps",
 ]  # fmt: skip
 
-AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | Driven | AtRest
 UNBOUNDED = 2**62
 LARGE_TIME = 1e300  # below it an integer can be converted to a float
 LEAST_RTOL = 100 * EPS  # as in SciPy
@@ -54,7 +48,7 @@ class Stepping(NamedTuple):
         return cls(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
 
     def first(
-        self, rhs: Callable[[float, np.ndarray], np.ndarray], y0: np.ndarray, f0: np.ndarray, tableau: AnyMethod
+        self, rhs: Callable[[float, np.ndarray], np.ndarray], y0: np.ndarray, f0: np.ndarray, tableau: Method
     ) -> float:
         """Return the length of the first step: `h`, at most the length of the interval, `first_step` or an estimate."""
         if self.h is not None:
@@ -130,7 +124,7 @@ class StepOptions(NamedTuple):
     rtol: Any = 1e-3
     atol: Any = ATOL
 
-    def checked(self, name: str, method: AnyMethod, t0: float, t_bound: float, n: int, *, stacklevel: int) -> Stepping:
+    def checked(self, name: str, method: Method, t0: float, t_bound: float, n: int, *, stacklevel: int) -> Stepping:
         """Return the step control of a run with n components; `stacklevel` is for a warning about `rtol`."""
         h = self.h
         if h is None and method.fixed_steps_only:

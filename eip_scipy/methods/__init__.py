@@ -1,6 +1,6 @@
 """Integration methods: their coefficients and orders."""
 
-from .multistep import GaussJackson
+from .gauss_jackson import GaussJackson
 from .nystrom import NystromTableau
 from .runge_kutta import Tableau
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..core.inputs import filled
 from ..core.states import as_derivative
-from ..core.steppers import check_halves
 from ..engine.native import LibraryFunction
+from ..methods.nystrom import check_halves
 
 __all__ = ["FORMS", "interpreted"]
 

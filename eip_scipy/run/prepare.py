@@ -13,11 +13,9 @@ import numpy as np
 
 from ..core.acceleration import BY_NAME, AccelerationField
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
-from ..core.driven import Jacobian
 from ..core.inputs import count, flag, real_array, require_arguments, shown
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError, is_compiled
-from ..core.multistep import times
 from ..core.native_functions import native_functions, with_events
 from ..core.options import ProjectionOptions
 from ..core.particles import compiled_items
@@ -32,6 +30,8 @@ from ..core.stepping import ATOL, StepOptions, Stepping, interval
 from ..core.variations import Variations, asked_columns, kept_symplectic, require_tableau, right_hand_side
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
+from ..methods.gauss_jackson import jacobian_product
+from ..methods.implicit import Jacobian
 from .driver import check_memory, saved_rows
 from .events import Events, as_events, replaced
 from .interpreted_functions import FORMS, interpreted
@@ -180,7 +180,7 @@ class System:
     def product(self) -> Callable[..., np.ndarray] | None:
         """Return the option `jacobian`, made now if it is `Deferred`, as ``product(t, q, dq)``; None without it."""
         self.jacobian = made(self.jacobian)
-        return None if self.jacobian is None else times(self.jacobian, *self.extra)
+        return None if self.jacobian is None else jacobian_product(self.jacobian, *self.extra)
 
     def matrix(self) -> Jacobian:
         """Return the option `jac`, with the arguments of `fun` bound, as SciPy's implicit solvers take it."""

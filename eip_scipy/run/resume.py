@@ -21,7 +21,7 @@ from ..core.callers import users_level
 from ..core.inputs import flag, is_number, shown
 from ..core.runs import Run
 from ..engine.data import NEXT_LENGTH, TIME
-from ..methods.multistep import Weights
+from ..methods.gauss_jackson import Weights
 from .events import Events
 
 __all__ = ["Keeper", "keeping", "plain", "settings"]

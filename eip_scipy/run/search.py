@@ -16,7 +16,7 @@ from ..core.problem import Problem
 from ..core.results import ProjectionWarning
 from ..core.runs import Counted
 from ..core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12
-from ..core.steppers import depends_on_velocity
+from ..methods.nystrom import depends_on_velocity
 from .integrate import integrate
 from .prepare import Request, prepared
 from .recommendation import Recommendation, called
@@ -378,7 +378,7 @@ def _asked_of_the_field(request: Request) -> tuple[bool | None, bool, Particles 
     calls, start = Counted(ready.system.derivative), ready.run.start
     with np.errstate(all="ignore"):
         try:
-            velocities = depends_on_velocity(calls, start, "")
+            velocities = depends_on_velocity(calls, start)
         except ValueError:
             velocities = None
     return velocities, why_not is None, ready.run.conserved.missing

@@ -6,8 +6,7 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPGJ12, EIPRKN8, EIPRKN12, Invariant, eip_method, integrate
 from eip_scipy.methods import NystromTableau
-from eip_scipy.methods.nystrom import RKN86, RKN1210
-from eip_scipy.methods.nystrom_interpolants import interpolant
+from eip_scipy.methods.nystrom import RKN86, RKN1210, interpolant
 from eip_scipy.problems import kepler
 
 both = pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12])
@@ -166,7 +165,7 @@ def test_methods_of_low_order_keep_the_quintic():
 @pytest.mark.parametrize("tableau", [RKN86, RKN1210], ids=["8", "12"])
 def test_polynomial_through_the_accelerations(tableau):
     """Legendre coefficients of powers sampled at its nodes are those that NumPy finds."""
-    _, c, legendre = interpolant(tableau)
+    legendre, c = interpolant(tableau).weights, interpolant(tableau).c
     nodes = np.concatenate([np.zeros(tableau.n_stages - tableau.fsal), [1.0], c])
     used = np.flatnonzero(legendre.any(axis=0))
     for power in range(legendre.shape[0]):

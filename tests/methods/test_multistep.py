@@ -9,7 +9,7 @@ import pytest
 
 from eip_scipy import EIPGJ12, eip_method, integrate
 from eip_scipy.methods import GaussJackson
-from eip_scipy.methods.multistep import (
+from eip_scipy.methods.gauss_jackson import (
     correction_weights,
     damping_limit,
     interpolation_weights,

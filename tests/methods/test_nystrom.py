@@ -63,7 +63,7 @@ def density(tree):
 
 def from_package(tree):
     """Return a tree of the package in the form above."""
-    return tuple(sorted([()] * tree.leaves + [(from_package(sub),) for sub in tree.subtrees]))
+    return tuple(sorted(map(from_package, tree)))
 
 
 class Conditions:

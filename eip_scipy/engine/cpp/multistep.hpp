@@ -1,5 +1,5 @@
 // Multistep steps for q'' = a(t, q): Gauss-Jackson's method, summed, one evaluation a step, with the projection in its sums
-// (methods/multistep.py has the formulas). The history is `middle` nodes ahead of the states that a run shows: formulas
+// (methods/gauss_jackson.py has the formulas). The history is `middle` nodes ahead of the states that a run shows: formulas
 // centred on it lose nothing to rounding, those at its newest end do.
 #pragma once
 

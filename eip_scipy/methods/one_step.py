@@ -1,19 +1,26 @@
-"""User-defined one-step methods in place of the Runge-Kutta step: their protocol, and their unprojected step."""
+"""User-defined one-step methods: their protocol, and their unprojected steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from ..core.blocks import blocks_of, kinds_of
+from ..core.gradients import random_directions, time_of_motion, unless_error
+from ..core.inputs import as_vector
 from ..engine.data import EPS, NFEV, Work
-from ..methods.orders import Ordered
-from .blocks import blocks_of, kinds_of
-from .gradients import random_directions, time_of_motion, unless_error
-from .inputs import numbers, shown
+from ..engine.native import Hooks
+from .base import Method
+from .runge_kutta import check_integer
 
-__all__ = ["OneStep", "OneStepMethod", "as_vector"]
+if TYPE_CHECKING:
+    from ..core.run_spec import RunSpec
+    from ..core.runs import Start
+
+__all__ = ["OneStep", "OneStepMethod"]
 
 # Length of the first step that is compared with the derivative, in times in which the state moves by its size; the
 # factor from one step to the next, because only short steps show the derivative of a stiff system; their number.
@@ -68,12 +75,12 @@ class OneStepMethod(Protocol):
         ...  # pragma: no cover
 
 
-class OneStep(Ordered):
-    """A user's one-step method after checks; it takes the place of a tableau and of its arrays.
+class OneStep(Method):
+    """A user's one-step method after checks.
 
     `name`, `order`, `error_estimator_order` (None without an estimate) and `evaluations` are as in `OneStepMethod`. `b`
     and `c`, 1 and 0, are those of a tableau with a single stage at the start of the step, for code that reads the
-    stages of any method. Adaptive steps change by the power `exponent` of the norm of the error estimate.
+    stages of any method.
 
     The steps do not use the right-hand side f. It is evaluated only for gradients that take f, at the start to compare
     it with a short step, and in a few steps to judge the projections. ``nfev`` counts the evaluations for gradients
@@ -81,28 +88,33 @@ class OneStep(Ordered):
     """
 
     in_python = True
+    multistep = None
 
     def __init__(self, method: OneStepMethod) -> None:
         if not isinstance(method, OneStepMethod) or isinstance(method, type) or not callable(method.one_step):
             raise TypeError(
                 f"expected a Tableau, a NystromTableau or an object with one_step(t, y, h) and order, got {method!r}."
             )
-        self.name = str(getattr(method, "name", type(method).__name__))
-        self.order = _integer(self.name, "order", method.order)
-        self.evaluations = _integer(self.name, "evaluations", getattr(method, "evaluations", 0), least=0)
+        name = str(getattr(method, "name", type(method).__name__))
         estimate = getattr(method, "error_estimator_order", None)
+        self.name, self.order = name, check_integer(name, "order", method.order)
+        self.evaluations = check_integer(name, "evaluations", getattr(method, "evaluations", 0), least=0)
         self.error_estimator_order = (
-            None if estimate is None else _integer(self.name, "error_estimator_order", estimate)
+            None if estimate is None else check_integer(name, "error_estimator_order", estimate)
         )
-        self._one_step: Callable[[float, np.ndarray, float], Any] = method.one_step
+        self._one_step: Callable[[float, Array, float], Any] = method.one_step
         self.b, self.c = np.ones(1), np.zeros(1)
-        self.exponent = -1.0 / ((self.error_estimator_order or 0) + 1)
-        self.multistep = None
 
     def __repr__(self) -> str:
         return f"<OneStep {self.name}: order {self.order}>"
 
-    def fill(self, w: Work, t: float, y: np.ndarray, h: float) -> None:
+    def for_engine(self, sees_velocity: bool = False) -> OneStep:
+        return self
+
+    def hooks(self, stepper: Any, work: Work) -> Hooks:
+        return Hooks(one_step=partial(self._fill, work), estimates=self.has_estimate)
+
+    def _fill(self, w: Work, t: float, y: Array, h: float) -> None:
         """Make one step and write the state, and the error estimate if there is one, to the buffers `w`."""
         result, estimate = self._made(t, y, h)
         w.counters[NFEV] += self.evaluations
@@ -122,28 +134,26 @@ class OneStep(Ordered):
             )
         return result
 
-    def of_another_equation(
-        self, rhs: Callable[[float, Array], Array], start: Any, sign: float, called: str
-    ) -> str | None:
-        """Return a sentence if short steps from the `start` show that they do not solve the equation of `rhs`, or None.
+    def contradiction(self, spec: RunSpec, start: Start) -> str | None:
+        """Return a sentence if short steps from the `start` do not solve the equation of `spec`, or None.
 
         The rate of change in a step of a method tends to the derivative as the step becomes shorter. The two are
-        compared for each half of a state (q, p), and for any other state as a whole. `sign` is the direction of the
-        steps, and `called` the argument that gave `rhs`. None is returned if the method or `rhs` raises an exception,
-        or if the method does not move the state, as an iteration whose tolerance is larger than the step.
+        compared for each half of a state (q, p), and for any other state as a whole. None is returned if the method or
+        the right-hand side raises an exception, or if the method does not move the state, as an iteration whose
+        tolerance is larger than the step.
         """
         with np.errstate(all="ignore"):
-            found: tuple[int, Any, Any, float] | None = unless_error(self._difference, rhs, start, sign)
+            found = unless_error(self._difference, spec.rhs, start, spec.stepping.span.sign)
         if found is None:
             return None
         k, own, given, h = found
         return (
-            f"the steps of {self.name} do not solve the equation of {called}: at the start, in a step of h={h:.2g}, "
-            f"component {k} changes at the rate {own:.6g}, and {called} gives {given:.6g}"
+            f"the steps of {self.name} do not solve the equation of {spec.called}: at the start, in a step of "
+            f"h={h:.2g}, component {k} changes at the rate {own:.6g}, and {spec.called} gives {given:.6g}"
         )
 
     def _difference(
-        self, rhs: Callable[[float, Array], Array], start: Any, sign: float
+        self, rhs: Callable[[float, Array], Array], start: Start, sign: float
     ) -> tuple[int, Any, Any, float] | None:
         """Return the component that differs most, its rates by a step and by `rhs`, and the step; None if none does."""
         t, y, f, tau = start
@@ -178,25 +188,3 @@ class OneStep(Ordered):
     def _vector(self, value: Any, what: str, t: float, y: np.ndarray) -> np.ndarray:
         vector = as_vector(value, y.size, y.dtype, f"{self.name}.one_step returned {what}:", t)
         return np.ascontiguousarray(vector, dtype=y.dtype)
-
-
-def _integer(name: str, what: str, value: Any, least: int = 1) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise ValueError(f"{name}: {what} must be an integer >= {least}, got {value!r}.")
-    return int(value)
-
-
-def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
-    """Return the value of a user's function at t as an array (n,); `came` begins messages, as "fun returned"."""
-    if value is None:
-        raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
-    a = numbers(came.removesuffix(":"), value)
-    if a is None:
-        raise TypeError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.")
-    if n == 1 and a.shape == ():
-        a = a.reshape(1)
-    if a.shape != (n,):
-        raise ValueError(f"{came} shape {a.shape}, expected ({n},), at t={t:.10g}.")
-    if a.dtype.kind == "c" and dtype.kind != "c":
-        raise ValueError(f"{came} complex values at t={t:.10g}, but y0 is real; pass y0.astype(complex).")
-    return a
