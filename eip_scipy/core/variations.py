@@ -344,7 +344,7 @@ def _of_columns_in_order(
     if jvp is not None:
         _require_products(check, jvp)
         if is_jitted(jitted_call(fun)) and is_jitted(jvp) and not jit_is_off():
-            from .jitted_columns import rhs_by_products
+            from .jitted_tangents import rhs_by_products
 
             return rhs_by_products(jitted_call(fun), form, jvp, n, columns.count), "jvp"
 
@@ -357,7 +357,7 @@ def _of_columns_in_order(
         return _interpreted(columns, fun, form, y0, products), "jvp"
     why: str | None = "it is not compiled by Numba"
     if is_jitted(fun) and not jit_is_off() and scalars(extra) is not None:
-        from .jitted_columns import rhs_by_duals
+        from .jitted_tangents import rhs_by_duals
 
         try:
             rhs = rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
@@ -503,7 +503,7 @@ def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
     if np.array_equal(places.ravel(), np.arange(places.size)):
         return rhs
     if is_jitted(jitted_call(rhs)) and not jit_is_off():
-        from .jitted_columns import rearranged
+        from .jitted_tangents import rearranged
 
         return rearranged(jitted_call(rhs), tuple(places.ravel().tolist()))
 
@@ -678,7 +678,7 @@ def _of_state(
             own.gradient = gradient_by_duals(own.function, n, shape, bool(extra), scalars(extra) or "")
             own.in_place = True
         if parameters:
-            from .jitted_columns import parameter_gradient
+            from .jitted_tangents import parameter_gradient
 
             slopes = parameter_gradient(own.function, extra[0].size, shape, parameters)
     except NotCompilableError:  # the function is then called from Python
