@@ -33,7 +33,7 @@ from .options import ProjectionOptions
 from .particles import Particles, missing_particles
 from .runs import Run, Start
 from .stepping import AnyMethod, Stepping
-from .variations import Columns, widened
+from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
 
 __all__ = ["RunSpec"]
 
@@ -55,10 +55,11 @@ class RunSpec(NamedTuple):
     ``jacobian()`` returns the Jacobian for a multistep method (see `SecondOrder`) or an implicit one, or None, and
     ``frequencies(y0, length)`` is that of `Problem`. With `level` a multistep method returns the state at the newest
     end of its history; otherwise that in the middle. ``hint()`` returns the end of a message: advice for equations that
-    are not of second order. `columns` of derivatives follow the state; `stepping` and `projection` are for the state
-    without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with velocities too,
-    on which it may come to depend; `is_second_order` that `rhs` is (v, a) by its construction. `called` and `left_out`:
-    see `Run`. `uncounted` is `rhs` without the count of its calls, to search for what the system keeps, or None.
+    are not of second order. `tangents` are the vectors in the augmented state; `stepping` and `projection` are for the
+    state without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with
+    velocities too, on which it may come to depend; `is_second_order` that `rhs` is (v, a) by its construction. `called`
+    and `left_out`: see `Run`. `uncounted` is `rhs` without the count of its calls, to search for what the system keeps,
+    or None.
     """
 
     name: str
@@ -74,7 +75,7 @@ class RunSpec(NamedTuple):
     hint: Callable[[], str] = str
     called: str = "fun"
     left_out: str = ""
-    columns: Columns | None = None
+    tangents: TangentVectors = NO_TANGENT_VECTORS
     sees_velocity: bool = True
     is_second_order: bool = False
     uncounted: Callable[[float, Array], Array] | None = None
@@ -125,24 +126,16 @@ class RunSpec(NamedTuple):
         run.method.begin(self.rhs, start, self.stepping, self.jacobian())
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
-        """Return the length of the first step, chosen from the state alone, without columns of derivatives."""
-        columns = self.columns
-        if columns is None:
-            return self.stepping.first(self.rhs, y0, f0, method)
-
-        def derivative(t: float, y: Array) -> Array:
-            wide = y0.copy()
-            wide[columns.places] = y
-            return columns.own(self.rhs(t, wide))
-
-        return self.stepping.first(derivative, columns.own(y0), columns.own(f0), method)
+        """Return the length of the first step, chosen from the state alone, without tangent vectors."""
+        tangents = self.tangents
+        derivative = tangents.of_state(self.rhs, y0)
+        return self.stepping.first(derivative, tangents.state(y0), tangents.state(f0), method)
 
     def _with_buffers(self, method: AnyMethod, start: Start, tell: bool) -> Run:
         """Return a run whose invariants have been evaluated at the start; `tell`: see `InvariantSet`."""
         t_bound, projection = self.stepping.span.t_bound, self.projection
         invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
-        columns = self.columns
-        y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
+        y, f = map(self.tangents.state, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
         depends_on_time = method is not AT_REST and invariants.size > 0 and invariants.add_rounding_of_time(start.y)
         options, sigma, identity = projection.settled(method, self.stepping, y, f, invariants)
@@ -151,8 +144,7 @@ class RunSpec(NamedTuple):
             linear = unless_error(self._linear_invariants, start, invariants)
             C = np.zeros((0, 0)) if linear is None else linear.C
             options = options._replace(frame=frame_rows((C, C.T), y.size, 1)) if len(C) else options
-        if columns is not None:
-            options, sigma = widened(options, sigma, columns, invariants.start_gradients)
+        options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)
         invariants.kinds = options.kinds
         arrays = steppers.arrays(method)
         if isinstance(arrays, Method) and arrays.nystrom and self.sees_velocity:
@@ -184,9 +176,14 @@ class RunSpec(NamedTuple):
 
     def _linear_invariants(self, start: Start, invariants: InvariantSet) -> FoundInvariants | None:
         """Return the linear invariants that the corrections of a run from `start` leave unchanged."""
-        derivative, gradients = self._of_state(start, invariants)
-        columns = self.columns
-        y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
+        assert self.uncounted is not None
+        tangents = self.tangents
+        derivative, (y, f) = tangents.of_state(self.uncounted, start.y), map(tangents.state, start[1:3])
+
+        def gradients(t: float, y: Array, f: Array) -> Array:
+            Y, F = tangents.with_state(start.y, y), tangents.with_state(start.f, f)
+            return tangents.state(invariants.gradients(t, Y, F))
+
         searched = self.projection.linear_invariants == "auto" and y.size <= MOST_COMPONENTS
         given = next((item.linear for item in invariants.items if item.linear is not None), None)
         if not searched and (given is None or given.C.shape[1] != y.size):
@@ -203,27 +200,10 @@ class RunSpec(NamedTuple):
             kept = independent_of(found, np.array([gradients(*point) for point in points]), samples.sizes)
         return FoundInvariants(kept, len(found.C), samples.calls)
 
-    def _of_state(self, start: Start, invariants: InvariantSet) -> tuple[Any, Any]:
-        """Return the derivative and the gradients as functions of the state alone, without columns of derivatives."""
-        columns, rhs = self.columns, self.uncounted
-        assert rhs is not None
-        if columns is None:
-            return rhs, invariants.gradients
-
-        def wide(y: Array) -> Array:
-            out = start.y.copy()
-            out[columns.places] = y
-            return out
-
-        def gradients(t: float, y: Array, f: Array) -> Array:
-            return invariants.gradients(t, wide(y), rhs(t, wide(y)))[:, columns.places]
-
-        return lambda t, y: columns.own(rhs(t, wide(y))), gradients
-
     def _missing(self, run: Run) -> Particles | None:
         """Return the particles whose momentum and angular momentum the run does not keep, see `missing_particles`."""
         invariants, (t, y, f, _) = run.invariants, run.begin
-        if self.uncounted is None or self.columns is not None or invariants.balances.items or y.dtype.kind == "c":
+        if self.uncounted is None or self.tangents.count or invariants.balances.items or y.dtype.kind == "c":
             return None
         if invariants.by_values.any() and y.size > MOST_COMPONENTS:
             return None  # gradients take long
@@ -245,8 +225,7 @@ class RunSpec(NamedTuple):
         if self.projection.project_initial:
             t0, y0, _, tau = run.begin
             moved = projected_start(run, self.rhs)
-            compared = y0, moved, run.invariants.floors
-            run.moved = _moved(*(compared if self.columns is None else map(self.columns.own, compared)))
+            run.moved = _moved(*map(self.tangents.state, (y0, moved, run.invariants.floors)))
             run.start = Start(t0, moved, self.rhs(t0, moved), tau)
         violation = run.invariants.start_violation(*run.start[:3])
         if violation:
