@@ -29,7 +29,6 @@ TOLERANCES = {"jvp": (0.0, 1e-3), "dual numbers": (1e-3, 1e-12), "complex steps"
 DISTANCES = (1e-2, 1e-4, 1e-6, 0.0)
 COMPLEX_STEP = 2.0**-332  # a power of two, so that the product has no other error than the rounding of the function
 LEAST = 1e-3  # size for differences of a parameter that is 0
-TINY = 1e-150  # least size of a component: the product of it and a complex step does not underflow
 
 
 class First(NamedTuple):
@@ -196,19 +195,25 @@ class _Products:
 
     def by_numbers(self) -> tuple[Any, str]:
         """Return the right-hand side by dual numbers, or else by complex steps, and which of them, if it is right."""
-        as_derivative(self.derivative(*self.first), self.n, self.first.y.dtype, self.first.t)
-        try:
-            rhs = self._dual_numbers()
-            reason = self.wrong(rhs, "dual numbers")
-        except NotCompilableError as error:
-            reason = str(error)
-        except MemoryError:
-            raise
-        except Exception as error:  # the function itself raises none at the start
-            reason = f"it raises {type(error).__name__} with dual numbers"
-        if reason is None:
-            return rhs, "dual numbers"
-        rhs = self._interpreted(self._complex_steps())
+        t, y, extra = self.first
+        as_derivative(self.derivative(t, y, extra), self.n, y.dtype, t)
+        numbers, reason = scalars(extra), "it is not compiled by Numba"
+        if is_jitted(self.fun) and not jit_is_off() and numbers is not None:
+            from .jitted_tangents import rhs_by_duals
+
+            parameters, count = self.tangents.parameters, self.tangents.count
+            try:
+                rhs = rhs_by_duals(self.fun, self.form, self.n, parameters, count, bool(extra), numbers)
+                if (wrong := self.wrong(rhs, "dual numbers")) is None:
+                    return rhs, "dual numbers"
+                reason = wrong
+            except NotCompilableError as error:
+                reason = str(error)
+            except MemoryError:
+                raise
+            except Exception as error:  # the function itself raises none at the start
+                reason = f"it raises {type(error).__name__} with dual numbers"
+        rhs = self._interpreted(self._by_complex_steps)
         if not unless_error(lambda: self.wrong(rhs, "complex steps") is None):
             raise ValueError(
                 "variations: the derivatives of the right-hand side cannot be computed: it does not belong to a "
@@ -216,16 +221,6 @@ class _Products:
                 "jvp(t, y, dy) that returns the product of the Jacobian with dy."
             )
         return rhs, "complex steps"
-
-    def _dual_numbers(self) -> Any:
-        """Return the right-hand side by dual numbers; raise NotCompilableError if `fun` does not take them."""
-        extra, tangents = self.first.extra, self.tangents
-        numbers = scalars(extra)
-        if not is_jitted(self.fun) or jit_is_off() or numbers is None:
-            raise NotCompilableError("it is not compiled by Numba")
-        from .jitted_tangents import rhs_by_duals
-
-        return rhs_by_duals(self.fun, self.form, self.n, tangents.parameters, tangents.count, bool(extra), numbers)
 
     def derivative(self, t: float, y: Array, extra: tuple) -> Array:
         """Return the derivative (n,) of a real or complex state y."""
@@ -259,25 +254,16 @@ class _Products:
 
         return rhs
 
-    def _complex_steps(self) -> Callable[[float, Array, Array, tuple], Array]:
-        """Return products by complex steps, which take vectors of about the size of the state."""
-        floors = typical_sizes(self.first.y, np.zeros(self.n), 0.0)
+    def _by_complex_steps(self, t: float, y: Array, M: Array, extra: tuple) -> Array:
+        """Return the products (k, n) of the Jacobian and the rows of M by complex steps."""
+        # Rows of a size below 2, because complex steps have to be small. Powers of two change them without rounding.
+        sizes = 2.0 ** (np.frexp(np.abs(M).max(axis=1, keepdims=True))[1] - 1)
+        rows = M / sizes
 
-        def products(t: float, y: Array, M: Array, extra: tuple) -> Array:
-            scale = np.maximum(np.abs(y) + floors, TINY)
-            if self.places:
-                own = np.abs(extra[0][self.places])
-                scale = np.concatenate([scale, np.where(own > 0, own, LEAST)])
-            with np.errstate(over="ignore"):  # vectors that grow without bound end the run later, with a message
-                sizes = 2.0 ** (np.frexp((np.abs(M) / scale).max(axis=1))[1][:, None] - 1)
-            rows = M / sizes  # without rounding, because sizes are powers of two
+        def along(t: float, shares: Array) -> Array:
+            return self._shifted(t, y, shares @ rows, extra)
 
-            def along(t: float, shares: Array) -> Array:
-                return self._shifted(t, y, shares @ rows, extra)
-
-            return BUILD.gradients.complex_step(along, t, np.zeros(len(rows)), (), COMPLEX_STEP).T * sizes
-
-        return products
+        return BUILD.gradients.complex_step(along, t, np.zeros(len(rows)), (), COMPLEX_STEP).T * sizes
 
     def wrong(self, rhs: Callable[..., Any], source: str) -> str | None:
         """Return a clause about a wrong product in `rhs`, from the `source`, along the test direction; None if right.
