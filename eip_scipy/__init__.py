@@ -10,12 +10,12 @@ from sys import version_info as _python
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from . import chaos as chaos
     from . import checkpoint as checkpoint
     from . import methods as methods
     from . import problems as problems
     from . import results as results
     from . import solvers as solvers
-    from . import tangent_maps as tangent_maps
     from .core.balances import Balance
     from .core.config import show_config
     from .core.invariants import Invariant, check_gradient
@@ -123,7 +123,7 @@ _require_main_interpreter()
 if not _Path(__file__).with_name("integrations").exists():
     __path__.append(str(_Path(__file__).parents[1]))
 
-_MODULES = ("checkpoint", "methods", "problems", "results", "solvers", "tangent_maps")
+_MODULES = ("chaos", "checkpoint", "methods", "problems", "results", "solvers")
 
 
 def __getattr__(name: str) -> Any:

@@ -12,9 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from eip_scipy import EIPDOP853, ProjectionWarning
+from eip_scipy.chaos import megno
 from eip_scipy.plotting.chaos import draw_stability
 from eip_scipy.problems import nbody
-from eip_scipy.tangent_maps import megno
 
 try:
     from eip_scipy.integrations import rebound

@@ -15,6 +15,7 @@ from .invariants import InvariantSet
 from .linear import LinearInvariants, confirmed, found_invariants, undetermined
 from .options import ProjectionOptions
 from .particles import Particles, missing_particles
+from .tangent_vectors import TangentVectors
 
 __all__ = ["Conserved", "Samples", "conserved"]
 
@@ -54,13 +55,19 @@ class Samples:
     """States around the start of a run and their derivatives. The states are the same in each run that starts there.
 
     There are `near` points near the start, at its time, and `far` points at larger distances, at times up to the end.
-    `start` is a `Start`; in a state with columns of derivatives only the components at `places` are varied and
-    returned. `calls` counts the evaluations of ``rhs(t, y)``.
+    `start` is a `Start`; of a state with `tangents` only the state itself is varied and returned. `calls` counts the
+    evaluations of ``rhs(t, y)``.
     """
 
-    def __init__(self, rhs: Callable[[float, Array], Array], start: Any, invariants: InvariantSet, places: Any) -> None:
-        self._rhs, self._start, self.invariants, self._places = rhs, start, invariants, places
-        self.y0, self.f0, self.G0 = start.y[places], start.f[places], invariants.start_gradients[:, places]
+    def __init__(
+        self,
+        rhs: Callable[[float, Array], Array],
+        start: Any,
+        invariants: InvariantSet,
+        tangents: TangentVectors,
+    ) -> None:
+        self._rhs, self._start, self.invariants, self._tangents = rhs, start, invariants, tangents
+        self.y0, self.f0, self.G0 = map(tangents.state, (start.y, start.f, invariants.start_gradients))
         self.near, self.far, self.calls = NEAR, 0, 0
 
     @cached_property
@@ -82,22 +89,20 @@ class Samples:
         times = [t0] * self.near + [t0 + span * k / (FAR - 1) for k in range(self.far)]
         self.calls += len(times)
         for k, t in enumerate(times):
-            found = unless_error(self._rhs, t, self._wide(y[k]))
-            f[k] = np.nan if found is None else found[self._places]
+            found = unless_error(self._rhs, t, self._augmented(y[k]))
+            f[k] = np.nan if found is None else self._tangents.state(found)
         return y, f
 
     @cached_property
     def gradients(self) -> Array:
         """Return the gradients (NEAR, l, n) of the invariants at the first points."""
         self.calls += NEAR
-        states = [(self._start.t, self._wide(state)) for state in self.points[0][:NEAR]]
+        states = [(self._start.t, self._augmented(state)) for state in self.points[0][:NEAR]]
         found = [self.invariants.gradients(*here, self._rhs(*here)) for here in states]
-        return np.array(found)[:, :, self._places]
+        return self._tangents.state(np.array(found))
 
-    def _wide(self, y: Array) -> Array:
-        out: Array = self._start.y.copy()
-        out[self._places] = y
-        return out
+    def _augmented(self, y: Array) -> Array:
+        return self._tangents.with_state(self._start.y, y)
 
 
 @lru_cache(maxsize=8)

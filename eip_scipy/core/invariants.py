@@ -113,7 +113,7 @@ class Invariant:
 
     # These are attributes of balances, see `Balance`.
     is_balance = False
-    of_state: Any = None  # of a state with columns of derivatives behind it, see `variations.OfState`
+    unaugmented: Any = None  # for invariants of augmented states, see `variations.Unaugmented`
     # The linear invariants that corrections leave unchanged in runs with this one, see `particle_invariants`.
     linear: LinearInvariants | None = None
     rate_function: Callable[..., Any] | None = None

@@ -35,15 +35,14 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     """
     dual = dual_along(n)
     lanes = dual.lanes
-    call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
-    make_state = new_state(dual, n)
+    fun, make_state = for_duals(fun, dual), new_state(dual, n)
 
-    def filled(t, y, out, params):
+    def filled(t, y, out, args):
         x = make_state()
         for first in range(0, n, lanes):
             for i in range(n):
                 x[i] = seed(dual, y[i], i - first)
-            put_slopes(call(t, x, params), out, first, min(lanes, n - first))
+            put_slopes(fun(t, x, *args), out, first, min(lanes, n - first))
 
     return compiled_for(filled, 1 + len(shape), has_params, scalars)
 
@@ -55,14 +54,13 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
     The arguments and the exception are those of `gradient_by_duals`.
     """
     dual = Dual(1)
-    call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
-    make_state, slopes = new_state(dual, n), inside(_slopes_of(shape))
+    fun, make_state, slopes = for_duals(fun, dual), new_state(dual, n), inside(_slopes_of(shape))
 
-    def along(t, y, f, params):
+    def along(t, y, f, args):
         x = make_state()
         for i in range(n):
             x[i] = put_slope(seed(dual, y[i], 1), 0, f[i])
-        return slopes(call(seed(dual, t, 0), x, params))
+        return slopes(fun(seed(dual, t, 0), x, *args))
 
     return compiled_for(along, 1, has_params, scalars)
 
@@ -92,29 +90,18 @@ def _slopes_of(shape: tuple[int, ...]) -> Callable[..., Any]:
     return slopes
 
 
-def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
-    if one_by_one:
-        return inside(lambda t, x, numbers: fun(t, x, *numbers))
-    return inside((lambda t, x, params: fun(t, x, params)) if has_params else (lambda t, x, params: fun(t, x)))
-
-
 def compiled_for(function: Callable[..., Any], ndim: int, has_params: bool, scalars: str) -> Any:
-    """Compile ``function(t, y, a, params)`` for real states and a of `ndim` dimensions; it takes params as a user's."""
+    """Compile ``function(t, y, a, args)`` as ``call(t, y, a, *args)``, for real y (n,) and a of `ndim` dimensions.
+
+    `args` are the arguments that follow in a user's functions: params if `has_params`, or numbers of the types in
+    `scalars`, see `Packed`.
+    """
     function = inside(function)
     floats, third = (types.Array(types.float64, dimensions, "C") for dimensions in (1, ndim))
-    if scalars:
-        numbers = types.BaseTuple.from_types([NUMBERS[scalar] for scalar in scalars])
-        return _by_signature(lambda t, y, a, *numbers: function(t, y, a, numbers), [floats, third, numbers])
-    if has_params:
-        return _by_signature(lambda t, y, a, params: function(t, y, a, params), [floats, third, floats])
-    return _by_signature(lambda t, y, a: function(t, y, a, y), [floats, third])
-
-
-def _by_signature(function: Callable[..., Any], arguments: list[Any]) -> Any:
-    """Return `function` compiled for a float t and for further arguments of the Numba types `arguments`."""
-    compiled = njit(function)
+    args = [NUMBERS[scalar] for scalar in scalars] if scalars or not has_params else [floats]
+    compiled = njit(lambda t, y, a, *args: function(t, y, a, args))
     try:
-        compiled.compile((types.float64, *arguments))
+        compiled.compile((types.float64, floats, third, types.BaseTuple.from_types(args)))
     except Exception as error:  # Numba has no one class for what its parts raise on a type that they do not expect
         said = [line for line in str(error).splitlines() if line.startswith(SAYING)] or [type(error).__name__]
         raise NotCompilableError(f"it does not compile for dual numbers: {said[0].rstrip(':')}") from error

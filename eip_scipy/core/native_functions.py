@@ -82,8 +82,9 @@ def native_functions(
     slopes: list[Native] = []
     rate: list[Native] = []
     product: list[Native] = []
-    for k, (wide, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
-        item, value = _of_state(wide, number)
+    for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
+        own = item.unaugmented
+        item, value = _unaugmented(item, number)
         name, shape = f"invariant {label!r}", _shape(invariants, k)
         if item.args:
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
@@ -93,10 +94,9 @@ def native_functions(
         rows = (*shape, value.size)
         of_rows = value.like(rows, value.size, takes_f=item.uses_f, in_place=item.in_place, gradient=True)
         grad.append(_native(item.gradient, of_rows, f"gradient of {name}"))
-        if wide.of_state is not None and wide.of_state.by_parameters is not None:
-            p, slope = wide.of_state.parameters, wide.of_state.by_parameters
-            of_slope = value.like((*shape, p), value.size, real=True)
-            slopes.append(_native(slope, of_slope, f"derivatives by parameters of {name}"))
+        if own is not None and own.by_parameters is not None:
+            of_slope = value.like((*shape, own.parameters), value.size, real=True)
+            slopes.append(_native(own.by_parameters, of_slope, f"derivatives by parameters of {name}"))
     for k, item in invariants.balances.items.items():
         of_rate = number.like(_shape(invariants, k), y0.size, real=True, takes_f=item.rate_uses_f, gradient=True)
         rate.append(_native(item.rate_function, of_rate, f"rate of balance {invariants.labels[k]!r}"))
@@ -127,9 +127,9 @@ def _shape(invariants: InvariantSet, k: int) -> tuple[int, ...]:
     return () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
 
 
-def _of_state(fun: Any, number: Kind) -> tuple[Any, Kind]:
+def _unaugmented(fun: Any, number: Kind) -> tuple[Any, Kind]:
     """Return what the engine calls for `fun`, the function of the state alone if there is one, and its signature."""
-    alone = getattr(fun, "of_state", None)
+    alone = getattr(fun, "unaugmented", None)
     return (fun, number) if alone is None else (alone.function, number._replace(size=alone.n))
 
 
@@ -138,7 +138,7 @@ def with_events(
 ) -> NativeFunctions:
     """Return a copy of `functions` with the addresses of the events, or raise NotCompilableError."""
     number = _number(params, y0)
-    event = [_native(*_of_state(function, number), f"event {k}") for k, function in enumerate(events)]
+    event = [_native(*_unaugmented(function, number), f"event {k}") for k, function in enumerate(events)]
     return functions._replace(event=_addresses(event), owner=functions.owner | {"event": event})
 
 

@@ -21,7 +21,7 @@ from .invariants import TARGET_TOLERANCE, InvariantSet
 from .options import ProjectionOptions
 from .runs import Run, Start
 from .stepping import Stepping
-from .variations import Columns, widened
+from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
 
 __all__ = ["RunSpec"]
 
@@ -41,10 +41,10 @@ class RunSpec(NamedTuple):
     ``jacobian()`` returns the Jacobian for a multistep method (see `jacobian_product`) or an implicit one, or None, and
     ``frequencies(y0, length)`` is that of `Problem`. With `level` a multistep method returns the state at the newest
     end of its history; otherwise that in the middle. ``hint()`` returns the end of a message: advice for equations that
-    are not of second order. `columns` of derivatives follow the state; `stepping` and `projection` are for the state
-    without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with velocities too,
-    on which it may come to depend; `is_second_order` that `rhs` is (v, a) by its construction. `called` and `left_out`:
-    see `Run`.
+    are not of second order. `tangents` are the vectors in the augmented state; `stepping` and `projection` are for the
+    state without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with
+    velocities too, on which it may come to depend; `is_second_order` that `rhs` is (v, a) by its construction. `called`
+    and `left_out`: see `Run`.
     """
 
     name: str
@@ -60,7 +60,7 @@ class RunSpec(NamedTuple):
     hint: Callable[[], str] = str
     called: str = "fun"
     left_out: str = ""
-    columns: Columns | None = None
+    tangents: TangentVectors = NO_TANGENT_VECTORS
     sees_velocity: bool = True
     is_second_order: bool = False
 
@@ -95,36 +95,27 @@ class RunSpec(NamedTuple):
         return self.method.checked(self, Start(t0, y0, f0, 0.0)), f0
 
     def _first_step(self, method: Method, y0: Array, f0: Array) -> float:
-        """Return the length of the first step, chosen from the state alone, without columns of derivatives."""
-        columns = self.columns
-        if columns is None:
-            return self.stepping.first(self.rhs, y0, f0, method)
-
-        def derivative(t: float, y: Array) -> Array:
-            wide = y0.copy()
-            wide[columns.places] = y
-            return columns.own(self.rhs(t, wide))
-
-        return self.stepping.first(derivative, columns.own(y0), columns.own(f0), method)
+        """Return the length of the first step, chosen from the state alone, without tangent vectors."""
+        tangents = self.tangents
+        derivative = tangents.of_state(self.rhs, y0)
+        return self.stepping.first(derivative, tangents.state(y0), tangents.state(f0), method)
 
     def _with_buffers(self, method: Method, start: Start, tell: bool) -> Run:
         """Return a run whose invariants have been evaluated at the start; `tell`: see `InvariantSet`."""
         t_bound, projection = self.stepping.span.t_bound, self.projection
         invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
-        columns = self.columns
-        y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
+        y, f = map(self.tangents.state, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
         depends_on_time = (
             method is not PROJECTION_ONLY and invariants.size > 0 and invariants.add_rounding_of_time(start.y)
         )
         options, sigma, identity = projection.settled(method, self.stepping, y, f, invariants)
-        samples = Samples(self.rhs, start, invariants, slice(None) if columns is None else columns.places)
+        samples = Samples(self.rhs, start, invariants, self.tangents)
         found = unless_error(conserved, samples, projection, method, tell and options.watched)
         found = Conserved(calls=samples.calls) if found is None else found
         if len(C := found.linear.C):
             options = options._replace(frame=frame_rows((C, C.T), y.size, 1))
-        if columns is not None:
-            options, sigma = widened(options, sigma, columns, invariants.start_gradients)
+        options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)
         invariants.kinds = options.kinds
         stepper = method.for_engine(self.sees_velocity)
         carried, blocks = options.balances.place, options.groups.start.size - 1
@@ -149,8 +140,7 @@ class RunSpec(NamedTuple):
         if self.projection.project_initial:
             t0, y0, _, tau = run.begin
             moved = projected_start(run, self.rhs)
-            compared = y0, moved, run.invariants.floors
-            run.moved = _moved(*(compared if self.columns is None else map(self.columns.own, compared)))
+            run.moved = _moved(*map(self.tangents.state, (y0, moved, run.invariants.floors)))
             run.start = Start(t0, moved, self.rhs(t0, moved), tau)
         violation = run.invariants.start_violation(*run.start[:3])
         if violation:

@@ -39,7 +39,7 @@ from .run_spec import RunSpec
 from .runs import Run, Start, parts_of, run_of
 from .states import as_derivative, initial_state
 from .stepping import ATOL, StepOptions, Stepping, interval
-from .variations import Columns
+from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
 
 __all__ = [
     "EIPBDF", "EIPDOP853", "EIPGJ12", "EIPGJ14", "EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPRK23",
@@ -126,7 +126,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     TABLEAU: ClassVar[Method]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
-    _COLUMNS: ClassVar[Columns | None] = None  # columns of derivatives behind the state
+    _TANGENTS: ClassVar[TangentVectors] = NO_TANGENT_VECTORS
     order: Any = NotImplemented
     error_estimator_order: Any = NotImplemented
     n_stages: Any = NotImplemented
@@ -175,7 +175,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         start = initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
-        n = self.n if self._COLUMNS is None else self._COLUMNS.n
+        n = self._TANGENTS.state(start).size
         stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)
         kept = as_invariants(projection.invariants)
         self._jacobian = jacobian
@@ -183,7 +183,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._spec = self._specified(stepping, replace(projection, invariants=kept))
         self._take_stepping(stepping)
         if self.h is None and stepping.first_step is None:
-            stepping.require_scale(start if self._COLUMNS is None else self._COLUMNS.own(start))
+            stepping.require_scale(self._TANGENTS.state(start))
         self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated) or n < self.n)
         self.h_previous: float | None = None
         self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
@@ -233,7 +233,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             jacobian=lambda: moved,
             level=True,
             hint=lambda: f". If fun is the acceleration a(t, q), {BY_NAME}",
-            columns=self._COLUMNS,
+            tangents=self._TANGENTS,
         )
 
     def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:

@@ -33,7 +33,7 @@ from ..core.pointers import PointerFunction
 from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
 from ..core.states import states
-from ..core.variations import Columns
+from ..core.tangent_vectors import TangentVectors
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
@@ -583,19 +583,19 @@ class _Gathered:
             component_names=plan.ready.component_names,
         )
         if plan.variations is not None:
-            _separate(result, plan.variations.columns)
+            _separate(result, plan.ready.tangents)
             result["columns"] = plan.ready.described_columns
         return result
 
 
-def _separate(result: EnsembleResult, columns: Columns) -> None:
-    """Separate the states of a result from the columns of derivatives that follow them, in place."""
-    result["y"], result["variations"] = columns.apart(result.y)
+def _separate(result: EnsembleResult, tangents: TangentVectors) -> None:
+    """Separate the states of a result from the tangent vectors, in place."""
+    result["y"], result["variations"] = tangents.split(result.y)
     if result.trajectories is not None:
-        rows, result["variations"] = columns.apart(result.trajectories.swapaxes(1, 2))
+        rows, result["variations"] = tangents.split(result.trajectories.swapaxes(1, 2))
         result["trajectories"] = rows.swapaxes(1, 2)
     if result.y_events is not None:
-        result["y_events"] = [[columns.own(rows) for rows in member] for member in result.y_events]
+        result["y_events"] = [[tangents.state(rows) for rows in member] for member in result.y_events]
 
 
 def _check_options(options: dict[str, Any]) -> None:

@@ -87,9 +87,9 @@ def _member(plan: Plan, members: Members, k: int) -> IntegrationResult:
         epoch=None if problem is None else problem.epoch,
     )
     if plan.variations is not None:
-        columns = plan.variations.columns
-        own, result["variations"] = columns.apart(y)
+        tangents = plan.ready.tangents
+        own, result["variations"] = tangents.split(y)
         result["y"], result["columns"] = own.T, plan.ready.described_columns
         if events is not None:
-            result["y_events"] = [columns.own(states) for _, states in events]
+            result["y_events"] = [tangents.state(states) for _, states in events]
     return result

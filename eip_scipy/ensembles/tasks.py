@@ -228,8 +228,7 @@ def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members,
     try:
         loop = Loop(plan.task.prepared(y0, params), Keeper())
     except Exception as error:
-        places = slice(None) if plan.variations is None else plan.variations.columns.places
-        out.y[k, places], out.t[k] = y0, plan.t0
+        out.y[k], out.t[k] = plan.ready.tangents.with_state(out.y[k], y0), plan.t0
         out.status[k], out.message[k] = FAILED, _reason(error)
         return
     broken = False

@@ -9,7 +9,7 @@ from scipy.integrate import OdeSolution
 
 from ..core.inputs import is_number, shown
 from ..core.results import Diagnostics, Multipliers, joined_sums
-from ..core.variations import StateSolution
+from ..core.tangent_vectors import StateSolution
 from .events import ContinuedEvents, as_events
 from .integrate import integrate
 from .prepare import Request
@@ -120,4 +120,4 @@ def _solution(one: OdeSolution | None, two: OdeSolution | None) -> OdeSolution |
     if one is None or two is None:
         return None
     both = OdeSolution(np.append(one.ts, two.ts[1:]), [*one.interpolants, *two.interpolants])
-    return StateSolution(both, two.columns) if isinstance(two, StateSolution) else both
+    return StateSolution(both, two.tangents) if isinstance(two, StateSolution) else both

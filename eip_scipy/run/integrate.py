@@ -23,7 +23,7 @@ from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
-from ..core.variations import StateSolution
+from ..core.tangent_vectors import StateSolution
 from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, OK, PAUSE, ROW, STEP, TIME, Schedule
 from ..engine.native import PythonFunctions
 from ..engine.trust import ProjectionWarning
@@ -409,25 +409,25 @@ class Loop:
         for row in range(first_row, driver.rows):
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
-            if self.callback(t, _own(y, self.prepared), invariants.values(t, y) - invariants.fixed_target):
+            if self.callback(t, self.prepared.tangents.state(y), invariants.values(t, y) - invariants.fixed_target):
                 driver.schedule.place[ROW] = row + 1
                 return True
         return False
 
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
-        driver, problem = self.driver, self.prepared.problem
+        driver, problem, tangents = self.driver, self.prepared.problem, self.prepared.tangents
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
         values, target = self._values(broken), driver.run.invariants.fixed_target
         driver.note(values, target)
         result = IntegrationResult(
             t=driver.t[:rows],
-            y=_own(driver.y[:rows], self.prepared).T,
+            y=tangents.state(driver.y[:rows]).T,
             invariants=values,
             target=target,
             max_residual=driver.run.work.max_residual,
             diagnostics=self.diagnostics,
             t_events=[np.asarray(t) for t in events.t] if events.functions else None,
-            y_events=[_own(np.asarray(y), self.prepared) for y in events.y] if events.functions else None,
+            y_events=[tangents.state(np.asarray(y)) for y in events.y] if events.functions else None,
             sol=self._solution(),
             nfev=int(counters[NFEV]),
             njev=int(counters[NJEV]),
@@ -448,11 +448,10 @@ class Loop:
         t, y = events.last if self._event_ended else driver.now
         asked, variations = self.prepared.asked, self.prepared.variations
         if variations is not None:
-            columns = variations.columns
-            result["variations"] = columns.apart(driver.y[:rows])[1]
+            result["variations"] = tangents.split(driver.y[:rows])[1]
             result["columns"] = self.prepared.described_columns
-            asked = asked._replace(variations=columns.after(y))
-        origin = Origin(asked, t, _own(y.copy(), self.prepared), driver.schedule.span.sign, self._kept)
+            asked = asked._replace(variations=tangents.restarted(y))
+        origin = Origin(asked, t, tangents.state(y.copy()), driver.schedule.span.sign, self._kept)
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 
@@ -466,7 +465,7 @@ class Loop:
         found = self.driver.solution(self.events.last[0] if self._event_ended else self.driver.now[0])
         if found is None or self.prepared.variations is None:
             return found
-        return StateSolution(found, self.prepared.variations.columns)
+        return StateSolution(found, self.prepared.tangents)
 
     def explained(self, message: str) -> str:
         """Return the message with remarks: on a start that was moved and on doubts about the run.
@@ -492,11 +491,6 @@ class Loop:
             if not broken:
                 raise
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
-
-
-def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
-    """Return the states in `rows` without the columns of derivatives that follow them in a run with variations."""
-    return rows if prepared.variations is None or rows.size == 0 else prepared.variations.columns.own(rows)
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:

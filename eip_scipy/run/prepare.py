@@ -27,7 +27,8 @@ from ..core.runs import Counted, Run
 from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.states import as_derivative, initial_state
 from ..core.stepping import ATOL, StepOptions, Stepping, interval
-from ..core.variations import Variations, asked_columns, kept_symplectic, require_tableau, right_hand_side
+from ..core.tangent_vectors import NO_TANGENT_VECTORS, TangentVectors, tangent_vectors
+from ..core.variations import First, Variations, augmented_rhs
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from ..methods.gauss_jackson import jacobian_product
@@ -237,8 +238,8 @@ class System:
 
         in_python = isinstance(functions, PythonFunctions)
         found = {self.name: kind(self.fun, in_python)}
-        for wide, label in zip(run.invariants.items, run.invariants.labels, strict=True):
-            item = wide if wide.of_state is None else wide.of_state.function
+        for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
+            item = item if item.unaugmented is None else item.unaugmented.function
             found[label] = kind(item.function, in_python)
             differences = item.gradient is None and not in_python
             found[f"gradient of {label}"] = "differences" if differences else kind(item.gradient, in_python)
@@ -287,7 +288,12 @@ class Prepared:
     @property
     def n(self) -> int:
         """Return the number of components of the user's state."""
-        return self.run.y0.size if self.variations is None else self.variations.columns.n
+        return self.tangents.state(self.run.y0).size
+
+    @property
+    def tangents(self) -> TangentVectors:
+        """Return the tangent vectors, and their places in the state of the run."""
+        return NO_TANGENT_VECTORS if self.variations is None else self.variations.tangents
 
     @property
     def label(self) -> str:
@@ -298,13 +304,13 @@ class Prepared:
     def described_columns(self) -> dict[str, Any]:
         """Return the field ``columns`` of a result of this run, which carries derivatives."""
         assert self.variations is not None
-        columns = self.variations.columns
+        tangents = self.tangents
         known = {} if self.problem is None else dict(enumerate(self.problem.parameters))
         return {
-            "state": columns.is_transition,
-            "parameters": len(columns.parameters),
-            "names": [known.get(k, f"params[{k}]") for k in columns.parameters],
-            "symplectic": columns.symplectic,
+            "state": tangents.is_transition,
+            "parameters": len(tangents.parameters),
+            "names": [known.get(k, f"params[{k}]") for k in tangents.parameters],
+            "symplectic": tangents.symplectic,
             "source": self.variations.source,
         }
 
@@ -331,7 +337,7 @@ class Prepared:
         """Return all settings except functions, by users' names, that determine the result of a run to the last bit."""
         found = settings(self.label, y0, params, self.run, self.schedule, self.system.events)
         if self.variations is not None:
-            found |= {name: plain(value) for name, value in self.variations.columns.identity.items()}
+            found |= {name: plain(value) for name, value in self.tangents.identity.items()}
         return found
 
 
@@ -357,21 +363,22 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
         request = request._replace(projection=own | dict(request.projection) | {"invariants": items})
     variations = _variations(asked.fun, request, form)
     if variations is not None:
-        request, form, acc = _widened(request, variations), FORMS[False, True], None
+        request, form, acc = _augmented(request, variations), FORMS[False, True], None
     system = System(request, form, acc)
     t0, t_bound = _span(request, system.events)
     y0 = _state(request.y0)
-    n = y0.size if variations is None else variations.columns.n
+    tangents = NO_TANGENT_VECTORS if variations is None else variations.tangents
+    n = tangents.state(y0).size
     stepping = request.steps.checked(request.method.__name__, method, t0, t_bound, n, stacklevel=4)
     system.rhs = interpreted(form, system.fun, system.extra, y0)
     calls = Counted(system.derivative)
     spec = _spec(asked.fun, request, system, calls, stepping)
     if variations is not None:
         hint = (
-            f"components from {variations.columns.n} on are derivatives, which overflow in long chaotic runs: shorten "
+            f"components from {n} on are derivatives, which overflow in long chaotic runs: shorten "
             "the interval, or use megno or lyapunov_spectrum, which rescale them"
         )
-        spec = spec._replace(columns=variations.columns, left_out=hint)
+        spec = spec._replace(tangents=tangents, left_out=hint)
     run = spec.build(y0, check_start=check_start)
     schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)
@@ -411,7 +418,6 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
         if request.jvp is not None or request.symplectic is not None:
             raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
         return None
-    require_tableau(request.method)
     y0 = _state(request.y0)
     problem = given if isinstance(given, Problem) else None
     extra = extra_arguments(request.args, request.params)
@@ -419,29 +425,29 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     if request.symplectic is not None:
         flag("symplectic", request.symplectic)
     names = () if problem is None else tuple(problem.parameters)
-    columns = asked_columns(request.variations, y0, floats(extra), names, request.method.TABLEAU.of_second_order)
-    if projection.project_initial and columns.parameters:
+    tangents = tangent_vectors(request.variations, request.method, y0, floats(extra), names)
+    if projection.project_initial and tangents.parameters:
         raise ValueError(
             "variations: project_initial cannot be combined with derivatives with respect to parameters. Omit it, "
             "and pass y0 = eip_scipy.project(y0, ...).y."
         )
     own = None if problem is None else problem.variational
-    t0 = interval(_required("t_span", request.t_span))[0]
+    first = First(interval(_required("t_span", request.t_span))[0], y0, extra)
     items = as_invariants(projection.invariants)
     canonical = problem is not None and problem.canonical
-    columns = kept_symplectic(columns, request.symplectic, canonical, items)
-    products = right_hand_side(columns, request.fun, form, t0, y0, extra, request.jvp, own)
-    return Variations.of(columns, products, t0, y0, extra, items)
+    tangents = tangents.kept_symplectic(request.symplectic, canonical, bool(items))
+    rhs, source = augmented_rhs(tangents, request.fun, form, first, request.jvp, own)
+    return Variations.of(tangents, rhs, source, first, items)
 
 
-def _widened(request: Request, variations: Variations) -> Request:
-    """Return the request for the state followed by its columns of derivatives, with functions for this longer state."""
+def _augmented(request: Request, variations: Variations) -> Request:
+    """Return the request for the augmented state, with functions of it."""
     extra, events = extra_arguments(request.args, request.params), as_events(request.events)
     return request._replace(
         fun=variations.rhs,
-        y0=variations.columns.wide(_state(request.y0), floats(extra)),
+        y0=variations.tangents.augmented(_state(request.y0), floats(extra)),
         jacobian=None,
-        events=replaced(events, variations.events(events)),
+        events=replaced(events, map(variations.event, events)),
         projection={**request.projection, "invariants": variations.invariants},
     )
 

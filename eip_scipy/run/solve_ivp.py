@@ -29,7 +29,8 @@ from ..core.solvers import (
 )
 from ..core.states import initial_state
 from ..core.stepping import interval
-from ..core.variations import StateSolution, Variations, asked_columns, require_tableau, right_hand_side
+from ..core.tangent_vectors import StateSolution, TangentVectors, tangent_vectors
+from ..core.variations import First, Variations, augmented_rhs
 
 if TYPE_CHECKING:
     Result = dict[str, Any]
@@ -227,14 +228,14 @@ def _solve(
     if (jacobian := options.get("jacobian")) is not None and extra:
         options["jacobian"] = lambda *first: jacobian(*first, *extra)
     record = options.setdefault("diagnostics", Diagnostics())
-    wide = None
+    augmented = None
     if variations is not None:
-        wide = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
-        function, y0 = wide.derivative, wide.columns.wide(initial_state(y0), NOTHING)
-        method = _subclass(method, _COLUMNS=wide.columns)
-        options["invariants"] = wide.invariants
+        augmented = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
+        function, y0 = augmented.derivative, augmented.tangents.augmented(initial_state(y0), NOTHING)
+        method = _subclass(method, _TANGENTS=augmented.tangents)
+        options["invariants"] = augmented.invariants
         if (events := common["events"]) is not None:
-            common["events"] = wide.events((events,) if callable(events) else events)
+            common["events"] = [augmented.event(event) for event in ((events,) if callable(events) else events)]
     elif jvp is not None:
         raise TypeError("solve_ivp: jvp needs variations=...; pass variations, or omit jvp.")
     start = initial_state(y0) if options.get("project_initial") else None
@@ -242,8 +243,8 @@ def _solve(
     sol = scipy.integrate.solve_ivp(
         function, t_span, y0 if start is None else start, method=noting, **common, **options
     )
-    if wide is not None:
-        _split(sol, wide)
+    if augmented is not None:
+        _split(sol, augmented.tangents)
     if sol.status == 1:  # SciPy does not inform the solver that its run has ended
         solvers[0]._watch(ended=True)
     missing = solvers[0]._run.conserved.missing
@@ -254,12 +255,11 @@ def _solve(
 def _variations(
     method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, asked: Any, extra: tuple, items: Any, jvp: Any
 ) -> Variations:
-    """Return the `Variations` for the option `variations` (`asked`): functions of the state followed by its columns."""
-    require_tableau(method)
-    start, t0 = initial_state(y0), interval(t_span)[0]
-    columns = asked_columns(asked, start, NOTHING, (), method.TABLEAU.of_second_order)
-    products = right_hand_side(columns, fun, "value", t0, start, extra, jvp)
-    return Variations.of(columns, products, t0, start, (), as_invariants(items), in_python=True)
+    """Return the `Variations` for the option `variations` (`asked`): functions of augmented states."""
+    first = First(interval(t_span)[0], initial_state(y0), extra)
+    tangents = tangent_vectors(asked, method, first.y, NOTHING)
+    rhs, source = augmented_rhs(tangents, fun, "value", first, jvp)
+    return Variations.of(tangents, rhs, source, first._replace(extra=()), as_invariants(items), in_python=True)
 
 
 def _subclass(method: type[EIPSolver], **attributes: Any) -> Any:
@@ -267,15 +267,14 @@ def _subclass(method: type[EIPSolver], **attributes: Any) -> Any:
     return SolverClass(method.__name__, (method,), {**attributes, "__doc__": method.__doc__})
 
 
-def _split(sol: Any, wide: Variations) -> None:
-    """Split the states followed by columns in a result `sol` into its states and its ``variations``, in place."""
-    columns = wide.columns
-    sol.y, sol.variations = columns.apart(sol.y.T)
+def _split(sol: Any, tangents: TangentVectors) -> None:
+    """Split the augmented states in a result `sol` into its states and its ``variations``, in place."""
+    sol.y, sol.variations = tangents.split(sol.y.T)
     sol.y = sol.y.T
     if sol.y_events is not None:
-        sol.y_events = [columns.own(rows) if rows.size else rows for rows in sol.y_events]
+        sol.y_events = list(map(tangents.state, sol.y_events))
     if sol.sol is not None:
-        sol.sol = StateSolution(sol.sol, columns)
+        sol.sol = StateSolution(sol.sol, tangents)
 
 
 def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:

@@ -8,8 +8,8 @@ from scipy.special import ellipe, ellipk
 from sympy.physics import mechanics as me
 
 from eip_scipy import EIPDOP853, ensemble, integrate
+from eip_scipy.chaos import lyapunov_spectrum, megno
 from eip_scipy.problems import mechanics, mechanism
-from eip_scipy.tangent_maps import lyapunov_spectrum, megno
 
 G = 9.81
 OPTIONS = {"method": EIPDOP853, "h": 0.02}

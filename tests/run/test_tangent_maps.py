@@ -9,9 +9,9 @@ from numba import njit
 from systems import pericentre, refuse
 
 from eip_scipy import EIPDOP853, EIPRK4, equations, hamiltonian, integrate
+from eip_scipy.chaos import lyapunov_spectrum, megno
 from eip_scipy.problems import harmonic, nbody
 from eip_scipy.problems import kepler as kepler_problem
-from eip_scipy.tangent_maps import lyapunov_spectrum, megno
 
 pytestmark = pytest.mark.needs_jit
 
