@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -19,11 +18,11 @@ from ..engine import data
 from ..engine.data import LEAST_CHANGE, Grouping, Method
 from ..engine.native import BUILD
 from ..methods.runge_kutta import DOP853, RK4
-from .gradients import random_directions
+from .gradients import random_directions, unless_error
 from .invariant_checks import complaints
-from .invariants import InvariantSet, copied
+from .invariants import InvariantSet
 
-__all__ = ["Examiner", "is_check_due", "steps_to_check", "unless_refused", "unresolved"]
+__all__ = ["Examiner", "is_check_due", "steps_to_check", "unresolved"]
 
 # Number of steps before the first check of the invariants, and the factor from one check to the next.
 FIRST_CHECK = SPACING = 10
@@ -69,6 +68,9 @@ class Examiner:
     `figures` (l, N_FIGURES) are numbers about the projections of the run, see `engine.trust`; rates of change are also
     stored there. ``resolution(rhs, t, h, y, end_of_run)`` is `unresolved` for the method and the blocks of this run.
     `largest` is the largest correction, in local errors, when a large correction was last examined.
+
+    The run does not visit all of the examined states. Therefore an exception of a user's function at one of them says
+    nothing about the run, and the examination finds nothing.
     """
 
     invariants: InvariantSet
@@ -79,15 +81,10 @@ class Examiner:
 
     def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return a sentence about an invariant or a gradient that is wrong at a state of the run, or None."""
-        if not self.invariants.balances.items and unless_refused(self._is_in_order, rhs, t, y) is not False:
-            return None
-        return self._unless_refused(_complaint, rhs, t, y, True)
-
-    def _is_in_order(self, rhs: Derivative, t: float, y: Array) -> bool:
-        """Return True if a first look at a state of a run without balances finds nothing, and note rates."""
-        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
-        of_run = known.target, known.scales, self.tau, known.t_span, directions
-        return bool(_guarded(known.functions.look)(self.figures, t, y, rhs(t, y), *of_run))
+        with np.errstate(all="ignore"):
+            if not self.invariants.balances.items and unless_error(self._is_in_order, rhs, t, y) is not False:
+                return None
+            return unless_error(self._complaint, rhs, t, y)
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
         """Return a sentence about what is wrong in the step that the engine suspects, or None; clear its record."""
@@ -96,101 +93,48 @@ class Examiner:
         old, new = np.split(suspect[data.N_SUSPECT :].copy().view(self.invariants.dtype), 2)
         if reason == data.CHANGES_ALONG_FLOW:
             return self.complaint(rhs, t_new, new)
-        if reason == data.LARGE_ERROR:
-            return unless_refused(self.resolution, rhs, t_old, t_new - t_old, old, self.invariants.t_span[1])
-        if reason != data.LARGE_CORRECTION:
-            return None
-        return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new), int(suspect[data.SUSPECT_WAITED]))
-
-    def _unless_refused(self, look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
-        """Return the result of the examination `look`; None if a function of the user raises an exception in it.
-
-        The run does not visit the examined states. Therefore an exception there says nothing about the run.
-        """
-        known = copied(self.invariants)
-        known.functions = _Guarded(known.functions)
-        return unless_refused(partial(look, self, known), rhs, *args)
-
-
-def unless_refused(look: Callable[..., Any], rhs: Derivative, *args: Any) -> Any:
-    """Return ``look(rhs, *args)``; None if the right-hand side raises an exception in it, except MemoryError."""
-    try:
         with np.errstate(all="ignore"):
-            return look(_guarded(rhs), *args)
-    except _RefusedError:
+            if reason == data.LARGE_ERROR:
+                return unless_error(self.resolution, rhs, t_old, t_new - t_old, old, self.invariants.t_span[1])
+            if reason == data.LARGE_CORRECTION:
+                waited = int(suspect[data.SUSPECT_WAITED])
+                return unless_error(self._along_chord, rhs, (t_old, t_new), (old, new), waited)
         return None
 
+    def _is_in_order(self, rhs: Derivative, t: float, y: Array) -> bool:
+        """Return True if a first look at a state of a run without balances finds nothing, and note rates."""
+        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
+        of_run = known.target, known.scales, self.tau, known.t_span, directions
+        return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
 
-class _RefusedError(Exception):
-    """A function of the user raised an exception at a state that the run does not visit."""
+    def _complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
+        """Return the text of the first of the `complaints` at a state, if f is finite there, and note rates."""
+        f = rhs(t, y)
+        if not BUILD.are_finite(f.view(float)):
+            return None
+        evaluated = self.invariants.gradients(t, y, f), self.invariants.values(t, y)
+        self.invariants.note_rates(self.figures, t, y, f, *evaluated)
+        found = complaints(self.invariants, t, y, f, self.tau, rhs, evaluated)
+        return found[0].text if found else None
 
+    def _along_chord(
+        self, rhs: Derivative, times: tuple[float, float], ends: tuple[Array, Array], waited: int
+    ) -> str | None:
+        """Return a sentence about what is wrong in a step with a large correction, or in the steps before it, or None.
 
-class _Guarded:
-    """The functions of a set of invariants, whose exceptions, except MemoryError, become `_RefusedError`."""
-
-    def __init__(self, functions: Any) -> None:
-        self._functions = functions
-
-    def __getattr__(self, name: str) -> Any:
-        return _guarded(getattr(self._functions, name))
-
-
-def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` with its exceptions, except MemoryError, replaced by `_RefusedError`."""
-
-    def call(*args: Any) -> Any:
-        try:
-            return function(*args)
-        except MemoryError:
-            raise
-        except Exception as error:
-            raise _RefusedError from error
-
-    return call
-
-
-def _complaint(
-    examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, y: Array, on_manifold: bool
-) -> str | None:
-    """Return the text of the first of the `complaints` at a state, or None, and note rates in ``examiner.figures``.
-
-    `known` is a copy of the examiner's invariants whose functions raise `_RefusedError`. Without `on_manifold`,
-    complaints about invariants that depend on other invariants are ignored. A state whose derivative is not finite is
-    not examined.
-    """
-    f = rhs(t, y)
-    if not BUILD.are_finite(f.view(float)):
-        return None
-    evaluated = known.gradients(t, y, f), known.values(t, y)
-    known.note_rates(examiner.figures, t, y, f, *evaluated)
-    found = complaints(known, t, y, f, examiner.tau, rhs, evaluated)
-    return next((one.text for one in found if on_manifold or not one.dependent), None)
-
-
-def _along_chord(
-    examiner: Examiner,
-    known: InvariantSet,
-    rhs: Derivative,
-    times: tuple[float, float],
-    ends: tuple[Array, Array],
-    waited: int,
-) -> str | None:
-    """Return a sentence about what is wrong in a step with a large correction, or in the steps before it, or None.
-
-    The states examined in the step are on the straight line between its `ends`, those before it on the trajectory. The
-    `waited` steps before that step were not projected, and each of them may be the cause of the correction. Nothing is
-    examined unless the largest correction of the run has grown by the factor `GROWTH` since the last examination.
-    """
-    largest = float(examiner.figures[:, data.NU].max(initial=0.0))
-    if largest < GROWTH * examiner.largest:
-        return None
-    examiner.largest = largest
-    (t_old, t_new), (old, new) = times, ends
-    shares = np.arange(1, POINTS + 1) / POINTS
-    chord = ((t_old + float(share) * (t_new - t_old), old + share * (new - old)) for share in shares)
-    states = chain(chord, _before(known.t_span[0], rhs, t_old, old, t_new - t_old, waited))
-    texts = (_complaint(examiner, known, rhs, t, y, False) for t, y in states)
-    return next((text for text in texts if text is not None), None)
+        The states examined in the step are on the straight line between its `ends`, those before it on the trajectory.
+        The `waited` steps before that step were not projected, and each of them may be the cause of the correction.
+        Nothing is examined unless the largest correction has grown by the factor `GROWTH` since the last examination.
+        """
+        largest = float(self.figures[:, data.NU].max(initial=0.0))
+        if largest < GROWTH * self.largest:
+            return None
+        self.largest = largest
+        (t_old, t_new), (old, new) = times, ends
+        shares = np.arange(1, POINTS + 1) / POINTS
+        chord = ((t_old + float(share) * (t_new - t_old), old + share * (new - old)) for share in shares)
+        states = chain(chord, _before(self.invariants.t_span[0], rhs, t_old, old, t_new - t_old, waited))
+        return next(filter(None, (self._complaint(rhs, t, y) for t, y in states)), None)
 
 
 def _before(begin: float, rhs: Derivative, t: float, y: Array, h: float, steps: int) -> Iterator[tuple[float, Array]]:
@@ -200,7 +144,7 @@ def _before(begin: float, rhs: Derivative, t: float, y: Array, h: float, steps: 
     for _ in range(BACK * (steps + (steps + 1) // 2)):
         if (t - part - begin) * part < 0:
             return
-        t, y = t - part, runge_kutta_step(RK4.A, RK4.b, RK4.c, rhs, t, -part, y)
+        t, y = t - part, _runge_kutta_step(RK4, rhs, t, -part, y)
         if not np.isfinite(y).all():
             return
         yield t, y
@@ -218,15 +162,13 @@ def unresolved(
     steps = int(min(STEPS, (end_of_run - t) / h * (1 + ROUNDING)))
     if method.b.size == 1 or steps < 2:
         return None
+    step = _nystrom_step if method.nystrom else _runge_kutta_step
     shares, end = [], y
-    for k in range(steps):
-        begin, at = end, t + k * h
-        end = begin
+    for at in (t + h * np.arange(steps)).tolist():
+        begin = end
         for part in range(SUBSTEPS):
-            end = runge_kutta_step(DOP853.A, DOP853.b, DOP853.c, rhs, at + part * h / SUBSTEPS, h / SUBSTEPS, end)
-        own = _nystrom_step(method, rhs, at, h, begin) if method.nystrom else runge_kutta_step(
-            method.A, method.b, method.c, rhs, at, h, begin
-        )  # fmt: skip
+            end = _runge_kutta_step(DOP853, rhs, at + part * h / SUBSTEPS, h / SUBSTEPS, end)
+        own = step(method, rhs, at, h, begin)
         size = np.max([_norms(part, groups) for part in (end - begin, h * rhs(at, begin), begin)], axis=0)
         if not (np.isfinite(end).all() and np.isfinite(own).all() and size.max() > 0):
             return None
@@ -244,12 +186,12 @@ def unresolved(
     )
 
 
-def runge_kutta_step(A: Array, b: Array, c: Array, rhs: Derivative, t: float, h: float, y: Array) -> Array:
-    """Return the state (n,) after a step of length h, which may be negative, by the Runge-Kutta method (A, b, c)."""
-    K = np.empty((b.size, y.size), y.dtype)
-    for i in range(b.size):
-        K[i] = rhs(t + c[i] * h, y + h * (A[i, :i] @ K[:i]))
-    return y + h * (b @ K)
+def _runge_kutta_step(method: Any, rhs: Derivative, t: float, h: float, y: Array) -> Array:
+    """Return the state (n,) after a step of length h, which may be negative, by a Runge-Kutta method."""
+    K = np.empty((method.b.size, y.size), y.dtype)
+    for i in range(method.b.size):
+        K[i] = rhs(t + method.c[i] * h, y + h * (method.A[i, :i] @ K[:i]))
+    return y + h * (method.b @ K)
 
 
 def _nystrom_step(method: Method, rhs: Derivative, t: float, h: float, y: Array) -> Array:

@@ -6,19 +6,24 @@ import datetime
 import inspect
 import math
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
 
 __all__ = [
-    "as_vector", "count", "filled", "flag", "is_number", "numbers", "real_array", "reals", "require_arguments", "shown",
+    "as_vector", "converted_from_single", "count", "filled", "flag", "is_number", "numbers", "real_array", "reals",
+    "require_arguments", "shown",
 ]  # fmt: skip
 
 PLAIN = frozenset((int, float, complex, str, bool, type(None), np.float64, np.complex128))
 DATES = (datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
 NO_UNITS = ("", "dimensionless")
 SHOWN = 120
+SINGLE = ("float32", "complex64")
 LARGEST_COUNT = 2**63 - 1  # largest 64-bit integer
+# Names of the values of single precision that have been converted, while `converted_from_single` looks for them.
+_singles: ContextVar[list[str] | None] = ContextVar("_singles", default=None)
 
 
 def shown(value: Any) -> str:
@@ -37,6 +42,9 @@ def numbers(name: str, value: Any) -> np.ndarray | None:
     argument's `name` is raised for dates and for values with a unit, because NumPy would silently drop the unit.
     """
     _refuse_units(name, value)
+    singles = _singles.get()
+    if singles is not None and _is_single(value):
+        singles.append(name)
     try:
         found = np.asarray(value)
         if found.dtype.kind == "O":
@@ -45,6 +53,24 @@ def numbers(name: str, value: Any) -> np.ndarray | None:
         return None
     kind = found.dtype.kind
     return np.array(found, complex if kind == "c" else float, order="C") if kind in "fiubc" else None
+
+
+def converted_from_single(evaluate: Callable[[], Any]) -> str:
+    """Return the name of the first value of single precision that `numbers` converts in ``evaluate()``, or ""."""
+    found: list[str] = []
+    token = _singles.set(found)
+    try:
+        evaluate()
+    finally:
+        _singles.reset(token)
+    return found[0] if found else ""
+
+
+def _is_single(value: Any) -> bool:
+    """Return True if an array or a number of NumPy, JAX or PyTorch has single precision, also one in a list."""
+    if isinstance(value, list | tuple):
+        return any(map(_is_single, value))
+    return str(getattr(value, "dtype", "")).rpartition(".")[2] in SINGLE
 
 
 def _converted(objects: np.ndarray) -> np.ndarray:

@@ -642,7 +642,8 @@ class InvariantSet:
         self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
     ) -> list[str]:
         """Check the invariants at the start, with step `tau`: raise ValueError or warn; return the warnings' texts."""
-        return reported(list(complaints(self, t, y, f, tau, self.rhs, evaluated)))
+        assert self.rhs is not None
+        return reported(complaints(self, t, y, f, tau, self.rhs, evaluated))
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:

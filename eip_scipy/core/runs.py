@@ -138,12 +138,14 @@ class Run:
                 self.examiner.examine(suspect, rhs)
             return self._is_doubtful(ended)
         found = self.examiner.examine(suspect, rhs) if suspect[REASON] != NOTHING else None
-        due = ended or is_check_due(steps)
-        if found is None and ((due and steps != self.looked) or self._is_doubtful(ended)):
+        due = (ended or is_check_due(steps)) and steps != self.looked
+        doubtful = not due and self._is_doubtful(ended)
+        if found is None and (due or doubtful):
             self.looked = steps
             found = self.examiner.complaint(rhs, t, y)
+            doubtful = self._is_doubtful(ended)  # which depends on the rates that the examination has noted
         self.trust.doubts += [found] if found else []
-        return found is not None or self._is_doubtful(ended)
+        return found is not None or doubtful
 
     def _warn_of_fast_balances(self) -> None:
         """Warn once about balances that change too fast to be useful."""

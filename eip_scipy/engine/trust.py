@@ -12,34 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .data import (
-    AT,
-    BY_VALUES,
-    EXAMINED,
-    EXPECTED,
-    FAR_FROM,
-    FIRST,
-    JUDGED,
-    LARGE,
-    LARGE_CORRECTION,
-    LARGE_ERROR,
-    LARGE_SHARE,
-    MANY,
-    NOTED,
-    NU,
-    RATE,
-    RATE_NOTED,
-    RATE_TERMS,
-    RAW,
-    RAW_AT,
-    RAW_MANY,
-    REASON,
-    ROUGH_NOTED,
-    SHARE,
-    SHARE_AT,
-    SUM,
-    TERMS,
-)
+from . import data
 
 __all__ = ["ProjectionWarning", "Trust"]
 
@@ -55,6 +28,8 @@ TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
 ROUNDING_OF_RATES, ROUNDING_OF_DIFFERENCES = 1e-11, 1e-7
 # Smallest number of projections for which fractions and sums are judged, if more than one correction is LARGE.
 ENOUGH = 5
+# Counts and shares that are 0 unless a step was suspicious.
+SUSPICIOUS = [data.SHARE, data.RAW, data.RAW_MANY, data.MANY]
 MOST_REASONS = 3  # largest number of reasons in a message
 PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
@@ -85,38 +60,41 @@ class Trust:
     @property
     def is_sick(self) -> bool:
         """Return True if the corrections or errors of an invariant do not occur in correct runs."""
-        return not are_calm(self.figures) and bool(sick(self.figures).any())
+        return bool(sick(self.figures).any())
 
     @property
     def beyond_doubt(self) -> bool:
         """Return True if later projections cannot make the run reliable again."""
-        return not are_calm(self.figures) and bool(_extreme(self.figures).any())
+        return self.is_sick and bool(_extreme(self.figures).any())
 
     @property
     def worst(self) -> tuple[str, float, float] | None:
         """Return invariant, time and size in local errors of the largest correction; None if none was measured."""
-        if not np.any(self.figures[:, JUDGED] > 0):
+        if not np.any(self.figures[:, data.JUDGED] > 0):
             return None
-        k = int(np.argmax(self.figures[:, NU]))
-        return self.names[k], float(self.figures[k, AT]), float(self.figures[k, NU])
+        k = int(np.argmax(self.figures[:, data.NU]))
+        return self.names[k], float(self.figures[k, data.AT]), float(self.figures[k, data.NU])
 
     @property
     def corrections(self) -> np.ndarray:
         """Size in local errors of each invariant's largest correction, (l,); nan where none was measured."""
-        return np.where(self.figures[:, JUDGED] > 0, self.figures[:, NU], np.nan)
+        return np.where(self.figures[:, data.JUDGED] > 0, self.figures[:, data.NU], np.nan)
 
     def followed_by(self, other: Trust) -> Trust:
         """Return the combined record of this run and of the run `other` that continued it."""
         one, two = self.figures, other.figures
-        both = two.copy()  # START, TERMS, LEFT: of the last
-        largest = [TERMS, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED]
+        both = two.copy()  # START, LEFT and others: of the last
+        largest = [
+            data.TERMS, data.RATE, data.RATE_TERMS, data.RATE_NOTED, data.ROUGH_NOTED, data.FAR_FROM, data.BY_VALUES,
+            data.EXAMINED,
+        ]  # fmt: skip
         both[:, largest] = np.maximum(one[:, largest], two[:, largest])
-        counts = [NOTED, RAW_MANY, MANY, SUM, EXPECTED, JUDGED]
+        counts = [data.NOTED, data.RAW_MANY, data.MANY, data.SUM, data.EXPECTED, data.JUDGED]
         both[:, counts] = one[:, counts] + two[:, counts]
-        for size, at in ((SHARE, SHARE_AT), (RAW, RAW_AT), (NU, AT)):
+        for size, at in ((data.SHARE, data.SHARE_AT), (data.RAW, data.RAW_AT), (data.NU, data.AT)):
             larger = one[:, size] > two[:, size]
             both[larger, size], both[larger, at] = one[larger, size], one[larger, at]
-        both[:, FIRST] = np.where(one[:, MANY] > 0, one[:, FIRST], two[:, FIRST])
+        both[:, data.FIRST] = np.where(one[:, data.MANY] > 0, one[:, data.FIRST], two[:, data.FIRST])
         trust = Trust(self.names, both)
         trust.doubts = list(dict.fromkeys(self.doubts + other.doubts))
         trust.failed = self.failed or other.failed
@@ -128,10 +106,12 @@ class Trust:
 
         There is one for each of the worst three invariants, and one that counts the other invariants.
         """
-        if not self.is_sick:
-            return []
         found = np.flatnonzero(sick(self.figures))
-        worst = found[np.argsort(-_severity(self.figures[found]), kind="stable")]
+        if not found.size:
+            return []
+        rows = self.figures[found]
+        shares = (rows[:, data.NU] / BEYOND_DOUBT, rows[:, data.RAW] / TOO_FAR, rows[:, data.SHARE] / data.LARGE_SHARE)
+        worst = found[np.argsort(-np.max(shares, axis=0), kind="stable")]
         reasons = [_reason(self.names[k], self.figures[k]) for k in worst[:MOST_REASONS]]
         if found.size > MOST_REASONS:
             reasons.append(f"{found.size - MOST_REASONS} more invariants exceed the bounds of correct runs")
@@ -152,23 +132,11 @@ class Trust:
 
 def sick(figures: np.ndarray) -> np.ndarray:
     """Return a mask of the rows of figures (..., N_FIGURES) that do not occur in correct runs."""
-    if are_calm(figures):
-        return np.zeros(figures.shape[:-1], bool)
-    far = figures[..., RAW_MANY] > FAR_OFTEN * figures[..., NOTED]
+    large = (figures[..., data.NU] > BEYOND_DOUBT) | (figures[..., data.SUM] > TOGETHER * figures[..., data.EXPECTED])
+    if not (np.count_nonzero(large) or np.count_nonzero(figures[..., SUSPICIOUS])):  # as in most runs
+        return large
+    far = figures[..., data.RAW_MANY] > FAR_OFTEN * figures[..., data.NOTED]
     return _extreme(figures) | (_may_leak(figures) & _large_corrections(figures)) | far
-
-
-# Counts and shares that are 0 unless a step was suspicious.
-NOTED_STEPS = [SHARE, RAW, RAW_MANY, MANY]
-
-
-def are_calm(figures: np.ndarray) -> bool:
-    """Return True if no row of figures (..., N_FIGURES) can be that of a faulty run.
-
-    This quick test usually suffices; if it is False, `sick` decides.
-    """
-    large = (figures[..., NU] > BEYOND_DOUBT) | (figures[..., SUM] > TOGETHER * figures[..., EXPECTED])
-    return not (figures[..., NOTED_STEPS].any() or large.any())
 
 
 def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:
@@ -176,22 +144,22 @@ def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:
 
     `suspect`, (m, ...), holds for each run the suspicious step that the engine has kept, and the reason for it.
     """
-    reason = suspect[:, REASON]
-    return (reason >= LARGE_ERROR) | ((reason == LARGE_CORRECTION) & _large_corrections(figures).any(axis=1))
+    reason = suspect[:, data.REASON]
+    return (reason >= data.LARGE_ERROR) | ((reason == data.LARGE_CORRECTION) & _large_corrections(figures).any(axis=1))
 
 
 def _large_corrections(figures: np.ndarray) -> np.ndarray:
     """Return a mask of the rows with corrections that are much larger than the errors of the steps."""
-    judged = figures[..., JUDGED]
-    often = figures[..., MANY] > np.maximum(1, OFTEN * judged)
-    together = figures[..., SUM] > TOGETHER * figures[..., EXPECTED]
-    return (figures[..., NU] > BEYOND_DOUBT) | ((judged >= ENOUGH) & (often | together))
+    judged = figures[..., data.JUDGED]
+    often = figures[..., data.MANY] > np.maximum(1, OFTEN * judged)
+    together = figures[..., data.SUM] > TOGETHER * figures[..., data.EXPECTED]
+    return (figures[..., data.NU] > BEYOND_DOUBT) | ((judged >= ENOUGH) & (often | together))
 
 
 def _extreme(figures: np.ndarray) -> np.ndarray:
     """Return a mask of the rows with a single correction or error that is larger than in any correct run."""
-    large = _may_leak(figures) & (figures[..., NU] > BEYOND_DOUBT)
-    return large | (figures[..., RAW] > TOO_FAR * figures[..., FAR_FROM]) | (figures[..., SHARE] > 0)
+    large = _may_leak(figures) & (figures[..., data.NU] > BEYOND_DOUBT)
+    return large | (figures[..., data.RAW] > TOO_FAR * figures[..., data.FAR_FROM]) | (figures[..., data.SHARE] > 0)
 
 
 def _may_leak(figures: np.ndarray) -> np.ndarray:
@@ -200,35 +168,32 @@ def _may_leak(figures: np.ndarray) -> np.ndarray:
     If the rate of change is only rounding, large corrections come from error estimates that are too small, as in a step
     over a kink, or if the derivative depends on time only.
     """
-    by_values, by_gradient = figures[..., EXAMINED] > ROUNDING_OF_DIFFERENCES, figures[..., RATE] > ROUNDING_OF_RATES
-    return np.where(figures[..., BY_VALUES] > 0, by_values, by_gradient)
-
-
-def _severity(figures: np.ndarray) -> np.ndarray:
-    """Return the factors by which rows of figures (..., N_FIGURES) exceed the limits of correct runs."""
-    corrections = np.maximum(figures[..., NU] / BEYOND_DOUBT, figures[..., RAW] / TOO_FAR)
-    return np.maximum(corrections, figures[..., SHARE] / LARGE_SHARE)
+    by_values, by_gradient = figures[..., data.EXAMINED], figures[..., data.RATE]
+    has_values = figures[..., data.BY_VALUES] > 0
+    return np.where(has_values, by_values > ROUNDING_OF_DIFFERENCES, by_gradient > ROUNDING_OF_RATES)
 
 
 def _reason(name: str, row: np.ndarray) -> str:
     """Return a sentence about the corrections of one invariant in a faulty run."""
-    parts = []
-    if _may_leak(row) and row[NU] > LARGE:
+    nu, expected, raw, share = (row[k] for k in (data.NU, data.EXPECTED, data.RAW, data.SHARE))
+    leaks, parts = _may_leak(row), []
+    if leaks and nu > data.LARGE:
         parts.append(
-            f"{name!r} was corrected by up to {row[NU]:.2g} local errors, at t={row[AT]:.6g} (by more than {LARGE:g} "
-            f"in {row[MANY]:.0f} of {row[JUDGED]:.0f} projections, first at t={row[FIRST]:.6g})"
+            f"{name!r} was corrected by up to {nu:.2g} local errors, at t={row[data.AT]:.6g} (by more than "
+            f"{data.LARGE:g} in {row[data.MANY]:.0f} of {row[data.JUDGED]:.0f} projections, first at "
+            f"t={row[data.FIRST]:.6g})"
         )
-    elif _may_leak(row) and row[SUM] > TOGETHER * row[EXPECTED]:
-        parts.append(f"{name!r} was corrected by {row[SUM] / row[EXPECTED]:.2g} local errors per projection on average")
-    if row[RAW] > 0:
+    elif leaks and row[data.SUM] > TOGETHER * expected:
+        parts.append(f"{name!r} was corrected by {row[data.SUM] / expected:.2g} local errors per projection on average")
+    if raw > 0:
         parts.append(
-            f"before projections the error of {name!r} was up to {row[RAW]:.2g} times the size of its terms, at "
-            f"t={row[RAW_AT]:.6g} (more than {row[FAR_FROM]:g} times this size in {row[RAW_MANY]:.0f} of "
-            f"{row[NOTED]:.0f} projections)"
+            f"before projections the error of {name!r} was up to {raw:.2g} times the size of its terms, at "
+            f"t={row[data.RAW_AT]:.6g} (more than {row[data.FAR_FROM]:g} times this size in {row[data.RAW_MANY]:.0f} "
+            f"of {row[data.NOTED]:.0f} projections)"
         )
-    if row[SHARE] > 0:
+    if share > 0:
+        at = row[data.SHARE_AT]
         parts.append(
-            f"the projection left an error of {name!r} of {row[SHARE]:.2g} times the size of its terms, at "
-            f"t={row[SHARE_AT]:.6g}"
+            f"the projection left an error of {name!r} of {share:.2g} times the size of its terms, at t={at:.6g}"
         )
     return ", and ".join(parts)

@@ -149,17 +149,26 @@ def in_single(fun):
     return lambda t, y: np.asarray(fun(t, np.asarray(y, np.float32)), np.float32)
 
 
+class Tensor:
+    """A tensor of PyTorch, as far as it matters here."""
+
+    dtype = "torch.float32"
+
+    def __init__(self, values):
+        self._values = np.float32(values)
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(self._values, dtype)
+
+
 SINGLE = {
     "value": (pendulum, Invariant(in_single(energy), energy_gradient, name="E")),
-    "value as a float": (pendulum, Invariant(lambda t, y: float(in_single(energy)(t, y)), energy_gradient, name="E")),
     "gradient": (pendulum, Invariant(energy, lambda t, y: np.float32(energy_gradient(t, y)), name="E")),
     "field": (in_single(pendulum), Invariant(energy, energy_gradient, name="E")),
     # The rate of change is smaller than what differences of values show.
     "field, with a computed gradient": (in_single(pendulum), Invariant(energy, name="E")),
-    "half of the field": (
-        lambda t, y: np.array([y[1], float(in_single(pendulum)(t, y)[1])]),
-        Invariant(energy, energy_gradient, name="E"),
-    ),
+    "tensor": (lambda t, y: Tensor(pendulum(t, y)), Invariant(energy, energy_gradient, name="E")),
+    "list": (lambda t, y: list(in_single(pendulum)(t, y)), Invariant(energy, energy_gradient, name="E")),
 }
 
 
@@ -168,7 +177,9 @@ def test_single_precision_is_named(kind):
     fun, kept = SINGLE[kind]
     options = {"method": EIPRK4, "h": 0.05, "invariants": kept}
     if kind.startswith("value"):
-        with pytest.raises(ValueError, match=r"'E' have single precision \(float32\).*jax_enable_x64.*torch.float64"):
+        with pytest.raises(
+            ValueError, match=r"'E' returned .* single precision \(float32\).*jax_enable_x64.*torch.float64"
+        ):
             integrate(fun, (0, 5), [1.0, 0.3], **options)
         return
     run, texts = said(lambda: integrate(fun, (0, 5), [1.0, 0.3], **options))
@@ -183,7 +194,7 @@ def test_a_field_in_single_precision_is_named_from_every_start(method, step, gra
     kept = Invariant(lambda t, y: 0.5 * (y[0] ** 2 + y[1] ** 2), grad, name="E")
     for y0 in ([1.0, 0.2], [1.0, 0.0], [0.3, 0.7], [0.25, 0.5]):
         run, _ = said(lambda: integrate(in_single(oscillator), (0, 10), y0, method=method, invariants=kept, **step))  # noqa: B023
-        assert "fun returns numbers of single precision (float32), which hides whether" in run.message
+        assert "fun returned numbers of single precision (float32), which hides whether" in run.message
 
 
 def test_a_constant_in_single_precision_is_no_field_in_single_precision():
@@ -380,47 +391,35 @@ MISSING = {
 
 
 @pytest.mark.parametrize("name", MISSING)
-def test_a_missing_constraint_is_named_as_the_cause(name):
-    """The message does not suggest friction as the cause."""
+def test_a_missing_constraint_is_reported(name):
     fun, y0, kept = MISSING[name]
     run, texts = said(lambda: integrate(fun, (0, 10), y0, method=EIPRK4, h=0.05, invariants=kept))
-    assert "is kept only where its rate of change is 0" in run.message
-    assert "depends is missing or not met" in run.message
-    assert "not an invariant of this system" not in "".join((run.message, *texts))
+    assert not run.trusted
+    assert all("not an invariant of this system" in text for text in (run.message, *texts))
 
 
-def test_a_start_off_a_constraint_is_named_as_the_cause():
+def test_a_start_off_a_constraint_is_reported():
     """The velocity along the rod is taken as a level where it should be 0: the length cannot be kept."""
     fun, lengths, velocities, _ = SINGLE_PENDULUM
     level = Invariant(velocities.fun, velocities.grad, name="velocities")
     y0 = [0.6, -0.8, 0.8006, 0.5992]
     _, texts = said(lambda: integrate(fun, (0, 1), y0, method=EIPRK4, h=0.05, invariants=[lengths, level]))
-    assert "'lengths[0]' is kept only where its rate of change is 0" in texts[0]
-    assert "missing or not met" in texts[0]
+    assert "'lengths[0]' is not an invariant of this system" in texts[0]
+    assert "add the constraint on which it depends" in texts[0]
 
 
-def test_friction_is_no_missing_constraint():
-    """Neither that of a pendulum in its coordinates with all constraints, nor that of one in its angle, nor a force."""
+def test_friction_of_a_constrained_system_is_reported():
+    """That of a pendulum in its coordinates with all constraints."""
     fun, lengths, velocities, kept = SINGLE_PENDULUM
-    damped = {
-        "coordinates": (lambda t, y: fun(t, y) - 1e-3 * np.concatenate([0 * y[2:], y[2:]]), [0.6, -0.8, 0.8, 0.6]),
-        "angle": (lambda t, y: pendulum(t, y) - np.array([0.0, 1e-4 * y[1]]), [1.0, 0.3]),
-        "from rest": (lambda t, y: pendulum(t, y) - np.array([0.0, 1e-4 * y[1]]), [1.0, 0.0]),
-        "driven": (lambda t, y: pendulum(t, y) + np.array([0.0, 1e-4 * np.sin(t)]), [1.0, 0.0]),
-    }
-    for name, (moved, y0) in damped.items():
-        items = [lengths, velocities, kept] if name == "coordinates" else Invariant(energy, energy_gradient, name="E")
-        run, _ = said(lambda: integrate(moved, (0, 10), y0, method=EIPRK4, h=0.05, invariants=items))  # noqa: B023
-        assert "not an invariant of this system" in run.message
-        assert "constraint" not in run.message
+    damped = lambda t, y: fun(t, y) - 1e-3 * np.concatenate([0 * y[2:], y[2:]])  # noqa: E731
+    options = {"method": EIPRK4, "h": 0.05, "invariants": [lengths, velocities, kept]}
+    run, _ = said(lambda: integrate(damped, (0, 10), [0.6, -0.8, 0.8, 0.6], **options))
+    assert "'energy' is not an invariant of this system" in run.message
 
 
 @pytest.mark.parametrize("y0", [[0.6, -0.8, 0.8, 0.6], [0.6, -0.8, 1.6, 1.2]])
 @pytest.mark.parametrize("force", [lambda t, y: -1e-3 * y[2:], lambda t, y: np.array([0.3 * np.cos(3 * t + 1), 0.0])])
-def test_friction_is_no_missing_constraint_where_the_constraints_are_not_given(force, y0):
-    """The energy alone, whose rate is the force's power: a constraint a little violated could make up for it next to
-    the start, but not for longer than a moment.
-    """
+def test_the_rate_of_a_constrained_system_is_the_power_of_its_force(force, y0):
     fun, _, _, kept = SINGLE_PENDULUM
 
     def moved(t, y):
@@ -430,7 +429,6 @@ def test_friction_is_no_missing_constraint_where_the_constraints_are_not_given(f
     _, texts = said(lambda: integrate(moved, (0, 1), y0, method=EIPRK4, h=0.05, invariants=kept))
     assert "not an invariant of this system" in texts[0]
     assert f"at the rate {force(0, np.array(y0)) @ y0[2:]:.3g}" in texts[0]
-    assert "constraint" not in texts[0]
 
 
 def test_one_warning_names_three_of_many():
