@@ -3,7 +3,7 @@
 from .core.results import Diagnostics, Multipliers, ProjectionResult
 from .ensembles.ensemble import EnsembleResult
 from .run.figures import plot
-from .run.recommendation import Recommendation
+from .run.recommend import Recommendation
 from .run.results import IntegrationResult
 from .run.saving import load, save
 from .run.solve_ivp import OdeResult

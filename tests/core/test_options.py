@@ -10,7 +10,6 @@ from eip_scipy import EIPRK4, EIPRK45, ensemble, integrate
 from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
 from eip_scipy.ensembles.ensemble import EnsembleKeywords
 from eip_scipy.problems import kepler
-from eip_scipy.run.recommend import COMMON, RecommendKeywords
 from eip_scipy.solvers import EIPSolver
 
 NAMES = ProjectionOptions.names()
@@ -22,7 +21,6 @@ def test_keywords_for_type_checkers_are_the_options():
     assert set(EnsembleKeywords.__annotations__) >= {*NAMES} - {"invariants"}
     alone = {"y0", "diagnostics", "variations", "jvp", "symplectic"}
     assert given >= set(inspect.signature(integrate).parameters) - alone
-    assert tuple(RecommendKeywords.__annotations__) == COMMON
 
 
 @pytest.mark.parametrize("function", [EIPSolver, EIPRK4, integrate])

@@ -1,16 +1,16 @@
 """`recommend`: the recommended run has the wanted error, and reasons against it are reported."""
 
+import itertools
 import math
 import pickle
-import re
+import time
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 from systems import pendulum, pendulum_energy, pendulum_gradient, refuse
 
-from eip_scipy import EIPGJ14, EIPRadau, Invariant, ProjectionWarning, integrate, recommend
+from eip_scipy import EIPGJ14, Invariant, ProjectionWarning, integrate, recommend
 from eip_scipy.problems import kepler, satellite, solar_system
 from eip_scipy_studies.hard_cases import hard_cases
 
@@ -63,8 +63,6 @@ def test_it_finds_the_multistep_method_for_planets():
     choice = recommend(problem, (0, 10), error=1e-8)
     assert choice.method is EIPGJ14
     assert error(choice.run().y[:, -1], problem.reference(10)) < 1e-8
-    others = [trial for trial in choice.trials if trial.options["method"] is not EIPGJ14 and trial.good]
-    assert choice.nfev < min(trial.nfev for trial in others if trial.error <= 1e-8)
 
 
 def test_a_long_run_is_tried_on_a_part():
@@ -88,9 +86,7 @@ def test_what_is_no_invariant_is_left_out_and_told():
     assert "'E'" in choice.message
     assert choice.message in repr(choice)
     assert_near(error(choice.run().y[:, -1], exact), 1e-6)
-    failed = [trial for trial in choice.trials if "invariants" not in trial.options]
-    assert failed
-    assert not any(trial.good for trial in failed)
+    assert not any(trial.good for trial in choice.trials if "invariants" not in trial.options)
 
 
 def test_errors_that_cannot_be_reached():
@@ -104,31 +100,38 @@ def test_errors_that_cannot_be_reached():
         recommend(lorenz, (0, 60), [1.0, 1.0, 1.0])
 
 
-A = np.array([[-1000.0, 999.0], [1.0, -2.0]])  # eigenvalues -1001 and -1
+ROBERTSON = np.array([[-0.04, 1e4, 0], [0.04, -1e4, -3e7], [0, 0, 3e7]])
+RATES = 10.0 ** np.random.default_rng(4).uniform(-2, 5, (2, 39))  # of a chain of reactions
 STIFF = {
-    "linear": (lambda t, y: A @ y, (0, 10), [1.0, 0.0]),
-    "relaxation": (lambda t, y: np.array([-2000 * (y[0] - math.cos(t))]), (0, 2), [1.0]),
-    "van der Pol": (lambda t, y: np.array([y[1], 1000 * (1 - y[0] ** 2) * y[1] - y[0]]), (0, 500), [2.0, 0.0]),
+    "relaxation": (lambda t, y: np.array([-2000 * (y[0] - math.cos(t))]), 2, [1.0], ()),
+    "van der Pol": (lambda t, y: np.array([y[1], 1000 * (1 - y[0] ** 2) * y[1] - y[0]]), 500, [2.0, 0.0], ()),
+    "Robertson": (lambda t, y: ROBERTSON @ [y[0], y[1] * y[2], y[1] ** 2], 4e5, [1.0, 0.0, 0.0], lambda t, y: y.sum()),
+    "40 species": (lambda t, y: -np.diff(np.pad(RATES[0] * y[:-1] - RATES[1] * y[1:] ** 2, 1)), 1e3, np.eye(40)[0], ()),
 }
 
 
 @pytest.mark.parametrize("name", STIFF)
-def test_stiffness_is_named(name):
-    """The reason names an implicit method that takes at most 0.33 of the evaluations, as it does when it is run."""
-    fun, t_span, y0 = STIFF[name]
-    choice = recommend(fun, t_span, y0, error=1e-4)
+def test_stiff_equations_get_an_implicit_method(name):
+    """It is run over the whole interval, and all its evaluations are counted."""
+    fun, end, y0, kept = STIFF[name]
+    calls = itertools.count()
+    choice = recommend(lambda t, y: fun(t, y) if next(calls) < 2e5 else None, (0, end), y0, invariants=kept, error=1e-4)
     assert choice.stiff
-    said = re.search(r"error of (\S+) with (\d+) evaluations.*rtol=(\S+), atol=(\S+), or EIPBDF", choice.reason)
-    error, nfev, rtol, atol = map(float, said.groups())
+    assert choice.share == 1
     assert "The equations are stiff: stability limits the steps" in choice.reason
-    assert error <= 1e-4
-    assert 3 * nfev <= choice.nfev
-    if choice.share == 1:
-        sol = integrate(fun, t_span, y0, method=EIPRadau, rtol=rtol, atol=atol)
-        assert sol.nfev <= 1.05 * nfev
-        if name == "linear":
-            exact = expm(A * 10) @ y0
-            assert np.abs(sol.y[:, -1] - exact).max() <= 1.1e-4 * np.abs(exact).max()
+    before = next(calls)
+    run = choice.run()
+    assert next(calls) - before - 1 == choice.nfev < 2000
+    exact = solve_ivp(fun, (0, end), y0, method="Radau", rtol=1e-10, atol=1e-14).y[:, -1]
+    assert error(run.y[:, -1], exact) <= 1.02 * choice.error <= 1.02e-4
+
+
+def test_a_projection_that_does_not_pay():
+    """The invariant takes much longer to evaluate than the right-hand side."""
+    slow = Invariant(lambda t, y: (time.sleep(1e-4), pendulum_energy(t, y))[1], pendulum_gradient, name="E")
+    choice = recommend(pendulum, (0, 5), [1.0, 0.5], invariants=slow)
+    assert 0 < choice.pays < 0.5
+    assert "The projection does not pay" in choice.reason
 
 
 def test_what_is_printed():
@@ -149,7 +152,6 @@ def test_what_is_printed():
 def test_arguments():
     rows = [
         ({"error": 0}, ValueError, "error must be a number between 0 and 1, got 0"),
-        ({"error": "a"}, ValueError, "error must be a number between 0 and 1"),
         ({"error": math.nan}, ValueError, "error must be"),
         ({"max_nfev": 10}, ValueError, "max_nfev must be at least 1000, got 10"),
         ({"rtol": 1e-3}, TypeError, "no option 'rtol'"),
