@@ -86,6 +86,10 @@ class RunSpec(NamedTuple):
         `check_start` is False if the invariants and the steps of a user-defined method have been checked, and costs
         reported, at the start of a similar run.
         """
+        made: Any = BUILD.call(self._built, y0, f0, tau, check_start)
+        return made
+
+    def _built(self, y0: Array, f0: Array | None, tau: float | None, check_start: bool) -> Run:
         t0 = self.stepping.span.t0
         method, f0 = self.examined(y0, f0)
         tau = self._first_step(method, y0, f0) if tau is None else tau
@@ -122,7 +126,7 @@ class RunSpec(NamedTuple):
 
     def attach_solver(self, run: Run, start: Start) -> None:
         """Give a run with an implicit method its solver of SciPy, which begins at `start`."""
-        run.method.begin(self.rhs, start, self.stepping, self.jacobian())
+        run.method.begin(self.uncounted or self.rhs, start, self.stepping, self.jacobian())
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
         """Return the length of the first step, chosen from the state alone, without columns of derivatives."""
