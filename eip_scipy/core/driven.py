@@ -8,7 +8,6 @@ lists them, and a run raises an error that names those that the installed versio
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -90,9 +89,9 @@ class Driven(Ordered):
 
 
 class Stepper:
-    """Maker of the steps of one run, by a solver of SciPy that is created in the first step.
+    """Maker of the steps of one run, by a solver of SciPy, the attribute `solver`, which `begin` creates.
 
-    `solver` is the solver of SciPy, None before the first step. `not_finite_at` is a time at which the right-hand side
+    `not_finite_at` is a time at which the right-hand side
     had a value that is not finite in the last step, or None. `b`, `c`, `exponent` and `multistep` are attributes of a
     tableau that the engine reads. The array work.K has one row more than `b` has entries.
     """
@@ -103,14 +102,13 @@ class Stepper:
     def __init__(self, method: Driven) -> None:
         self.method = method
         self.b = self.c = np.zeros(method.weights.shape[1] - 1)
-        self.solver: Any = None
+        self.solver: Any
         self.not_finite_at: float | None = None
-        self._make: Callable[[], OdeSolver]
         self._before: dict[str, Any] = {}
         self._counted = dict.fromkeys(COUNTERS, 0)
 
     def begin(self, rhs: Derivative, start: Any, stepping: Stepping, jacobian: Jacobian | None) -> None:
-        """Prepare the steps of a run; `start` consists of t, y, f and the length of the first step."""
+        """Make the solver of a run; `start` consists of t, y, f and the length of the first step."""
         (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
         if y.dtype.kind == "c" and not self.method.takes_complex:
             raise ValueError(
@@ -128,16 +126,12 @@ class Stepper:
             return found
 
         make: Any = self.method.solver
-        self.solver, self._make = None, partial(
-            make, fun, t, y, stepping.span.t_bound, max_step=stepping.span.max_step,
-            rtol=float(rtol.max(initial=0.0)), atol=stepping.atol, first_step=length,
+        self.solver = solver = make(
+            fun, t, y, stepping.span.t_bound, max_step=stepping.span.max_step,
+            rtol=float(rtol.max(initial=0.0)), atol=stepping.atol, first_step=length or None,
             **(jacobian or Jacobian())._asdict(),
         )  # fmt: skip
-
-    def _made(self) -> Any:
-        """Make and return SciPy's solver, without counting the evaluations of its Jacobian at the start."""
-        solver = self._make()
-        solver.nfev = 0
+        solver.nfev = 0  # without the evaluations for the Jacobian
         self._counted = dict.fromkeys(COUNTERS, 0)
         lacking = [name for name in PRIVATE[self.method.solver] if not hasattr(solver, name)]
         if lacking:
@@ -147,7 +141,6 @@ class Stepper:
             )
         self._keep_finite(solver)
         self._watch(solver)
-        return solver
 
     def _keep_finite(self, solver: Any) -> None:
         """Let the solver keep its last Jacobian where a new one is not finite, because `fun` is not.
@@ -172,8 +165,6 @@ class Stepper:
         fails because the step would become too short.
         """
         self.not_finite_at = None
-        if self.solver is None:
-            self.solver = self._made()
         solver = self.solver
         longest = solver.max_step
         if again:
@@ -187,7 +178,7 @@ class Stepper:
             solver.jac_factor = np.minimum(solver.jac_factor, LARGEST_SHIFT)
         solver.step()
         solver.max_step = longest
-        self._count(w)
+        self.count(w)
         if solver.status == "failed":
             return None
         h = solver.t - t
@@ -197,7 +188,8 @@ class Stepper:
         w.K[-1] = self._slope(w.K[1:-1])
         return float(solver.t), float(solver.h_abs)
 
-    def _count(self, w: Work) -> None:
+    def count(self, w: Work) -> None:
+        """Add the evaluations and factorisations since the last call to the counters of the run."""
         for name, place in COUNTERS.items():
             found = getattr(self.solver, name)
             w.counters[place] += found - self._counted[name]
@@ -216,20 +208,15 @@ class Stepper:
     def _factors(self) -> list[str]:
         return [name for name in vars(self.solver) if name.startswith("LU")]
 
-    def state(self) -> dict[str, Any] | None:
-        """Return the values from which another stepper continues with the same bits; None before the first step."""
-        if self.solver is None:
-            return None
+    def state(self) -> dict[str, Any]:
+        """Return the values from which another stepper continues with the same bits."""
         own = vars(self.solver)
         values = {name: value for name, value in own.items() if isinstance(value, DenseOutput) or not callable(value)}
         # Sparse factorisations cannot be copied; the solver makes them again.
         return values | {name: None for name in self._factors() if not isinstance(values[name], tuple)}
 
-    def resume(self, values: dict[str, Any] | None) -> None:
+    def resume(self, values: dict[str, Any]) -> None:
         """Continue from the `state` of another stepper; `begin` must have been called before."""
-        if values is None:
-            return
-        self.solver = self._made()
         vars(self.solver).update(values)
         self._counted = {name: getattr(self.solver, name) for name in COUNTERS}
 
