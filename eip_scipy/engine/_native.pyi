@@ -593,6 +593,7 @@ class Members(NamedTuple):
     starts: numpy.typing.NDArray[numpy.inexact]
     params: numpy.typing.NDArray[numpy.float64]
     first_steps: numpy.typing.NDArray[numpy.float64]
+    events: numpy.typing.NDArray[numpy.float64]
     evaluations: int
     sigma: numpy.typing.NDArray[numpy.float64]
     left: numpy.typing.NDArray[numpy.float64]

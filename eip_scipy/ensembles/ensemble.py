@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from ..checkpoint.locks import absolute
 from ..checkpoint.signals import sigterm_as_ctrl_c
 from ..core.arguments import extra_arguments, floats, parameter_values
+from ..core.events import Events
 from ..core.gradients import unless_error
 from ..core.inputs import count, flag, is_number, shown
 from ..core.invariants import as_invariants
@@ -35,7 +36,6 @@ from ..core.states import states
 from ..core.variations import Columns
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
-from ..run.events import Events
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from ..run.results import WithColumns
