@@ -19,7 +19,7 @@ class Diagnostics:
     ----------
     names : tuple of str
         Names of the l invariants, in order.
-    max_defect, last_defect : ndarray, shape (l,)
+    max_residual, last_residual : ndarray, shape (l,)
         Largest and last invariant error ``|I - target|`` after a projection, in the unit of each invariant.
     n_projections, n_skipped : int
         Number of projections made, and of projections omitted because every invariant error was round-off.
@@ -58,8 +58,8 @@ class Diagnostics:
 
     def _attach(
         self,
-        max_defect: np.ndarray,
-        last_defect: np.ndarray,
+        max_residual: np.ndarray,
+        last_residual: np.ndarray,
         max_correction: np.ndarray,
         counters: np.ndarray,
         trust: Trust,
@@ -76,8 +76,8 @@ class Diagnostics:
         """
         self.names = trust.names
         self._trust = trust
-        self.max_defect = max_defect
-        self._defect = last_defect
+        self.max_residual = max_residual
+        self._residual = last_residual
         self._max_correction = max_correction
         self._counters = counters
         self._estimated = estimated
@@ -85,9 +85,9 @@ class Diagnostics:
         self._slow = (np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))) if slow is None else slow
 
     @property
-    def last_defect(self) -> np.ndarray:
+    def last_residual(self) -> np.ndarray:
         """Last invariant errors ``|I - target|``, (l,)."""
-        return np.abs(self._defect)
+        return np.abs(self._residual)
 
     @property
     def n_projections(self) -> int:
@@ -153,8 +153,8 @@ class Diagnostics:
             f"{self.n_skipped} skipped (round-off), {self.n_rejected_projections} rejected"
         ]
         width = max(len(name) for name in self.names)
-        for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):
-            lines.append(f"  {name:<{width}}  max defect {largest:.2e}, last {last:.2e}")
+        for name, largest, last in zip(self.names, self.max_residual, self.last_residual, strict=True):
+            lines.append(f"  {name:<{width}}  max residual {largest:.2e}, last {last:.2e}")
         if self.worst is not None:
             name, t, size = self.worst
             lines.append(f"  largest correction: {size:.3g} local errors, of {name} at t={t:.6g}")
@@ -217,7 +217,7 @@ class ProjectionResult(NamedTuple):
     ----------
     y : ndarray, shape (n,)
         The projected state.
-    defect : ndarray, shape (l,)
+    residual : ndarray, shape (l,)
         I(y) - target.
     rank : int
         Rank of the gradients: l if all invariants are independent; 0 if no correction was necessary.
@@ -226,6 +226,6 @@ class ProjectionResult(NamedTuple):
     """
 
     y: Any
-    defect: np.ndarray
+    residual: np.ndarray
     rank: int
     correction: Any

@@ -116,8 +116,8 @@ class Run:
             raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
         w = self.work
         diagnostics._attach(
-            w.max_defect,
-            w.defect,
+            w.max_residual,
+            w.residual,
             w.max_correction,
             w.counters,
             self.trust,

@@ -100,7 +100,7 @@ class EnsembleResult(WithColumns):
         Indices of the members with status -1.
     success : bool
         True if all members ran and none failed.
-    max_defect : ndarray, shape (members, l)
+    max_residual : ndarray, shape (members, l)
         Largest invariant error ``|I - target|`` after a projection; each member has its own target.
     max_correction : ndarray, shape (members,)
         Largest correction in units of the local error; nan if the method has no error estimate.
@@ -156,7 +156,7 @@ class EnsembleResult(WithColumns):
     message: np.ndarray
     failed: np.ndarray
     success: bool
-    max_defect: np.ndarray
+    max_residual: np.ndarray
     max_correction: np.ndarray
     side_by_side: np.ndarray
     one_by_one: str
@@ -198,7 +198,7 @@ class EnsembleResult(WithColumns):
         -------
         xarray.Dataset
             Dataset with ``y`` (member, component), ``t_end``, ``status``, ``message``, ``trusted``, ``max_correction``
-            (member), ``max_defect``, ``target`` (member, invariant), and the counts. If trajectories are in memory,
+            (member), ``max_residual``, ``target`` (member, invariant), and the counts. If trajectories are in memory,
             also ``states`` (member, component, time) and ``invariants`` (member, invariant, time); otherwise
             ``end_invariants`` (member, invariant).
 
@@ -212,7 +212,7 @@ class EnsembleResult(WithColumns):
         variables["y"] = ("member", "component"), self.y
         variables["t_end"] = ("member",), self.t
         variables["message"] = ("member",), self.message.astype(str)
-        variables["max_defect"] = ("member", "invariant"), self.max_defect
+        variables["max_residual"] = ("member", "invariant"), self.max_residual
         variables["target"] = ("member", "invariant"), self.target
         if self.invariants.ndim == 2:
             variables["end_invariants"] = ("member", "invariant"), self.invariants
@@ -291,9 +291,11 @@ class EnsembleResult(WithColumns):
         if self.one_by_one:
             lines.append(f"  not vectorised: {self.one_by_one}")
         width = max((len(name) for name in self.names), default=0)
-        for name, defects in zip(self.names, self.max_defect[self.status >= 0].T, strict=True):
-            if defects.size:
-                lines.append(f"  {name:<{width}}  largest error {defects.max():.2e}, median {np.median(defects):.2e}")
+        for name, residuals in zip(self.names, self.max_residual[self.status >= 0].T, strict=True):
+            if residuals.size:
+                lines.append(
+                    f"  {name:<{width}}  largest error {residuals.max():.2e}, median {np.median(residuals):.2e}"
+                )
         doubtful = np.flatnonzero((self.status >= 0) & ~self.trusted)
         for those, what in ((self.failed, ".failed"), (doubtful, ".trusted")):
             lines += [f"  member {self.first + k}: {self.message[k]}" for k in those[:SHOWN]]
@@ -395,7 +397,7 @@ def ensemble(
     Returns
     -------
     EnsembleResult
-        ``y`` (members, n), ``status``, ``message``, ``max_defect`` (members, l), ``t``, and more.
+        ``y`` (members, n), ``status``, ``message``, ``max_residual`` (members, l), ``t``, and more.
 
     Raises
     ------
@@ -421,7 +423,7 @@ def ensemble(
     >>> problem = kepler()
     >>> starts = problem.y0 * np.linspace(0.99, 1.01, 5)[:, None]
     >>> run = ensemble(problem, (0, 20), starts)
-    >>> run.y.shape, run.success, bool((run.max_defect < 1e-11).all())
+    >>> run.y.shape, run.success, bool((run.max_residual < 1e-11).all())
     ((5, 4), True, True)
     """
     options: dict[str, Any] = dict(keywords)
@@ -554,7 +556,7 @@ class _Gathered:
             message=np.array(members.message, dtype=object),
             failed=np.flatnonzero(members.status == FAILED),
             success=bool((members.status >= 0).all()),
-            max_defect=members.max_defect,
+            max_residual=members.max_residual,
             max_correction=members.max_correction,
             side_by_side=members.side_by_side,
             one_by_one=self.one_by_one,

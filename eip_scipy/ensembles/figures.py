@@ -26,7 +26,7 @@ def plot(result: Any, names: Any = None) -> Any:
         times,
         {label: states[:, k] for k, label in enumerate(labels)},
         members=result.first + members,
-        errors={name: result.max_defect[members, k] for k, name in enumerate(result.names)},
+        errors={name: result.max_residual[members, k] for k, name in enumerate(result.names)},
         failed=result.status[members] == FAILED,
         counts=_counts(result),
         title=f"{len(result.t)} members, {result.method}, {step}",

@@ -69,7 +69,7 @@ def _member(plan: Plan, members: Members, k: int) -> IntegrationResult:
         y=y.T,
         invariants=values.T,
         target=members.target[k],
-        max_defect=members.max_defect[k],
+        max_residual=members.max_residual[k],
         t_events=None if events is None else [times for times, _ in events],
         y_events=None if events is None else [states for _, states in events],
         nfev=int(members.counters[k, NFEV]),

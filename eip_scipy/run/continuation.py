@@ -74,7 +74,7 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
     if "outputs" in one or "multipliers" in one:
         both.update(_observed(one, two, new))
     both["diagnostics"] = _diagnostics(one.diagnostics, two.diagnostics)
-    both["max_defect"] = both.diagnostics.max_defect
+    both["max_residual"] = both.diagnostics.max_residual
     both["trusted"] = both.diagnostics.trusted
     both["sol"] = _solution(one.sol, two.sol)
     if "_origin" in vars(two):
@@ -103,8 +103,8 @@ def _observed(one: IntegrationResult, two: IntegrationResult, new: slice) -> dic
 def _diagnostics(one: Diagnostics, two: Diagnostics) -> Diagnostics:
     both = Diagnostics()
     both._attach(
-        np.maximum(one.max_defect, two.max_defect),
-        two._defect.copy(),
+        np.maximum(one.max_residual, two.max_residual),
+        two._residual.copy(),
         np.maximum(one._max_correction, two._max_correction),
         one._counters + two._counters,
         one._trust.followed_by(two._trust),

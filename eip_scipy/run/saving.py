@@ -23,7 +23,7 @@ ENSEMBLE = "EnsembleResult"
 RESULTS: dict[str, Any] = {IntegrationResult.__name__: IntegrationResult}
 RESUMED = ("integrate", "ensemble")  # functions that continue from a checkpoint if called with the same arguments
 # Buffers of Diagnostics, in the order of its arguments.
-BUFFERS = ("_max_defect", "_last_defect", "_max_correction", "_counters", "_figures")
+BUFFERS = ("_max_residual", "_last_residual", "_max_correction", "_counters", "_figures")
 OF_BALANCES = ("_balance_places", "_balance_sums")
 
 
@@ -135,7 +135,7 @@ def load(path: str | os.PathLike[str]) -> Any:
 def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """Return the part of `diagnostics` that JSON can hold; the other part is added to `arrays`."""
     trust = diagnostics._trust
-    buffers = (diagnostics.max_defect, diagnostics._defect, diagnostics._max_correction, diagnostics._counters)
+    buffers = (diagnostics.max_residual, diagnostics._residual, diagnostics._max_correction, diagnostics._counters)
     arrays |= zip(BUFFERS, (*buffers, trust.figures), strict=True)
     if diagnostics._slow[0].size:
         arrays |= zip(OF_BALANCES, diagnostics._slow, strict=True)

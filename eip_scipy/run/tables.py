@@ -37,7 +37,7 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     -------
     xarray.Dataset
         ``y`` (component, t) with the coordinates ``component`` and ``t``: ``data.y.sel(component="x")``. If the run has
-        invariants, also ``invariants`` and ``invariant_errors`` (I - target), both (invariant, t), and ``max_defect``.
+        invariants, also ``invariants`` and ``invariant_errors`` (I - target), both (invariant, t), and ``max_residual``.
         If it has derivatives, also ``variations`` (t, component, column); a column is named after the component of the
         initial state or the parameter with respect to which it is the derivative, or 0, 1 and so on. A mechanical
         system adds ``outputs`` (output, t), ``multipliers`` (constraint, t) and ``constraint_rank`` (t,). Attributes
@@ -69,7 +69,7 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
         both = np.array(list(rows.values()))
         variables["invariants"] = (("invariant", "t"), both[:, 0])
         variables["invariant_errors"] = (("invariant", "t"), both[:, 1])
-        variables["max_defect"] = (("invariant",), np.asarray(result.max_defect))
+        variables["max_residual"] = (("invariant",), np.asarray(result.max_residual))
     if "variations" in result:
         coordinates["column"] = column_names(result, coordinates["component"])
         variables["variations"] = (("t", "component", "column"), np.asarray(result.variations))
@@ -101,7 +101,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         "invariant H" and "invariant H error". Columns of derivatives follow, such as "dx/dvy" of x with respect to the
         initial vy; see `to_xarray` for the names. A mechanical system adds its outputs, "output x" if there is a column
         x, and its multipliers, such as "multiplier g1'". The table of an ensemble is indexed by ``member``: a column
-        for each component of the last state, then "t_end", "status", "message", "trusted", and "H max_defect" for each
+        for each component of the last state, then "t_end", "status", "message", "trusted", and "H max_residual" for each
         invariant.
 
     Raises
@@ -126,7 +126,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     if of_members(result):
         columns = dict(zip(component_names(result, names, result.y.shape[1]), result.y.T, strict=True))
         columns |= {"t_end": result.t, "status": result.status, "message": result.message, "trusted": result.trusted}
-        columns |= {f"{name} max_defect": result.max_defect[:, k] for k, name in enumerate(result.names)}
+        columns |= {f"{name} max_residual": result.max_residual[:, k] for k, name in enumerate(result.names)}
         members = pandas.Index(result.first + np.arange(len(result.y)), name="member")
         return pandas.DataFrame(columns, index=members)
     columns = dict(zip(component_names(result, names), np.asarray(result.y), strict=True))
