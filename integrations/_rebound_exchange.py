@@ -146,9 +146,9 @@ def problem_from_simulation(
 
 
 class _Exit:
-    """Terminal event that is 0 when the distance `name` reaches the limit at which a simulation ends."""
+    """Terminal event at the distance `name` that ends a simulation: a limit, beyond which its value is negative."""
 
-    terminal, direction = True, 0.0
+    terminal, direction = True, -math.inf
 
     def __init__(self, name: str, limit: float) -> None:
         self.__name__, self._limit = name, limit
@@ -174,7 +174,7 @@ def exit_events(sim: rebound.Simulation) -> list[_Exit]:
         The events that `problem_from_simulation` sets, to be combined with further events: one for a particle whose
         distance from the origin reaches ``sim.exit_max_distance``, and one for two particles that come as near as
         ``sim.exit_min_distance``, if these are set. REBOUND checks the distances after each step, while an event is
-        located within the step.
+        located within the step. If a distance is exceeded at the start, the run ends there.
     """
     given = {name: float(getattr(sim, name)) for name in ("exit_max_distance", "exit_min_distance")}
     return [_Exit(name, limit) for name, limit in given.items() if limit > 0]

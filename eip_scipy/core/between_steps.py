@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +12,10 @@ from .inputs import is_number, shown
 from .states import initial_state
 from .stepping import StepOptions, Stepping, fixed_steps
 
-__all__ = ["N_LEFT", "Settings", "checked_stepping", "checked_vector", "is_state", "kept_state"]
+__all__ = ["Settings", "checked_stepping", "checked_vector", "is_state", "kept_state", "settings_of"]
 
 # Up to this number of components a copy of the state is compared as bytes, which is faster for short arrays.
 SHORT = 2048
-# The first settings, which each step leaves anew; the others it takes.
-N_LEFT = 7
 
 
 class Settings(NamedTuple):
@@ -26,14 +25,17 @@ class Settings(NamedTuple):
     y: np.ndarray
     f: np.ndarray
     h_abs: float
-    rtol: np.ndarray
-    atol: np.ndarray
+    rtol: Any
+    atol: Any
     nfev: int
     fun: Any
     t_bound: float
     direction: float
     max_step: float
     h: float | None
+
+
+settings_of = attrgetter(*Settings._fields)
 
 
 def kept_state(y: np.ndarray) -> bytes | np.ndarray:

@@ -86,21 +86,25 @@ def _converted(objects: np.ndarray) -> np.ndarray:
     return np.array([complex(item) for item in items]).reshape(objects.shape)
 
 
-def _refuse_units(name: str, value: Any) -> None:
-    """Raise a TypeError for a date or a number with a unit, also in lists, tuples and arrays of objects."""
+def _refuse_units(name: str, value: Any, *, is_item: bool = False) -> None:
+    """Raise a TypeError for a date or a number with a unit, also in lists, tuples and arrays of objects.
+
+    Items of a sequence are converted by ``float``, which applies units without a dimension, such as m / km of astropy.
+    """
     if type(value) in PLAIN or (type(value) is np.ndarray and value.dtype.kind in "fiubc"):
         return
     if type(value) in (list, tuple):
         if not PLAIN.issuperset(map(type, value)):
             for item in value:
-                _refuse_units(name, item)
+                _refuse_units(name, item, is_item=True)
         return
     if isinstance(value, np.ndarray) and value.dtype.kind == "O":
         _refuse_units(name, value.ravel().tolist())
     unit = getattr(value, "unit", getattr(value, "units", None))
     is_date = isinstance(value, DATES) or hasattr(value, "jd1")  # a time of astropy
     is_date |= getattr(getattr(value, "dtype", None), "kind", "") in ("m", "M")
-    if is_date or (unit is not None and str(unit) not in NO_UNITS):
+    dimension = getattr(unit, "physical_type", unit) if is_item else unit
+    if is_date or (unit is not None and str(dimension) not in NO_UNITS):
         raise TypeError(
             f"{name}: {shown(value)} has a unit or is a date; expected plain numbers, in the units of the equations. "
             "Convert it first: eip_scipy.integrations.astropy.plain does this for the arguments of a problem."

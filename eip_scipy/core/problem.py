@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import library
+from .events import Events
 from .inputs import real_array, shown
 from .invariants import Invariant, as_invariants
 from .names import nearest
@@ -194,9 +195,13 @@ class Problem:
             fixed = self.h is not None and not method.TABLEAU.drives
             if fixed and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
                 brought["h"] = self.h
-        if self.events is not None:
-            brought["events"] = self.events
-        sol = solve_ivp(self.fun, t_span, y0, method=method, **brought | options)
+        options = {"events": self.events, **brought, **options}
+        if options["events"] is not None:
+            is_own, short = hasattr(method, "TABLEAU"), options.get("h") or 1e-3 * np.clip(t_span[1] - t_span[0], -1, 1)
+            start = (lambda t, y: (np.asarray(self.fun(t, y)), short)) if is_own else None
+            as_scipy = not is_own or method._takes_scipys_steps(options)
+            options["events"] = Events(options["events"], options.get("args") or ()).for_scipy(start, as_scipy=as_scipy)
+        sol = solve_ivp(self.fun, t_span, y0, method=method, **options)
         if self.component_names is not None and len(self.component_names) == len(sol.y):
             sol.component_names = self.component_names
         sol.units, sol.epoch = self.units, self.epoch

@@ -44,7 +44,7 @@ class RunSpec(NamedTuple):
     are not of second order. `tangents` are the vectors in the augmented state; `stepping` and `projection` are for the
     state without them. `sees_velocity` says, for q'' = a, whether a comes from a function that is called with
     velocities too, on which it may come to depend; `is_second_order` that `rhs` is (v, a) by its construction. `called`
-    and `left_out`: see `Run`.
+    and `left_out`: see `Run`. ``uncount(calls)`` takes back the count of calls of `rhs` that are no part of ``nfev``.
     """
 
     name: str
@@ -63,6 +63,7 @@ class RunSpec(NamedTuple):
     tangents: TangentVectors = NO_TANGENT_VECTORS
     sees_velocity: bool = True
     is_second_order: bool = False
+    uncount: Callable[[int], None] = lambda calls: None
 
     def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
         """Return the run that starts at the state y0, after a check of the options, the functions and the invariants.
@@ -71,6 +72,10 @@ class RunSpec(NamedTuple):
         `check_start` is False if the invariants and the steps of a user-defined method have been checked, and costs
         reported, at the start of a similar run.
         """
+        made: Any = BUILD.call(self._built, y0, f0, tau, check_start)
+        return made
+
+    def _built(self, y0: Array, f0: Array | None, tau: float | None, check_start: bool) -> Run:
         t0 = self.stepping.span.t0
         method, f0 = self.examined(y0, f0)
         tau = self._first_step(method, y0, f0) if tau is None else tau
@@ -113,6 +118,7 @@ class RunSpec(NamedTuple):
         samples = Samples(self.rhs, start, invariants, self.tangents)
         found = unless_error(conserved, samples, projection, method, tell and options.watched)
         found = Conserved(calls=samples.calls) if found is None else found
+        self.uncount(found.calls)
         if len(C := found.linear.C):
             options = options._replace(frame=frame_rows((C, C.T), y.size, 1))
         options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)

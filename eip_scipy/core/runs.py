@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engine.data import BY_ERROR, EXAMINED, NO_BALANCES, NO_METHOD, NOTHING, REASON, Schedule, Work
-from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
+from ..engine.native import BUILD, Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from ..methods.base import Method
 from .callers import users_level
@@ -126,6 +126,9 @@ class Run:
         Steps that the engine has marked as suspicious are examined. The invariants are checked after 10, 100, 1000, ...
         steps, at the end, and if the corrections are too large, to find the reason. `rhs` returns a new array.
         """
+        return bool(BUILD.call(self._look, steps, ended, t, y, rhs))
+
+    def _look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
         if self.trust.failed or not self.options.watched:  # a failure has its own message
             return False
         if ended:
@@ -206,6 +209,10 @@ class Counted:
         """Return the derivative (n,) at (t, y) as a new array, and count the call."""
         self.count += 1
         return self._rhs(t, y).copy()
+
+    def uncount(self, calls: int) -> None:
+        """Take back the count of some calls."""
+        self.count -= calls
 
 
 def parts_of(run: Run) -> dict[str, Any]:

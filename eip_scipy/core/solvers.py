@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 import copyreg
+import inspect
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from operator import is_
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,12 +26,12 @@ from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.one_step import OneStep, OneStepMethod
 from ..methods.runge_kutta import ATTRIBUTES, DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau, is_same, tableau_of
 from .acceleration import BY_NAME
-from .between_steps import N_LEFT, Settings, checked_stepping, checked_vector, is_state, kept_state
+from .between_steps import Settings, checked_stepping, checked_vector, is_state, kept_state, settings_of
 from .callers import users_level
 from .dense import ExactEnds, Interpolants
 from .examination import is_check_due
 from .failures import failure
-from .inputs import numbers, shown
+from .inputs import is_number, numbers, shown
 from .invariants import InvariantSet, as_invariants
 from .jitted import compiled_call
 from .names import nearest
@@ -51,7 +53,9 @@ HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_
 # SHARED: attributes that a solver and its copies share; MADE: attributes that each copy makes again.
 SHARED = {"_user_fun", "_jacobian"}
 MADE = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_derivative", "_call", "_spec", "_scipy"}
-MADE |= {"_run", "_work", "_schedule", "_engine", "_interpolants", "_left", "_taken", "diagnostics"}
+MADE |= {"_run", "_work", "_schedule", "_engine", "_interpolants", "_was", "diagnostics"}
+# Options of SciPy's other solvers, which code that runs several of them passes to all.
+OF_OTHERS = {"jac", "jac_sparsity", "lband", "uband", "min_step"}
 OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnostics", *ProjectionOptions.names())
 
 
@@ -142,8 +146,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     h_abs: Any
     nfev: int
     _interpolants: Interpolants | None
-    _left: tuple[Any, ...]
-    _taken: tuple[Any, ...]
+    _was: Settings
+    rtol: Any
+    atol: Any
     _run: Run
     _spec: RunSpec
     _work: Work
@@ -174,14 +179,15 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         t0, t_bound = interval((t0, t_bound))
         start = initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
+        longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN is no bound, as in SciPy
+        steps = StepOptions(h=h, first_step=first_step, max_step=longest, rtol=rtol, atol=atol)
         n = self._TANGENTS.state(start).size
         stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)
         kept = as_invariants(projection.invariants)
         self._jacobian = jacobian
         self._bind(fun, [0])
         self._spec = self._specified(stepping, replace(projection, invariants=kept))
-        self._take_stepping(stepping)
+        self._take_stepping(stepping, rtol, atol)
         if self.h is None and stepping.first_step is None:
             stepping.require_scale(self._TANGENTS.state(start))
         self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated) or n < self.n)
@@ -196,6 +202,12 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._noted, self._told = 0, False
         self._count()
         self._settle()
+
+    @classmethod
+    def _takes_scipys_steps(cls, options: Mapping[str, Any]) -> bool:
+        """Return True if the steps of a run with these options are those of a method of SciPy."""
+        known = cls._SCIPY is not None or cls.TABLEAU.drives
+        return known and options.get("h") is None and not options.get("invariants")
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         """Give a subclass the attributes of SciPy's RungeKutta classes: order, n_stages, A, B, C, E, P ..."""
@@ -214,12 +226,12 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         vectorized = self.vectorized and fun is not self.fun
         self._derivative, self._call = _checked(fun, self.n, self.y.dtype, vectorized, calls)
 
-    def _take_stepping(self, stepping: Stepping) -> None:
-        """Store options of the step control that have been checked."""
+    def _take_stepping(self, stepping: Stepping, rtol: Any, atol: Any) -> None:
+        """Store options of the step control that have been checked; numbers stay numbers, as in SciPy."""
         self._spec = self._spec._replace(stepping=stepping)
         self.h, self.max_step = stepping.h, stepping.span.max_step
-        self._taken = self.fun, self.t_bound, self.direction, self.max_step, self.h
-        self.rtol, self.atol = _frozen(stepping.rtol), _frozen(stepping.atol)
+        given = (rtol, stepping.rtol), (atol, stepping.atol)  # the checked arrays of an empty state have no number
+        self.rtol, self.atol = (a.copy() if np.size(x) > 1 else float(np.max(a if a.size else x)) for x, a in given)
 
     def _specified(self, stepping: Stepping, projection: ProjectionOptions) -> RunSpec:
         """Return a `RunSpec` of the solver's present right-hand side with these options."""
@@ -234,13 +246,16 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             level=True,
             hint=lambda: f". If fun is the acceleration a(t, q), {BY_NAME}",
             tangents=self._TANGENTS,
+            uncount=self._uncount,
         )
+
+    def _uncount(self, calls: int) -> None:
+        self._calls[0] -= calls
 
     def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:
         """Start a run at a state and make its buffers; the arguments are those of `RunSpec.build`."""
         run = self._spec.build(y0, f0, tau, check_start=check)
         self._run, self._work = run, run.work
-        self._calls[0] -= run.conserved.calls
         self._spec = self._spec._replace(method=run.tableau, is_known=True)
         run.attach(self.diagnostics)
         self.y, self.f = run.y0, run.start.f
@@ -255,6 +270,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._k, self._interpolants = 0, None
         if self._scipy is not None:
             return
+        if self.TABLEAU.drives:
+            self._run.method.count(self._work)
         self._work.K[0] = self.f
         self._schedule = bare_schedule(self._spec.stepping.span, float(self.h_abs or 0.0))
         self._schedule.place[PENDING] = 1  # the solver shows the end of the last step
@@ -270,29 +287,19 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _settle(self) -> None:
         """Store the attributes after a step, so that the next step detects which of them the user has set."""
-        self._left = self.t, self.y, self.f, self.h_abs, self.rtol, self.atol, self.nfev
+        self._was = Settings._make(settings_of(self))
         self._kept = kept_state(self.y) if self._scipy is None else None
 
     @property
     def _untouched(self) -> bool:
         """Return True if no attribute was set since the last step."""
-        t, y, f, h_abs, rtol, atol, nfev = self._left
+        stepping = self._spec.stepping
         return (
-            self.y is y
-            and self.t is t
-            and self.f is f
-            and self.h_abs is h_abs
-            and self.rtol is rtol
-            and self.atol is atol
-            and self.nfev == nfev
-            and (self.fun, self.t_bound, self.direction, self.max_step, self.h) == self._taken
-            and (self._kept is None or is_state(y, self._kept))
+            all(map(is_, settings_of(self), self._was))
+            and (type(self.rtol) is float or np.array_equal(self.rtol, stepping.rtol))  # or changed in place
+            and (type(self.atol) is float or np.array_equal(self.atol, stepping.atol))
+            and (self._kept is None or is_state(self.y, self._kept))
         )
-
-    @property
-    def _was(self) -> Settings:
-        """Return the attributes as they were after the last step."""
-        return Settings(*self._left, *self._taken)
 
     def _hand_on(self) -> None:
         """Apply the attributes that were set between two steps, as the notes of `EIPSolver` describe."""
@@ -308,7 +315,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if refunctioned:
             self._bind(self.fun, self._calls)
             self._spec = self._specified(stepping, self._spec.projection)
-        self._take_stepping(stepping)
+        self._take_stepping(stepping, self.rtol, self.atol)
         if self._scipy is not None:
             if refunctioned:
                 self._scipy.fun = self._derivative
@@ -413,8 +420,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self.diagnostics = Diagnostics()
         self._run.attach(self.diagnostics)
         now = {name: getattr(self, name) for name in Settings._fields}
-        was = Settings(**now | copied["set"])
-        self._left, self._taken = tuple(was[:N_LEFT]), tuple(was[N_LEFT:])
+        self._was = Settings(**now | copied["set"])
         self.fun = shared.get("fun", self.fun)
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
@@ -474,7 +480,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     @property
     def _moved(self) -> bool:
         """Return True if the state or the time was changed since the last step."""
-        t, y = self._left[:2]
+        t, y = self._was.t, self._was.y
         if self.t != t or (self._kept is not None and not is_state(self.y, self._kept)):
             return True
         return self.y is not y and not np.array_equal(self.y, y)
@@ -524,7 +530,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         return self._sampled().shown(t, y) if waits else y
 
     def _dense_output_impl(self) -> DenseOutput:
-        t, y = self._left[:2]
+        t, y = self._was.t, self._was.y
         if self._kept is not None and not is_state(y, self._kept):  # y was changed in place since the last step
             y = np.frombuffer(self._kept, y.dtype) if isinstance(self._kept, bytes) else self._kept
         if self._scipy is not None:
@@ -534,7 +540,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             ends = (self._raw_old, self._raw) if self._shows else (self.y_old, y)
             out = self._sampled().over(self.t_old, ends[0], t, ends[1])
             self._count()
-        self._left = *self._left[:-1], self.nfev
+        self._was = self._was._replace(nfev=self.nfev)
         return out
 
 
@@ -559,13 +565,6 @@ def _copied(derivative: Callable[[float, np.ndarray], np.ndarray], t: float, y: 
     return derivative(t, y).copy()
 
 
-def _frozen(a: np.ndarray) -> np.ndarray:
-    """Return a read-only copy, because a step would not notice a change in place."""
-    a = a.copy()
-    a.setflags(write=False)
-    return a
-
-
 def _jacobian(method: Any, options: dict[str, Any]) -> Any:
     """Remove the options for the Jacobian from `options`, and return them as a method that takes them needs them."""
     if method.drives:
@@ -579,7 +578,7 @@ def _jacobian(method: Any, options: dict[str, Any]) -> Any:
 def _without_effect(names: Iterable[str]) -> str:
     """Return SciPy's warning about unknown options in its own words, so that existing warning filters apply."""
     listed = ", ".join(f"`{name}`" for name in names)
-    hints = ((name, nearest(name, OPTIONS).removeprefix("; ")) for name in names)
+    hints = ((name, nearest(name, OPTIONS).removeprefix("; ")) for name in names if name not in OF_OTHERS)
     meant = "".join(f" `{name}`: {hint}" for name, hint in hints if hint)
     return f"The following arguments have no effect for a chosen solver: {listed}.{meant}"
 
@@ -597,7 +596,7 @@ def _checked(
     def flat(t: float, y: np.ndarray) -> np.ndarray:
         f = fun(t, y[:, None])
         found = numbers("fun returned", f)
-        return f if found is None else found.reshape(-1)
+        return f if found is None else np.resize(found, n) if found.size == 1 else found.reshape(-1)
 
     called = flat if vectorized else fun
 
@@ -765,7 +764,20 @@ class EIPGJ14(EIPSolver):
     TABLEAU = GaussJackson(order=14, corrected=True)
 
 
-class EIPRadau(EIPSolver):
+class _Implicit(EIPSolver):
+    """Base of the methods on SciPy's implicit solvers, whose arguments have the order of those of SciPy's classes."""
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(**inspect.signature(scipy.integrate.Radau).bind_partial(*given).arguments, **options)
+
+    _own = inspect.signature(EIPSolver.__init__).parameters.values()
+    __init__.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [*list(inspect.signature(scipy.integrate.Radau.__init__).parameters.values())[:-1],
+         *(item for item in _own if item.kind in (item.KEYWORD_ONLY, item.VAR_KEYWORD))]
+    )  # fmt: skip
+
+
+class EIPRadau(_Implicit):
     """EIP method on the steps of SciPy's Radau, the implicit Runge-Kutta method of order 5, for stiff systems.
 
     Options: see `EIPSolver`, without `h` and `compensated`, and ``jac`` and ``jac_sparsity`` as for
@@ -800,15 +812,19 @@ class EIPRadau(EIPSolver):
     TABLEAU = RADAU
 
 
-class EIPBDF(EIPSolver):
+class EIPBDF(_Implicit):
     """EIP method on the steps of SciPy's BDF, of variable order up to 5, for stiff systems and loose tolerances.
 
     Options and notes: see `EIPRadau`; complex states are possible.
     """
 
     TABLEAU = BDF
-    order: Any = NotImplemented  # it varies
-    error_estimator_order: Any = NotImplemented
+    error_estimator_order: Any = NotImplemented  # it varies
+
+    @property
+    def order(self) -> int:
+        """Order of the next step, as in `scipy.integrate.BDF`."""
+        return int(self._run.method.scipy_solver.order)
 
 
 def class_named(method: Any) -> str | None:

@@ -185,7 +185,7 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
         a = reals(name, value)
         if a is None:
             raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {shown(value)}.")
-        if a.ndim > 0 and a.shape != (n,):
+        if a.ndim > 0 and a.shape != (n,) and not (name == "rtol" and a.shape == (1,)):  # which SciPy takes
             raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, but the state has ({n},).")
         if not np.all(a >= 0):
             raise ValueError(f"`{name}` must be positive. Got {shown(value)}.")

@@ -130,7 +130,7 @@ class TangentVectors:
         options = options._replace(
             rtol=self.spread(options.rtol), atol=self.spread(options.atol), groups=blocks, kinds=kinds, columns=vectors,
             joint=None, metric=GIVEN if options.metric == EUCLIDEAN and self.parameters else options.metric,
-            linear_invariants=options.frame._replace(bodies=np.zeros((2, 0, 0)), place=moved(options.frame.place)),
+            frame=options.frame._replace(bodies=np.zeros((2, 0, 0)), place=moved(options.frame.place)),
         )  # fmt: skip
         return options, self.spread(1.0 if sigma is None else sigma)
 

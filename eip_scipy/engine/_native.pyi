@@ -1,5 +1,6 @@
 """Engine of eip_scipy in C++. Written by .ci/stub."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy
@@ -9,6 +10,9 @@ def work_alone(alone: bool) -> bool:
     """
     If `alone` is True, keep the calling thread from sharing sums over many bodies with other threads; if False, let it share them. Return the previous setting.
     """
+
+def call(arg0: Callable, /, *args: Any) -> object:
+    """Return ``fun(*args)``, with subnormal numbers."""
 
 def end_threads() -> None:
     """
@@ -589,6 +593,7 @@ class Members(NamedTuple):
     starts: numpy.typing.NDArray[numpy.inexact]
     params: numpy.typing.NDArray[numpy.float64]
     first_steps: numpy.typing.NDArray[numpy.float64]
+    events: numpy.typing.NDArray[numpy.float64]
     evaluations: int
     sigma: numpy.typing.NDArray[numpy.float64]
     left: numpy.typing.NDArray[numpy.float64]

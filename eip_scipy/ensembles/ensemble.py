@@ -22,6 +22,7 @@ from ..checkpoint.locks import absolute
 from ..checkpoint.signals import sigterm_as_ctrl_c
 from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.conserved import NEAR_DISTANCE
+from ..core.events import Events
 from ..core.gradients import unless_error
 from ..core.inputs import count, flag, is_number, shown
 from ..core.invariants import as_invariants
@@ -36,7 +37,6 @@ from ..core.states import states
 from ..core.tangent_vectors import TangentVectors
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
-from ..run.events import Events
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from ..run.results import WithColumns

@@ -21,6 +21,7 @@ from ..core.jitted import NotCompilableError
 from ..core.stepping import UNBOUNDED, saved_steps
 from ..engine import data
 from ..engine.data import DOUBTFUL, N_COUNTERS, NFEV, OK, PAUSE, Schedule
+from ..engine.native import BUILD
 from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
@@ -36,8 +37,8 @@ FAILED, NOT_RUN = -1, -2
 FIRST_STEPS, SWEEP_SECONDS = 1024, 0.1
 ENDS = (ARRIVED, ENDED_BY_EVENT)
 BY_MEMBER = (
-    *("starts", "params", "first_steps", "y", "t", "status", "max_residual", "counters", "max_correction", "figures"),
-    "suspects",
+    *("starts", "params", "first_steps", "events", "y", "t", "status", "max_residual", "counters", "max_correction"),
+    *("figures", "suspects"),
 )
 LEAST_WORK = 3e7  # floats times steps, one or two seconds: compiling functions for eight members takes as long
 LISTS = "message", "happened"  # fields of Members that are lists; the others are arrays
@@ -327,7 +328,7 @@ class Sweeper:
             self._side_by_side(each, out, watch)
             for k in np.flatnonzero(out.status == NOT_RUN).tolist():
                 self._one_by_one(plan, slice(k, k + 1), each, out, watch)
-        self._examine(each, out)
+        BUILD.call(self._examine, each, out)
         if each.kept:
             out.saved[:] = each.rows[:, : plan.times.size]
         self._evaluate(plan, y0s, params, out)
@@ -368,11 +369,12 @@ class Sweeper:
         """Return the inputs of the members and the buffers for their results."""
         driver, m = self.loop.driver, len(y0s)
         y0s, params = (np.require(a, requirements=["A", "C", "W"]) for a in (y0s, params))
-        kept = plan.times.size > 0
+        kept, (first_steps, events) = plan.times.size > 0, self._at_start(y0s, params)
         return data.Members(
             starts=y0s,
             params=params,
-            first_steps=self._first_steps(y0s, params),
+            first_steps=first_steps,
+            events=events,
             evaluations=self._evaluations,
             sigma=self._sigma,
             left=self._left,
@@ -487,19 +489,20 @@ class Sweeper:
         if each.kept:
             each.rows[k, driver.rows :] = np.nan
 
-    def _first_steps(self, y0s: np.ndarray, params: np.ndarray) -> np.ndarray:
-        """Return the length (m,) of each member's first step; NaN if it cannot be estimated."""
-        t0, stepping = self.loop.driver.schedule.span.t0, self.loop.driver.run.stepping
-        if stepping.h is not None or stepping.first_step is not None:
-            return np.full(len(y0s), stepping.h or stepping.first_step, float)
-        taus = np.empty(len(y0s))
-        for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
+    def _at_start(self, y0s: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the length (m,) of each member's first step, NaN if it cannot be found, and the events (m, events)."""
+        span, stepping, events = self.loop.driver.schedule.span, self.loop.driver.run.stepping, self.loop.events
+        known = stepping.h or stepping.first_step
+        taus, values = np.full(len(y0s), known or np.nan), np.zeros((len(y0s), len(events.functions)))
+        for k, (y0, p) in enumerate(zip(y0s, params, strict=True) if events.functions or not known else ()):
             derivative = self._derivative(p)
             try:
-                taus[k] = stepping.first(derivative, y0, derivative(t0, y0), self.loop.driver.run.tableau)
+                f = derivative(span.t0, y0)
+                taus[k] = known or stepping.first(derivative, y0, f, self.loop.driver.run.tableau)
+                values[k] = events.at_start(span.t0, y0, f, span.sign * taus[k])
             except Exception:
                 taus[k] = np.nan
-        return taus
+        return taus, values
 
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
         """Set the parameters of the driver to those of a member, and return the right-hand side."""

@@ -7,7 +7,6 @@ lists them, and a run raises an error that names those that the installed versio
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -55,9 +54,10 @@ class ScipySolverAdapter(Method):
     """A method whose steps are made by the class `solver` of SciPy.
 
     Entry (p, j) of `polynomials` (k, k) is the coefficient of x^(p + 1), x = (t - t_old) / h, in the interpolant, which
-    multiplies the j-th row that `_describe` fills. The solver of a run is created in its first step. `not_finite_at` is
-    a time at which the right-hand side had a value that is not finite in the last step, or None. The engine reads `b`,
-    `c`, `exponent` and `multistep`, as those of a tableau; the array work.K has one row more than `b` has entries.
+    multiplies the j-th row that `_describe` fills. `scipy_solver` is the solver of a run, which `begin` makes.
+    `not_finite_at` is a time at which the right-hand side had a value that is not finite in the last step, or None. The
+    engine reads `b`, `c`, `exponent` and `multistep`, as those of a tableau; the array work.K has one row more than `b`
+    has entries.
     """
 
     in_python = drives = True
@@ -75,8 +75,7 @@ class ScipySolverAdapter(Method):
         self.name = self.solver.__name__
         self.b = self.c = np.zeros(len(self.polynomials) + 1)
         self.not_finite_at: float | None = None
-        self._solver: Any = None  # of this run
-        self._make: Callable[[], OdeSolver]
+        self.scipy_solver: Any
         self._before: dict[str, Any] = {}
         self._counted = dict.fromkeys(COUNTERS, 0)
 
@@ -105,9 +104,10 @@ class ScipySolverAdapter(Method):
             )
         if rtol.size and np.ptp(rtol) > 0:
             raise ValueError(f"rtol={rtol}: SciPy's {self.name} takes one number. Give atol by component instead.")
-        known = [f]  # the solver's first call asks for this derivative
+        known, calls = [f], [0]  # the solver's first call asks for this derivative
 
         def fun(t: float, y: Array) -> Array:
+            calls[0] += not known
             found = known.pop() if known else spec.rhs(t, y)
             if not BUILD.are_finite(found.view(float)):
                 self.not_finite_at = t
@@ -115,14 +115,11 @@ class ScipySolverAdapter(Method):
 
         make: Any = self.solver
         jacobian = spec.jacobian() or Jacobian()
-        self._solver, self._make = None, partial(
-            make, fun, t, y, span.t_bound, max_step=span.max_step, rtol=float(rtol.max(initial=0.0)),
-            atol=spec.stepping.atol, first_step=length, **jacobian._asdict(),
+        self.scipy_solver = solver = make(
+            fun, t, y, span.t_bound, max_step=span.max_step, rtol=float(rtol.max(initial=0.0)),
+            atol=spec.stepping.atol, first_step=length or None, **jacobian._asdict(),
         )  # fmt: skip
-
-    def _made(self) -> Any:
-        """Make and return SciPy's solver, without counting the evaluations of its Jacobian at the start."""
-        solver: Any = self._make()
+        spec.uncount(calls[0])  # those of its Jacobian
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
         lacking = [name for name in PRIVATE[self.solver] if not hasattr(solver, name)]
@@ -132,7 +129,10 @@ class ScipySolverAdapter(Method):
                 f"not have: {', '.join(lacking)}. Use another version of SciPy."
             )
         self._keep_finite(solver)
-        return solver
+        self._watch(solver)
+
+    def _watch(self, solver: Any) -> None:
+        """Change the solver so that it keeps values of a step that `_error` needs."""
 
     def _keep_finite(self, solver: Any) -> None:
         """Let the solver keep its last Jacobian where a new one is not finite, because `fun` is not.
@@ -157,9 +157,7 @@ class ScipySolverAdapter(Method):
         fails because the step would become too short.
         """
         self.not_finite_at = None
-        if self._solver is None:
-            self._solver = self._made()
-        solver = self._solver
+        solver = self.scipy_solver
         longest = solver.max_step
         if again:
             # SciPy's solver returns to the state before the last step, and must make its factorisations again.
@@ -173,10 +171,7 @@ class ScipySolverAdapter(Method):
             solver.jac_factor = np.minimum(solver.jac_factor, LARGEST_SHIFT)
         solver.step()
         solver.max_step = longest
-        for name, place in COUNTERS.items():
-            found = getattr(solver, name)
-            w.counters[place] += found - self._counted[name]
-            self._counted[name] = found
+        self.count(w)
         if solver.status == "failed":
             return None
         h = solver.t - t
@@ -186,29 +181,31 @@ class ScipySolverAdapter(Method):
         w.K[-1] = self._slope(w.K[1:-1])
         return float(solver.t), float(solver.h_abs)
 
+    def count(self, w: Work) -> None:
+        """Add the evaluations and factorisations since the last call to the counters of the run."""
+        for name, place in COUNTERS.items():
+            found = getattr(self.scipy_solver, name)
+            w.counters[place] += found - self._counted[name]
+            self._counted[name] = found
+
     def _kept(self) -> dict[str, Any]:
         """Return the attributes of SciPy's solver that take it back to the state before a step."""
-        return {name: value for name, value in vars(self._solver).items() if name not in (*COUNTERS, "jac_factor")}
+        return {name: value for name, value in vars(self.scipy_solver).items() if name not in (*COUNTERS, "jac_factor")}
 
     def _factors(self) -> list[str]:
-        return [name for name in vars(self._solver) if name.startswith("LU")]
+        return [name for name in vars(self.scipy_solver) if name.startswith("LU")]
 
-    def state(self) -> dict[str, Any] | None:
-        """Return the values from which another object continues with the same bits; None before the first step."""
-        if self._solver is None:
-            return None
-        own = vars(self._solver)
+    def state(self) -> dict[str, Any]:
+        """Return the values from which another object continues with the same bits."""
+        own = vars(self.scipy_solver)
         values = {name: value for name, value in own.items() if isinstance(value, DenseOutput) or not callable(value)}
         # Sparse factorisations cannot be copied; the solver makes them again.
         return values | {name: None for name in self._factors() if not isinstance(values[name], tuple)}
 
-    def resume(self, values: dict[str, Any] | None) -> None:
+    def resume(self, values: dict[str, Any]) -> None:
         """Continue from the `state` of another object; `begin` must have been called before."""
-        if values is None:
-            return
-        self._solver = self._made()
-        vars(self._solver).update(values)
-        self._counted = {name: getattr(self._solver, name) for name in COUNTERS}
+        vars(self.scipy_solver).update(values)
+        self._counted = {name: getattr(self.scipy_solver, name) for name in COUNTERS}
 
     def _move(self, y: Array) -> None:
         """Set the state of SciPy's solver to the projected state y."""
@@ -239,8 +236,7 @@ class _Radau(ScipySolverAdapter):
     polynomials = np.linalg.inv(NODES[:, None] ** np.arange(1, 4))
     _solved: Array
 
-    def _made(self) -> Any:
-        solver = super()._made()
+    def _watch(self, solver: Any) -> None:
         solve = solver.solve_lu
 
         def solve_lu(factors: Any, b: Array) -> Array:
@@ -248,20 +244,19 @@ class _Radau(ScipySolverAdapter):
             return self._solved
 
         solver.solve_lu = solve_lu
-        return solver
 
     def _move(self, y: Array) -> None:
-        self._solver.y = y
-        self._solver.f = self._solver.fun(self._solver.t, y)
+        self.scipy_solver.y = y
+        self.scipy_solver.f = self.scipy_solver.fun(self.scipy_solver.t, y)
 
     def _error(self, h: float) -> Array:
         return self._solved  # an accepted step ends with the linear system whose solution is the error estimate
 
     def _describe(self, h: float, rows: Array) -> None:
-        np.divide(self._solver.Z, h, out=rows)
+        np.divide(self.scipy_solver.Z, h, out=rows)
 
     def _slope(self, rows: Array) -> Array:
-        slope: Array = self._solver.f
+        slope: Array = self.scipy_solver.f
         return slope
 
 
@@ -278,14 +273,14 @@ class _BDF(ScipySolverAdapter):
     polynomials = np.eye(MOST_ORDER)
 
     def _kept(self) -> dict[str, Any]:
-        return super()._kept() | {"D": self._solver.D.copy()}
+        return super()._kept() | {"D": self.scipy_solver.D.copy()}
 
     def _move(self, y: Array) -> None:
-        self._solver.y = y
-        self._solver.D[0] = y
+        self.scipy_solver.y = y
+        self.scipy_solver.D[0] = y
 
     def _error(self, h: float) -> Array:
-        solver, order = self._solver, self._before["order"]
+        solver, order = self.scipy_solver, self._before["order"]
         difference = solver.D[order + 1]
         if solver.order > order:  # then this difference has been scaled to the next step's length
             difference = difference / (solver.h_abs / abs(h)) ** (order + 1)
@@ -297,10 +292,10 @@ class _BDF(ScipySolverAdapter):
         The solver has already changed its differences D to the length of the next step. Therefore x - 1 is scaled
         by the ratio of the two lengths.
         """
-        order = self._solver.order
-        ratio = (abs(h) / self._solver.h_abs) ** np.arange(MOST_ORDER + 1)
+        order = self.scipy_solver.order
+        ratio = (abs(h) / self.scipy_solver.h_abs) ** np.arange(MOST_ORDER + 1)
         powers = (SHIFTED * ratio) @ NEWTON[:, : order + 1]
-        np.divide(powers[1:] @ self._solver.D[: order + 1], h, out=rows)
+        np.divide(powers[1:] @ self.scipy_solver.D[: order + 1], h, out=rows)
 
     def _slope(self, rows: Array) -> Array:
         return np.arange(1, MOST_ORDER + 1) @ rows

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.integrate import OdeSolution
 
+from ..core.events import ContinuedEvents, as_events
 from ..core.inputs import is_number, shown
 from ..core.results import Diagnostics, Multipliers, joined_sums
 from ..core.tangent_vectors import StateSolution
-from .events import ContinuedEvents, as_events
 from .integrate import integrate
 from .prepare import Request
 from .results import IntegrationResult, Origin

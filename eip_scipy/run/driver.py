@@ -11,13 +11,13 @@ import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..core.dense import Interpolants, ManifoldDenseOutput, solution
+from ..core.events import Events
 from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
 from ..core.runs import Run
 from ..core.stepping import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
-from .events import Events
 from .memory import most_bytes
 
 __all__ = ["Driver", "check_memory", "saved_rows"]

@@ -143,9 +143,10 @@ def integrate(
         between steps come from dense output and are projected. Without `save_every` and `t_eval`, the first and the
         last state are saved.
     events : callable or sequence of callable, optional
-        ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`;
-        Numba functions or C functions, or Python functions, which are called from Python even if `fun` is native. An
-        event does not happen where its value is NaN.
+        ``event(t, y[, params]) -> float``, or ``event(t, y, *args)``, with ``terminal`` and ``direction`` as for
+        `scipy.integrate.solve_ivp`; Numba functions or C functions, or Python functions, which are called from Python
+        even if `fun` is native. An event does not happen where its value is NaN, and not at the start if it is zero
+        there to rounding. An event with an infinite ``direction`` is a limit: it also happens at a start beyond it.
     dense_output : bool, optional
         If True, store the interpolants of all steps as ``.sol``, a function of time; not available with a checkpoint.
     callback : callable, optional

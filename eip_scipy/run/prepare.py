@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core.acceleration import BY_NAME, AccelerationField
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
+from ..core.events import Events, as_events, replaced
 from ..core.inputs import count, flag, real_array, require_arguments, shown
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError, is_compiled
@@ -34,7 +35,6 @@ from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, c
 from ..methods.gauss_jackson import jacobian_product
 from ..methods.implicit import Jacobian
 from .driver import check_memory, saved_rows
-from .events import Events, as_events, replaced
 from .interpreted_functions import FORMS, interpreted
 from .memory import check_bytes
 from .resume import plain, settings
@@ -385,10 +385,9 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     # `attach` sets all attributes of a new record.
     record = Diagnostics.__new__(Diagnostics) if request.diagnostics is None else request.diagnostics
     run.attach(record)
-    schedule.g[:] = system.events.values(t0, run.y0)
+    schedule.g[:] = system.events.at_start(t0, run.y0, run.start.f, run.start.tau * schedule.span.sign)
     run.work.K[0] = run.start.f
-    system.events.leave(t0, run.y0, run.work.K[0], run.start.tau * schedule.span.sign, schedule.g)
-    run.work.counters[NFEV] = calls.count - run.conserved.calls
+    run.work.counters[NFEV] = calls.count
     return Prepared(asked, request, system, schedule, run, record, variations)
 
 
@@ -409,6 +408,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         left_out=system.left_out,
         sees_velocity=system.name == "fun" and (problem is None or problem.acc is None),
         is_second_order=system.native_form[1].startswith("acceleration"),
+        uncount=calls.uncount,
     )
 
 

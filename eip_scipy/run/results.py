@@ -261,8 +261,8 @@ class IntegrationResult(WithColumns):
             Options of `integrate` that change. `t_eval` is not repeated: pass new times, otherwise the states at both
             ends are saved. Events keep their counts: an event with ``terminal = 3`` that happened twice before ends the
             run when it happens once more, and an event that ended the run ends it again when it happens next;
-            ``events=None`` removes all events. New events start to count at 0, and may happen at once. If they are not
-            the same functions in the same order, `t_events` and `y_events` contain those of the second run only.
+            ``events=None`` removes all events. New events start to count at 0. If they are not the same functions in
+            the same order, `t_events` and `y_events` contain those of the second run only.
 
         Returns
         -------

@@ -18,11 +18,11 @@ from ..checkpoint import CheckpointError
 from ..checkpoint.locks import Lock
 from ..checkpoint.signals import sigterm_as_ctrl_c
 from ..core.callers import users_level
+from ..core.events import Events
 from ..core.inputs import flag, is_number, shown
 from ..core.runs import Run
 from ..engine.data import NEXT_LENGTH, TIME
 from ..methods.gauss_jackson import Weights
-from .events import Events
 
 __all__ = ["Keeper", "keeping", "plain", "settings"]
 

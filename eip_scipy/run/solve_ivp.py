@@ -12,6 +12,7 @@ from scipy.integrate import OdeSolution, OdeSolver
 
 from ..core.acceleration import AccelerationField
 from ..core.arguments import are_same
+from ..core.events import Events
 from ..core.inputs import shown
 from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
@@ -138,7 +139,8 @@ def solve_ivp(
         the EIP methods are given, "RK23", "RK45", "DOP853", "Radau", "BDF" and other explicit Runge-Kutta classes are
         replaced by the EIP methods for them; otherwise the run uses SciPy's method.
     t_eval, dense_output, events, vectorized
-        As for `scipy.integrate.solve_ivp`.
+        As for `scipy.integrate.solve_ivp`. At the start, events are those of `integrate`; with the steps of SciPy and
+        without invariants, one that is exactly 0 there happens, as in SciPy.
     args : tuple, optional
         Further arguments of `fun`, of the events, of `jacobian` and `jac`, and of the invariants. An invariant receives
         them after its own ``args``, unless both are the same.
@@ -208,6 +210,8 @@ def solve_ivp(
     common = {"t_eval": t_eval, "dense_output": dense_output, "events": events, "vectorized": vectorized, "args": args}
     method = _with_projection(method, [name for name in options if name in OWN])
     if not (isinstance(method, type) and issubclass(method, EIPSolver)):
+        if events is not None:
+            common["events"] = Events(events, _unpacked(args)[1]).for_scipy(None, as_scipy=True)
         sol = scipy.integrate.solve_ivp(function, t_span, y0, method=method, **common, **options)
         return OdeResult(sol, trusted=bool(sol.success), diagnostics=Diagnostics())
     return _solve(method, function, t_span, y0, common, options)
@@ -240,6 +244,10 @@ def _solve(
         raise TypeError("solve_ivp: jvp needs variations=...; pass variations, or omit jvp.")
     start = initial_state(y0) if options.get("project_initial") else None
     noting, solvers = _noting(method, start)
+    if common["events"] is not None:
+        begun = lambda t, y: (solvers[0].f, solvers[0].direction * float(solvers[0].h or solvers[0].h_abs))  # noqa: E731
+        as_scipy = method._takes_scipys_steps(options)
+        common["events"] = Events(common["events"], extra).for_scipy(begun, as_scipy=as_scipy)
     sol = scipy.integrate.solve_ivp(
         function, t_span, y0 if start is None else start, method=noting, **common, **options
     )

@@ -37,11 +37,11 @@ DONE, CHECK_FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 class Output:
     """Where a study puts its text, tables, figures and checks; a file replaces an older one only when it is complete.
 
-    `numbers` is what the study wants in the JSON file.
+    `numbers` is what the study wants in the JSON file. The files `inputs` are never replaced.
     """
 
-    def __init__(self, folder: Path = OUT, *, quiet: bool = False) -> None:
-        self.folder, self.quiet = folder, quiet
+    def __init__(self, folder: Path = OUT, *, quiet: bool = False, inputs: Sequence[Path] = ()) -> None:
+        self.folder, self.quiet, self._inputs = folder, quiet, inputs
         self.numbers: dict[str, Any] = {}
         self.passed, self.interrupted = True, False
         self._absent: dict[str, None] = {}
@@ -70,7 +70,7 @@ class Output:
 
     def rows(self, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write the lines of a CSV file, each with its columns' names."""
-        self._wrote(write_csv(self.folder / name, rows))
+        self._write(write_csv, self.folder / name, rows)
 
     def figure(self, name: str, where: str, *arguments: Any) -> None:
         """Write the figure or what else the function `where`, "module:function", makes of the arguments.
@@ -88,7 +88,7 @@ class Output:
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Let `write` fill a temporary file, which then replaces the file `name`."""
-        self._wrote(write_file(self.folder / name, write))
+        self._write(write_file, self.folder / name, write)
 
     def missing(self, line: str) -> None:
         """Print a line at the end of the command about what a package that is not installed would have added."""
@@ -113,20 +113,28 @@ class Output:
         for line in self._absent:
             warn(line)
 
-    def _wrote(self, path: Path) -> None:
-        self.text(f"wrote {path}")
+    def require_other(self, path: Path) -> None:
+        """Raise a UsageError if the file `path` is an input of the command."""
+        if path.exists() and any(known.exists() and path.samefile(known) for known in self._inputs):
+            raise UsageError(f"{str(path)!r} is an input of this command, and is not replaced; choose another output")
+
+    def _write(self, write: Callable[[Path, Any], Path], path: Path, content: Any) -> None:
+        self.require_other(path)
+        self.text(f"wrote {write(path, content)}")
 
 
 def run(name: str, study: Callable[..., None], argv: Sequence[str]) -> int:
     """Run a study with the arguments `argv` of its command `name`, and return the exit status."""
     given = vars(parser(name, study).parse_args(argv))
-    out = Output(given.pop("out"), quiet=given.pop("quiet"))
-    target = given.pop("json")
+    folder, quiet, target = (given.pop(option) for option in ("out", "quiet", "json"))
+    out = Output(folder, quiet=quiet, inputs=[value for value in given.values() if isinstance(value, Path)])
     untrusted: list[str] = []
     try:
         for folder in (out.folder if out.folder != OUT else None, target and target.parent):
             if folder is not None:
                 check_folder(folder)
+        if target:
+            out.require_other(target)
         with sigterm_as_ctrl_c(), listening(untrusted):
             study(out, **given)
     except (UsageError, OSError, MemoryError, CheckpointError) as error:
@@ -140,7 +148,7 @@ def run(name: str, study: Callable[..., None], argv: Sequence[str]) -> int:
         out.interrupted = True
     finally:
         if target and out.numbers:
-            out._wrote(write_json(target, document(name, given, trusted=not untrusted, **out.numbers)))
+            out._write(write_json, target, document(name, given, trusted=not untrusted, **out.numbers))
         for line in untrusted:
             warn(line)
         out.end()

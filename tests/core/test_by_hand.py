@@ -224,9 +224,28 @@ def test_wrong_values_raise(method, name, value, match):
         setattr(solver, name, value)
         with pytest.raises(ValueError, match=match):
             solver.step()
-        if name == "max_step":
-            with pytest.raises(ValueError, match="read-only"):
-                solver.rtol[:] = 1e-9
+
+
+@pytest.mark.parametrize("kept", [(), KEPT], ids=["SciPy's steps", "own steps"])
+@pytest.mark.parametrize("given", [1e-4, [1e-4, 1e-5]], ids=["number", "array"])
+def test_tolerances_change_in_place(kept, given):
+    """As on SciPy's solvers: by ``*=``, and by items of an array."""
+    solver, other, scipys = (
+        method(pendulum, 0, Y0, 5.0, rtol=np.copy(given)[()], atol=np.copy(given)[()], **options)
+        for method, options in ((EIPRK45, {"invariants": kept}), (EIPRK45, {"invariants": kept}), (RK45, {}))
+    )
+    for one in (solver, other, scipys):
+        stepped(one, 2)
+    for one in (solver, scipys):
+        one.rtol *= 0.1
+        one.atol *= 0.1
+        if np.ndim(given):
+            one.atol[0] *= 1.0
+    other.rtol, other.atol = 0.1 * np.array(given), 0.1 * np.array(given)
+    for one in (solver, other, scipys):
+        stepped(one, 3)
+    assert solver.t == other.t
+    assert kept or solver.t == scipys.t
 
 
 # Copies.

@@ -1,6 +1,7 @@
 """EIPRadau and EIPBDF: SciPy's steps, projected; their options, results and errors."""
 
 import copy
+import inspect
 import pickle
 
 import numpy as np
@@ -129,6 +130,21 @@ def test_all_functions_take_the_same_steps(method):
 
 def spring(t, y, k):
     return np.array([y[1], -y[0] - k * y[1]])
+
+
+@both
+def test_they_are_made_as_scipys_classes_are(method):
+    """The order of the arguments, and the numbers and the order before the first step."""
+    own, plain = (list(inspect.signature(m).parameters) for m in (method, SCIPY[method]))
+    assert own[: len(plain) - 1] == plain[:-1]
+    own, plain = (m(relaxing, 0.0, START, 5.0, np.inf, 1e-3, 1e-6, relaxing_jac) for m in (method, SCIPY[method]))
+    for _ in range(4):
+        assert (own.njev, own.nlu) == (plain.njev, plain.nlu)
+        assert getattr(own, "order", None) == (getattr(plain, "order", 5))
+        own.step()
+        plain.step()
+        assert own.t == plain.t
+    assert method(relaxing, 0.0, START, 0.0).njev == 1
 
 
 def spring_jac(t, y, k):

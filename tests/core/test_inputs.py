@@ -92,6 +92,7 @@ def test_functions_that_return_units(what):
         lambda y: [mpmath.mpf(float(v)) for v in y],
         lambda y: np.array([sympy.Float(float(v), 17) for v in y]),
         lambda y: units.Quantity(y, ""),
+        lambda y: [4.0 * v * units.Unit(0.25) for v in y],
         tuple,
     ],
 )

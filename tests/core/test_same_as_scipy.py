@@ -157,6 +157,20 @@ def test_a_number_as_the_acceleration_of_one_component():
     np.testing.assert_array_equal(one.stm, two.stm)
 
 
+@pytest.mark.parametrize(
+    ("fun", "options"),
+    [
+        (van_der_pol, {"rtol": [1e-6]}),
+        (van_der_pol, {"max_step": math.nan}),
+        (lambda t, y: np.full((1, 1), 0.5), {"vectorized": True}),
+    ],
+)
+def test_unusual_values_that_scipy_takes(fun, options):
+    for method in SCIPY:
+        own, theirs = (solve_ivp(fun, (0, 3), [2.0, 0.0], method=m, **options) for m in (method, SCIPY[method]))
+        np.testing.assert_array_equal(own.y, theirs.y)
+
+
 @pairs
 def test_failures(method):
     """A step size below the spacing of t fails at the same place."""

@@ -107,7 +107,7 @@ def test_events_of_members_are_those_of_single_runs(compiled, steps):
         for i in range(2):
             np.testing.assert_array_equal(run.t_events[k][i], alone.t_events[i])
             np.testing.assert_array_equal(run.y_events[k][i].reshape(-1, 4), alone.y_events[i].reshape(-1, 4))
-    assert [t.size for t in run.t_events[0]] == [2, 2]
+    assert [t.size for t in run.t_events[0]] == [1, 2]
     assert run.status[0] == 1
 
 

@@ -4,10 +4,24 @@ import math
 
 import numpy as np
 import pytest
+import scipy.integrate
 from numba import njit
 from systems import Verlet, oscillator
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPRKN12, Invariant, eip_method, integrate
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPRK4,
+    EIPRK45,
+    EIPRKN12,
+    EIPRadau,
+    Invariant,
+    eip_method,
+    ensemble,
+    integrate,
+    solve_ivp,
+)  # fmt: skip
+from eip_scipy.problems import Problem
 
 PHASE = 0.3
 SPAN = 50.0
@@ -231,7 +245,103 @@ def test_a_run_goes_on_from_event_to_event(method):
         assert run.t[-1] == run.t_events[0][-1]
 
 
-def test_zeros_at_steps_and_at_the_start_count_once():
+def from_event_to_event(start, method, events, end, **options):
+    """Return the times at which runs end, each of which begins where the last one has ended: three by `start`."""
+    t, y, times = 0.0, START, []
+    for _ in range(3):
+        if start is ensemble:
+            run = ensemble(oscillator, (t, end), [y], method=method, events=events, executor=1, **options)
+            t, y = run.t[0], run.y[0]
+        else:
+            run = start(oscillator, (t, end), y, method=method, events=events, **options)
+            t, y = run.t[-1], run.y[:, -1]
+        assert np.all(run.status == 1)
+        times.append(t)
+    return np.array(times)
+
+
+@pytest.mark.parametrize("start", [integrate, ensemble, solve_ivp], ids=lambda start: start.__name__)
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853, EIPRKN12, EIPGJ12, EIPRadau])
+def test_a_run_begins_at_the_event_that_ended_another(start, method):
+    """Where the state was exact or off by rounding, to either side; see `test_a_run_goes_on_from_event_to_event`."""
+    step = {"h": 0.05} if method in (EIPRK4, EIPGJ12) else {"rtol": 1e-7, "atol": 1e-7}
+    for level, end in ((0.0, 20), (0.3, -20), (0.5, 20)):
+        times = from_event_to_event(start, method, reaching(level, terminal=True), end, invariants=ENERGY, **step)
+        expected = passages(level, 20) if end > 0 else -(np.array(passages(level, 20 + 2 * PHASE)) + 2 * PHASE)
+        expected = expected[expected < 0] if end < 0 else expected
+        assert (np.abs(np.diff(times)) > 0.1).all()
+        np.testing.assert_allclose(np.diff(times), np.diff(expected)[:2], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_zeros_near_the_start(scale):
+    """The event is at 1e-6 of the first step, which counts, or at 1e-14, which is rounding: of the time, of terms."""
+    for begin, level in ((0.0, 0.0), (1e3 * scale, 0.0), (0.0, 1e3)):
+        for part, count in ((1e-6, 1), (1e-14, 0), (0.0, 0)):
+            run = integrate(
+                lambda t, y: [1 / scale], (begin, begin + scale), [level - 0.1 * part], method=EIPRK4, h=0.1 * scale,
+                events=lambda t, y, level=level: y[0] - level,
+            )  # fmt: skip
+            assert run.t_events[0].size == count, (begin, level, part)
+
+
+def test_an_event_where_two_parts_of_a_run_meet_happens_once():
+    """The first part ends at the event, or up to ten roundings next to it."""
+    for shift in range(-10, 11):
+        middle = math.pi / 2 - PHASE + shift * 2e-16
+        run = integrate(oscillator, (0, middle), START, method=EIPDOP853, rtol=1e-13, atol=1e-15, events=reaching(0.0))
+        assert run.continue_to(3.0).t_events[0].size == 1
+
+
+def beyond(direction):
+    def event(t, y):
+        return 0.5 - y[0] if direction < 0 else y[0] - 0.5
+
+    event.terminal, event.direction = True, direction
+    return event
+
+
+@pytest.mark.parametrize("direction", [math.inf, -math.inf])
+@pytest.mark.parametrize("native", [False, pytest.param(True, marks=pytest.mark.needs_jit)])
+def test_a_run_that_starts_beyond_a_limit_ends_there(direction, native):
+    event = compiled(beyond(direction)) if native else beyond(direction)
+    options = {"method": EIPDOP853, "rtol": 1e-6, "events": event}
+    fun = njit(oscillator) if native else oscillator
+    one, other = np.array([0.6, 0.1]), np.array([0.4, 0.0])
+    for t_span in ((0, 9), (9, 0)):
+        for run in (integrate(fun, t_span, one, **options), solve_ivp(fun, t_span, one, **options)):
+            assert (run.status, run.t[-1], run.t_events[0].tolist()) == (1, t_span[0], [t_span[0]])
+            np.testing.assert_array_equal(run.y[:, -1], one)
+        many = ensemble(fun, t_span, [one, other], executor=1, **options)
+        assert many.t[0] == t_span[0]
+        assert many.status.tolist() == [1, 0]
+        sol = Problem("oscillator", oscillator, y0=one, t_span=t_span).solve_ivp(**options)
+        assert sol.t_events[0].tolist() == [t_span[0]]
+    ended = integrate(fun, (0, 9), one, **options).continue_to(9)  # goes on, and ends when it is beyond again
+    assert 5 < ended.t[-1] < 2 * math.pi
+
+
+@pytest.mark.parametrize("value", [[0.5], np.ones(1), np.ones(2), 0.5j, np.complex128(1), None, "1"])
+@pytest.mark.parametrize("late", [-1.0, 0.5])
+def test_an_event_returns_a_real_number(value, late):
+    """Without the check CPython raises SystemError, without a word of the event."""
+    event = lambda t, y: y[0] if t < late else value  # noqa: E731
+    for solve in (solve_ivp, integrate, lambda fun, *given, **more: Problem("", fun, *given).solve_ivp(**more)):
+        y0, t_span = (START, (0, 3)) if solve not in (solve_ivp, integrate) else ((0, 3), START)
+        with pytest.raises(TypeError, match=r"event 0 returned .* at t=.*, expected a real number"):
+            solve(oscillator, y0, t_span, method=EIPRK45, events=event)
+
+
+def test_a_zero_at_the_start_is_that_of_scipy_with_its_steps():
+    event = reaching(0.0, terminal=True)
+    for method, options, time in ((EIPRK45, {}, 0.0), (EIPRK4, {"h": 0.1}, math.pi), (EIPRK45, {"h": 0.1}, math.pi)):
+        sol = solve_ivp(oscillator, (0, 9), [0.0, 1.0], method, events=event, **options)
+        assert sol.t[-1] == pytest.approx(time, abs=1e-4)
+    scipys = scipy.integrate.solve_ivp(oscillator, (0, 9), [0.0, 1.0], events=event)
+    assert scipys.t[-1] == 0.0
+
+
+def test_zeros_at_steps_count_once_and_at_the_start_not_at_all():
     def event(t, y):
         return (t - 0.25) * (t - 0.5) * (t - 0.75)
 
@@ -239,6 +349,6 @@ def test_zeros_at_steps_and_at_the_start_count_once():
     for h in (0.125, 0.12):
         run = integrate(oscillator, (0, 2), [1.0, 0.0], method=EIPRK4, h=h, events=event)
         np.testing.assert_allclose(run.t_events[0], [0.25, 0.5, 0.75], rtol=1e-14)
-    for end, time in ((8.0, 0.0), (8.0, 5.0), (-8.0, 0.0), (-8.0, -5.0)):
+    for end, time, count in ((8.0, 0.0, 0), (8.0, 5.0, 1), (-8.0, 0.0, 0), (-8.0, -5.0, 1)):
         run = integrate(oscillator, (0, end), [1.0, 0.0], method=EIPRK4, h=0.01, events=lambda t, y, s=time: t - s)
-        np.testing.assert_allclose(run.t_events[0], [time], atol=1e-14)
+        np.testing.assert_allclose(run.t_events[0], [time] * count, atol=1e-14)

@@ -405,7 +405,7 @@ def test_members_are_single_runs(c):
     masses = np.linspace(0.9, 1.1, 5)[:, None]
     invariants = kepler_s(*in_c(c))["invariants"]
     event = c.turn
-    event.function.terminal = 3
+    event.function.terminal = 2
     options = {"method": EIPRK45, "h": 0.05, "invariants": invariants, "events": event}
     run = ensemble(c.kepler, (0, 10), starts, params=masses, executor=2, **options)
     for k in range(5):

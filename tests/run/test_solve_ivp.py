@@ -160,7 +160,6 @@ BAD = [
     {"first_step": -1},
     {"first_step": 100},
     {"max_step": 0},
-    {"events": [second_fall, 3]},
     {"every": 0},
     {"metric": "taxicab"},
     {"h": -1, "method": EIPRK4},
@@ -197,7 +196,9 @@ def test_warnings_name_the_line_of_the_call():
         solve_ivp(spring, (0, 1), [1.0, 0.0], args=(K,), hh=0.1)
     with pytest.warns(UserWarning, match="`rtol` is too small") as low:
         solve_ivp(spring, (0, 1), [1.0, 0.0], args=(K,), rtol=1e-20, invariants=energy)
-    assert {item.filename for item in [*found, *low]} == {__file__}
+    with pytest.warns(UserWarning, match="no effect for a chosen solver: `min_step`.$") as other:
+        solve_ivp(spring, (0, 1), [1.0, 0.0], args=(K,), min_step=0.1)  # of SciPy's LSODA, and no misspelling
+    assert {item.filename for item in [*found, *low, *other]} == {__file__}
 
 
 def test_arguments_of_invariants():

@@ -4,6 +4,7 @@ import inspect
 import json
 import warnings
 from importlib import import_module
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -40,6 +41,31 @@ def sums(out: Output, *, upto: int = 3, then: Literal["pass", "fail", "stop", "w
     out.figure("first.png", "plot:blank_figure", 4, 3)
     out.text(f"sum: {total}")
     out.check("all", then != "fail")
+
+
+def copied(out: Output, *, given: Path | None = None) -> None:
+    """Write a number to a file, which may be the one that is given.
+
+    Parameters
+    ----------
+    given : Path
+        an input
+    """
+    out.numbers["sum"] = 1
+    out.rows("sums.csv", [{"number": 1}])
+
+
+@pytest.mark.parametrize("place", ["--out", "--json", "link"])
+def test_no_input_of_a_command_is_overwritten(place, tmp_path, capsys):
+    given = tmp_path / "sums.csv"
+    given.write_text("kept")
+    target, out = tmp_path / "sums.json", tmp_path if place == "--out" else tmp_path / "out"
+    if place == "link":
+        target.hardlink_to(given)
+    words = ["--given", str(given), "--out", str(out), "--json", str(given if place == "--json" else target)]
+    assert run("copied", copied, words) == 2
+    assert given.read_text() == "kept"
+    assert "is an input of this command" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

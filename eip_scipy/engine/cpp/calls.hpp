@@ -1,9 +1,11 @@
 // Set-up and error handling around each call of the engine from Python.
 #pragma once
 
-#include "system.hpp"
+#include <cstdint>
 
 namespace eip {
+
+struct System;
 
 // The mode of the processor's floating-point unit, and the bits that have it take or leave subnormal numbers as zero.
 #if defined(__SSE2__)

@@ -170,7 +170,7 @@ std::optional<Array> checked_complex_step(nb::handle fun, nb::handle t, State y,
 
 }  // namespace
 
-void add_gradients(nb::module_ module) {
+void add_gradients(Module module) {
     module.def("complex_step", complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a,
                "Return the derivatives (..., n) of ``fun(t, y, *args)`` with respect to the components of `y` (n,), by "
                "complex steps of length `step`.");

@@ -69,6 +69,12 @@ struct Piece {
     }
 };
 
+// Returns false if an interpolant, which a file may hold, does not say at which node of the history its step begins.
+inline bool has_node(const Dense &d, double *piece) {
+    const double node = Piece(piece, d).rows[(d.rows() - 1) * d.work.m];
+    return d.kind != HISTORY || (node >= 0.0 && node < static_cast<double>(d.polynomials / d.columns));
+}
+
 // Buffers in which the balances are the state, and their rates its derivatives.
 inline Work work_of_balances(const Work &w) {
     Work own(w);

@@ -282,11 +282,11 @@ bool are_finite(PointsOf<const double, false> numbers) { return all_finite(numbe
 
 }  // namespace
 
-void add_examination(nb::module_ &module) {
+void add_examination(Module module) {
     module.def("are_finite", &are_finite, "numbers"_a, "Return True if no number is NaN or infinite.");
     using Functions = InvariantFunctions;
-    nb::class_<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
-                          "The invariants of a run and their gradients, each as a `Call`.")
+    Class<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
+                     "The invariants of a run and their gradients, each as a `Call`.")
         .def(nb::init<const nb::tuple &, const nb::tuple &, int64_t, bool>(), "values"_a, "gradients"_a, "n"_a,
              "is_complex"_a)
         .def("values", &Functions::values, "t"_a, "y"_a, "Return all values (l,).")

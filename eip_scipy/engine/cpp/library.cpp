@@ -64,6 +64,7 @@ nb::object called(const LibraryFunction &function, PyObject *arguments) {
 // Python calls it without a detour: through a method it takes three times as long. No exception may pass into its frames.
 PyObject *call(PyObject *self, PyObject *arguments, PyObject *names) noexcept {
     const LibraryFunction &function = *nb::inst_ptr<LibraryFunction>(self);
+    const FloatingPoint mode;
     try {
         if (names && PyDict_Size(names) > 0) refuse(PyExc_TypeError, "%s takes no keywords", function.name);
         return called(function, arguments).release().ptr();

@@ -95,10 +95,14 @@ void fields(Samples &s, Visit &visit) {
 
 // Says whether event i goes from the value `before` to the value `after` in the direction that it looks at.
 inline bool crosses(const Schedule &s, int64_t i, double before, double after) {
-    // A zero at the end of the step before has been counted there.
-    if (before == 0.0 && s.clock[TIME] != s.span.t0) return false;
-    return (before <= 0.0 && 0.0 <= after && s.g_direction[i] >= 0.0) ||
-           (before >= 0.0 && 0.0 >= after && s.g_direction[i] <= 0.0);
+    // A zero before has been counted at the end of the last step, and does not count at the start of a run.
+    return (before < 0.0 && 0.0 <= after && s.g_direction[i] >= 0.0) ||
+           (before > 0.0 && 0.0 >= after && s.g_direction[i] <= 0.0);
+}
+
+// Says whether event i is a limit, which has an infinite direction, and the run starts beyond it.
+inline bool starts_beyond(const Schedule &s, int64_t i) {
+    return s.clock[TIME] == s.span.t0 && s.g[i] * s.g_direction[i] == ENDLESS;
 }
 
 inline EventEnds ends_of(const Schedule &s, int64_t i) {
@@ -109,7 +113,7 @@ inline EventEnds ends_of(const Schedule &s, int64_t i) {
 // Says whether an event happens in the step, or may happen there twice.
 inline bool any_crossing(const Schedule &s) {
     for (int64_t i = 0; i < s.n_events; ++i)
-        if (crosses(s, i, s.g[i], s.g_new[i]) || may_cross_inside(ends_of(s, i))) return true;
+        if (starts_beyond(s, i) || crosses(s, i, s.g[i], s.g_new[i]) || may_cross_inside(ends_of(s, i))) return true;
     return false;
 }
 
@@ -126,7 +130,7 @@ inline bool any_crossing(const Schedule &s) {
     };
     run.system.event(w, t_new, y_new, s.g_new);
     if (std::isnan(s.rate[0])) {
-        // If a run is continued at an event, s.g is not its value there.
+        // An event that does not count at the start has the value 0 in s.g.
         values_near(t, part, y, slope_at(false, run, d, t, t, y), s.rate);
         run.system.event(w, t, y, s.rate_new);
         for (int64_t i = 0; i < s.n_events; ++i) s.rate[i] = (s.rate[i] - s.rate_new[i]) / part;
@@ -147,6 +151,10 @@ inline std::vector<Root> roots_in_step(const Run &run, const DenseRun &dense, co
     std::vector<double> values(s.n_events), state(w.m);
     std::vector<Root> found;
     for (int64_t i = 0; i < s.n_events; ++i) {
+        if (starts_beyond(s, i)) {
+            found.insert(found.begin(), {t, i});
+            continue;
+        }
         const auto value_at = [&](double time) {
             interpolate(dense, piece, time, state.data());
             run.system.event(w, time, state.data(), values.data());

@@ -5,12 +5,12 @@
 
 namespace eip {
 
-// All members: `count` starts, parameters and lengths of first steps, and the results of each member. `where` holds the
+// All members: `count` starts, parameters, lengths of first steps and values of the events, and the results of each member. `where` holds the
 // current member and whether it has begun. Rows are saved for each member, or for none if `kept` is false.
 struct Members {
     int64_t count, n_rows, evaluations;
     bool kept;
-    double *starts, *params, *first_steps, *sigma, *left, *t_saved;
+    double *starts, *params, *first_steps, *events, *sigma, *left, *t_saved;
     double *y, *t, *rows, *max_residual, *max_correction, *figures, *suspects;
     int64_t *status, *counters, *where;
 
@@ -23,6 +23,7 @@ void fields(Members &m, Visit &visit) {
     visit.states("starts", m.starts, Bound{m.count}, is.n);
     visit("params", m.params, m.count, is.params);
     visit("first_steps", m.first_steps, m.count);
+    visit("events", m.events, m.count, is.events);
     visit("evaluations", m.evaluations);
     visit("sigma", m.sigma, is.m);
     visit("left", m.left, is.events);
@@ -89,7 +90,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     system.rhs(w, t0, y, w.row(0));
     if (!evaluate_start(system, w, t0, y)) return false;
     if (o.watched) start_figures(y, w.row(0), members.first_steps[k], run.method, run.hooks, o, w);
-    if (s.n_events > 0) system.event(w, t0, y, s.g);
+    copy(members.events + k * s.n_events, s.g, s.n_events);
     fill(s.rate, NOT_A_NUMBER, s.n_events);
     if (samples) {
         *samples->roots.count = 0;

@@ -12,7 +12,6 @@
 #include <cpuid.h>
 #endif
 
-#include "calls.hpp"
 #include "python_functions.hpp"
 #include "threads.hpp"
 
@@ -49,11 +48,13 @@ using Times = ArrayOf<const double, 1>;
 // directly, because the library behind __builtin_cpu_supports is not available with each compiler and on each system.
 bool has_v3() {
 #if defined(__x86_64__)
-    constexpr unsigned FIRST = bit_FMA | bit_OSXSAVE, SEVENTH = bit_AVX2 | bit_BMI2, KEPT = 6;  // XMM and YMM
+    constexpr unsigned FIRST = bit_FMA | bit_MOVBE | bit_OSXSAVE | bit_F16C, SEVENTH = bit_AVX2 | bit_BMI | bit_BMI2;
+    constexpr unsigned EXTENDED = bit_LZCNT, KEPT = 6;  // XMM and YMM
     unsigned a, b, c, d, low, high;
     if (!__get_cpuid(1, &a, &b, &c, &d) || (c & FIRST) != FIRST) return false;
     __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
-    return (low & KEPT) == KEPT && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & SEVENTH) == SEVENTH;
+    if ((low & KEPT) != KEPT || !__get_cpuid_count(7, 0, &a, &b, &c, &d) || (b & SEVENTH) != SEVENTH) return false;
+    return __get_cpuid(0x80000001, &a, &b, &c, &d) && (c & EXTENDED) == EXTENDED;
 #else
     return false;
 #endif
@@ -217,6 +218,7 @@ class Engine {
         const Busy interpolating(interpolating_);
         const Dense &d = dense();
         require_shape(piece, "piece", {d.floats()});
+        require(has_node(d, piece.data), "engine: the interpolant belongs to no node of the history");
         double *states = checked(out, "out", t.shape[0]);
         stepped([&](const Run &run) { return interpolate_step(run, d, piece.data, t.data, t.shape[0], states), OK; });
     }
@@ -238,6 +240,7 @@ class Engine {
     }
 
     int project(double t_old, ConstState y, double t, bool last, State y_new) {
+        const Busy busy(busy_);
         const Step step{t_old, t, t - t_old, checked(y, "y"), checked(y_new, "y_new"), true, last};
         if (hooks_) hooks_->set_state(y_new.object);
         return stepped([&](const Run &run) { return project_once(run, step); });
@@ -321,7 +324,6 @@ class Engine {
     Code stepped(Call call) {
         if (!kept_.is_valid())
             refuse(PyExc_RuntimeError, "engine: this engine has been cleared or was never set up; make a new one");
-        const FloatingPoint mode;
         try {
             std::optional<WithoutLock> released;
             std::optional<Ending::Inside> inside;
@@ -348,9 +350,9 @@ class Engine {
 };
 
 void add_engine(nb::module_ &m) {
-    nb::class_<Engine>(m, "Engine", nb::type_slots(Collected<Engine>::slots),
-                       "Engine of one run, which makes its steps on its arrays. ``functions.native`` is True if "
-                       "`functions` holds addresses.")
+    Class<Engine>(m, "Engine", nb::type_slots(Collected<Engine>::slots),
+                  "Engine of one run, which makes its steps on its arrays. ``functions.native`` is True if "
+                  "`functions` holds addresses.")
         .def(nb::init<nb::object, nb::object, nb::object, nb::object, nb::object, nb::object>(), "method"_a,
              "options"_a, "work"_a, "functions"_a, "schedule"_a = nb::none(), "hooks"_a = nb::none(),
              nb::sig("def __init__(self, method: typing.Any, options: Options, work: Work, functions: typing.Any, "
@@ -423,7 +425,8 @@ void add_constants(nb::module_ &m) {
 }  // namespace
 }  // namespace eip
 
-NB_MODULE(EIP_MODULE, m) {
+NB_MODULE(EIP_MODULE, made) {
+    eip::Module m(made);
     if (_import_array() < 0) throw nanobind::python_error();
     nanobind::set_leak_warnings(false);  // objects that live until the end of the process are not leaks
     m.doc() = "Engine of eip_scipy in C++: steps, projections, dense output and ensembles.";
@@ -435,6 +438,9 @@ NB_MODULE(EIP_MODULE, m) {
         "work_alone", eip::work_alone, nanobind::arg("alone"),
         "If `alone` is True, keep the calling thread from sharing sums over many bodies with other threads; if False, "
         "let it share them. Return the previous setting.");
+    m.def(
+        "call", [](const nanobind::callable &fun, const nanobind::args &args) { return nanobind::object(fun(*args)); },
+        "Return ``fun(*args)``, with subnormal numbers.");
     m.def("end_threads", eip::end_threads,
           "End the threads that share sums over many bodies. They are not started again.");
     const auto at_exit = nanobind::module_::import_("atexit").attr("register");

@@ -3,6 +3,10 @@
 
 #include "arrays.hpp"
 
+#include <utility>
+
+#include "calls.hpp"
+
 namespace eip {
 
 // Slots of a class whose objects refer to Python objects: the garbage collector visits `kept()`, and `clear()` releases them.
@@ -22,10 +26,27 @@ struct Collected {
                                          {0, nullptr}};
 };
 
+// A module or class whose functions compute with subnormal numbers, whatever mode another library left behind.
+template <class Base>
+struct Guarded : Base {
+    using Base::Base;
+    Guarded(Base base) : Base(std::move(base)) {}
+
+    template <class... Given>
+    Guarded &def(Given &&...given) {
+        Base::def(std::forward<Given>(given)..., nb::call_guard<FloatingPoint>());
+        return *this;
+    }
+};
+
+using Module = Guarded<nb::module_>;
+template <class T>
+using Class = Guarded<nb::class_<T>>;
+
 void add_library(nb::module_ &module);
-void add_examination(nb::module_ &module);
-void add_condensates(nb::module_ module);
-void add_gradients(nb::module_ module);
-void add_multibody(nb::module_ module);
+void add_examination(Module module);
+void add_condensates(Module module);
+void add_gradients(Module module);
+void add_multibody(Module module);
 
 }  // namespace eip

@@ -249,7 +249,7 @@ double weighted_square(ConstField field, ConstReals weight) {
 
 }  // namespace
 
-void add_condensates(nb::module_ module) {
+void add_condensates(Module module) {
     module.def("multiply", multiply, "field"_a, "factor"_a);
     module.def("derivative", derivative, "rest"_a, "psi"_a, "V"_a, "beta"_a, "out"_a);
     module.def("derivative_at_once", derivative_at_once, "psi"_a, "V"_a, "beta"_a, "out"_a);

@@ -251,7 +251,7 @@ int64_t solve(const double *matrices, int64_t n, int64_t m, double tolerance, do
 
 }  // namespace
 
-void add_multibody(nb::module_ module) {
+void add_multibody(Module module) {
     module.def(
         "solve_address", [] { return reinterpret_cast<uintptr_t>(solve); },
         "Return the address of `solve` in multibody.cpp, for compiled code.");

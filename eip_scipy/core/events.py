@@ -1,4 +1,4 @@
-"""Events of `integrate`, with the meaning that `scipy.integrate.solve_ivp` gives them."""
+"""Events, with the meaning that `scipy.integrate.solve_ivp` gives them, except at the start of a run."""
 
 from __future__ import annotations
 
@@ -9,12 +9,21 @@ from typing import Any
 import numpy as np
 from scipy.integrate import DenseOutput
 
-from ..core.arguments import names
-from ..core.inputs import is_number, reals, require_arguments, shown
-from ..core.pointers import by_pointer, is_pointer
+from ..engine.data import EPS
 from ..engine.native import Call, call
+from .arguments import names
+from .inputs import is_number, reals, require_arguments, shown
+from .pointers import by_pointer, is_pointer
 
-__all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
+__all__ = ["ContinuedEvents", "Events", "Start", "as_events", "replaced"]
+
+# A value at the start is zero if it is at most this number of roundings of its terms and of the time, or if its zero is
+# within this share of the first step: the time of an event is a zero of an interpolant, and not known any better.
+ROUNDINGS, SHARE = 64.0, 1e-10
+PART = 2.0**-20  # of a step and of the components, for differences
+
+# Returns the derivative at the start (t, y) of a run and the first step.
+Start = Callable[[float, np.ndarray], tuple[np.ndarray, float]]
 
 
 def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[..., Any]]) -> tuple[Any, ...]:
@@ -49,9 +58,8 @@ class Events:
         self._extra = extra
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
-        self._happened = items.happened if isinstance(items, ContinuedEvents) else (np.zeros(0),) * len(items)
-        self._before = [len(times) for times in self._happened]
-        self._counts = list(self._before)
+        self._happened = items.happened if isinstance(items, ContinuedEvents) else (None,) * len(items)
+        self._before = [0 if times is None else len(times) for times in self._happened]
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
         self.last: tuple[float, np.ndarray] = math.nan, np.zeros(0)
@@ -77,12 +85,13 @@ class Events:
 
     def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
         """Record that event `k` has happened in this run at the times `t` (m,) in the states `y` (m, n)."""
-        self.t[k], self.y[k], self._counts[k] = t.tolist(), list(y), self._before[k] + t.size
+        self.t[k], self.y[k] = t.tolist(), list(y)
 
     @property
     def left(self) -> list[float]:
         """Return for each event after how many further times it ends the run; infinity if it never does."""
-        return [allowed - count for allowed, count in zip(self._allowed, self._counts, strict=True)]
+        counts = zip(self._allowed, self._before, self.t, strict=True)
+        return [allowed - before - len(times) for allowed, before, times in counts]
 
     def take(self, which: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
         """Record events that the loop has found, by their indices, times and states, in the order of their times."""
@@ -90,39 +99,62 @@ class Events:
             self._note(k, t, y.copy())
 
     def _note(self, k: int, t: float, y: np.ndarray) -> None:
-        self._counts[k] += 1
         self.t[k].append(t)
         self.y[k].append(y)
         self.last = t, y
 
-    def values(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the values of all events at (t, y)."""
-        return np.array([self._value(k, t, y.copy()) for k in range(len(self.functions))], float)
+    def at_start(self, t: float, y: np.ndarray, f: np.ndarray, step: float) -> np.ndarray:
+        """Return the values of all events at the start (t, y) of a run; 0 for those that do not happen there.
 
-    def sizes(self, t: float, y: np.ndarray, f: np.ndarray, step: float) -> np.ndarray:
-        """Return the sizes of the events' values at (t, y), relative to which rounding errors are small.
-
-        A size is the absolute value plus its change in a step along the derivative `f`, because the value of an event
-        that happens near (t, y) may be smaller than the terms that cancel in it.
+        `f` is the derivative, and `step` the first step. In a run that continues another one, the events that have
+        happened at `t` do not happen again.
         """
-        here = self.values(t, y)
+        values = [self._value(k, t, y.copy()) for k in range(len(self.functions))]
+        for k, (value, known) in enumerate(zip(values, self._happened, strict=True)):
+            if self._is_zero(k, value, t, y, f, step) if known is None else t in known[-1:]:
+                values[k] = 0.0
+        return np.array(values, float)
+
+    def _is_zero(self, k: int, value: float, t: float, y: np.ndarray, f: np.ndarray, step: float) -> bool:
+        """Return True if the `value` of event k at the start is zero to rounding, so that its sign means nothing.
+
+        The rounding is that of its terms, found by small changes of all components, and that of the time, at which the
+        event may have ended another run.
+        """
         try:
-            change = np.abs(self.values(t + step, y + step * f) - here)
-        except Exception:  # an event need not be defined in that state
-            change = np.zeros_like(here)
-        return np.abs(here) + np.where(np.isfinite(change), change, 0.0)
+            moved = abs(self._value(k, t + PART * step, y + PART * step * f) - value) / PART
+            terms = abs(self._value(k, t, y * (1.0 + PART * np.cos(np.arange(y.size)))) - value) / PART
+            rounding = ROUNDINGS * EPS * (terms + moved * abs(t / step)) + SHARE * moved
+        except Exception:  # an event need not be defined in these states, and the step may be 0
+            rounding = 0.0
+        return value == 0.0 or abs(value) <= rounding
 
-    def leave(self, t: float, y: np.ndarray, f: np.ndarray, step: float, values: np.ndarray) -> None:
-        """Replace the value of each event that happened at the start (t, y) of a continued run by a slightly later one.
+    def for_scipy(self, start: Start | None, *, as_scipy: bool) -> list[Callable[..., float]]:
+        """Return the events for `scipy.integrate.solve_ivp`, with checked values, and with a start as in `integrate`.
 
-        The value of such an event at the start is a rounding error, whose sign could make the event happen again.
-        `values` holds the values of all events. The later state is y plus a small part of `step` times the derivative
-        `f`.
+        ``start(t, y)`` returns the derivative at the start and the first step. A value that is zero to rounding at the
+        start becomes NaN there, because SciPy counts a zero. With `as_scipy` this does not apply to values that are
+        exactly 0, and without `start` to any.
         """
-        part = step / 4096
-        for k, times in enumerate(self._happened):
-            if len(times) and times[-1] == t:
-                values[k] = self._value(k, t + part, y + part * f)
+        return [self._for_scipy(k, start, as_scipy) for k in range(len(self.functions))]
+
+    def _for_scipy(self, k: int, start: Start | None, as_scipy: bool) -> Callable[..., float]:
+        begin: list[Any] = []  # time and value at the start, and whether it is beyond the event, which is a limit
+        direction = float(self.directions[k])
+
+        def event(t: float, y: np.ndarray, *_: Any) -> float:
+            value = self._value(k, t, y.copy())
+            if not begin:
+                exact = as_scipy and value == 0.0
+                is_zero = start is not None and not exact and self._is_zero(k, value, t, y, *start(t, y))
+                begin[:] = t, math.nan if is_zero else value, not is_zero and value * direction == math.inf
+            if begin[2]:  # SciPy finds the zero at the start, because the next value is beyond too
+                return 0.0 if t == begin[0] else direction
+            return begin[1] if t == begin[0] else value
+
+        made: Any = event
+        made.terminal, made.direction = getattr(self.functions[k], "terminal", None), direction
+        return made
 
     def handle(self, which: np.ndarray, times: np.ndarray, sol: DenseOutput) -> float | None:
         """Record the events with indices `which` that happen at `times`, in this order, until one ends the run.
@@ -137,7 +169,7 @@ class Events:
                     "so that its time cannot be found. The event must return a finite number for every state."
                 )
             self._note(k, t, sol(t))
-            if self._counts[k] >= self._allowed[k]:
+            if self.left[k] <= 0:
                 return t
         return None
 
