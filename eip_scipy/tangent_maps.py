@@ -17,6 +17,8 @@ from .core.inputs import is_number, reals, shown
 from .core.names import nearest
 from .core.options import ProjectionOptions
 from .core.results import Diagnostics
+from .run.continuation import continued
+from .run.fields import rows
 from .run.integrate import integrate
 from .run.prepare import Prepared, Request, prepared
 from .run.results import IntegrationResult
@@ -185,7 +187,7 @@ def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: fl
         if run is None:
             following = integrate(fun, (now, bound), y0, variations=columns, **options)
         else:
-            following = run.continue_to(bound, variations=columns)
+            following = continued(run, bound, {"variations": columns})
         found = following.variations[-1]
         finite = bool(np.isfinite(found).all())
         Q, R = np.linalg.qr(found) if finite else (columns, np.full((columns.shape[1],) * 2, np.nan))
@@ -199,9 +201,7 @@ def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: fl
         if run.status != 0:
             return
         columns = Q
-        for name in ("t", "y", "invariants"):  # only the last row is needed from here on
-            run[name] = run[name][..., -1:]
-        run["variations"] = run.variations[-1:]
+        run.update(rows(run, slice(-1, None)))  # only the last row is needed from here on
 
 
 def _orthonormal(n: int, k: int) -> Array:

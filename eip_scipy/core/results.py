@@ -9,7 +9,16 @@ import numpy as np
 from ..engine import data
 from ..engine.trust import ProjectionWarning, Trust
 
-__all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning", "joined_sums", "slowness"]
+__all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning", "slowness"]
+
+
+def _count(place: int, text: str) -> property:
+    """Return a property of `Diagnostics` that reads one of the engine's counters."""
+
+    def read(self: Diagnostics) -> int:
+        return int(self._counters[place])
+
+    return property(read, doc=text)
 
 
 class Diagnostics:
@@ -52,62 +61,68 @@ class Diagnostics:
         balance hardly helps. nan for invariants, and with ``check=False``.
     """
 
+    max_defect: np.ndarray
+    moved: str
+    remarks: tuple[str, ...]
+    _defect: np.ndarray
+    _max_correction: np.ndarray
+    _counters: np.ndarray
+    _trust: Trust
+    _estimated: bool
+    _slow: tuple[np.ndarray, np.ndarray]
+
     def __init__(self) -> None:
-        none, trust = np.zeros(0), Trust((), np.zeros((0, data.N_FIGURES)))
-        self._attach(none, none, np.zeros(1), np.zeros(data.N_COUNTERS, np.int64), trust, estimated=False)
+        none = np.zeros(0)
+        self._attach(
+            max_defect=none,
+            _defect=none,
+            _max_correction=np.zeros(1),
+            _counters=np.zeros(data.N_COUNTERS, np.int64),
+            _trust=Trust((), np.zeros((0, data.N_FIGURES))),
+            _estimated=False,  # True if the run has an error estimate
+            moved="",
+            remarks=(),
+            _slow=(np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))),  # indices of the balances, and their sums
+        )
 
-    def _attach(
-        self,
-        max_defect: np.ndarray,
-        last_defect: np.ndarray,
-        max_correction: np.ndarray,
-        counters: np.ndarray,
-        trust: Trust,
-        *,
-        estimated: bool,
-        moved: str = "",
-        remarks: tuple[str, ...] = (),
-        slow: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:
-        """Keep the buffers of a run, from which the attributes are computed when they are read.
+    def _attach(self, **buffers: Any) -> None:
+        """Keep the buffers of a run, from which the attributes are computed when they are read."""
+        vars(self).update(buffers)
 
-        `estimated` is False if the run has no error estimate. `slow` holds the indices of the balances and the sums
-        (`N_SLOW`, b) of their rates and terms.
-        """
-        self.names = trust.names
-        self._trust = trust
-        self.max_defect = max_defect
-        self._defect = last_defect
-        self._max_correction = max_correction
-        self._counters = counters
-        self._estimated = estimated
-        self.moved, self.remarks = moved, remarks
-        self._slow = (np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))) if slow is None else slow
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the invariants."""
+        return self._trust.names
+
+    def followed_by(self, other: Diagnostics) -> Diagnostics:
+        """Return the record of this run and of the run with the record `other`, which continued it, together."""
+        both = Diagnostics()
+        both._attach(
+            max_defect=np.maximum(self.max_defect, other.max_defect),
+            _defect=other._defect.copy(),
+            _max_correction=np.maximum(self._max_correction, other._max_correction),
+            _counters=self._counters + other._counters,
+            _trust=self._trust.followed_by(other._trust),
+            _estimated=self._estimated and other._estimated,
+            moved=self.moved or other.moved,
+            remarks=tuple(dict.fromkeys(self.remarks + other.remarks)),
+            _slow=(other._slow[0], _joined_sums(self._slow[1], other._slow[1])),
+        )
+        return both
+
+    def doubt(self, reason: str) -> None:
+        """Add a reason why the run is not to be trusted."""
+        self._trust.doubts.append(reason)
 
     @property
     def last_defect(self) -> np.ndarray:
         """Last invariant errors ``|I - target|``, (l,)."""
         return np.abs(self._defect)
 
-    @property
-    def n_projections(self) -> int:
-        """Number of projections."""
-        return int(self._counters[data.PROJECTIONS])
-
-    @property
-    def n_skipped(self) -> int:
-        """Number of projections omitted because all invariant errors were round-off."""
-        return int(self._counters[data.SKIPPED])
-
-    @property
-    def n_rank_reduced(self) -> int:
-        """Number of projections of reduced rank."""
-        return int(self._counters[data.RANK_REDUCED])
-
-    @property
-    def n_rejected_projections(self) -> int:
-        """Number of projections that failed."""
-        return int(self._counters[data.REJECTED])
+    n_projections = _count(data.PROJECTIONS, "Number of projections.")
+    n_skipped = _count(data.SKIPPED, "Number of projections omitted because all invariant errors were round-off.")
+    n_rank_reduced = _count(data.RANK_REDUCED, "Number of projections of reduced rank.")
+    n_rejected_projections = _count(data.REJECTED, "Number of projections that failed.")
 
     @property
     def max_correction(self) -> float:
@@ -176,7 +191,7 @@ def slowness(sums: np.ndarray) -> np.ndarray:
     return np.max(np.where(known, rates, np.nan) / np.where(known, terms, 1.0), axis=0)
 
 
-def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+def _joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     """Return the sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation together."""
     both = one + two
     late = [data.LATE_RATES, data.LATE_TERMS]
