@@ -28,7 +28,7 @@ def encoded(name: str, value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if value is None or isinstance(value, (str, bool, int)) or (isinstance(value, float) and math.isfinite(value)):
         return value
     if isinstance(value, np.ndarray):
-        if value.dtype == object and value.size and all(isinstance(item, str) for item in value.flat):
+        if value.dtype == object and value.ndim == 1 and value.size and all(isinstance(item, str) for item in value):
             return {"texts": _texts(value)}
         return {"array": _added(name, value, arrays)}
     if type(value) in RECORDS.values():

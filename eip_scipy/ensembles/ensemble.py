@@ -89,10 +89,10 @@ class EnsembleKeywords(ProjectionDetails, total=False):
 FIELDS = {
     "y": Field(("member", "component")),
     "t": Field(("member",), table="t_end"),
-    "trajectories": Field(("member", "component", "time"), table="states"),
-    "invariants": Field(("member", "invariant", "time")),
     "target": Field(("member", "invariant")),
     "max_defect": Field(("member", "invariant")),
+    "trajectories": Field(("member", "component", "time"), table="states"),
+    "invariants": Field(("member", "invariant", "time")),
     **dict.fromkeys(("status", "message", "trusted", "max_correction"), Field(("member",))),
     **dict.fromkeys(("nfev", "njev", "nlu", "n_rejected_projections"), Field(("member",))),
     **dict.fromkeys(("method", "h", "success", "stopped", "wall_time"), Field(())),
@@ -164,8 +164,6 @@ class EnsembleResult(Result):
         Step size; None for adaptive steps.
     chunk : int
         Number of members in a chunk.
-    component_names : tuple of str
-        Names of the components from the `Problem`, or "y0", "y1" and so on.
     """
 
     COMPONENTS = 1
@@ -264,7 +262,7 @@ class EnsembleResult(Result):
         lines = [
             f"Ensemble: {members} members of {n} components, {steps(self)}; {ran} ran in "
             f"{self.wall_time:.3g} s, {np.count_nonzero(self.side_by_side)} vectorised, "
-            f"{self.failed.size} failed",
+            f"{self.failed.size} failed"
         ]
         if self.one_by_one:
             lines.append(f"  not vectorised: {self.one_by_one}")

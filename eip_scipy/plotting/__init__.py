@@ -90,4 +90,4 @@ def draw_errors(axis: Axes, x: Any, errors: Mapping[str, Any], styles: Mapping[s
         axis.plot(x, np.where(row == 0, zero, row), **styles[name])
     if np.any(values == 0):
         across = axis.get_yaxis_transform()
-        axis.text(1.0, zero, "error 0 ", transform=across, ha="right", va="bottom", fontsize="x-small")
+        axis.text(1.0, zero, "error 0 ", transform=across, ha="right", va="top", fontsize="x-small")

@@ -85,13 +85,14 @@ def _draw_fan(axis: Axes, times: np.ndarray, name: str, values: Any, color: str)
 def _explain(axis: Axes, values: np.ndarray) -> None:
     """Draw a legend of the line and the bands above the first panel, which shows `values` (members, m)."""
     left = np.count_nonzero(~np.isnan(values), axis=0).min()
-    whose = "members" if left == len(values) else f"those still running (at least {left} of {len(values)})"
+    title = None if left == len(values) else f"of members still running: at least {left} of {len(values)}"
     parts = [
         Line2D([], [], color="0.25", lw=1.2, label="median"),
         Patch(color="0.25", alpha=WIDE + NARROW, lw=0, label="50 %"),
-        Patch(color="0.25", alpha=WIDE, lw=0, label=f"90 % of {whose}"),
+        Patch(color="0.25", alpha=WIDE, lw=0, label="90 %" if title else "90 % of members"),
     ]
-    axis.legend(handles=parts, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
+    look: dict[str, Any] = {"loc": "lower center", "ncols": 3, "fontsize": "small", "frameon": False}
+    axis.legend(handles=parts, bbox_to_anchor=(0.5, 1.0), title=title, title_fontsize="small", **look)
 
 
 def _draw_last(axis: Axes, components: Mapping[str, Any]) -> None:
@@ -122,7 +123,7 @@ def _draw_errors(axis: Axes, result: Any) -> None:
     small = 4.0 if members.size <= 300 else 2.0
     look: dict[str, Any] = {"ls": "", "ms": small, "mew": 0, "alpha": 0.8}
     styles = {name: style | look for name, style in method_styles(errors).items()}
-    draw_errors(axis, members[~failed], errors, styles, result.target)
+    draw_errors(axis, members[~failed], errors, styles, result.target[drawn][~failed])
     if failed.any():  # at the bottom, because their errors are meaningless
         bottom = np.full(np.count_nonzero(failed), 0.03)
         style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6, "mew": 1.4, "color": FAILURES, "label": "failed"}

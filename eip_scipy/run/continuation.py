@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
+from ..checkpoint import SAME
 from ..core.inputs import is_number, shown
 from ..core.names import nearest
 from ..core.options import ProjectionOptions
+from ..engine.data import START
 from .events import ContinuedEvents, as_events
 from .fields import joined
 from .integrate import integrate
@@ -53,6 +57,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
         )
     if not is_number(t, "t") or not origin.sign * (t - origin.t) > 0:
         raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
+    _require_same_functions(result, origin)
     request = origin.request
     asked = {name: getattr(request, name) for name in Request._fields if name not in OWN}
     asked |= {**request.projection, "invariants": origin.kept(), "t_span": (origin.t, t), "y0": origin.y}
@@ -72,13 +77,29 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
         raise
 
 
+def _require_same_functions(result: IntegrationResult, origin: Origin) -> None:
+    """Raise ValueError if an invariant has another value in the last state now than at the end of the run."""
+    if not (result.t.size and result.t[-1] == origin.t and np.array_equal(result.y[:, -1], origin.y)):
+        return  # the last state was not saved
+    before, now = result.invariants[:, -1], origin.values()
+    terms = np.maximum(np.abs(before), result.diagnostics._trust.figures[:, START])
+    changed = ~np.isnan(result.target) & (np.abs(now - before) > SAME * terms)  # balances have no target
+    for k in np.flatnonzero(changed)[:1]:
+        raise ValueError(
+            f"continue_to: the invariant {result.diagnostics.names[k]!r} was {before[k]:.12g} at t={origin.t:.10g} and "
+            f"is {now[k]:.12g} in the same state now: its function, or a value that it uses, has changed since the "
+            "first run. Start a new run with integrate from the last state."
+        )
+
+
 def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult:
     """Return one result for a run and its continuation."""
     first, last = vars(one)["_origin"], vars(two)["_origin"]
     others = () if _events(first) == _events(last) else ("t_events", "y_events")
     both = IntegrationResult(two | joined(one, two, but=others))
     if one.status < 0:
-        both.diagnostics.doubt(f"the part of the run up to t={first.t:.6g} did not end regularly: {first.ended}")
+        doubts = both.diagnostics._trust.doubts
+        doubts.append(f"the part of the run up to t={first.t:.6g} did not end regularly: {first.ended}")
     last = last._replace(notes=tuple(dict.fromkeys(first.notes + last.notes)))
     both["message"] = described(last.ended, both.diagnostics, last.notes)
     object.__setattr__(both, "_origin", last)

@@ -15,7 +15,7 @@ from ..core.results import Diagnostics
 from ..core.variations import StateSolution
 
 __all__ = [
-    "FIELDS", "Field", "component_names", "default_names", "distinct", "joined", "label", "labels", "rows", "time_name"
+    "FIELDS", "Field", "component_names", "distinct", "joined", "label", "labels", "rows", "time_name"
 ]  # fmt: skip
 
 
@@ -23,21 +23,14 @@ class Field(NamedTuple):
     """The declaration of a field of a result.
 
     `dims` are its dimensions in tables, () for a number or text that describes the whole run, None if tables leave it
-    out. ``join(one, two)`` returns the field of a run and its continuation; fields along t are concatenated instead, or
-    computed when they are first requested. `table` is the name in tables, if it is another one.
+    out. ``join(one, two)`` returns the field of a run and its continuation. Without it fields along t are concatenated,
+    or computed when they are first requested, and others are those of the continuation. `table` is the name in tables,
+    if it is another one.
     """
 
     dims: tuple[str, ...] | None = None
     join: Callable[[Any, Any], Any] | None = None
     table: str = ""
-
-
-def _first(one: Any, two: Any) -> Any:
-    return one
-
-
-def _last(one: Any, two: Any) -> Any:
-    return two
 
 
 def _by_event(one: list[np.ndarray] | None, two: list[np.ndarray] | None) -> list[np.ndarray] | None:
@@ -62,13 +55,12 @@ FIELDS = {
     "variations": Field(("t", "component", "column")),
     "outputs": Field(("output", "t")),
     "multipliers": Field(("constraint", "t")),
-    **dict.fromkeys(("method", "h", "message", "status", "success"), Field((), _last)),
+    **dict.fromkeys(("method", "h", "message", "status", "success", "units"), Field(())),
     **dict.fromkeys(("trusted", "compiled"), Field((), operator.and_)),
     **dict.fromkeys(("nfev", "njev", "nlu", "wall_time"), Field((), operator.add)),
-    "units": Field((), _first),
-    **dict.fromkeys(("target", "columns", "component_names", "epoch"), Field(None, _first)),
     **dict.fromkeys(("t_events", "y_events"), Field(None, _by_event)),
-    "calls": Field(None, _last),
+    **dict.fromkeys(("target", "calls", "columns", "epoch"), Field(None)),
+    "component_names": Field(None, lambda one, two: one),  # the user may have assigned others
     "sol": Field(None, _solution),
     "diagnostics": Field(None, Diagnostics.followed_by),
 }
@@ -124,14 +116,8 @@ def component_names(result: Any, names: Any = None, n: int | None = None) -> tup
     By default `n` is len(result.y). ValueError is raised if `names` are not `n` different names.
     """
     n = len(result.y) if n is None else n
-    if names is None:
-        names = getattr(result, "component_names", None)
-    return default_names(n) if names is None else checked(names, n)
-
-
-def default_names(n: int) -> tuple[str, ...]:
-    """Return the names y0, y1 and so on."""
-    return tuple(f"y{k}" for k in range(n))
+    names = getattr(result, "component_names", None) if names is None else names
+    return tuple(f"y{k}" for k in range(n)) if names is None else checked(names, n)
 
 
 def labels(result: Any, names: Any = None) -> dict[str, list[str]]:

@@ -67,7 +67,7 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
 def plain(text: str) -> str:
     """Return text that matplotlib draws as it is, though it contains $ or begins with _, which legends leave out."""
     text = text.replace("$", r"\$")
-    return f" {text}" if text.startswith("_") else text
+    return f" {text}" if not text or text.startswith("_") else text
 
 
 def real_rows(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from copy import copy
 from typing import Any, Unpack
 
 import numpy as np
@@ -444,11 +445,13 @@ class Loop:
             h=abs(driver.schedule.span.h) or None,
         )
         t, y = events.last if self._event_ended else driver.now
+        last, values_at = (np.array([t]), y[None].copy()), driver.values_at
         asked, variations = self.prepared.asked, self.prepared.variations
         if variations is not None:
             asked = asked._replace(variations=variations.columns.after(y))
         y, sign = _own(y.copy(), self.prepared), driver.schedule.span.sign
-        origin = Origin(asked, t, y, sign, self._kept, message, self.notes)
+        asked = asked._replace(params=copy(asked.params))  # the user may change the array
+        origin = Origin(asked, t, y, sign, self._kept, lambda: values_at(*last)[0], message, self.notes)
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 

@@ -12,7 +12,6 @@ from scipy.optimize import OptimizeResult
 
 from ..core.problem import Problem
 from ..core.results import Diagnostics, Multipliers
-from .fields import default_names
 from .tables import to_dataframe, to_xarray
 
 __all__ = ["Fields", "IntegrationResult", "Origin", "Result", "described"]
@@ -26,6 +25,7 @@ class Origin(NamedTuple):
     y: np.ndarray  # (n,): last state of the run, saved or not
     sign: float  # direction of time, 1 or -1
     kept: Callable[[], Any]  # returns the invariants of the run, with the kept values as their targets
+    values: Callable[[], np.ndarray]  # returns the invariants (l,) in the last state, as their functions are now
     ended: str  # reason for the end of the run
     notes: tuple[str, ...]  # remarks at the end of its message
 
@@ -95,9 +95,9 @@ class Result(Fields):
 
     @property
     def component_names(self) -> tuple[str, ...]:
-        """Names of the components of the state, (n,)."""
-        given = self.get("component_names")
-        return default_names(self.y.shape[self.COMPONENTS]) if given is None else tuple(given)
+        """Names of the components from the `Problem`, or "y0", "y1" and so on; other names can be assigned."""
+        names = self.get("component_names")
+        return tuple(f"y{k}" for k in range(self.y.shape[self.COMPONENTS])) if names is None else tuple(names)
 
     def to_xarray(self, names: Any = None) -> Any:
         """Return the run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
@@ -190,8 +190,6 @@ class IntegrationResult(Result):
         "parameters", the number of derivatives with respect to parameters, and "names", the names of these parameters;
         "symplectic", True if the matrix was kept symplectic; "source", the origin of the products with the Jacobian:
         "problem", "jvp", "dual numbers" or "complex steps".
-    component_names : tuple of str
-        Names of the components from the `Problem`, or "y0", "y1" and so on; other names can be assigned.
     units : str
         Units of the `Problem`; "" without one.
     epoch : (float, float) or None
@@ -209,8 +207,6 @@ class IntegrationResult(Result):
     projected, because that needs the functions; in a loaded result it is None.
     """
 
-    t: np.ndarray
-    y: np.ndarray
     invariants: np.ndarray
     target: np.ndarray
     max_defect: np.ndarray
@@ -268,10 +264,11 @@ class IntegrationResult(Result):
         ------
         ValueError
             If another option of `integrate` is given, because a value of the first part belongs to it: the targets of
-            the invariants to `params`, derivatives to the first start. If `t` is not beyond the end, if the result was
-            loaded, unpickled or copied, or if at the last state the error of an invariant exceeds 1e-8 of the terms of
-            this invariant, as after an unreliable run or one without checks; ``project_initial=True`` then projects the
-            state first.
+            the invariants to `params`, derivatives to the first start. If an invariant has another value in the last
+            state than before, because something that its function uses has changed. If `t` is not beyond the end, or
+            the result was loaded, unpickled or copied. If at the last state the error of an invariant with a given
+            target exceeds 1e-8 of the terms of this invariant, as after an unreliable run or one without checks;
+            ``project_initial=True`` then projects the state first.
 
         Notes
         -----

@@ -114,10 +114,13 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         return _table_of_members(result, names, pandas)
     known = labels(result, names)
     components = known["component"]
+    time = time_name(components)
     columns: dict[str, Any] = dict(zip(components, np.asarray(result.y), strict=True))
+    used = {time, *components}
 
     def add(name: str, values: np.ndarray, kind: str = "") -> str:
-        columns[found := label(name, columns, kind)] = values
+        columns[found := label(name, used, kind)] = values
+        used.add(found)
         return found
 
     if "invariant" in known:
@@ -130,7 +133,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         add(name, result.outputs[name], "output")
     for name, values in zip(known.get("constraint", ()), getattr(result, "multipliers", (0, ()))[1], strict=True):
         add(f"multiplier {name}", values)
-    return pandas.DataFrame(columns, index=pandas.Index(result.t, name=time_name(components)))
+    return pandas.DataFrame(columns, index=pandas.Index(result.t, name=time))
 
 
 def _table_of_members(result: Any, names: Any, pandas: Any) -> DataFrame:
