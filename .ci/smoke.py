@@ -48,7 +48,7 @@ for problem, t_span in (kepler(), (0, 100)), (solar_system(), (0, 100)), (solito
     run = integrate(problem, t_span, method=EIPRK4)
     assert run.success, run.message
     assert run.trusted, run.message
-    assert max(run.diagnostics.max_defect) < BOUND, run.diagnostics
+    assert max(run.diagnostics.max_residual) < BOUND, run.diagnostics
 starts = np.array([[0.4, 0, 0, 2], [0.5, 0, 0, 1.7]])
 members = ensemble(kepler(), (0, 10), starts, method=EIPRK4)
 assert members.success, members.message

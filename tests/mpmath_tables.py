@@ -95,10 +95,10 @@ def project(problem, names, target, y_hat, iterations):
     directions = [getattr(problem, f"grad_{name}")(y_hat) for name in names]
     multipliers, y = [mpf(0)] * len(names), y_hat
     for _ in range(iterations):
-        defects = mpmath.matrix([getattr(problem, n)(y) - v for n, v in zip(names, target, strict=True)])
+        residuals = mpmath.matrix([getattr(problem, n)(y) - v for n, v in zip(names, target, strict=True)])
         rows = [getattr(problem, f"grad_{name}")(y) for name in names]
         jacobian = mpmath.matrix([[inner(row, d) for d in directions] for row in rows])
-        newton = mpmath.inverse(jacobian) * defects
+        newton = mpmath.inverse(jacobian) * residuals
         multipliers = [m - newton[i] for i, m in enumerate(multipliers)]
         y = shifted(y_hat, 1, multipliers, directions)
     return y, multipliers
@@ -122,7 +122,7 @@ def multiplier_error(series, h):
     return abs(multiplier + (1 - 1 / length) / problem.omega)
 
 
-def defect(series, h):
+def residual(series, h):
     """Return tables 2 and 4: the last residual of the first preserved invariant."""
     problem = Harmonic() if series["table"] == 2 else Kepler()
     names = list(series["invariants"])
@@ -142,7 +142,7 @@ def evaluate(series):
         if series["table"] == 3:
             ends = [end_state(series, h) for h in (2 * steps[0], *steps)]
             return [max(abs(a - b) for a, b in zip(*pair, strict=True)) for pair in pairwise(ends)]
-        return [(multiplier_error if series["table"] == 1 else defect)(series, h) for h in steps]
+        return [(multiplier_error if series["table"] == 1 else residual)(series, h) for h in steps]
 
 
 def write(data):

@@ -57,7 +57,7 @@ class Step:
 
     def projected(self, t_old: float, y: Array, t: float, y_hat: Array, err: Array | None, f: Array) -> Array:
         """y_hat on the invariants' targets; `f` is the derivative there, or nearly so."""
-        g = self.defects(t, y_hat)
+        g = self.residuals(t, y_hat)
         sigma, shares, units = self.weights(y, y_hat, err)
         if not g.any():
             return y_hat
@@ -69,7 +69,7 @@ class Step:
             if k >= self.iterations and self.shares(t, now).max() <= MOST_LEFT:
                 break
             B = sigma * self.neutral(floats(self.gradients(t, now)))
-            mu += np.linalg.lstsq(B @ Q.T, -self.defects(t, now), rcond=None)[0]
+            mu += np.linalg.lstsq(B @ Q.T, -self.residuals(t, now), rcond=None)[0]
             move = self.kept(sigma * (Q.T @ mu))
             if k == 0 and shares is not None and self.direction == "new":
                 shift = self.shift(move, shares * floats(f) / sigma, B, sigma, units)
@@ -84,7 +84,7 @@ class Step:
         shift = self.kept(sigma * tangent)
         return (move @ (units * shift)) / (shift @ (units * shift)) * shift
 
-    def defects(self, t: float, y: Array) -> Array:
+    def residuals(self, t: float, y: Array) -> Array:
         """I - target, which is given; 0 where all of it is the rounding of four of the invariants' terms."""
         return self.values(t, y) - self.target if (self.shares(t, y) > 4 * EPS).any() else np.zeros(len(self.target))
 

@@ -155,7 +155,7 @@ VOLTERRA = Invariant(_volterra, lambda t, u: 1 - 1 / u, name="V")
 def same(one, *others):
     """Compare every number of results of `integrate`."""
     for other in others:
-        for key in ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "method", "h"):
+        for key in ("t", "y", "invariants", "max_residual", "status", "nfev", "njev", "nlu", "success", "method", "h"):
             np.testing.assert_array_equal(one[key], other[key], err_msg=key)
         for key in ("t_events", "y_events"):
             assert (one[key] is None) == (other[key] is None)
@@ -163,7 +163,7 @@ def same(one, *others):
                 np.testing.assert_array_equal(a, b, err_msg=key)
         for key in ("names", "n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections"):
             assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
-        for key in ("last_defect", "max_defect", "max_correction"):
+        for key in ("last_residual", "max_residual", "max_correction"):
             np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)
         assert one.message.split(" (")[0] == other.message.split(" (")[0]
 

@@ -21,12 +21,12 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     The largest residual is the one that most exceeds its dead band, within which it would not be corrected. `work` has
     the buffers of the step, which hold the residuals and the rank.
     """
-    excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
+    excess = np.abs(work.residual) / np.maximum(work.band, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
     broken = [name for name, row in zip(invariants.names, work.G, strict=True) if not np.isfinite(row).all()]
     because = f"; the gradient of {broken[0]!r} is not finite there" if broken else ""
     return (
-        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
+        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.residual[worst]:.3g}, "
         f"rank {int(work.counters[data.LAST_RANK])} of {invariants.size}{because}"
     )
 

@@ -20,7 +20,7 @@ __all__ = [
 ]  # fmt: skip
 
 # Options of the projection that a problem brings.
-BROUGHT = ("invariants", "metric", "blocks", "frame")
+BROUGHT = ("invariants", "metric", "blocks", "linear_invariants")
 MOST = 12  # components that are printed
 
 

@@ -64,7 +64,7 @@ def project(
     Returns
     -------
     ProjectionResult
-        ``y`` (n,), ``defect`` (l,) = I(y) - target, ``rank``, ``correction`` (n,).
+        ``y`` (n,), ``residual`` (l,) = I(y) - target, ``rank``, ``correction`` (n,).
 
     Raises
     ------
@@ -89,7 +89,7 @@ def project(
     >>> import numpy as np
     >>> from eip_scipy import Invariant, project
     >>> length = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=1.0)
-    >>> project(np.array([0.6, 0.81]), length, iterations=3).defect
+    >>> project(np.array([0.6, 0.81]), length, iterations=3).residual
     array([0.])
     """
     if not is_number(t, "t") or not math.isfinite(t):
@@ -101,7 +101,7 @@ def project(
     given = ProjectionOptions(
         invariants=invariants,
         metric=None if sigma is None else weights("sigma", sigma, n),  # None: the euclidean metric
-        frame=frame,
+        linear_invariants=frame,
         iterations=iterations,
         check=False,
     )
@@ -122,16 +122,16 @@ def project(
     out, status = run.projected(derivative, t, y)
     if status != 0:
         raise ValueError(projection_failure(known, work, t))
-    left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
+    left = np.abs(work.residual) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
     for k in np.flatnonzero(left > LARGE_SHARE):
         warnings.warn(
-            f"the projection left an error of {work.defect[k]:.3g} in {known.names[k]!r}, {left[k]:.2g} of the size of "
+            f"the projection left an error of {work.residual[k]:.3g} in {known.names[k]!r}, {left[k]:.2g} of the size of "
             "its terms: the state was far from the target, or the gradient is wrong; increase iterations, or correct "
             "grad",
             ProjectionWarning,
             stacklevel=2,
         )
-    return ProjectionResult(out, work.defect.copy(), int(work.counters[LAST_RANK]), out - y)
+    return ProjectionResult(out, work.residual.copy(), int(work.counters[LAST_RANK]), out - y)
 
 
 def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:

@@ -26,7 +26,7 @@ class Diagnostics:
 
     Attributes
     ----------
-    max_defect : ndarray, shape (l,)
+    max_residual : ndarray, shape (l,)
         Largest invariant error ``|I - target|`` after a projection, in the unit of each invariant.
     moved : str
         How far ``project_initial=True`` moved y0; "" if it did not.
@@ -36,7 +36,7 @@ class Diagnostics:
 
     def __init__(self) -> None:
         none = np.zeros(0)
-        self.max_defect, self._defect, self._max_correction = none, none, np.zeros(1)
+        self.max_residual, self._residual, self._max_correction = none, none, np.zeros(1)
         self._counters, self._estimated = np.zeros(data.N_COUNTERS, np.int64), False  # True with an error estimate
         self._trust = Trust((), np.zeros((0, data.N_FIGURES)))
         self.moved, self.remarks = "", tuple[str, ...]()
@@ -55,8 +55,8 @@ class Diagnostics:
         """Return the record of this run and of the run with the record `other`, which continued it, together."""
         both = Diagnostics()
         both._attach(
-            max_defect=np.maximum(self.max_defect, other.max_defect),
-            _defect=other._defect.copy(),
+            max_residual=np.maximum(self.max_residual, other.max_residual),
+            _residual=other._residual.copy(),
             _max_correction=np.maximum(self._max_correction, other._max_correction),
             _counters=self._counters + other._counters,
             _trust=self._trust.followed_by(other._trust),
@@ -68,9 +68,9 @@ class Diagnostics:
         return both
 
     @property
-    def last_defect(self) -> np.ndarray:
+    def last_residual(self) -> np.ndarray:
         """Last invariant errors ``|I - target|`` after a projection, (l,)."""
-        return np.abs(self._defect)
+        return np.abs(self._residual)
 
     n_projections = _count(data.PROJECTIONS, "Number of projections.")
     n_skipped = _count(data.SKIPPED, "Number of projections omitted because all invariant errors were round-off.")
@@ -136,8 +136,8 @@ class Diagnostics:
             f"{self.n_skipped} skipped (round-off), {self.n_rejected_projections} rejected"
         ]
         width = max(len(name) for name in self.names)
-        for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):
-            lines.append(f"  {name:<{width}}  max defect {largest:.2e}, last {last:.2e}")
+        for name, largest, last in zip(self.names, self.max_residual, self.last_residual, strict=True):
+            lines.append(f"  {name:<{width}}  max residual {largest:.2e}, last {last:.2e}")
         if self.worst is not None:
             name, t, size = self.worst
             lines.append(f"  largest correction: {size:.3g} local errors, of {name} at t={t:.6g}")
@@ -200,7 +200,7 @@ class ProjectionResult(NamedTuple):
     ----------
     y : ndarray, shape (n,)
         The projected state.
-    defect : ndarray, shape (l,)
+    residual : ndarray, shape (l,)
         I(y) - target.
     rank : int
         Rank of the gradients: l if all invariants are independent; 0 if no correction was necessary.
@@ -209,6 +209,6 @@ class ProjectionResult(NamedTuple):
     """
 
     y: Any
-    defect: np.ndarray
+    residual: np.ndarray
     rank: int
     correction: Any

@@ -116,8 +116,8 @@ class Run:
             raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
         w = self.work
         diagnostics._attach(
-            max_defect=w.max_defect,
-            _defect=w.defect,
+            max_residual=w.max_residual,
+            _residual=w.residual,
             _max_correction=w.max_correction,
             _counters=w.counters,
             _trust=self.trust,

@@ -226,10 +226,10 @@ class Work:
     def worth(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
-    def defect(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+    def residual(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
-    def max_defect(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+    def max_residual(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
     def max_correction(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
@@ -597,7 +597,7 @@ class Members(NamedTuple):
     y: numpy.typing.NDArray[numpy.inexact]
     t: numpy.typing.NDArray[numpy.float64]
     status: numpy.typing.NDArray[numpy.int64]
-    max_defect: numpy.typing.NDArray[numpy.float64]
+    max_residual: numpy.typing.NDArray[numpy.float64]
     counters: numpy.typing.NDArray[numpy.int64]
     max_correction: numpy.typing.NDArray[numpy.float64]
     figures: numpy.typing.NDArray[numpy.float64]

@@ -63,7 +63,7 @@ SHOWN = 5
 HANDLED = {"fun", "acceleration", "t_span", "params", "callback", "max_bytes", "progress"}
 ALONE = HANDLED | {"y0", "diagnostics", "projection"}
 # Fields of `Members` that are fields of the result.
-SAME = ("y", "t", "status", "message", "max_defect", "max_correction", "side_by_side", "trusted", "target")
+SAME = ("y", "t", "status", "message", "max_residual", "max_correction", "side_by_side", "trusted", "target")
 OWN = ("y0s", "executor", "reduce", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(HANDLED))
 
 
@@ -90,7 +90,7 @@ FIELDS = {
     "y": Field(("member", "component")),
     "t": Field(("member",), table="t_end"),
     "target": Field(("member", "invariant")),
-    "max_defect": Field(("member", "invariant")),
+    "max_residual": Field(("member", "invariant")),
     "trajectories": Field(("member", "component", "time"), table="states"),
     "invariants": Field(("member", "invariant", "time")),
     **dict.fromkeys(("status", "message", "trusted", "max_correction"), Field(("member",))),
@@ -118,7 +118,7 @@ class EnsembleResult(Result):
         Indices of the members with status -1.
     success : bool
         True if all members ran and none failed.
-    max_defect : ndarray, shape (members, l)
+    max_residual : ndarray, shape (members, l)
         Largest invariant error ``|I - target|`` after a projection; each member has its own target.
     max_correction : ndarray, shape (members,)
         Largest correction in units of the local error; nan if the method has no error estimate.
@@ -171,7 +171,7 @@ class EnsembleResult(Result):
     message: np.ndarray
     failed: np.ndarray
     success: bool
-    max_defect: np.ndarray
+    max_residual: np.ndarray
     max_correction: np.ndarray
     side_by_side: np.ndarray
     one_by_one: str
@@ -207,7 +207,7 @@ class EnsembleResult(Result):
         -------
         xarray.Dataset
             Dataset with ``y`` (member, component), ``t_end``, ``status``, ``message``, ``trusted``, ``max_correction``
-            (member), ``max_defect``, ``target`` (member, invariant), and the counts. If trajectories are in memory,
+            (member), ``max_residual``, ``target`` (member, invariant), and the counts. If trajectories are in memory,
             also ``states`` (member, component, time) and ``invariants`` (member, invariant, time); otherwise
             ``end_invariants`` (member, invariant).
 
@@ -267,9 +267,11 @@ class EnsembleResult(Result):
         if self.one_by_one:
             lines.append(f"  not vectorised: {self.one_by_one}")
         width = max((len(name) for name in self.names), default=0)
-        for name, defects in zip(self.names, self.max_defect[self.status >= 0].T, strict=True):
-            if defects.size:
-                lines.append(f"  {name:<{width}}  largest error {defects.max():.2e}, median {np.median(defects):.2e}")
+        for name, residuals in zip(self.names, self.max_residual[self.status >= 0].T, strict=True):
+            if residuals.size:
+                lines.append(
+                    f"  {name:<{width}}  largest error {residuals.max():.2e}, median {np.median(residuals):.2e}"
+                )
         doubtful = np.flatnonzero((self.status >= 0) & ~self.trusted)
         for those, what in ((self.failed, ".failed"), (doubtful, ".trusted")):
             lines += [f"  member {self.first + k}: {self.message[k]}" for k in those[:SHOWN]]
@@ -371,7 +373,7 @@ def ensemble(
     Returns
     -------
     EnsembleResult
-        ``y`` (members, n), ``status``, ``message``, ``max_defect`` (members, l), ``t``, and more.
+        ``y`` (members, n), ``status``, ``message``, ``max_residual`` (members, l), ``t``, and more.
 
     Raises
     ------
@@ -397,7 +399,7 @@ def ensemble(
     >>> problem = kepler()
     >>> starts = problem.y0 * np.linspace(0.99, 1.01, 5)[:, None]
     >>> run = ensemble(problem, (0, 20), starts)
-    >>> run.y.shape, run.success, bool((run.max_defect < 1e-11).all())
+    >>> run.y.shape, run.success, bool((run.max_residual < 1e-11).all())
     ((5, 4), True, True)
     """
     options: dict[str, Any] = dict(keywords)

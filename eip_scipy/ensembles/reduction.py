@@ -71,7 +71,7 @@ def _member(plan: Plan, members: Members, k: int) -> IntegrationResult:
         t=t,
         invariants=values.T,
         target=members.target[k],
-        max_defect=members.max_defect[k],
+        max_residual=members.max_residual[k],
         status=int(members.status[k]),
         message=members.message[k],
         success=True,

@@ -34,7 +34,7 @@ FAILED, NOT_RUN = -1, -2
 FIRST_STEPS, SWEEP_SECONDS = 1024, 0.1
 ENDS = (ARRIVED, ENDED_BY_EVENT)
 BY_MEMBER = (
-    *("starts", "params", "first_steps", "y", "t", "status", "max_defect", "counters", "max_correction", "figures"),
+    *("starts", "params", "first_steps", "y", "t", "status", "max_residual", "counters", "max_correction", "figures"),
     "suspects",
 )
 LEAST_WORK = 3e7  # floats times steps, one or two seconds: compiling functions for eight members takes as long
@@ -67,7 +67,7 @@ class Members(NamedTuple):
     t: np.ndarray  # (m,): their times
     status: np.ndarray  # (m,): 0 or 1, as in `integrate`, `FAILED`, or `NOT_RUN`
     message: np.ndarray  # (m,): str
-    max_defect: np.ndarray  # (m, l)
+    max_residual: np.ndarray  # (m, l)
     counters: np.ndarray  # (m, N_COUNTERS): the engine's, such as that of the evaluations of f (index `NFEV`)
     max_correction: np.ndarray  # (m,)
     side_by_side: np.ndarray  # (m,)
@@ -88,7 +88,7 @@ class Members(NamedTuple):
             t=np.full(m, np.nan),
             status=np.full(m, NOT_RUN),
             message=np.full(m, "not run", object),
-            max_defect=np.full((m, invariants), np.nan),
+            max_residual=np.full((m, invariants), np.nan),
             counters=np.zeros((m, N_COUNTERS), np.int64),
             max_correction=np.full(m, np.nan),
             side_by_side=np.zeros(m, bool),
@@ -264,12 +264,12 @@ def _cover(out: Members, those: slice, rows: np.ndarray, schedule: Schedule) -> 
 
     The state at an event that ended a member is not included if `t_eval` was given, as in the result of a single run.
     """
-    target, before = out.target[those], out.max_defect[those]
+    target, before = out.target[those], out.max_residual[those]
     not_saved = (out.status[those] == 1) & (schedule.t_eval.size > 0)
     with np.errstate(invalid="ignore"):  # members that have failed contain nan
         last = np.where(not_saved[:, None], 0.0, np.abs(out.values[those] - target))
         largest = np.fmax(last, np.fmax.reduce(np.abs(rows - target[:, None]), axis=1, initial=0.0))
-    out.max_defect[those] = np.where(np.isnan(before), before, np.fmax(before, largest))
+    out.max_residual[those] = np.where(np.isnan(before), before, np.fmax(before, largest))
 
 
 def _values(driver: Driver, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
@@ -294,7 +294,7 @@ def _store(
     elif status == FAILED and not broken:
         y = rows[-1] if len(rows) and driver.t[len(rows) - 1] == t else driver.shown(t, y)
     out.y[k], out.t[k] = y, t
-    out.max_defect[k] = work.max_defect
+    out.max_residual[k] = work.max_residual
     out.counters[k] = work.counters
     out.max_correction[k] = loop.diagnostics.max_correction
     out.trusted[k] = driver.run.trust.trusted and status >= 0
@@ -383,7 +383,7 @@ class Sweeper:
             y=out.y,
             t=out.t,
             status=out.status,
-            max_defect=out.max_defect,
+            max_residual=out.max_residual,
             counters=out.counters,
             max_correction=out.max_correction,
             figures=np.zeros((m, *driver.run.work.trust.shape)),

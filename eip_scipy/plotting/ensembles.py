@@ -118,8 +118,8 @@ def _draw_errors(axis: Axes, result: Any) -> None:
     """Draw the largest error of each invariant in each member, and a cross at the bottom for each failed member."""
     total = len(result.t)
     drawn = np.unique(np.linspace(0, total - 1, min(total, AT_MOST)).round().astype(int))
-    members, failed, defects = result.first + drawn, result.status[drawn] == -1, result.max_defect[drawn].T
-    errors = {plain(name): row[~failed] for name, row in zip(distinct(result.names), defects, strict=True)}
+    members, failed, residuals = result.first + drawn, result.status[drawn] == -1, result.max_residual[drawn].T
+    errors = {plain(name): row[~failed] for name, row in zip(distinct(result.names), residuals, strict=True)}
     small = 4.0 if members.size <= 300 else 2.0
     look: dict[str, Any] = {"ls": "", "ms": small, "mew": 0, "alpha": 0.8}
     styles = {name: style | look for name, style in method_styles(errors).items()}

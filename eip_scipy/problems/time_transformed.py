@@ -94,7 +94,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         )
     params = np.zeros(0) if problem.params is None else problem.params
     rhs = _transformed_rhs(jitted_call(problem.rhs), jitted(g))
-    n, blocks, frame = problem.y0.size, problem.blocks, problem.frame
+    n, blocks, frame = problem.y0.size, problem.blocks, problem.linear_invariants
     if frame is not None:
         frame = np.pad(frame[0], ((0, 0), (0, 1))), np.pad(frame[1], ((0, 1), (0, 0)))
     return Problem(
@@ -107,7 +107,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         invariants=tuple(_transformed_invariant(item, problem) for item in problem.invariants),
         component_names=None if problem.component_names is None else (*problem.component_names, "t"),
         blocks=tuple(np.arange(n).reshape(-1, blocks)) if isinstance(blocks, int) else blocks,
-        frame=frame,
+        linear_invariants=frame,
         units=problem.units and f"state in {problem.units}",  # fictitious time has no unit
         source=problem.source,
     )

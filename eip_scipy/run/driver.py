@@ -151,7 +151,17 @@ class Driver:
         if history is not None:
             found |= {"rates": history.rates, "rate_sums": history.rate_sums} if balanced else {}
             found |= {"nodes": history.nodes, "sums": history.sums, "node": history.place, "levels": history.levels}
-        kept = ("carry", "err_sum", "sigma", "memory", "defect", "max_defect", "max_correction", "trust", "counters")
+        kept = (
+            "carry",
+            "err_sum",
+            "sigma",
+            "memory",
+            "residual",
+            "max_residual",
+            "max_correction",
+            "trust",
+            "counters",
+        )
         return found | {name: getattr(w, name) for name in kept}
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -250,7 +260,7 @@ class Driver:
     def note(self, values: np.ndarray, target: np.ndarray) -> None:
         """Update the largest errors (l,) with the `values` (l, m) at the saved states except the start."""
         errors = np.abs(values[:, self.t[: self.rows] != self.schedule.span.t0].T - target)
-        largest = self.run.work.max_defect
+        largest = self.run.work.max_residual
         np.fmax(largest, np.fmax.reduce(errors, axis=0, initial=0.0), out=largest)  # NaN does not count
 
     def values(self) -> np.ndarray:

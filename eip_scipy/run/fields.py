@@ -51,7 +51,7 @@ FIELDS = {
     "t": Field(("t",)),
     "y": Field(("component", "t")),
     "invariants": Field(("invariant", "t")),
-    "max_defect": Field(("invariant",), np.maximum),
+    "max_residual": Field(("invariant",), np.maximum),
     "variations": Field(("t", "component", "column")),
     "outputs": Field(("output", "t")),
     "multipliers": Field(("constraint", "t")),

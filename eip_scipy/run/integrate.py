@@ -150,7 +150,7 @@ def integrate(
     dense_output : bool, optional
         If True, store the interpolants of all steps as ``.sol``, a function of time; not available with a checkpoint.
     callback : callable, optional
-        ``callback(t, y, defects)``, called at each saved point with the invariant errors `defects`; return True to stop
+        ``callback(t, y, residuals)``, called at each saved point with the invariant errors `residuals`; return True to stop
         the run. With `save_every` the interval may then be infinite, as with a terminal event.
     progress : bool, optional
         Show a progress bar with the remaining time.
@@ -182,7 +182,7 @@ def integrate(
     Returns
     -------
     IntegrationResult
-        Times ``t`` (m,), states ``y`` (n, m), values ``invariants`` (l, m), ``max_defect`` (l,), and more.
+        Times ``t`` (m,), states ``y`` (n, m), values ``invariants`` (l, m), ``max_residual`` (l,), and more.
 
     Raises
     ------
@@ -210,7 +210,7 @@ def integrate(
     >>> from eip_scipy import EIPRK4, integrate
     >>> from eip_scipy.problems import kepler
     >>> run = integrate(kepler(), (0, 200), method=EIPRK4, h=0.03, save_every=100)
-    >>> run.y.shape, bool((run.max_defect < 1e-11).all())
+    >>> run.y.shape, bool((run.max_residual < 1e-11).all())
     ((4, 68), True)
     """
     asked = locals()  # the fields of Request have the same names and defaults
@@ -432,7 +432,7 @@ class Loop:
             t=driver.t[:rows],
             invariants=values,
             target=target,
-            max_defect=driver.run.work.max_defect,
+            max_residual=driver.run.work.max_residual,
             diagnostics=self.diagnostics,
             sol=self._solution(),
             status=status,
@@ -573,7 +573,7 @@ def _keep_start(error: BaseException, request: Request, seconds: float) -> None:
         t0, start = started_at(request)
         error.partial = IntegrationResult(  # type: ignore[attr-defined]
             {"t": np.array([t0]), "y": start[:, None], "invariants": np.zeros((0, 1)), "target": np.zeros(0)},
-            max_defect=np.zeros(0),
+            max_residual=np.zeros(0),
             diagnostics=Diagnostics(),
             **dict.fromkeys(("t_events", "y_events", "sol")),
             **dict.fromkeys(("nfev", "njev", "nlu"), 0),

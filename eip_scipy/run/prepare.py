@@ -499,7 +499,7 @@ def _method(method: Any) -> Any:
 def _check_choices(request: Request) -> None:
     callback, compiled = request.callback, request.compiled
     if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be a function callback(t, y, defects), got {shown(callback)}.")
+        raise TypeError(f"callback must be a function callback(t, y, residuals), got {shown(callback)}.")
     flag("progress", request.progress)
     flag("dense_output", request.dense_output)
     if compiled is not None and not isinstance(compiled, (bool, np.bool_)):

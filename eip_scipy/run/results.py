@@ -147,7 +147,7 @@ class IntegrationResult(Result):
         Values of the invariants at the saved times.
     target : ndarray, shape (l,)
         Values to which the invariants were projected.
-    max_defect : ndarray, shape (l,)
+    max_residual : ndarray, shape (l,)
         Largest invariant error ``|I - target|`` after a projection or at a saved state.
     diagnostics : Diagnostics
         Record of the projections.
@@ -209,7 +209,7 @@ class IntegrationResult(Result):
 
     invariants: np.ndarray
     target: np.ndarray
-    max_defect: np.ndarray
+    max_residual: np.ndarray
     diagnostics: Diagnostics
     t_events: list[np.ndarray] | None
     y_events: list[np.ndarray] | None
@@ -284,7 +284,7 @@ class IntegrationResult(Result):
         >>> from eip_scipy.problems import kepler
         >>> run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=10)
         >>> longer = run.continue_to(20)
-        >>> float(longer.t[-1]), bool((longer.max_defect < 1e-11).all())
+        >>> float(longer.t[-1]), bool((longer.max_residual < 1e-11).all())
         (20.0, True)
         """
         from .continuation import continue_to

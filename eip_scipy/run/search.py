@@ -165,7 +165,7 @@ class Search:
         every = max(1, steps * problem.y0.size // MOST_SAVED)
         rows = iter(range(steps // every))
 
-        def enough(t: float, y: np.ndarray, defects: np.ndarray) -> bool:
+        def enough(t: float, y: np.ndarray, residuals: np.ndarray) -> bool:
             return next(rows, None) is None
 
         with warnings.catch_warnings(), np.errstate(all="ignore"):

@@ -191,7 +191,7 @@ def solve_ivp(
     >>> def energy(t, y, g):
     ...     return 0.5 * y[1] ** 2 - g * np.cos(y[0])
     >>> sol = solve_ivp(pendulum, (0, 20), [1.0, 0.0], EIPDOP853, args=(9.81,), invariants=energy, rtol=1e-8)
-    >>> sol.success, sol.trusted, bool(sol.diagnostics.max_defect < 1e-11)
+    >>> sol.success, sol.trusted, bool(sol.diagnostics.max_residual < 1e-11)
     (True, True, True)
     """
     options: dict[str, Any] = {

@@ -34,7 +34,7 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     -------
     xarray.Dataset
         ``y`` (component, t) with the coordinates ``component`` and ``t``: ``data.y.sel(component="x")``. If the run has
-        invariants, also ``invariants`` and ``invariant_errors`` (I - target), both (invariant, t), and ``max_defect``.
+        invariants, also ``invariants`` and ``invariant_errors`` (I - target), both (invariant, t), and ``max_residual``.
         If it has derivatives, also ``variations`` (t, component, column); a column is named after the component of the
         initial state or the parameter with respect to which it is the derivative, or 0, 1 and so on. A mechanical
         system adds ``outputs`` (output, t), ``multipliers`` (constraint, t) and ``constraint_rank`` (t,). Attributes
@@ -89,7 +89,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         "dx/dvy" of x with respect to the initial vy; see `to_xarray` for the names. A mechanical system adds its
         outputs, "output x" if there is a column x, and its multipliers, such as "multiplier g1'". Names that would
         still be equal get a number. The table of an ensemble is indexed by ``member``: a column for each component of
-        the last state, then "t_end", "status", "message", "trusted", and "H max_defect" for each invariant.
+        the last state, then "t_end", "status", "message", "trusted", and "H max_residual" for each invariant.
 
     Raises
     ------
@@ -143,8 +143,8 @@ def _table_of_members(result: Any, names: Any, pandas: Any) -> DataFrame:
     ends |= {"trusted": result.trusted}
     for name, values in ends.items():
         columns[label(name, columns, "member")] = values
-    for name, values in zip(result.names, result.max_defect.T, strict=True):
-        columns[label(f"{name} max_defect", columns)] = values
+    for name, values in zip(result.names, result.max_residual.T, strict=True):
+        columns[label(f"{name} max_residual", columns)] = values
     return pandas.DataFrame(columns, index=pandas.Index(result.first + np.arange(len(result.y)), name="member"))
 
 

@@ -112,7 +112,7 @@ class Bench:
             steps = max(self.most // asked["method"].TABLEAU.n_stages, ROWS)
             rows = iter(range(ROWS))
 
-            def too_many(t: float, y: np.ndarray, defects: np.ndarray) -> bool:
+            def too_many(t: float, y: np.ndarray, residuals: np.ndarray) -> bool:
                 return next(rows, None) is None
 
             states = []

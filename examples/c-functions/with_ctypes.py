@@ -27,5 +27,5 @@ run = integrate(
     events=LowLevelCallable(library.turn),
 )
 print(run.compiled, set(run.calls.values()))
-kept = run.max_defect.max() < 1e-11
+kept = run.max_residual.max() < 1e-11
 print(f"{run.t_events[0].size} pericentres, energy and angular momentum kept: {kept}")

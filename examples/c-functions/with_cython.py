@@ -18,4 +18,4 @@ run = integrate(
     invariants=Invariant(energy, energy_gradient, name="H"),
 )
 print(run.compiled, run.calls)
-print(f"energy kept: {run.max_defect.max() < 1e-12}")
+print(f"energy kept: {run.max_residual.max() < 1e-12}")

@@ -18,7 +18,7 @@ from eip_scipy.problems import kepler, solar_system
 from .output import Output
 from .report import compact, describe_machine, table, warn
 
-DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
+RESIDUAL, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
 
 class Trial(NamedTuple):
@@ -48,7 +48,7 @@ def _timed(name: str, bound: float, measure: Callable[[], float]) -> Trial:
     return Trial(name, found, bound, perf_counter() - begin)
 
 
-def _defects() -> float:
+def _residuals() -> float:
     """Return the largest change of energy or angular momentum in a run, computed by their formulas."""
     problem = kepler(relativistic=0.0)
     run = solve_ivp(problem.fun, (0, 20), problem.y0, method=EIPRK4, h=0.02, invariants=problem.invariants)
@@ -89,7 +89,7 @@ def _members() -> float:
 
 
 CHECKS = (
-    ("solve_ivp keeps H and L", DEFECT, _defects),
+    ("solve_ivp keeps H and L", RESIDUAL, _residuals),
     ("Python and native functions: the same bits", 0.0, _bits),
     ("Kepler's orbit: the closed form", DISTANCE, _orbit),
     ("a year of the planets by two methods, AU", PLANETS, _planets),

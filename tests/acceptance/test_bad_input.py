@@ -127,10 +127,10 @@ WRONG = [
     ("blocks", [1.5], ValueError, "blocks must be an integer or a sequence of index arrays"),
     ("blocks", [[[0, 1], [1]]], ValueError, "blocks: a component is in two blocks"),
     ("blocks", [[[0, 2]], [[0.5]]], ValueError, "blocks: .* not an array of indices from 0 to 1"),
-    ("frame", [3], ValueError, r"frame must be a pair \(C, S\)"),
-    ("frame", [(np.ones((1, 3)), np.ones((3, 1)))], ValueError, r"frame: C has shape \(1, 3\)"),
-    ("frame", [(np.eye(1, 2), np.eye(1, 2, 1).T)], ValueError, "frame: C S is singular"),
-    ("frame", [(1j * np.eye(1, 2), np.ones((2, 1)))], ValueError, "frame: C and S must be real"),
+    ("linear_invariants", [3], ValueError, r"frame must be a pair \(C, S\)"),
+    ("linear_invariants", [(np.ones((1, 3)), np.ones((3, 1)))], ValueError, r"frame: C has shape \(1, 3\)"),
+    ("linear_invariants", [(np.eye(1, 2), np.eye(1, 2, 1).T)], ValueError, "frame: C S is singular"),
+    ("linear_invariants", [(1j * np.eye(1, 2), np.ones((2, 1)))], ValueError, "frame: C and S must be real"),
     ("direction", ["newest"], ValueError, "direction must be 'new', 'old' or 'midpoint', got 'newest'"),
     ("every", [2**70], ValueError, "every must be at most 9223372036854775807, got 1180591620717411303424"),
     ("iterations", [1001], ValueError, "iterations must be at most 1000, got 1001"),
@@ -553,7 +553,7 @@ WRONG_OF_PROJECT = [
     ({"target": 1.0, "sigma": "a"}, "sigma must be an array of numbers, got"),
     ({"target": 1.0, "iterations": 0}, "iterations must be an integer >= 1"),
     ({"target": 1.0, "iterations": 2**70}, "iterations must be at most 1000"),
-    ({"target": 1.0, "frame": 3}, "frame must be a pair"),
+    ({"target": 1.0, "linear_invariants": 3}, "frame must be a pair"),
     ({"target": 1.0, "f": [1.0]}, r"f has shape \(1,\), expected \(2,\)"),
     ({"target": 1.0, "y": [1.0, math.nan]}, "must be finite"),
     ({"target": 1.0, "y": [Y0]}, "1-dimensional"),
@@ -577,7 +577,7 @@ def test_project_needs_f_where_a_gradient_uses_it():
         project([0.6, 0.81], kept)
     with pytest.raises(ValueError, match=r"function f\(t, y\)"):
         project([0.6, 0.81], kept, f=[1.0, 1.0], iterations=2)
-    assert project([0.6, 0.81], kept, f=oscillator, iterations=3).defect[0] == pytest.approx(0, abs=4 * EPS)
+    assert project([0.6, 0.81], kept, f=oscillator, iterations=3).residual[0] == pytest.approx(0, abs=4 * EPS)
     with pytest.raises(ValueError, match="pass fun="):
         check_gradient(kept, 0.0, Y0)
 

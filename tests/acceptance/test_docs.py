@@ -79,10 +79,10 @@ def test_page(page, capsys, tmp_path, monkeypatch):
 
 
 def test_a_wrong_output_is_seen():
-    assert_output("error 2.40e-05, defect 3e-15 [1, 2]\n", "error 2.4e-05, defect 8e-16  [1, 2]")
-    for wrong in ("error 2.7e-05, defect 8e-16 [1, 2]", "error 2.4e-05, defect 8e-8 [1, 2]", "error 2.4e-05"):
+    assert_output("error 2.40e-05, residual 3e-15 [1, 2]\n", "error 2.4e-05, residual 8e-16  [1, 2]")
+    for wrong in ("error 2.7e-05, residual 8e-16 [1, 2]", "error 2.4e-05, residual 8e-8 [1, 2]", "error 2.4e-05"):
         with pytest.raises(AssertionError):
-            assert_output("error 2.4e-05, defect 3e-15 [1, 2]", wrong)
+            assert_output("error 2.4e-05, residual 3e-15 [1, 2]", wrong)
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])

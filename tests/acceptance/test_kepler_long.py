@@ -32,12 +32,12 @@ def values(result):
     return terms.sum(axis=1), np.abs(terms).sum(axis=1)
 
 
-def check_no_drift(t, defects):
+def check_no_drift(t, residuals):
     """There is no slope within 3 standard errors, and its possible sum over the run is below the residuals' spread."""
-    fits = [linregress(t, row) for row in defects]
+    fits = [linregress(t, row) for row in residuals]
     slope, stderr = (np.array([getattr(fit, name) for fit in fits]) for name in ("slope", "stderr"))
     assert (np.abs(slope) < 3 * stderr).all()
-    assert ((np.abs(slope) + 3 * stderr) * T < 0.5 * defects.std(axis=1)).all()
+    assert ((np.abs(slope) + 3 * stderr) * T < 0.5 * residuals.std(axis=1)).all()
 
 
 # Largest residuals of H and L over all steps. RK4's are the truncation error O(h^10) at the pericentre, and as such
@@ -51,12 +51,12 @@ def check_no_drift(t, defects):
         (EIPRK5, "default", (2.0e-15, 1.8e-15)),
     ],
 )
-def test_defects_are_stationary(method, setting, largest):
+def test_residuals_are_stationary(method, setting, largest):
     result = run(method, setting)
     assert result.compiled
     assert result.diagnostics.n_rank_reduced == 0
     roundings = 4 * np.finfo(float).eps  # one more or less of those that remain
-    assert result.max_defect == pytest.approx(largest, rel=0.05, abs=roundings)
+    assert result.max_residual == pytest.approx(largest, rel=0.05, abs=roundings)
     check_no_drift(result.t, result.invariants - result.invariants[:, :1])
 
 
@@ -68,26 +68,26 @@ def test_two_newton_steps_reach_round_off(setting):
     times as large, relative to H itself. A residual up to 4 eps times the terms of G y, 6e-15 there, is not corrected.
     """
     result = run(EIPRK4, setting, iterations=2)
-    defects = result.invariants - result.invariants[:, :1]
-    rms = np.sqrt(np.mean(defects**2, axis=1))
+    residuals = result.invariants - result.invariants[:, :1]
+    rms = np.sqrt(np.mean(residuals**2, axis=1))
     assert (rms / np.abs(result.invariants[:, 0]) < 1e-15).all()
-    assert (np.abs(defects) < 2e-15 * values(result)[1]).all()
-    assert (result.max_defect < (7e-15, 2e-15)).all()
-    check_no_drift(result.t, defects)
+    assert (np.abs(residuals) < 2e-15 * values(result)[1]).all()
+    assert (result.max_residual < (7e-15, 2e-15)).all()
+    check_no_drift(result.t, residuals)
 
 
 def test_one_newton_step_does_not():
     result = run(EIPRK4, "paper")
-    defects = np.abs(result.invariants - result.invariants[:, :1])
-    assert (defects > 1e-14 * values(result)[1]).any(axis=1).all()
+    residuals = np.abs(result.invariants - result.invariants[:, :1])
+    assert (residuals > 1e-14 * values(result)[1]).any(axis=1).all()
 
 
 @pytest.mark.parametrize(("kept", "other"), [("H", 1), ("L", 0)])
 def test_the_invariant_that_is_not_kept_drifts(kept, other):
     """The check for drift is meaningful: the paper's EIP-H and EIP-L fail the same test by orders of magnitude."""
     result = run(EIPRK4, "paper", kept=kept)
-    defects = values(result)[0]
-    defects = defects - defects[:, :1]
-    fit = linregress(result.t, defects[other])
+    residuals = values(result)[0]
+    residuals = residuals - residuals[:, :1]
+    fit = linregress(result.t, residuals[other])
     assert abs(fit.slope) > 50 * fit.stderr
-    assert abs(fit.slope) * T > 1e6 * np.abs(defects[1 - other]).max()
+    assert abs(fit.slope) * T > 1e6 * np.abs(residuals[1 - other]).max()

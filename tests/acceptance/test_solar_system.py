@@ -71,9 +71,9 @@ def test_mercury_gains_a_hundredfold_in_any_orientation(seed):
 
 def test_frame_keeps_momentum_and_centre_of_mass():
     problem = solar_system(years=200)
-    C = problem.frame[0]
+    C = problem.linear_invariants[0]
     framed = np.abs(C @ integrate(problem, method=EIPRK4).y[:, -1])
-    free = np.abs(C @ integrate(problem, method=EIPRK4, frame=None).y[:, -1])
+    free = np.abs(C @ integrate(problem, method=EIPRK4, linear_invariants=None).y[:, -1])
     assert framed[3:].max() < 1e-14
     assert framed[:3].max() < 1e-11
     assert free[3:].max() > 1e-12

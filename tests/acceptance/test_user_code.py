@@ -27,8 +27,8 @@ def test_it_uses_all_public_names():
 
 def test_it_runs(program, tmp_path):
     assert 0 < program.slow() < 1e-3
-    defect, states, message, trusted = program.one_run()
-    assert defect < 1e-14
+    residual, states, message, trusted = program.one_run()
+    assert residual < 1e-14
     assert states.shape == (2, 11)
     assert (message, trusted) == ("The solver successfully reached the end of the integration interval.", True)
     assert program.long_run(tmp_path / "run.npz") > 4 * 334

@@ -65,8 +65,8 @@ def test_invariants_are_kept(method):
         assert len(set(np.round(np.diff(found.t), 12))) > 5, "steps of one length"
         at_steps = np.array([[abs(item.fun(0, y) - item.fun(0, Y0)) for item in (H, L)] for y in found.y.T])
         assert at_steps.max() < 1e-9
-        np.testing.assert_allclose(d.max_defect, at_steps.max(axis=0), rtol=0, atol=1e-15)
-        np.testing.assert_allclose(d.last_defect, at_steps[-1], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(d.max_residual, at_steps.max(axis=0), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(d.last_residual, at_steps[-1], rtol=0, atol=1e-15)
         assert np.abs(energy(0, run(**options).y[:, -1]) - energy(0, Y0)) > 1e-8
         # The counts of projections.
         assert d.names == ("energy", "momentum")
@@ -117,7 +117,7 @@ OPTIONS = {
     "several": ({"every": 2, "iterations": 2, "blocks": 2, "reuse_f": False, "max_step": 0.5}, True, -0.5),
     "blocks": ({"blocks": 2}, True, -0.5),
     "blocks by index": ({"blocks": [[0, 1], [2, 3]]}, True, -0.5),
-    "frame": ({"frame": ([[0.0, 0.0, 1.0, 0.0]], [[0.0], [0.0], [1.0], [0.0]])}, True, -0.5),
+    "linear_invariants": ({"linear_invariants": ([[0.0, 0.0, 1.0, 0.0]], [[0.0], [0.0], [1.0], [0.0]])}, True, -0.5),
     "direction old": ({"direction": "old"}, True, -0.5),
     "direction midpoint": ({"direction": "midpoint"}, True, -0.5),
     "iterations": ({"iterations": 4}, True, -0.5),
@@ -155,7 +155,7 @@ def test_options_of_both_drivers(option):
             np.testing.assert_array_equal(sol.y[:, 0], Y0)  # as it was given
             assert found.njev > 0
             left = abs(energy(0, sol.y[:, -1]) - (kept if option == "project_initial" else energy(0, Y0)))
-            assert d.last_defect[0] == pytest.approx(left, abs=1e-15)
+            assert d.last_residual[0] == pytest.approx(left, abs=1e-15)
             assert abs(energy(0, found.y[:, -1]) - kept) < 1e-5
             assert energy(0, found.y[:, 0]) == pytest.approx(kept, abs=1e-14)
         bare = run(method=method, rtol=1e-4, atol=1e-6, invariants=H)
@@ -237,7 +237,7 @@ def test_invariant_nan_after_a_trial_step_is_mended_by_shorter_ones(method):
     assert (found.y > 0).all()
     assert found.diagnostics.n_rejected_projections >= 1
     assert found.t[1] - found.t[0] < 1.0
-    assert np.isfinite(found.max_defect).all()
+    assert np.isfinite(found.max_residual).all()
     assert np.ptp([VOLTERRA.fun(0, u) for u in found.y.T]) < 3.0
 
 

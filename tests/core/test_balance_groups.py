@@ -47,7 +47,7 @@ def places():
 PROBLEM = nbody(GM, *places(), t_span=(0, 0.25), h=0.002, units="AU, yr")
 Y0 = PROBLEM.y0
 BODIES = np.arange(30).reshape(2, 5, 3)
-UNIFORM = (PROBLEM.frame[0], np.kron(np.eye(2), np.kron(np.ones((5, 1)), np.eye(3))))
+UNIFORM = (PROBLEM.linear_invariants[0], np.kron(np.eye(2), np.kron(np.ones((5, 1)), np.eye(3))))
 KEPT = orbital_balances(GM, Y0)
 ALL = orbital_balances(GM, Y0, ("energy", "momentum", "laplace"))
 
@@ -59,7 +59,7 @@ def derivative(t, y):
 
 
 def run(balances=KEPT, **options):
-    options.setdefault("frame", UNIFORM)
+    options.setdefault("linear_invariants", UNIFORM)
     return integrate(PROBLEM, invariants=balances, **options)
 
 
@@ -113,14 +113,16 @@ def test_weights_and_rows():
     assert np.allclose(project(y, plane(components=[2]), target=g @ y + 1e-3).correction[2], 1e-3 / g[2], rtol=1e-10)
 
 
-@pytest.mark.parametrize(("kept", "frame"), [(KEPT, None), (KEPT, UNIFORM), (ALL, UNIFORM), (ALL, PROBLEM.frame)])
+@pytest.mark.parametrize(
+    ("kept", "linear_invariants"), [(KEPT, None), (KEPT, UNIFORM), (ALL, UNIFORM), (ALL, PROBLEM.linear_invariants)]
+)
 def test_a_group_does_not_disturb_the_others(kept, frame):
     """A planet that is off, with its moon, is brought back without a change of any other relative motion."""
     f = derivative(0.0, Y0)
     target = np.concatenate([np.ravel(balance.fun(0.0, Y0)) for balance in kept])
     off = Y0.copy()
     off[BODIES[1, [PLANET, MOON]]] += [1e-7, -2e-7, 5e-8]
-    found = project(off, kept, target=target, f=f, frame=frame)
+    found = project(off, kept, target=target, f=f, linear_invariants=frame)
     q, v = found.y.reshape(2, 5, 3)
     q0, v0 = off.reshape(2, 5, 3)
     loose = 4 * EPS
@@ -130,8 +132,8 @@ def test_a_group_does_not_disturb_the_others(kept, frame):
     after = np.concatenate([np.ravel(balance.fun(0.0, found.y)) for balance in kept])
     before = np.concatenate([np.ravel(balance.fun(0.0, off)) for balance in kept])
     assert np.abs(after - target).max() < 1e-5 * np.abs(before - target).max()
-    moved = PROBLEM.frame[0] @ found.correction  # centre of mass and momentum
-    assert (np.abs(moved) <= EPS * np.abs(PROBLEM.frame[0]) @ np.abs(off)).all()
+    moved = PROBLEM.linear_invariants[0] @ found.correction  # centre of mass and momentum
+    assert (np.abs(moved) <= EPS * np.abs(PROBLEM.linear_invariants[0]) @ np.abs(off)).all()
     assert found.rank == (4 if kept is KEPT else 4 * 5)
 
 
@@ -164,7 +166,14 @@ def test_compiled_runs_have_the_bits_of_interpreted_ones(options, kept):
 def test_states_between_the_steps_and_of_continued_runs_are_on_the_targets(options):
     right = energies(exact(TIMES))
     loose = 1e-5 if options["method"] is EIPRK4 else 2e-8
-    given = {"fun": derivative, "t_span": (0, 0.25), "y0": Y0, "invariants": KEPT, "frame": UNIFORM, **options}
+    given = {
+        "fun": derivative,
+        "t_span": (0, 0.25),
+        "y0": Y0,
+        "invariants": KEPT,
+        "linear_invariants": UNIFORM,
+        **options,
+    }
     sol = scipy.integrate.solve_ivp(t_eval=TIMES, **given)
     assert np.array_equal(scipy.integrate.solve_ivp(dense_output=True, **given).sol(TIMES), sol.y)
     found, halves = run(t_eval=TIMES, **options), run(t_span=(0, 0.125), **options).continue_to(0.25)
@@ -184,7 +193,7 @@ class StoppedError(Exception):
 def test_a_resumed_run_has_the_same_bits(tmp_path, options):
     rows = iter(range(4))
 
-    def stop(t, y, defects):
+    def stop(t, y, residuals):
         if next(rows, None) is None:
             raise StoppedError
 
@@ -218,7 +227,7 @@ def test_a_checkpoint_knows_the_components(tmp_path):
 @pytest.mark.parametrize("options", [RUNS[0], RUNS[3]])
 def test_members_of_ensembles_are_single_runs(options):
     starts = np.array([Y0 * (1 + 1e-4 * k) for k in range(10)])
-    many = ensemble(PROBLEM, None, starts, invariants=KEPT, frame=UNIFORM, **options)
+    many = ensemble(PROBLEM, None, starts, invariants=KEPT, linear_invariants=UNIFORM, **options)
     for k in (0, 9):
         one = run(y0=starts[k], **options)
         assert np.array_equal(many.y[k], one.y[:, -1])
@@ -274,7 +283,7 @@ def test_project():
     plain = project(y, [Invariant(energy, energy_gradient), PLAIN], target=target)
     found = project(y, items, target=target)
     assert np.abs(found.y - plain.y).max() < 4 * EPS
-    assert np.allclose(found.defect, plain.defect, rtol=1e-3)
+    assert np.allclose(found.residual, plain.residual, rtol=1e-3)
     for more in ({"iterations": 3}, {"sigma": [1, 1, 1, 1]}):
         with pytest.raises(ValueError, match="do not apply to balances with components"):
             project(y, items, target=target, **more)

@@ -242,7 +242,7 @@ def test_project_needs_a_target():
     for given in ({}, {"start": [1.0, 0.0]}):
         with pytest.raises(ValueError, match=r"balance 'E' changes and has no value to keep\. Pass .* target="):
             project([1.0, 0.1], DAMPED, **given)
-    assert abs(project([1.0, 0.1], DAMPED, target=0.5, iterations=5).defect[0]) < 1e-15
+    assert abs(project([1.0, 0.1], DAMPED, target=0.5, iterations=5).residual[0]) < 1e-15
 
 
 def test_what_balances_are_made_of():

@@ -279,7 +279,7 @@ def rest(solver):
     middle = solver.dense_output()(0.5 * (solver.t_old + solver.t))
     rows = stepped(solver)
     counts = solver.nfev, solver.njev, solver.nlu, solver.diagnostics.n_projections, getattr(solver, "seen", 0)
-    return np.concatenate([middle, *rows, [solver.h_abs, *solver.diagnostics.max_defect, *counts]])
+    return np.concatenate([middle, *rows, [solver.h_abs, *solver.diagnostics.max_residual, *counts]])
 
 
 @pytest.mark.parametrize("case", range(len(COPIED)))

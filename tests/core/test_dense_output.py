@@ -45,7 +45,7 @@ CASES = [
 ]
 
 
-def defects(y):
+def residuals(y):
     """Return invariant errors of states (4, m)."""
     y = np.asarray(y).reshape(4, -1)
     return np.abs(np.array([energy(0, y), momentum(0, y)]) - I0[:, None])
@@ -101,7 +101,7 @@ def test_on_the_level_between_the_ends(method, variant):
             found = np.array([item.fun(t, piece(t)) for item in items])
             np.testing.assert_allclose(found, level, rtol=0, atol=2e-13 * (1 + np.abs(level).max(initial=0.0)))
     if not items and np.isrealobj(sol.y):  # the test above is able to fail
-        assert defects(sol.sol(np.linspace(*sol.t[[0, -1]], 500))).max() > 1e-5 * (method is not EIPDOP853)
+        assert residuals(sol.sol(np.linspace(*sol.t[[0, -1]], 500))).max() > 1e-5 * (method is not EIPDOP853)
 
 
 @pytest.mark.parametrize(("method", "variant"), CASES)
@@ -228,7 +228,7 @@ def test_adversarial_thresholds(method, kind, rtol):
     np.testing.assert_array_equal(found.y, sol.y)
     assert sum(len(t) > 0 for t in found.t_events) >= 57
     # The steps' own level: what they have left of the invariants (unprojected ones, of every k-th, included).
-    level = defects(sol.y).max()
+    level = residuals(sol.y).max()
     assert level <= 1e-7 or rtol != 1e-4 or "every" in options
     for (i, value), t, y in zip(cases, found.t_events, found.y_events, strict=True):
         signs = np.sign(sol.y[i] - value)
@@ -236,7 +236,7 @@ def test_adversarial_thresholds(method, kind, rtol):
         y = y.reshape(-1, 4)
         # The correction itself carries round-off: residuals of eps, divided by gradients that are nearly dependent.
         assert np.abs(y[:, i] - value).max(initial=0.0) <= 1e-11
-        assert defects(y.T).max(initial=0.0) <= max(level, 1e-14) * (1 + 1e-3) + 4e-15
+        assert residuals(y.T).max(initial=0.0) <= max(level, 1e-14) * (1 + 1e-3) + 4e-15
         assert (np.diff(t) * np.sign(sol.t[-1] - sol.t[0]) >= 0).all()
 
 
@@ -254,7 +254,7 @@ def test_thresholds_as_terminal_events(method):
             assert found.t[-1] == found.t_events[0][-1]
             np.testing.assert_array_equal(found.y[:, -1], found.y_events[0][-1])
             assert abs(found.y[i, -1] - value) <= 1e-13
-            assert defects(found.y[:, -1]).max() <= 1e-7
+            assert residuals(found.y[:, -1]).max() <= 1e-7
 
 
 @pytest.mark.parametrize("method", [*PAIRS, *OWN.values()], ids=lambda m: m.__name__)
@@ -285,13 +285,17 @@ def test_an_invariant_as_an_event(method):
 def test_frame_and_blocks(method):
     """Planets: samples keep energy and angular momentum, and the frame's linear invariants to round-off."""
     problem = solar_system()
-    options = {"invariants": problem.invariants, "blocks": problem.blocks, "frame": problem.frame}
+    options = {
+        "invariants": problem.invariants,
+        "blocks": problem.blocks,
+        "linear_invariants": problem.linear_invariants,
+    }
     options |= {"fun": problem.fun, "y0": problem.y0, "t_span": (0.0, 0.3), "rtol": 1e-7, "atol": 1e-10}
     sol = solve(method, dense_output=True, **options)
     assert sol.status == 0
     np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
     y = sol.sol(np.linspace(0.0, 0.3, 301))
-    C = np.atleast_2d(problem.frame[0])
+    C = np.atleast_2d(problem.linear_invariants[0])
     between, at_steps = (np.abs(C @ (states - problem.y0[:, None])).max() for states in (y, sol.y))
     assert between <= max(at_steps + 1e-13 * np.abs(C).sum(axis=1).max(), 1e-12)
     for item in problem.invariants:

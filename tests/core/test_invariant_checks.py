@@ -40,7 +40,7 @@ def test_a_function_stands_for_its_invariant_everywhere():
         np.testing.assert_array_equal(run.y[:, -1], wanted)
     np.testing.assert_array_equal(ensemble(oscillator, span, [y0], invariants=given, **fixed).y[0], wanted)
     assert recommend(oscillator, span, y0, invariants=given).options["invariants"]
-    assert project([0.6, 0.81], given, target=[1.0], iterations=5).defect == pytest.approx(0, abs=1e-15)
+    assert project([0.6, 0.81], given, target=[1.0], iterations=5).residual == pytest.approx(0, abs=1e-15)
 
     def scaled(t, y, k):
         return k * (y @ y)

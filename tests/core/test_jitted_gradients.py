@@ -151,7 +151,7 @@ def test_the_run_is_compiled_and_its_bits_are_those_of_the_interpreted_one():
     assert result.compiled
     assert result.calls["gradient of H"] == result.calls["gradient of L"] == "jitted"
     assert BOTH[0].grad is None  # the invariant of the user is left as it was
-    assert np.max(result.max_defect) < 1e-11
+    assert np.max(result.max_residual) < 1e-11
     np.testing.assert_array_equal(result.y, interpreted.y)
 
 

@@ -79,7 +79,7 @@ def test_order_of_the_solution_without_blocks(method, end):
 ORBIT = kepler(eccentricity=0.2)
 STATES = integrate(ORBIT, (0, 6.2), method=EIPRK5, h=0.002, t_eval=np.linspace(0.1, 6.1, 24), compiled=False).y.T
 QUADRATIC_STEPS = {1: 0.01, 2: 0.05, 3: 0.1, 4: 0.2, 5: 0.3}
-DEFECT_STEPS = {(1, 1): 0.02, (2, 1): 0.05, (3, 1): 0.075, (4, 1): 0.19, (1, 2): 0.045, (2, 2): 0.14}
+RESIDUAL_STEPS = {(1, 1): 0.02, (2, 1): 0.05, (3, 1): 0.075, (4, 1): 0.19, (1, 2): 0.045, (2, 2): 0.14}
 
 
 def one_step(y, method, h, options):
@@ -115,7 +115,7 @@ def rms(values):
 
 @pytest.mark.parametrize("options", ["error", "error-old", "euclidean", "weights"])
 @pytest.mark.parametrize("method", METHODS)
-def test_defects_are_the_quadratic_term_of_the_correction(method, options):
+def test_residuals_are_the_quadratic_term_of_the_correction(method, options):
     """One Newton step leaves x H x / 2, where x is the correction."""
     left, quadratic = [], []
     for y in STATES:
@@ -125,15 +125,15 @@ def test_defects_are_the_quadratic_term_of_the_correction(method, options):
     assert (np.abs(np.subtract(left, quadratic)).max(axis=0) < 5e-4 * rms(quadratic)).all()
 
 
-def mean_defects(method, h, options):
+def mean_residuals(method, h, options):
     """Return rms residuals of H and L, each the geometric mean of steps h and -h, which has even powers of h only."""
     both = [[invariants(one_step(y, method, s, options)[1]) - invariants(y) for y in STATES] for s in (h, -h)]
     return rms(np.sqrt(np.abs(both[0]) * np.abs(both[1])))
 
 
-@pytest.mark.parametrize(("p", "iterations"), DEFECT_STEPS.keys())
-def test_order_of_the_defects(p, iterations):
+@pytest.mark.parametrize(("p", "iterations"), RESIDUAL_STEPS.keys())
+def test_order_of_the_residuals(p, iterations):
     """2^k (p + 1) with k Newton steps; RK5's lie below round-off wherever h^12 is their largest term."""
-    steps = DEFECT_STEPS[p, iterations] * np.array([1.0, 0.8])
-    defects = [mean_defects(METHODS[p - 1], h, {**EUCLIDEAN, "iterations": iterations}) for h in steps]
-    assert observed_order(defects, steps)[0] == pytest.approx(2**iterations * (p + 1), abs=TOLERANCE)
+    steps = RESIDUAL_STEPS[p, iterations] * np.array([1.0, 0.8])
+    residuals = [mean_residuals(METHODS[p - 1], h, {**EUCLIDEAN, "iterations": iterations}) for h in steps]
+    assert observed_order(residuals, steps)[0] == pytest.approx(2**iterations * (p + 1), abs=TOLERANCE)

@@ -72,7 +72,7 @@ def test_powers_of_two_in_the_invariants_change_no_bit(seed, size, iterations, d
     plain = project(q.y_hat, q.invariant(), iterations=iterations)
     scaled = project(q.y_hat, q.invariant(2.0 ** np.array(exponents)), iterations=iterations)
     np.testing.assert_array_equal(scaled.y, plain.y)
-    np.testing.assert_array_equal(scaled.defect, plain.defect * 2.0 ** np.array(exponents))
+    np.testing.assert_array_equal(scaled.residual, plain.residual * 2.0 ** np.array(exponents))
     assert scaled.rank == plain.rank
 
 
@@ -126,7 +126,7 @@ def test_least_norm_in_the_metric_and_neutral_to_the_frame(seed, n, rows, k):
     assume(np.linalg.cond(A / np.linalg.norm(A, axis=1, keepdims=True)) < 1e3)
     x = np.linalg.pinv(A) @ (target - G @ y_hat)
     linear = Invariant(lambda t, y: G @ y, lambda t, y: G, target=target)
-    result = project(y_hat, linear, sigma=sigma, frame=(C, S) if k else None)
+    result = project(y_hat, linear, sigma=sigma, linear_invariants=(C, S) if k else None)
     move = P @ (sigma / sigma.max() * x * sigma.max())
     np.testing.assert_allclose(result.correction, move, rtol=0, atol=1e-10 * np.abs(move).max())
     assert result.rank == rows
@@ -166,7 +166,7 @@ def test_nearly_parallel_rows(angle):
             A = mpmath.matrix(G.tolist())
             wanted = A.T * mpmath.lu_solve(A * A.T, mpmath.matrix((G @ shift).tolist()))
         np.testing.assert_allclose(result.correction, np.array(wanted, float), rtol=0, atol=20 * EPS / angle)
-        np.testing.assert_allclose(result.defect, 0.0, atol=40 * EPS)
+        np.testing.assert_allclose(result.residual, 0.0, atol=40 * EPS)
 
 
 @given(seeds, sizes, st.sampled_from([1e-2, 1e-3, 1e-4]))
@@ -264,7 +264,7 @@ def test_complex_frame(seed, n):
     rows = np.conj(q.grad(0.0, q.y_hat)) @ (np.eye(n) - S @ C / (C @ S)[0, 0])
     assume(np.linalg.cond(rows.view(float) / np.linalg.norm(rows, axis=1, keepdims=True)) < 20)
     kept = Invariant(q.value, q.grad, target=q.target)
-    assert abs(C @ project(q.y_hat, kept, frame=(C, S), iterations=5).correction) < 1e-13
+    assert abs(C @ project(q.y_hat, kept, linear_invariants=(C, S), iterations=5).correction) < 1e-13
     assert abs(C @ project(q.y_hat, kept, iterations=5).correction) > 1e-9
 
 
@@ -294,7 +294,7 @@ def n_body_run(gm, q, v, steps=5, h=0.2, **options):
 def test_rotation_of_n_bodies(seed, metric, framed):
     gm, q, v = three_bodies(seed)
     turn = Rotation.random(random_state=np.random.default_rng(seed + 1)).as_matrix()
-    options = {"metric": metric, "atol": 0.0} | ({} if framed else {"frame": None})
+    options = {"metric": metric, "atol": 0.0} | ({} if framed else {"linear_invariants": None})
     run = n_body_run(gm, q, v, **options)
     turned = n_body_run(gm, q @ turn.T, v @ turn.T, **options)
     assert run.status == turned.status == 0
@@ -401,7 +401,7 @@ def test_given_weights_and_components_without_error():
     keep = Invariant(lambda t, y: y[0] + y[1], lambda t, y: np.ones(2))
     options |= {"invariants": keep, "check": False}
     run = integrate(lambda t, y: np.array([np.sin(5 * y[0]), 0.0]), (0, 0.5), [1.0, 1.0], **options)
-    assert run.max_defect[0] <= 4 * EPS
+    assert run.max_residual[0] <= 4 * EPS
     assert abs(run.y[1, -1] - 1.0) < 1e-12
 
 

@@ -232,7 +232,7 @@ def test_integrate_takes_the_steps_of_the_class(case, compiled):
         assert (run.status, run.nfev, run.njev, run.nlu) == (sol.status, sol.nfev, sol.njev, sol.nlu)
         np.testing.assert_array_equal(run.t, sol.t)
         np.testing.assert_array_equal(run.y, sol.y)
-        np.testing.assert_array_equal(run.max_defect, d.max_defect)
+        np.testing.assert_array_equal(run.max_residual, d.max_residual)
         assert repr(run.diagnostics) == repr(d)
         assert run.h is None
 

@@ -47,15 +47,15 @@ def test_the_last_direction_is_left_out(slope, bend):
     result = project([1e-3, 0.0, 0.0], [place(0), nearly])
     assert result.rank == 1
     np.testing.assert_allclose(result.y, 0.0, atol=1e-18)
-    np.testing.assert_allclose(result.defect, [0.0, 0.5e-3], atol=1e-18)
+    np.testing.assert_allclose(result.residual, [0.0, 0.5e-3], atol=1e-18)
     three = project([1e-3, 0.0, 2e-3], [place(0), nearly, place(2)])
     assert three.rank == 2
     np.testing.assert_allclose(three.y, 0.0, atol=1e-18)
 
 
 @pytest.mark.filterwarnings("ignore:the projection left:eip_scipy.ProjectionWarning")
-def test_what_is_left_may_not_exceed_the_defects_of_all():
-    """Defects of 1.0e-3 and 1.5e-3: the second may become 5.0e-3, twice their sum. It is 0.5e-3 + rise 1e-6."""
+def test_what_is_left_may_not_exceed_the_residuals_of_all():
+    """Residuals of 1.0e-3 and 1.5e-3: the second may become 5.0e-3, twice their sum. It is 0.5e-3 + rise 1e-6."""
 
     def nearly(rise):
         return Invariant(
@@ -90,7 +90,7 @@ def test_a_circular_orbit_is_followed_with_other_options_too(method, options):
     run = integrate(problem, (0, 20), method=method, **({"blocks": 1} if "compensated" in options else {}), **options)
     assert (run.status, run.trusted) == (0, True)
     assert np.abs(run.y[:, -1] - problem.reference(20.0)).max() < 5e-3
-    assert (run.max_defect < 2e-6).all()
+    assert (run.max_residual < 2e-6).all()
 
 
 @pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])

@@ -72,7 +72,7 @@ def spoilt(a):
 
 
 CASES = {
-    "kepler": {"h": 0.1, "invariants": H, "blocks": [[0, 1]], "frame": (np.eye(4)[2:], np.eye(4)[:, 2:])},
+    "kepler": {"h": 0.1, "invariants": H, "blocks": [[0, 1]], "linear_invariants": (np.eye(4)[2:], np.eye(4)[:, 2:])},
     "nystrom": {"h": 0.1, "invariants": H, "method": EIPRKN12},
     "adaptive": {"rtol": 1e-3, "invariants": H, "method": EIPDOP853},
     "complex": {"h": 0.1, "dtype": complex, "invariants": SPIN_NORM},
@@ -224,9 +224,9 @@ RUNS = """
             fun = {"acceleration": lambda t, q: -q / np.hypot(*q) ** 3}
         more = {"invariants": problem.invariants} if given["method"] is not EIPRKN12 else {}
         run = integrate(**fun, t_span=(0, 20), y0=problem.y0, **given, **more)
-        seen.update(run.y.tobytes() + run.max_defect.tobytes())
+        seen.update(run.y.tobytes() + run.max_residual.tobytes())
     run = integrate(bodies, (0, 2.0), method=EIPRK4, compiled=False, h=0.01)
-    seen.update(run.y.tobytes() + run.max_defect.tobytes())
+    seen.update(run.y.tobytes() + run.max_residual.tobytes())
     print(BUILD.__name__.rpartition(".")[2], seen.hexdigest())
 """
 

@@ -92,8 +92,8 @@ OPTIONS = [
     {"direction": "midpoint"},
     {"iterations": 3},
     {"direction": "midpoint", "iterations": 2, "blocks": [[0, 1, 2], [3, 4, 5]]},
-    {"frame": FRAME},
-    {"frame": FRAME, "blocks": [[0, 1, 2], [3, 4, 5]], "iterations": 2},
+    {"linear_invariants": FRAME},
+    {"linear_invariants": FRAME, "blocks": [[0, 1, 2], [3, 4, 5]], "iterations": 2},
 ]
 
 
@@ -105,7 +105,7 @@ def test_a_step_is_that_of_the_method(options):
         moved = np.abs(expected - Y0).max()
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16, err_msg=cls.__name__)
         if options.get("iterations", 1) > 2:
-            assert np.abs(step.defects(length(cls), found)).max() <= 1e-15
+            assert np.abs(step.residuals(length(cls), found)).max() <= 1e-15
 
 
 @pytest.mark.parametrize("options", [{}, {"blocks": [[0, 3], [1, 4], [2, 5]]}, {"blocks": 3}, {"atol": 0.0}])

@@ -45,7 +45,7 @@ def same_members(run, single):
         assert run.t[k] == own.t[-1]
         assert run.status[k] == own.status
         assert run.message[k] == own.message
-        np.testing.assert_array_equal(run.max_defect[k], own.max_defect)
+        np.testing.assert_array_equal(run.max_residual[k], own.max_residual)
         np.testing.assert_array_equal(run.max_correction[k], own.diagnostics.max_correction)
         assert (run.nfev[k], run.njev[k], run.nlu[k]) == (own.nfev, own.njev, own.nlu)
         if run.trajectories is not None:

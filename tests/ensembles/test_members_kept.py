@@ -118,7 +118,7 @@ def seen(run):
     """Return numbers from all fields of a result that do not need the run itself."""
     counts = [run.nfev, run.njev, run.nlu, run.status, run.success, run.trusted, run.t.size]
     events = [] if run.t_events is None else [t.size for t in run.t_events] + [t.sum() for t in run.t_events]
-    sums = [run.t.sum(), *run.y.sum(axis=1), *run.invariants.sum(axis=1), *run.target, *run.max_defect]
+    sums = [run.t.sum(), *run.y.sum(axis=1), *run.invariants.sum(axis=1), *run.target, *run.max_residual]
     return np.array([*counts, *events, *sums, run.t[-1], *run.y[:, -1], *run.y.max(axis=1), len(run.message)])
 
 
@@ -227,7 +227,7 @@ def test_a_figure_of_members_in_time(tmp_path):
     np.testing.assert_allclose(fans[0].lines[0].get_ydata(), median, rtol=1e-15)
     assert [line.get_label() for line in errors.lines] == ["H", "L", "failed"]
     ran = np.arange(len(STARTS)) != FAILING
-    np.testing.assert_array_equal(errors.lines[0].get_ydata(), run.max_defect[ran, 0])
+    np.testing.assert_array_equal(errors.lines[0].get_ydata(), run.max_residual[ran, 0])
     np.testing.assert_array_equal(errors.lines[-1].get_xdata(), [FAILING])
     ends = dict(zip([label.get_text() for label in counts.get_yticklabels()], counts.patches, strict=True))
     assert {name: bar.get_width() for name, bar in ends.items()} == {"reached the end": 20, "failed": 1}

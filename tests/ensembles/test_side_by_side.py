@@ -22,7 +22,7 @@ from eip_scipy.ensembles import tasks
 from eip_scipy.problems import harmonic, kepler, solar_system
 from eip_scipy.problems.gravity.nbody import nbody
 
-FIELDS = ("y", "max_defect", "nfev", "njev", "nlu")
+FIELDS = ("y", "max_residual", "nfev", "njev", "nlu")
 
 
 def spread_starts(y0, members, size=1e-3, seed=0):
@@ -46,7 +46,7 @@ def check_bits(problem, t_span, starts, *, params=None, members=None, **options)
         assert run.t[k] == single.t[-1]
         if saved and single.success:
             np.testing.assert_array_equal(run.trajectories[k], single.y)
-        np.testing.assert_array_equal(run.max_defect[k], single.max_defect)
+        np.testing.assert_array_equal(run.max_residual[k], single.max_residual)
         assert [run[name][k] for name in FIELDS[2:]] == [single[name] for name in FIELDS[2:]]
         np.testing.assert_array_equal(run.max_correction[k], single.diagnostics.max_correction)
     return run
@@ -70,7 +70,7 @@ def test_members_get_the_bits_of_single_runs(method):
         {"blocks": None},
         {"invariants": ()},
         {"save_every": 7},
-        {"frame": (np.array([[1.0, 0, 0, 0.5]]), np.array([[1.0], [0], [0], [0]]))},
+        {"linear_invariants": (np.array([[1.0, 0, 0, 0.5]]), np.array([[1.0], [0], [0], [0]]))},
     ],
     ids=lambda options: next(iter(options)) + "-" + type(next(iter(options.values()))).__name__,
 )

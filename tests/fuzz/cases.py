@@ -337,8 +337,8 @@ def _projection(rng: np.random.Generator, system: System, size: Array, has_estim
         divisors = [b for b in range(1, n + 1) if n % b == 0]
         lists = np.array_split(rng.permutation(n), rng.integers(1, n + 1))
         found["blocks"] = lists[1:] or lists if rng.random() < 0.5 else int(rng.choice(divisors))
-    if system.frame is not None and rng.random() < 0.4:
-        found["frame"] = system.frame
+    if system.linear_invariants is not None and rng.random() < 0.4:
+        found["linear_invariants"] = system.linear_invariants
     if rng.random() < 0.3:
         found["direction"] = str(rng.choice(["old", "midpoint"]))
     every = [2, 3, 10, "auto" if has_estimate else 5]

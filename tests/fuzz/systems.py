@@ -153,7 +153,7 @@ def finite(runs: Runs) -> Iterator[str]:
     for name, run in (("saved", runs.whole), ("sampled", runs.sampled), ("solve_ivp", runs.scipy)):
         if not run.success:
             continue
-        for part in ("t", "y", "invariants", "max_defect"):
+        for part in ("t", "y", "invariants", "max_residual"):
             if part in run and not np.isfinite(run[part]).all():
                 yield f"{name}: success, and {part} holds {run[part][~np.isfinite(run[part])][:3]}"
         t0, end = runs.case.t_span
@@ -190,15 +190,15 @@ def survives(runs: Runs) -> Iterator[str]:
 
 
 def kept(runs: Runs) -> Iterator[str]:
-    """Check that the invariants of saved states agree with `max_defect`."""
+    """Check that the invariants of saved states agree with `max_residual`."""
     run, case = runs.whole, runs.case
-    if not run.success or not run.max_defect.size or case.compensated:
+    if not run.success or not run.max_residual.size or case.compensated:
         return
     target = run.invariants[:, 0]
     off = np.abs(run.invariants[:, 1:] - target[:, None]).max(axis=1, initial=0.0)
     rounding = 1e-15 * np.abs(run.invariants).max(axis=1)
-    if not (off <= run.max_defect + rounding).all() and run.status == 0:
-        yield f"saved states are off by {off}, max_defect says {run.max_defect}"
+    if not (off <= run.max_residual + rounding).all() and run.status == 0:
+        yield f"saved states are off by {off}, max_residual says {run.max_residual}"
 
 
 def quiet(runs: Runs) -> Iterator[str]:
@@ -297,7 +297,7 @@ def resumed(runs: Runs, *, compiled: bool = False) -> Iterator[str]:
         yield f"broken off {broken} times, {run.message!r}: {text}"
 
 
-BITS = ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "trusted", "h")
+BITS = ("t", "y", "invariants", "max_residual", "status", "nfev", "njev", "nlu", "success", "trusted", "h")
 COUNTS = ("n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections", "max_correction")
 
 
@@ -311,7 +311,7 @@ def _at_a_row(runs: Runs) -> dict[str, Any]:
     """Return options that stop the run at a saved state."""
     left = int(runs.rng.integers(runs.whole.t.size + 1))
 
-    def stop(t: float, y: np.ndarray, defects: np.ndarray) -> None:
+    def stop(t: float, y: np.ndarray, residuals: np.ndarray) -> None:
         nonlocal left
         left -= 1
         if left < 0:

@@ -96,7 +96,7 @@ def test_invariants_reference_and_order(make, form):
     runs = [integrate(problem, (0.0, t), method=EIPRK4, h=problem.h / n) for n in (2, 4)]
     errors = [np.linalg.norm(run.y[:, -1] - truth) for run in runs]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.25)
-    assert max((run.max_defect / np.abs(run.invariants[:, 0])).max() for run in runs) < 1e-10
+    assert max((run.max_residual / np.abs(run.invariants[:, 0])).max() for run in runs) < 1e-10
 
 
 @pytest.mark.slow
@@ -180,7 +180,7 @@ def test_own_field(name, truth):
     assert run.compiled == (name != "plain" and not config.DISABLE_JIT)
     assert run.success
     assert len(run.invariants) == len(kept)
-    assert run.max_defect.max(initial=0.0) < 1e-11
+    assert run.max_residual.max(initial=0.0) < 1e-11
     np.testing.assert_allclose(end, truth, rtol=0, atol=2e-9)
     points = np.array(POINTS).T
     np.testing.assert_allclose(field.along("B", points), np.array([mirror_b(*p) for p in POINTS]).T, rtol=1e-9)
@@ -242,7 +242,7 @@ def test_compiled_functions_may_return_integers_and_arrays(form):
     jitted = replace(field, potential=njit(field.potential))
     problem = charged_particle(jitted, [1, 0, 0], [0.1, 0, 0.2], form=form, t_span=(0, 20), h=0.05)
     run = integrate(problem, method=EIPRK4, compiled=True)
-    assert run.max_defect.max() < 1e-13
+    assert run.max_residual.max() < 1e-13
     plain = charged_particle(field, [1, 0, 0], [0.1, 0, 0.2], form=form, t_span=(0, 20), h=0.05)
     np.testing.assert_allclose(integrate(plain, method=EIPRK4).y[:, -1], run.y[:, -1], atol=1e-13)
     out = np.empty(6)

@@ -206,7 +206,7 @@ def test_the_energy_that_comes_with_the_accelerations_has_the_bits_of_the_energy
     expected = integrate(replace(problem, invariants=(alone, problem.invariants[1])), **options)
     assert found.diagnostics.n_projections > 0
     np.testing.assert_array_equal(found.y, expected.y)
-    np.testing.assert_array_equal(found.diagnostics.max_defect, expected.diagnostics.max_defect)
+    np.testing.assert_array_equal(found.diagnostics.max_residual, expected.diagnostics.max_residual)
 
 
 @pytest.mark.usefixtures("in_vectors")

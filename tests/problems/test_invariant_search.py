@@ -292,7 +292,7 @@ def test_they_serve_a_run_and_can_be_pickled():
     found = find_invariants(forced(lambda t, q: K @ q), start)
     run = integrate(forced(lambda t, q: K @ q), (0, 20), start, method=EIPRK4, h=0.05, invariants=found)
     assert run.trusted
-    assert (run.max_defect < 1e-13).all()
+    assert (run.max_residual < 1e-13).all()
     for item in found + find_invariants(kepler, PLANET, terms=ELLIPSE[:1]):
         again = pickle.loads(pickle.dumps(item))
         assert (again.name, again.fun(0.0, y)) == (item.name, item.fun(0.0, y))

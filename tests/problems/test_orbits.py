@@ -376,7 +376,7 @@ def test_rates_of_the_same_pass_and_of_a_pass_of_their_own_have_the_same_bits(n)
             gm, q, v = planets(n, heaviest)
             y0 = np.concatenate([q, v], axis=None)
             items = orbital_balances(gm, y0, ALL if n < 6 else "kepler", newton=True)
-            options = {"t_span": (0.0, 40 * h), "h": h, "y0": y0, "method": method, "frame": None}
+            options = {"t_span": (0.0, 40 * h), "h": h, "y0": y0, "method": method, "linear_invariants": None}
             acc = library["gravity.acc"]
             fused = integrate(acceleration=acc, params=gm, invariants=items, **options)
             items = [in_python(item) for item in items]
@@ -398,10 +398,10 @@ def test_other_orders_of_bodies_and_of_directions_change_nothing(quantities):
     runs = [integrate(item, method=EIPDOP853).y[:, -1].reshape(2, 10, 3) for item in (problem, moved)]
     np.testing.assert_allclose(runs[0][:, order], runs[1], rtol=0, atol=2e-12)
     items = orbital_balances(problem.params, problem.y0, quantities, newton=True)
-    together = integrate(problem, (0, 2), method=EIPDOP853, invariants=items, frame=None)
+    together = integrate(problem, (0, 2), method=EIPDOP853, invariants=items, linear_invariants=None)
     for item in items:  # directions in another order, of which no three are those of a body
         item.subspaces = tuple((components[::-1], weights[::-1]) for components, weights in item.subspaces)
-    alone = integrate(problem, (0, 2), method=EIPDOP853, invariants=items, frame=None)
+    alone = integrate(problem, (0, 2), method=EIPDOP853, invariants=items, linear_invariants=None)
     np.testing.assert_allclose(together.y, alone.y, rtol=0, atol=4e-15)
 
 
@@ -411,11 +411,11 @@ def test_a_frame_does_what_neutral_directions_do():
     neutral = orbital_balances(problem.params, problem.y0, newton=True)
     for items, count in ((problem.invariants, 1), (neutral, 10)):
         assert [len(components[0]) for components, _ in items[0].subspaces] == [count] * 9
-    choices = {}, {"invariants": neutral, "frame": None}, {"invariants": neutral}
+    choices = {}, {"invariants": neutral, "linear_invariants": None}, {"invariants": neutral}
     runs = [integrate(problem, method=EIPDOP853, **options) for options in choices]
     for run in runs:
-        moved = problem.frame[0] @ (run.y[:, -1] - run.y[:, 0])
-        np.testing.assert_allclose(moved[:3], 12 * (problem.frame[0] @ problem.y0)[3:], rtol=0, atol=2e-16)
+        moved = problem.linear_invariants[0] @ (run.y[:, -1] - run.y[:, 0])
+        np.testing.assert_allclose(moved[:3], 12 * (problem.linear_invariants[0] @ problem.y0)[3:], rtol=0, atol=2e-16)
         np.testing.assert_allclose(run.y[:30, -1], runs[0].y[:30, -1], rtol=0, atol=1e-13)
     run = runs[0]
     assert tuple(run.diagnostics.names[:2]) == ("energy of Mercury", "energy of Venus")

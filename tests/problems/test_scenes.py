@@ -130,7 +130,7 @@ def test_comet_passes_jupiter_and_is_thrown_out():
     assert axes[0] == pytest.approx(3.17, abs=0.01)
     assert axes[1] == pytest.approx(502, abs=1)
     assert distance(problem, run.y[:, -1], 20.0) < 1e-7
-    centre = problem.frame[0] @ problem.y0
+    centre = problem.linear_invariants[0] @ problem.y0
     assert np.abs(centre).max() < 1e-15
 
 

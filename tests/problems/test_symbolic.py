@@ -274,7 +274,7 @@ def test_runs_are_those_of_scipy_and_forces_are_gradients(make, y0, end):
     expected = solve_ivp(problem.fun, (0, end), y0, method="DOP853", rtol=1e-12, atol=1e-12)
     assert run.y[:, -1] == pytest.approx(expected.y[:, -1], abs=1e-8)
     assert run.trusted
-    assert run.max_defect[0] < 1e-12
+    assert run.max_residual[0] < 1e-12
 
 
 def test_rigid_body_by_its_poisson_matrix():
@@ -287,7 +287,7 @@ def test_rigid_body_by_its_poisson_matrix():
     y0 = np.array([1.0, 0.2, 0.3])
     assert values(problem, y0) == pytest.approx(values(euler, y0), rel=1e-14)
     assert dict(euler.checks) == {"H": "symbolically", "C": "symbolically"}
-    assert (integrate(problem, (0, 20), y0, **ADAPTIVE).max_defect < 1e-13).all()
+    assert (integrate(problem, (0, 20), y0, **ADAPTIVE).max_residual < 1e-13).all()
 
 
 def test_h_that_depends_on_time():
@@ -301,7 +301,7 @@ def test_h_that_depends_on_time():
     for problem in (plain, extended):
         run = integrate(problem, (0, 3), np.zeros(len(problem.component_names)), **ADAPTIVE)
         assert run.y[0, -1] == pytest.approx((math.cos(3) - math.cos(6)) / 3, abs=1e-9)
-        assert run.max_defect.max(initial=0) < 1e-14
+        assert run.max_residual.max(initial=0) < 1e-14
     assert run.trusted
 
 
@@ -310,7 +310,7 @@ def test_invariants_of_time():
     problem = equations(["v", "0"], "x v", invariants={"start": "x - v*t"})
     run = integrate(problem, (1, 3), [0.5, 2.0], method=EIPRK4, h=0.1)
     assert run.y[:, -1] == pytest.approx([4.5, 2.0])
-    assert run.max_defect[0] < 1e-14
+    assert run.max_residual[0] < 1e-14
 
 
 # How invariants are known. The last: also next to q = 2 and q = -2.

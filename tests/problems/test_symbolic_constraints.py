@@ -40,7 +40,7 @@ def test_constraints_hold_where_all_of_them_do(pendulum):
 def test_a_run_keeps_them(pendulum):
     found = integrate(pendulum, (0, 5), [0.6, -0.8, 0.8, 0.6], method=EIPDOP853, rtol=1e-6, atol=1e-6)
     assert found.trusted
-    assert found.max_defect.max() < 1e-11
+    assert found.max_residual.max() < 1e-11
     with pytest.raises(ValueError, match=r"violates invariant 'length' by 0\.21"):
         integrate(pendulum, (0, 5), [1.1, 0, 0, 0], method=EIPDOP853, rtol=1e-6, atol=1e-6)
 

@@ -168,7 +168,7 @@ def test_c_functions(library):
 def test_a_resumed_run_has_the_same_bits(tmp_path, stopped, options):
     balance, file = BALANCES["gradient" if "every" in options else "rate"], tmp_path / "run.npz"
     seen = []
-    whole = run(balance, save_every=4, callback=lambda t, y, defects: seen.append(defects), **options)
+    whole = run(balance, save_every=4, callback=lambda t, y, residuals: seen.append(residuals), **options)
     assert np.isnan(seen).all()  # the value that is kept changes
     with stopped(9):
         run(balance, save_every=4, checkpoint=file, **options)
@@ -243,7 +243,7 @@ def test_members_of_ensembles_are_single_runs(options):
     for k, start in enumerate(starts):
         single = integrate(swinging, (0, 20), start, **given)
         np.testing.assert_array_equal(members.trajectories[k], single.y)
-        np.testing.assert_array_equal(members.max_defect[k], single.max_defect)
+        np.testing.assert_array_equal(members.max_residual[k], single.max_residual)
     assert members.trusted.all()
     assert np.isnan(members.target).all()
     assert "the runs have balances" in str(members)

@@ -103,7 +103,7 @@ def test_a_result_is_there_at_once(tmp_path):
     options = {"checkpoint": path, "fun": counted}
     whole = run(**options)
     before, content = next(calls), path.read_bytes()
-    again = run(resume=True, callback=lambda t, y, defects: seen.append(t), **options)
+    again = run(resume=True, callback=lambda t, y, residuals: seen.append(t), **options)
     same(whole, again)
     assert next(calls) - before < 20
     assert seen == []
@@ -179,7 +179,7 @@ OTHERS = {
     "invariants": [H],
     "metric": "euclidean",
     "blocks": 2,
-    "frame": FRAME,
+    "linear_invariants": FRAME,
 }
 OTHERS |= {"direction": "midpoint", "iterations": 2, "every": 2, "reuse_f": False, "compensated": True, "save_every": 8}
 OTHERS |= {"events": crossing, "y0": pericentre(0.5), "t_span": (0, 7)}

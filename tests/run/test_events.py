@@ -196,7 +196,7 @@ def test_counts_go_on_from_a_checkpoint_of_a_continued_run(tmp_path):
     first = integrate(oscillator, (0, times[1] + 0.1), START, method=EIPDOP853, h=0.1, events=event)
     path, stopped = tmp_path / "run", []
 
-    def stop(t, y, defects):
+    def stop(t, y, residuals):
         if t > times[3] + 0.1 and not stopped:
             stopped.append(t)
             raise RuntimeError("broken off")

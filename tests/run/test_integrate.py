@@ -82,14 +82,14 @@ def test_an_autonomous_system_does_not_see_the_time(method, how):
 def test_fields():
     result = run(invariants=[SQUARE, PAIR], save_every=2)
     assert isinstance(result, IntegrationResult)
-    assert [result[name].shape for name in ("t", "y", "invariants", "max_defect")] == [(6,), (2, 6), (3, 6), (3,)]
+    assert [result[name].shape for name in ("t", "y", "invariants", "max_residual")] == [(6,), (2, 6), (3, 6), (3,)]
     np.testing.assert_array_equal(result.invariants[0], (result.y**2).sum(axis=0))
     assert (result.status, result.success, result.method, result.h) == (0, True, "EIPRK4", 0.1)
     assert "end of the interval" in result.message
     assert result.t_events is result.y_events is None
     assert 0 < result.wall_time < 10
     none = run(save_every=1)
-    assert (none.invariants.shape, none.max_defect.shape, none.njev, none.nlu) == ((0, 11), (0,), 0, 0)
+    assert (none.invariants.shape, none.max_residual.shape, none.njev, none.nlu) == ((0, 11), (0,), 0, 0)
     assert none.diagnostics.names == ()
 
 
@@ -116,9 +116,9 @@ def test_t_eval_meets_both_ends_exactly(t_span):
 def test_callback_sees_the_saved_points():
     seen = []
 
-    def callback(t, y, defects):
-        seen.append((t, y.copy(), defects.copy()))
-        y[:], defects[:] = 1e9, 1e9  # cannot spoil the run
+    def callback(t, y, residuals):
+        seen.append((t, y.copy(), residuals.copy()))
+        y[:], residuals[:] = 1e9, 1e9  # cannot spoil the run
 
     result = run(save_every=3, invariants=SQUARE, callback=callback)
     assert [t for t, _, _ in seen] == result.t.tolist()
@@ -134,7 +134,7 @@ def test_callback_stops_the_run(options):
     """The last point is the one at which the callback stopped the run."""
     seen = []
 
-    def callback(t, y, defects):
+    def callback(t, y, residuals):
         seen.append(t)
         return np.bool_(t >= 0.35)
 
@@ -144,21 +144,21 @@ def test_callback_stops_the_run(options):
     assert result.message.startswith("stopped by the callback")
     assert result.t.tolist() == seen
     assert seen[-1] < 0.5
-    assert run(callback=lambda t, y, defects: True).t.tolist() == [0.0]
+    assert run(callback=lambda t, y, residuals: True).t.tolist() == [0.0]
 
 
 @pytest.mark.parametrize("options", [{"h": 0.01}, {"method": EIPRK45, "h": None, "max_step": 0.01, "rtol": 1e-3}])
 def test_a_callback_at_every_step(options):
     """Also in endless runs, and in runs of more steps than there are doublings of a float's range."""
     seen = []
-    result = run((0, 12), save_every=1, callback=lambda t, y, defects: seen.append(t), invariants=SQUARE, **options)
+    result = run((0, 12), save_every=1, callback=lambda t, y, residuals: seen.append(t), invariants=SQUARE, **options)
     assert result.t.size >= 1200
     assert seen == result.t.tolist()
-    endless = run((0, math.inf), save_every=5, callback=lambda t, y, defects: t > 3, invariants=SQUARE, **options)
+    endless = run((0, math.inf), save_every=5, callback=lambda t, y, residuals: t > 3, invariants=SQUARE, **options)
     assert endless.status == 1
     assert 3 < endless.t[-1] <= 3.06
     np.testing.assert_allclose(endless.y, exact(endless.t), atol=1e-3)
-    stop = {"callback": lambda t, y, defects: t > 3}
+    stop = {"callback": lambda t, y, residuals: t > 3}
     for without in (stop, stop | {"t_eval": [1.0, 2.0]}, {"save_every": 1}):  # it would not be called to the end
         with pytest.raises(ValueError, match=r"t_span must be finite unless .*callback.*save_every"):
             run((0, math.inf), **without)
@@ -189,7 +189,7 @@ def test_options_override_the_problem():
     assert result.diagnostics.names == ("L",)
     plain = integrate(problem, (0, 1), method=EIPRK4, invariants=())
     assert plain.njev == 0
-    assert plain.max_defect.size == 0
+    assert plain.max_residual.size == 0
 
 
 def test_params_override_the_problem_s_everywhere():
@@ -200,12 +200,12 @@ def test_params_override_the_problem_s_everywhere():
     assert stronger.status == 0
     np.testing.assert_allclose(stronger.y, same.y, rtol=0, atol=1e-14)
     np.testing.assert_allclose(stronger.invariants, same.invariants, rtol=0, atol=1e-14)
-    assert (stronger.max_defect < 1e-12).all()
+    assert (stronger.max_residual < 1e-12).all()
 
 
 def test_problem_s_metric_blocks_and_frame_are_used():
     blocks, frame = [[0, 1]], (np.array([[1.0, 0.0]]), np.array([[1.0], [0.0]]))
-    for name, value_of in (("metric", "euclidean"), ("blocks", blocks), ("frame", frame)):
+    for name, value_of in (("metric", "euclidean"), ("blocks", blocks), ("linear_invariants", frame)):
         problem = Problem("p", oscillator, Y0, (0.0, 1.0), invariants=(SQUARE,), h=0.25, **{name: value_of})
         given = run(h=0.25, invariants=SQUARE, **{name: value_of})
         np.testing.assert_array_equal(integrate(problem, method=EIPRK4).y, given.y)
@@ -278,9 +278,9 @@ def test_diagnostics_are_filled():
     assert diagnostics.n_projections == 10
     assert diagnostics.n_rank_reduced == 10
     assert (diagnostics.n_skipped, diagnostics.n_rejected_projections) == (0, 0)
-    np.testing.assert_array_equal(diagnostics.max_defect, result.max_defect)
+    np.testing.assert_array_equal(diagnostics.max_residual, result.max_residual)
     last = np.abs(result.invariants[:, -1] - [5.0, 5.0, 6.0])
-    np.testing.assert_array_equal(diagnostics.last_defect, last)
+    np.testing.assert_array_equal(diagnostics.last_residual, last)
     assert 0 < diagnostics.max_correction < 5
     text = repr(diagnostics)
     assert "10 projections" in text
@@ -290,13 +290,13 @@ def test_diagnostics_are_filled():
     assert math.isnan(Diagnostics().max_correction)
 
 
-def test_max_defect_is_that_of_the_steps():
+def test_max_residual_is_that_of_the_steps():
     """Every step counts, saved or not; interpolated states are not steps."""
     options = {"h": 0.25, "invariants": SQUARE, "method": EIPRK2}
     every, ends = run(save_every=1, **options), run(**options)
-    assert every.max_defect == ends.max_defect == np.abs(every.invariants - 5.0).max()
-    assert run(t_eval=[0.1, 0.9], **options).diagnostics.max_defect == ends.max_defect
-    seldom = [run(save_every=n, every=2, **options).diagnostics.max_defect for n in (1, None)]
+    assert every.max_residual == ends.max_residual == np.abs(every.invariants - 5.0).max()
+    assert run(t_eval=[0.1, 0.9], **options).diagnostics.max_residual == ends.max_residual
+    seldom = [run(save_every=n, every=2, **options).diagnostics.max_residual for n in (1, None)]
     assert seldom[0] == seldom[1]
 
 
@@ -334,7 +334,7 @@ def same_as_by_gradient(value, y0, **options):
     by_hand = run((0, 20), invariants=Invariant(pendulum_energy, pendulum_gradient), **options)
     computed = run((0, 20), invariants=Invariant(value, name="H"), **options)
     assert computed.status == 0
-    assert (computed.max_defect <= 1e-14).all()
+    assert (computed.max_residual <= 1e-14).all()
     np.testing.assert_allclose(computed.y[:, -1], by_hand.y[:, -1], rtol=0, atol=1e-9)
 
 
@@ -474,13 +474,13 @@ def test_targets():
     near = Invariant(SQUARE.fun, SQUARE.grad, target=5.0 * (1 + 5e-9))
     assert run(invariants=near).invariants[0, -1] == pytest.approx(5.0 * (1 + 5e-9), rel=2 * EPS)
     both = Invariant(lambda t, y: np.array([y @ y, y @ y]), PAIR.grad, target=5.0)
-    assert (run(invariants=both).max_defect < 1e-14).all()
+    assert (run(invariants=both).max_residual < 1e-14).all()
     zero = Invariant(lambda t, y: y @ y - 5.0, SQUARE.grad, target=0.0, name="0")
     np.testing.assert_allclose(run(invariants=zero).y, run(invariants=SQUARE).y, rtol=0, atol=4 * EPS)
     assert run(invariants=zero).diagnostics.n_projections == 10
     # homproj never preserves 0: the start may miss it by 1e-8 of the terms.
     off = Invariant(lambda t, y: y[0] ** 2 + y[1] ** 2 - 5.0 - 2e-8, SQUARE.grad, target=0.0)
-    assert max(abs(run(invariants=off).invariants[0, -1]), run(invariants=off).max_defect[0]) < 8 * EPS
+    assert max(abs(run(invariants=off).invariants[0, -1]), run(invariants=off).max_residual[0]) < 8 * EPS
     # A residual below four rounding errors of the scale is not corrected.
     wide = run(invariants=Invariant(SQUARE.fun, SQUARE.grad, scale=1e12))
     assert wide.diagnostics.n_skipped == 10

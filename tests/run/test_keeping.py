@@ -40,7 +40,7 @@ keeping = pytest.mark.parametrize("keep", [kept_by_integrate, kept_by_ensemble])
 
 
 def same(one, other):
-    for key in ("t", "y", "max_defect", "status", "nfev"):
+    for key in ("t", "y", "max_residual", "status", "nfev"):
         np.testing.assert_array_equal(one[key], other[key], err_msg=key)
 
 

@@ -151,7 +151,7 @@ def test_free_flight_has_no_constraints():
 def test_nothing_is_found():
     """Functions in Python and runs with a given frame are not searched; a value that is not finite ends a search."""
     C = np.kron(np.eye(2), np.kron(MASSES, np.eye(2)))
-    given = integrate(springs, (0, 1), START, invariants=[H, *L], frame=(C, C.T), **FIXED)
+    given = integrate(springs, (0, 1), START, invariants=[H, *L], linear_invariants=(C, C.T), **FIXED)
     same = integrate(springs, (0, 1), START, invariants=[H, *L], linear_invariants=(C, C.T), **FIXED)
     assert given.diagnostics.remarks == same.diagnostics.remarks == ()
     np.testing.assert_array_equal(given.y, same.y)

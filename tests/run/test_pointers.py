@@ -138,7 +138,7 @@ def test_invariants_of_several_values(c, options):
     np.testing.assert_allclose(one.y, apart.y, rtol=1e-7)
     assert one.compiled
     assert one.diagnostics.names == ("HL[0]", "HL[1]")
-    assert one.max_defect.max() < 1e-10
+    assert one.max_residual.max() < 1e-10
 
 
 @pytest.mark.needs_jit
@@ -200,7 +200,7 @@ def test_the_run_holds_the_only_reference():
         run = integrate(fun(), (0, 2), [1, 2], method=EIPRK4, h=0.1, save_every=1, invariants=kept, events=events)
         np.testing.assert_allclose(run.y, plain.y, atol=1e-5)
         assert run.compiled
-        assert run.max_defect[0] < 1e-14
+        assert run.max_residual[0] < 1e-14
 
 
 # Statuses.

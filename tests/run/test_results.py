@@ -93,7 +93,7 @@ def test_to_xarray():
     np.testing.assert_array_equal(data.y.sel(t=run.t[3]), run.y[:, 3])
     np.testing.assert_array_equal(data.invariants.sel(invariant="L"), run.invariants[1])
     np.testing.assert_array_equal(data.invariant_errors, run.invariants - run.target[:, None])
-    np.testing.assert_array_equal(data.max_defect, run.max_defect)
+    np.testing.assert_array_equal(data.max_residual, run.max_residual)
     for name in ("method", "h", "message", "trusted", "nfev"):
         assert data.attrs[name] == run[name]
     assert to_xarray(run, "a b c d").component.values.tolist() == ["a", "b", "c", "d"]
@@ -162,15 +162,15 @@ def test_tables_of_ensembles():
     np.testing.assert_array_equal(data.y.sel(member=3), result.y[3])
     np.testing.assert_array_equal(data.y.sel(component="y"), result.y[:, 1])
     np.testing.assert_array_equal(data.t_end, result.t)
-    np.testing.assert_array_equal(data.max_defect.sel(invariant="H"), result.max_defect[:, 0])
+    np.testing.assert_array_equal(data.max_residual.sel(invariant="H"), result.max_residual[:, 0])
     assert data.message[3] == result.message[3]
     assert data.invariants.dims == ("member", "invariant", "time")
     np.testing.assert_array_equal(data.invariants, result.invariants)
     frame = to_dataframe(result, "a b c d")
-    wanted = ["a", "b", "c", "d", "t_end", "status", "message", "trusted", "H max_defect", "L max_defect"]
+    wanted = ["a", "b", "c", "d", "t_end", "status", "message", "trusted", "H max_residual", "L max_residual"]
     assert (list(frame.columns), frame.index.name) == (wanted, "member")
     np.testing.assert_array_equal(frame["b"], result.y[:, 1])
-    np.testing.assert_array_equal(frame["L max_defect"], result.max_defect[:, 1])
+    np.testing.assert_array_equal(frame["L max_residual"], result.max_residual[:, 1])
     last = ensemble(oscillator, (0, 1), np.ones((3, 2)), h=0.1).to_xarray("q p")
     assert "states" not in last
     assert last.end_invariants.dims == ("member", "invariant")
@@ -281,14 +281,14 @@ def test_own_end_states_are_starts(method, options):
     rod = Invariant(lambda t, y: y[:2] @ y[:2] - 1, target=0, name="rod")
     along = Invariant(lambda t, y: y[:2] @ y[2:], target=0, name="along")
     options = {"method": method, "invariants": [rod, along], **options}
-    y, defects = np.array([1.0, 0.0, 0.0, 0.0]), []
+    y, residuals = np.array([1.0, 0.0, 0.0, 0.0]), []
     for k in range(20):
         run = integrate(pendulum, (0.37 * k, 0.37 * (k + 1)), y, **options)
         assert run.status == 0
         y = run.y[:, -1]
-        defects += [abs(y[:2] @ y[:2] - 1), abs(y[:2] @ y[2:])]
+        residuals += [abs(y[:2] @ y[:2] - 1), abs(y[:2] @ y[2:])]
     # Terms of `along` reach 2 g = 20 in the square of the speed.
-    assert max(defects) < 1e-7
+    assert max(residuals) < 1e-7
     assert (ensemble(pendulum, (0, 0.37), [[1.0, 0, 0, 0], y], **options).status == 0).all()
 
 
@@ -307,8 +307,8 @@ def test_continue_to(method, options):
     np.testing.assert_allclose(joined.y[:, -1], whole.y[:, -1], rtol=0, atol=3e-6 if method is EIPRK4 else 1e-8)
     # The second run keeps the values of the first start.
     np.testing.assert_array_equal(joined.target, first.target)
-    assert np.all(first.max_defect <= joined.max_defect)
-    assert np.all(joined.max_defect <= 2 * whole.max_defect + 1e-14)
+    assert np.all(first.max_residual <= joined.max_residual)
+    assert np.all(joined.max_residual <= 2 * whole.max_residual + 1e-14)
     assert joined.trusted
     assert joined.nfev > first.nfev
     assert (joined.method, joined.h) == (first.method, first.h)
@@ -319,7 +319,7 @@ def test_figures_of_both_runs():
     second = first.continue_to(9.0)
     assert second.diagnostics.n_projections == 300
     assert second.diagnostics.max_correction >= first.diagnostics.max_correction
-    np.testing.assert_array_equal(second.max_defect, second.diagnostics.max_defect)
+    np.testing.assert_array_equal(second.max_residual, second.diagnostics.max_residual)
     assert second.t_events[0].size == second.y_events[0].shape[0] > first.t_events[0].size
     assert np.all(np.diff(second.t_events[0]) > 0)
     assert (second.sol.t_min, second.sol.t_max) == (0.0, 9.0)
@@ -367,7 +367,7 @@ def test_values_that_change_between_two_parts():
 def test_an_interrupted_run_goes_on_and_what_breaks_it_off_again_keeps_both():
     calls = []
 
-    def broken(t, y, defects):
+    def broken(t, y, residuals):
         calls.append(t)
         if len(calls) in (3, 6):
             raise KeyboardInterrupt

@@ -228,10 +228,10 @@ def test_output_between_projections_lies_on_the_manifold(method, steps):
     saved = integrate(problem, (0, 30), save_every=1, dense_output=True, events=apsis, **given)
     times = np.linspace(0, 30, 401)
     sampled = integrate(problem, (0, 30), t_eval=times, **given)
-    level = max(plain.max_defect.max(), 1e-14)
+    level = max(plain.max_residual.max(), 1e-14)
     for run in (saved, sampled):
         assert np.abs(run.invariants - run.target[:, None]).max() < 1.01 * level
-        assert np.all(run.max_defect >= np.abs(run.invariants - run.target[:, None]).max(axis=1))
+        assert np.all(run.max_residual >= np.abs(run.invariants - run.target[:, None]).max(axis=1))
     for t, y in zip(saved.t_events[0], saved.y_events[0], strict=True):
         values = [item.fun(t, y, *item.args) for item in problem.invariants]
         assert np.abs(values - saved.target).max() < 1.01 * level
@@ -246,7 +246,7 @@ def test_output_between_projections_lies_on_the_manifold(method, steps):
     many = ensemble(problem, (0, 3), starts, method=method, executor=1, **rows, **steps)
     single = integrate(problem, (0, 3), starts[8], method=method, check=False, **rows, **steps)
     np.testing.assert_array_equal(many.trajectories[8], single.y)
-    np.testing.assert_array_equal(many.max_defect[8], single.max_defect)
+    np.testing.assert_array_equal(many.max_residual[8], single.max_residual)
 
 
 def test_an_event_at_the_very_start_ends_the_run():
@@ -297,7 +297,7 @@ def test_a_callback_stops_at_the_time_it_sees():
     """Nothing happens after the end: no event is recorded, no step counted."""
     times, seen = np.linspace(0.0, 30.0, 31), []
     options = {"method": EIPRK45, "events": clock, "rtol": 1e-6}
-    found = run(t_eval=times, callback=lambda t, y, defects: seen.append(t) or t >= 7.0, **options)
+    found = run(t_eval=times, callback=lambda t, y, residuals: seen.append(t) or t >= 7.0, **options)
     np.testing.assert_array_equal(found.t, times[:8])
     assert seen == times[:8].tolist()
     assert found.t_events[0][-1] <= 7.5

@@ -127,7 +127,14 @@ def test_linear_invariants_of_a_frame_stay(method):
     C[0, [4, 6]] = C[1, [5, 7]] = 1.0
     start = [0.0, 0, 1, 0, 0, -0.4, 0, 0.5]
     run = integrate(
-        pair, (0, 10), start, method=method, h=0.05, invariants=Invariant(of_pair), frame=(C, C.T), variations="state"
+        pair,
+        (0, 10),
+        start,
+        method=method,
+        h=0.05,
+        invariants=Invariant(of_pair),
+        linear_invariants=(C, C.T),
+        variations="state",
     )
     assert np.abs(C @ run.stm[-1] - C).max() < 1e-12
 

@@ -186,9 +186,14 @@ RUNS = {
     "uses f": {"invariants": [H_OF_F, L], "reuse_f": False},
     "weights": {"metric": [1.0, 0.5, 0.25, 0.3]},
     "tolerances": {"rtol": [1e-3, 1e-4, 1e-5, 1e-2], "atol": 0.0},
-    "old, two iterations, frame": {"invariants": [H_OF_F, L], "direction": "old", "iterations": 2, "frame": FRAME},
+    "old, two iterations, frame": {
+        "invariants": [H_OF_F, L],
+        "direction": "old",
+        "iterations": 2,
+        "linear_invariants": FRAME,
+    },
     "midpoint, two iterations, blocks": {"direction": "midpoint", "iterations": 2, "blocks": 4},
-    "every seventh, blocks, frame": {"every": 7, "blocks": 2, "frame": FRAME},
+    "every seventh, blocks, frame": {"every": 7, "blocks": 2, "linear_invariants": FRAME},
     "compensated, every second": {"invariants": [H_OF_F, L], "compensated": True, "every": 2, "iterations": 2},
     "euclidean, RK2": {"metric": "euclidean", "method": EIPRK2, "h": 0.01},
     "RK5, compensated": {"method": EIPRK5, "compensated": True, "h": 0.0317},
@@ -204,7 +209,8 @@ RUNS = {
     "params": PARAMS | {"fun": fun_of_params, "direction": "old", "iterations": 2},
     "params, in place": PARAMS | {"fun": fun_in_place, "in_place": True},
     "waves": WAVES | {"invariants": [ENERGY, MASS], "metric": np.linspace(0.1, 1.0, 7)},
-    "waves, frame": WAVES | {"invariants": [MASS, ENERGY], "frame": COMPLEX_FRAME, "blocks": GROUPS, "every": 4},
+    "waves, frame": WAVES
+    | {"invariants": [MASS, ENERGY], "linear_invariants": COMPLEX_FRAME, "blocks": GROUPS, "every": 4},
     "waves, midpoint": WAVES | {"invariants": [MASS, ENERGY], "direction": "midpoint", "compensated": True},
 }
 # They compile functions for themselves alone.
@@ -222,7 +228,7 @@ def test_compiled_and_interpreted(name):
     compiled, interpreted = (run(name, compiled=c) for c in (True, False))
     assert (compiled.compiled, interpreted.compiled) == (True, False)
     assert compiled.status == (1 if "ends" in name else 0)
-    assert compiled.diagnostics.n_projections + compiled.diagnostics.n_skipped > 0 or not compiled.max_defect.size
+    assert compiled.diagnostics.n_projections + compiled.diagnostics.n_skipped > 0 or not compiled.max_residual.size
     for key in ("t", "y", "invariants"):
         np.testing.assert_allclose(compiled[key], interpreted[key], rtol=1e-11, atol=1e-12)
     for key in ("status", "nfev", "njev", "nlu"):
@@ -241,7 +247,7 @@ def test_members_of_ensembles(name):
     rows = alone.t.size - ("save_every" in options and alone.status)  # where the run's last row is that of the event
     np.testing.assert_array_equal(many.trajectories[1, :, :rows], alone.y[:, :rows])
     assert np.isnan(many.trajectories[1, :, rows:]).all()
-    np.testing.assert_array_equal(many.max_defect[1], alone.max_defect)
+    np.testing.assert_array_equal(many.max_residual[1], alone.max_residual)
     np.testing.assert_array_equal(many.max_correction[1], alone.diagnostics.max_correction)
     assert [many[key][1] for key in ("nfev", "njev", "nlu")] == [alone[key] for key in ("nfev", "njev", "nlu")]
     for found, times in zip(many.t_events[1] if many.t_events else (), alone.t_events or (), strict=True):

@@ -131,8 +131,8 @@ def test_says_where_the_products_come_from():
 
 def test_symplectic_keeps_what_it_says():
     plain, kept = (run_of(h=0.4, variations="state", symplectic=symplectic).stm[-1] for symplectic in (False, True))
-    defect = [np.abs(M.T @ J @ M - J).max() for M in (plain, kept)]
-    assert defect[1] < 1e-13 < 1e-11 < defect[0]
+    residual = [np.abs(M.T @ J @ M - J).max() for M in (plain, kept)]
+    assert residual[1] < 1e-13 < 1e-11 < residual[0]
 
 
 def test_results_without_derivatives_say_what_to_ask_for():

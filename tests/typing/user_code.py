@@ -88,7 +88,7 @@ def one_run() -> tuple[float, Vector, str, bool]:
     trusted: bool = sol.trusted
     message: str = sol.message
     states: Vector = sol.y
-    largest: Vector = record.max_defect
+    largest: Vector = record.max_residual
     return float(largest.max()), states, message, trusted
 
 

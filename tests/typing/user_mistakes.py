@@ -36,16 +36,16 @@ def run(tight: float) -> OdeResult:
         project_initial=False,
         diagnostics=Diagnostics(),
     )
-    defect: float = sol.diagnostics.max_defect.max()
+    residual: float = sol.diagnostics.max_residual.max()
     text: str = sol.message
-    print(sol.y[:, -1], sol["t"], defect, text, sol.t_events[0] if sol.t_events else None)
+    print(sol.y[:, -1], sol["t"], residual, text, sol.t_events[0] if sol.t_events else None)
     plain: OdeResult = solve_ivp(fun, [0, 1], np.ones(2), "Radau", args=[2.0], jac=lambda t, y, k: np.eye(2))
     return sol if sol.trusted and plain.success else plain
 
 
 longer = integrate(fun, (0, 1), [1.0, 0.0], method=EIPDOP853, invariants=energy, blocks=2).continue_to(3)
 members = ensemble(fun, (0, 1), np.ones((3, 2)), h=0.1, method=EIPRK4, invariants=energy, args=(2.0,), every=2)
-largest: float = max(longer.max_defect.max(), members.max_defect.max())
+largest: float = max(longer.max_residual.max(), members.max_residual.max())
 choice = recommend(fun, (0, 1), [1.0, 0.0], invariants=energy, params=[2.0], metric="euclidean")
 print(longer.diagnostics.moved + longer.message, members.reduced, choice.reason, largest)
 # Each statement below has the error that is named: where types do not show it, mypy reports an unused ignore.

@@ -168,29 +168,29 @@ template <class Value, class W>
 
 // Coefficients w.mu of the rows of B in their least-norm solution, and its rank. One row, the usual case, by itself.
 template <class W>
-inline int64_t solve_part(const Matrix &B, const double *defects, const W &w) {
+inline int64_t solve_part(const Matrix &B, const double *residuals, const W &w) {
     if (B.rows == 1) {
         const double square = dot<double>(B.data, B.data, B.columns);
         if (1e-200 < square && square < 1e200) {
-            w.mu[0] = -defects[0] / square;
+            w.mu[0] = -residuals[0] / square;
             return 1;
         }
     }
     const Matrix R = corner(w.R, B.rows, w);
     const int64_t rank = factor(B, w.inverse_norms, R, w.pivots);
-    if (rank >= 0) least_norm(defects, w.inverse_norms, R, w.pivots, rank, w.mu);
+    if (rank >= 0) least_norm(residuals, w.inverse_norms, R, w.pivots, rank, w.mu);
     return rank;
 }
 
 // The Newton step of each group of values separately, along its own directions, SIZE of which are adjacent; all
-// components together then restore the frame's C y. Defects within rounding are corrected too, because the rounding of values
-// that are carried does not accumulate. Returns the sum of the ranks, -1 where gradients are not finite. w.g are the defects
-// that `judge` compares with: the carried values of a group whose rows are dependent need not agree exactly, so that the defect
+// components together then restore the frame's C y. Residuals within rounding are corrected too, because the rounding of values
+// that are carried does not accumulate. Returns the sum of the ranks, -1 where gradients are not finite. w.g are the residuals
+// that `judge` compares with: the carried values of a group whose rows are dependent need not agree exactly, so that the residual
 // of a row that was left out may grow to the sum of all.
 template <int SIZE, class W>
 [[gnu::noinline]] inline int64_t move_groups(const Options &o, const W &w, double *out) {
     const Groups &groups = o.balance_groups;
-    double *total = o.frame.rows > 0 ? w.stage : w.move, *defects = w.inner_g;
+    double *total = o.frame.rows > 0 ? w.stage : w.move, *residuals = w.inner_g;
     int64_t rank = 0;
     fill(total, 0.0, w.m);
     for (int64_t k = 0; k < groups.count; ++k) {
@@ -201,7 +201,7 @@ template <int SIZE, class W>
         const Matrix B{w.Q, rows, SIZE * directions, SIZE * directions};
         for (int64_t i = 0; i < rows; ++i) {
             const double *G = w.gradient(value[i]);
-            defects[i] = w.before[value[i]];
+            residuals[i] = w.before[value[i]];
             for (int64_t d = 0; d < directions; ++d) {
                 double slope[SIZE] = {};
                 for (int64_t j = start[d]; j < start[d + 1]; ++j)
@@ -209,14 +209,14 @@ template <int SIZE, class W>
                 std::copy(slope, slope + SIZE, B.row(i) + SIZE * d);
             }
         }
-        const int64_t found = solve_part(B, defects, w);
+        const int64_t found = solve_part(B, residuals, w);
         if (found < 0) return -1;
         rank += found;
-        double total_defect = 0.0;
-        for (int64_t i = 0; found < rows && i < rows; ++i) total_defect += std::abs(defects[i]) * w.inverse_norms[i];
+        double total_residual = 0.0;
+        for (int64_t i = 0; found < rows && i < rows; ++i) total_residual += std::abs(residuals[i]) * w.inverse_norms[i];
         for (int64_t i = 0; i < rows; ++i) {
             const bool grows = found < rows && w.inverse_norms[i] > 0.0;
-            w.g[value[i]] = grows ? 2.0 * total_defect / w.inverse_norms[i] : defects[i];
+            w.g[value[i]] = grows ? 2.0 * total_residual / w.inverse_norms[i] : residuals[i];
         }
         for (int64_t d = 0; d < directions; ++d) {
             double move[SIZE] = {};
@@ -236,13 +236,13 @@ inline int64_t move_in_groups(const Options &o, const W &w, double *out) {
     return o.balance_groups.size == 3 ? move_groups<3>(o, w, out) : move_groups<1>(o, w, out);
 }
 
-// The defects that those after a projection are compared with.
+// The residuals that those after a projection are compared with.
 template <class W>
 inline auto *limits(const auto &o, const W &w) {
     return o.balance_groups.count > 0 ? w.g : w.before;
 }
 
-// The first Newton step by `factor`. Gradients that are nearly parallel are given their whole defects, also those inside the dead
+// The first Newton step by `factor`. Gradients that are nearly parallel are given their whole residuals, also those inside the dead
 // bands: 0 in the place of one would disagree with the other.
 template <class W>
 [[gnu::noinline]] inline int64_t factored_move(const Options &o, const W &w, const double *f, double *out) {
@@ -337,13 +337,13 @@ inline Moved move(const AnyRun &run, const Step &step) {
     return {rank, largest_error, correction_in_local_errors(largest_error, o, w)};
 }
 
-// One more Newton step along the same directions; false when every defect is inside its dead band.
+// One more Newton step along the same directions; false when every residual is inside its dead band.
 [[gnu::noinline]] inline bool newton_iteration(const Run &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     run.system.inv(w, step.t_new, step.y_new, w.values);
     evaluate_gradients(run, step.t_new, step.y_new, w.f_point);
-    if (!defects<double>(nullptr, step.y_new, o, w, w.defect)) return false;
+    if (!residuals<double>(nullptr, step.y_new, o, w, w.residual)) return false;
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);
     move_along(o, w, w.Q, step.y_new);
@@ -405,7 +405,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     const auto &o = run.options;
     const auto &w = run.work;
     if (rank < 0) {
-        copy(w.before, w.defect, w.l);
+        copy(w.before, w.residual, w.l);
         return FAILED_PROJECTION;
     }
     for (int64_t k = 1; k < o.iterations; ++k)
@@ -420,7 +420,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     return judge(limits(o, w), origin(step, w), step.y_new, o, w);
 }
 
-// Before another try: the raw state's carry, its gradients and its defects, where the last try has replaced them.
+// Before another try: the raw state's carry, its gradients and its residuals, where the last try has replaced them.
 [[gnu::cold, gnu::noinline]] inline void start_again(const Run &run, const Step &step) {
     const Options &o = run.options;
     const Work &w = run.work;
@@ -434,7 +434,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     evaluate_invariants(run, step.t_new, w.y_hat);
-    defects<double>(nullptr, w.y_hat, o, w, w.before);
+    residuals<double>(nullptr, w.y_hat, o, w, w.before);
 }
 
 // Further tries: with the shift in time, whose square may be large, then with weights ever nearer to equal relative errors,
@@ -462,7 +462,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
 //
 // Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at all:
 // the distance is of second order, and no shorter step corrects it. What the directions left out would have corrected
-// stays, so that a defect may grow to the sum of all.
+// stays, so that a residual may grow to the sum of all.
 [[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(const Run &run, const Step &step, int64_t &rank) {
     const Options &o = run.options;
     const auto &w = run.work;
@@ -475,7 +475,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     move_along(o, w, w.Q, step.y_new);
     add_move(run, step);
     evaluate_invariants(run, step.t_new, step.y_new);
-    shared_defects(w, w.g);
+    shared_residuals(w, w.g);
     return judge(w.g, origin(step, w), step.y_new, o, w);
 }
 
@@ -532,14 +532,14 @@ template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const auto &o = run.options;
     const auto &w = run.work;
-    if (!defects<double>(nullptr, w.y_hat, o, w, w.before) && o.balance_groups.count == 0) return stay(run, step);
+    if (!residuals<double>(nullptr, w.y_hat, o, w, w.before) && o.balance_groups.count == 0) return stay(run, step);
     Moved moved = move(run, step);
     if (step.avoids_singular && w.counters[TRIED_INDEPENDENT] < w.counters[INDEPENDENT]) [[unlikely]]
         return NEAR_SINGULAR;
     Code status = correct(run, step, moved.rank);
     const bool plain = o.direction == NEW && o.iterations == 1 && !o.compensated;
     const bool again = o.balance_groups.count == 0 && (plain || (!run.method.multistep && origin(step, w)));
-    if (status != OK && again && moved.largest_error > 0.0 && all_finite(w.defect, w.l)) [[unlikely]]
+    if (status != OK && again && moved.largest_error > 0.0 && all_finite(w.residual, w.l)) [[unlikely]]
         status = correct_evenly(of_any_length(run), step, moved);
     if (status != OK && again && moved.rank > 1) {
         --moved.rank;

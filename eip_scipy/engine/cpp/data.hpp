@@ -40,13 +40,13 @@ EIP_ENUM(Node, HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES);
 EIP_ENUM(Interpolant, CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM);
 
 // Columns of the figures of a run's projections. An invariant's terms at the start, and the largest on the manifold. The
-// number of projections; the defect that the last one left; the largest that one left, in these terms, and when. The
-// largest defect before a projection, in these terms, when, and how many were DISTANT. Between two projections an invariant
+// number of projections; the residual that the last one left; the largest that one left, in these terms, and when. The
+// largest residual before a projection, in these terms, when, and how many were DISTANT. Between two projections an invariant
 // changes: the largest change in local errors, when, how many were LARGE, and when the first was; the sum of the changes,
 // that of the local errors, and their number. The largest rate of change along the flow, in its own terms; the largest of
 // these terms; the largest rate when a step was kept for an examination last. In the first row only: the largest local
 // error of a block, in what the step changes there, when a step was kept for that reason last. The share of its terms from
-// which on a defect before a projection is DISTANT. A flag for a gradient that is computed from values, which is not accurate
+// which on a residual before a projection is DISTANT. A flag for a gradient that is computed from values, which is not accurate
 // near kinks; the largest rate of change along the flow that examinations found by short differences, in its own terms.
 EIP_ENUM(Figure, START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY, NU, AT, MANY, FIRST, SUM, EXPECTED,
          JUDGED, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED, N_FIGURES);
@@ -62,7 +62,7 @@ EIP_ENUM(SlowRow, ALL_RATES, ALL_TERMS, LATE_RATES, LATE_TERMS, SAMPLES, N_SLOW)
 // and terms vary within a period.
 constexpr double LATE_SHARE = 1.0 / 8.0, LEAST_LATE = 16.0;
 
-// Changes of LARGE local errors are noted, and defects of DISTANT and LARGE_SHARE of the terms before and after projections.
+// Changes of LARGE local errors are noted, and residuals of DISTANT and LARGE_SHARE of the terms before and after projections.
 constexpr double LARGE = 50.0, DISTANT = 0.03, LARGE_SHARE = 1e-2;
 constexpr double EPS = 2.220446049250313e-16;
 constexpr double ENDLESS = std::numeric_limits<double>::infinity();
@@ -299,7 +299,7 @@ struct Options {
     bool reuse_f, uses_f, compensated, adaptive, watched;
     double per_band;  // an invariant's terms are this many dead bands
     double limit;     // the share of the terms that may be left
-    double distant;   // defects before a projection are noted from this share of the terms on
+    double distant;   // residuals before a projection are noted from this share of the terms on
 };
 
 template <class Visit>
@@ -339,7 +339,7 @@ struct WorkOf {
     int64_t n, m, l, stages, balances;
     Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *inverse, *ratio, *remembered,
         *memory, *memory_new, *move, *shift, *unit, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g,
-        *band, *before, *worth, *defect, *max_defect, *max_correction, *trust, *flow, *rates, *level, *level_old,
+        *band, *before, *worth, *residual, *max_residual, *max_correction, *trust, *flow, *rates, *level, *level_old,
         *level_carry, *level_carry_new, *slow, *target,
         *products;  // the last two: the invariants' targets; scratch of the frame
     double *norm, *suspect;
@@ -375,7 +375,7 @@ void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
     each(visit, {l, m}, "B", w.B, "Q", w.Q);
     visit("R", w.R, {l, l});
     each(visit, {l}, "inverse_norms", w.inverse_norms, "mu", w.mu, "values", w.values, "g", w.g, "band", w.band,
-         "before", w.before, "worth", w.worth, "defect", w.defect, "max_defect", w.max_defect);
+         "before", w.before, "worth", w.worth, "residual", w.residual, "max_residual", w.max_residual);
     each(visit, {1}, "max_correction", w.max_correction, "norm", w.norm);
     visit("trust", w.trust, {l, N_FIGURES});
     visit("flow", w.flow, {l});

@@ -13,7 +13,7 @@ namespace eip {
 constexpr int64_t MOST_NODES = 32;
 // The number of roundings by which a state that is handed out as it is may miss its targets.
 constexpr double SHOWN_ROUNDINGS = 4.0;
-// A share of an invariant's terms: the square of a smaller defect is below rounding.
+// A share of an invariant's terms: the square of a smaller residual is below rounding.
 constexpr double SMALL_SHARE = 1e-9;
 
 // Inputs of the interpolants of a run, and the buffers of their projections. `weights` are rows over the stages:
@@ -341,14 +341,14 @@ inline void from_history(const Dense &d, const Piece &piece, double theta, doubl
 }
 
 // Project w.y_hat onto w.target by Newton steps, into `out`; return false if no state nearby meets the target. One step
-// removes a defect whose square is far below the rounding of the invariant's terms; no evaluation confirms that.
+// removes a residual whose square is far below the rounding of the invariant's terms; no evaluation confirms that.
 inline bool project_sample(const Run &run, double t, double *out) {
     const Options &o = run.options;
     const Work &w = run.work;
     for (int64_t k = 0; k < o.iterations; ++k) {
         evaluate_gradients(run, t, w.y_hat, w.last());
         evaluate_invariants(run, t, w.y_hat);
-        if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) {
+        if (!residuals<double>(nullptr, w.y_hat, o, w, w.before)) {
             copy(w.y_hat, out, w.m);
             return all_finite(out, w.m);
         }
@@ -359,7 +359,7 @@ inline bool project_sample(const Run &run, double t, double *out) {
         if (sure) return all_finite(out, w.m);
         evaluate_invariants(run, t, out);
         if (judge(limits(o, w), nullptr, out, o, w) != OK) return false;
-        for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.defect[i]) <= w.band[i];
+        for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.residual[i]) <= w.band[i];
         if (met) return true;
         copy(out, w.y_hat, w.m);
     }

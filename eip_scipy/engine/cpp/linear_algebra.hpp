@@ -8,7 +8,7 @@
 namespace eip {
 
 constexpr double RANK_TOLERANCE = 1.4901161193847656e-08;  // sqrt(EPS)
-// Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the defects uncorrected.
+// Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the residuals uncorrected.
 constexpr double REORTHOGONALISE = 0.05;
 // Rows of length 1 of which less than this is left without their components along others are nearly dependent.
 constexpr double NEARLY_DEPENDENT = 1e-4;

@@ -11,7 +11,7 @@ struct Members {
     int64_t count, n_rows, evaluations;
     bool kept;
     double *starts, *params, *first_steps, *sigma, *left, *t_saved;
-    double *y, *t, *rows, *max_defect, *max_correction, *figures, *suspects;
+    double *y, *t, *rows, *max_residual, *max_correction, *figures, *suspects;
     int64_t *status, *counters, *where;
 
     Saved saved(int64_t k, const Work &w) const { return {t_saved, rows + (kept ? k * n_rows * w.m : 0), n_rows}; }
@@ -31,7 +31,7 @@ void fields(Members &m, Visit &visit) {
     visit.states("y", m.y, m.count, is.n);
     visit("t", m.t, m.count);
     visit("status", m.status, m.count);
-    visit("max_defect", m.max_defect, m.count, is.l);
+    visit("max_residual", m.max_residual, m.count, is.l);
     visit("counters", m.counters, m.count, N_COUNTERS);
     visit("max_correction", m.max_correction, m.count);
     visit("figures", m.figures, m.count, is.l, N_FIGURES);
@@ -45,7 +45,7 @@ template <class W>
 inline void clear_notes(const Members &members, const Options &o, const W &w) {
     fill(w.memory, 0.0, MEMORIES * o.blocks.count);
     fill(w.err_sum, 0.0, w.m);
-    fill(w.max_defect, 0.0, w.l);
+    fill(w.max_residual, 0.0, w.l);
     w.max_correction[0] = 0.0;
     std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
     w.counters[NFEV] = members.evaluations;
@@ -79,7 +79,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     copy(members.sigma, w.sigma, w.m);
     clear_notes(members, o, w);
     fill(w.carry, 0.0, w.m);
-    fill(w.defect, 0.0, w.l);
+    fill(w.residual, 0.0, w.l);
     w.suspect[REASON] = NOTHING;
     std::fill_n(s.place, 3, 0);
     if (run.method.multistep) forget_history(*run.method.multistep, w.l);
@@ -130,7 +130,7 @@ inline void end_member(const Run &run, Samples *samples, const Schedule &s, cons
         members.t[k] = s.span.t_bound;
         copy(y, members.y + k * w.m, w.m);
     }
-    copy(w.max_defect, members.max_defect + k * w.l, w.l);
+    copy(w.max_residual, members.max_residual + k * w.l, w.l);
     copy(w.trust, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
     copy(w.suspect, members.suspects + k * w.suspect_size(), w.suspect_size());
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), members.counters + k * N_COUNTERS);

@@ -491,7 +491,7 @@ inline Truth<Value> estimate_nodes(const Multistep &ms, const Options &o, Value 
 
 // Computes how far the values w.values are from those at the start, into w.target.
 template <class W>
-inline void defects_of_values(const Multistep &ms, const W &w) {
+inline void residuals_of_values(const Multistep &ms, const W &w) {
     const auto *levels = as_values<typename W::Value>(ms.levels);
     for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - levels[i]) - levels[w.l + i];
 }
@@ -507,11 +507,11 @@ inline void newest_state(const AnyRun &run, double t) {
     ++w.counters[NJEV];
 }
 
-// Computes the corrections required at the newest state, into w.target: the defects in the middle of the history, where the formula for
+// Computes the corrections required at the newest state, into w.target: the residuals in the middle of the history, where the formula for
 // the state is the most accurate. Values at the newest state are left in w.values. (scratch, w.carry) is the state in the
 // middle, and w.Q the gradients there.
 template <class AnyRun, class Value>
-inline void defects_in_the_middle(const AnyRun &run, double t, Value *scratch) {
+inline void residuals_in_the_middle(const AnyRun &run, double t, Value *scratch) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double before = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
@@ -520,46 +520,46 @@ inline void defects_in_the_middle(const AnyRun &run, double t, Value *scratch) {
     run.system.grad(w, before, scratch, w.f_point, w.Q);
     ++w.counters[NJEV];
     evaluate_carried(run, before, scratch, w.carry, w.Q);
-    defects_of_values(ms, w);
+    residuals_of_values(ms, w);
     evaluate_invariants(run, t, w.y_hat);
 }
 
-// Before a projection of w.y_hat by the defects in w.target, with the targets in the first row of ms.levels: of a defect as
+// Before a projection of w.y_hat by the residuals in w.target, with the targets in the first row of ms.levels: of a residual as
 // small as its rounding only a part is to be taken, the less the smaller it is, because each correction turns the orbit a
 // little, in a direction that no invariant holds. What is left goes into the third row.
 template <class W>
-inline void soften_defects(const Multistep &ms, const Options &o, const W &w) {
+inline void soften_residuals(const Multistep &ms, const Options &o, const W &w) {
     using Value = typename W::Value;
     Value *levels = as_values<Value>(ms.levels), *left = levels + 2 * w.l;
     for (int64_t i = 0; i < w.l; ++i) {
-        const Value defect = w.target[i], square = defect * defect;
+        const Value residual = w.target[i], square = residual * residual;
         Value part = 1.0;
         if (o.balance_groups.count == 0) {
             const Value noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
             part = where(square > 0.0, square / (square + noise * noise), 0.0);
         }
-        w.target[i] = w.values[i] - part * defect;
-        left[i] = (defect - part * defect) + levels[w.l + i];
+        w.target[i] = w.values[i] - part * residual;
+        left[i] = (residual - part * residual) + levels[w.l + i];
     }
 }
 
-// To be called after the projection that `soften_defects` has prepared: restores the targets, and records what was left
-// of the defects. `those`: the members that were projected.
+// To be called after the projection that `soften_residuals` has prepared: restores the targets, and records what was left
+// of the residuals. `those`: the members that were projected.
 template <class W>
 inline void note_what_is_left(const Multistep &ms, const Truth<typename W::Value> &those, const W &w) {
     using Value = typename W::Value;
     const Value *levels = as_values<Value>(ms.levels), *left = levels + 2 * w.l;
     copy(levels, w.target, w.l);
     for (int64_t i = 0; i < w.l; ++i) {
-        w.defect[i] += left[i];
-        w.max_defect[i] = where(those, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
+        w.residual[i] += left[i];
+        w.max_residual[i] = where(those, max(w.max_residual[i], abs(w.residual[i])), w.max_residual[i]);
     }
 }
 
-// Projects between `soften_defects` and `note_what_is_left`.
+// Projects between `soften_residuals` and `note_what_is_left`.
 inline Code project_softly(const Run &run, const Step &step) {
     const Multistep &ms = *run.method.multistep;
-    soften_defects(ms, run.options, run.work);
+    soften_residuals(ms, run.options, run.work);
     const Code status = project_evaluated(run, step);
     note_what_is_left(ms, true, run.work);
     return status;
@@ -611,7 +611,7 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     if (o.every == AUTO && o.balance_groups.count == 0 && !tells_more(w)) return OK;
     aim_at_node(run, ms.middle);
     copy(w.target, ms.levels, w.l);
-    defects_in_the_middle(run, t, scratch);
+    residuals_in_the_middle(run, t, scratch);
     const int64_t before = w.counters[PROJECTIONS];
     const Code status = project_softly(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
     if (status != OK) return status;
@@ -639,7 +639,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     evaluate_invariants(run, step.t_new, w.y_hat);
     ++w.counters[NJEV];
     copy(w.target, ms.levels, w.l);
-    defects_of_values(ms, w);
+    residuals_of_values(ms, w);
     const Code status = project_softly(run, step);
     if (status != OK || run.options.reuse_f) return status;
     evaluate_f(run, step.t_new, step.y_new, w.last());

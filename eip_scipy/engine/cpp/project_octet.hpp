@@ -44,7 +44,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
     for (int64_t i = 0; i < w.l; ++i) {
         const Octet *figures = w.figures(i);
         const Octet own = own_terms(i, o, w);
-        more = more | (abs(w.before[i]) > o.distant * own) | (abs(w.defect[i]) > LARGE_SHARE * own);
+        more = more | (abs(w.before[i]) > o.distant * own) | (abs(w.residual[i]) > LARGE_SHARE * own);
         if (errors > 0.0)
             more = more | ((w.worth[i] > 0.0) & (abs(w.before[i] - figures[LEFT]) > LARGE * expected_of(i)));
     }
@@ -69,7 +69,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
                 set(AT, record, t);
             }
         }
-        set(LEFT, noted, w.defect[i]);
+        set(LEFT, noted, w.residual[i]);
     }
     return more;
 }
@@ -81,7 +81,7 @@ template <class W>
 [[gnu::flatten]] inline Mask project_octet_evaluated(Eight &eight, const W &w, const Step &step, const Octet *y,
                                                      const Mask &alive, const Work &single) {
     const Options &o = eight.options;
-    const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);
+    const Mask outside = residuals<Octet>(nullptr, w.y_hat, o, w, w.before);
     const Mask moved = outside & alive;
     const bool all_move = moved.all();
     const RunOf<W, OctetSystem> run{eight.method, o, w, eight.system, nullptr};
@@ -113,12 +113,12 @@ template <class W>
     }
     for (int64_t j = 0; !all_move && j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
     evaluate_invariants(run, step.t_new, eight.y_new);
-    const Mask held = defects_held<Octet>(w.before, o, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
+    const Mask held = residuals_held<Octet>(w.before, o, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
     if (o.has_limits) leave = leave | (missed_targets(o, w) > 1.0);
     Mask done = alive & held & !leave;
     if (o.watched) done = done & !note_octet(step.t_new, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)
-        w.max_defect[i] = where(done, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
+        w.max_residual[i] = where(done, max(w.max_residual[i], abs(w.residual[i])), w.max_residual[i]);
     for (int64_t b = 0; o.metric == BY_ERROR && b < MEMORIES * blocks; ++b)
         w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
     const Mask corrected = done & outside;
@@ -166,9 +166,9 @@ inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
     if (!any(those)) return noticed;
     copy(w.target, as_values<Octet>(ms.levels), w.l);
     const int64_t counted = w.counters[NJEV];
-    defects_in_the_middle(run, t, eight.y_new);
+    residuals_in_the_middle(run, t, eight.y_new);
     w.counters[NJEV] = counted;
-    soften_defects(ms, o, w);
+    soften_residuals(ms, o, w);
     const Octet before = *eight.projections;
     const Mask leave = project_octet_evaluated(eight, w, Step{t, t, ms.h, nullptr, nullptr, true, true}, w.y_hat, those,
                                                single),

@@ -256,7 +256,7 @@ bool PythonHooks::project_jointly(const Step &step) {
         const double err = norm(w.err, w.m);
         for (int64_t i = 0; i < w.l; ++i) w.worth[i] = std::abs(std::sqrt(w.R[i * w.l + i]) * err);
     }
-    const bool outside = defects<double>(w.inverse_norms, nullptr, o, w, w.before);
+    const bool outside = residuals<double>(w.inverse_norms, nullptr, o, w, w.before);
     if (outside) {
         if (!gram_solution(Matrix{w.R, w.l, w.l, w.l}, w.g, w.mu)) return false;
         const npy_intp n = w.n;
@@ -264,7 +264,7 @@ bool PythonHooks::project_jointly(const Step &step) {
     } else {
         copy(w.y_hat, step.y_new, w.m);
     }
-    if (!defects_held<double>(w.before, o, w) || !small_shares(o, w)) return false;
+    if (!residuals_held<double>(w.before, o, w) || !small_shares(o, w)) return false;
     ++w.counters[NJEV];
     if (outside) {
         ++w.counters[NLU];
@@ -274,7 +274,7 @@ bool PythonHooks::project_jointly(const Step &step) {
         ++w.counters[SKIPPED];
     }
     if (!o.watched) {
-        raise_to(w.defect, w.max_defect, w.l);
+        raise_to(w.residual, w.max_residual, w.l);
     } else {
         const double steps = 1.0 + static_cast<double>(w.counters[WAITED]);
         note(step, measured ? steps : 0.0, EPS * std::sqrt(steps), nullptr, o, w);

@@ -42,7 +42,7 @@ inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     eight.take(eights.sigma, lane, w.sigma, w.m);
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
-    eight.take(eights.max_defect, lane, w.max_defect, w.l);
+    eight.take(eights.max_residual, lane, w.max_residual, w.l);
     eight.take(eights.memory, lane, w.memory, MEMORIES * run.options.blocks.count);
     copy(eight.suspect(lane), w.suspect, w.suspect_size());
     w.max_correction[0] = eight.at(eights.max_correction, lane);
@@ -69,7 +69,7 @@ inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     eight.give(w.sigma, lane, eights.sigma, w.m);
     eight.give(w.memory, lane, eights.memory, MEMORIES * run.options.blocks.count);
     eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
-    eight.give(w.max_defect, lane, eights.max_defect, w.l);
+    eight.give(w.max_residual, lane, eights.max_residual, w.l);
     copy(w.suspect, eight.suspect(lane), w.suspect_size());
     eight.at(eights.max_correction, lane) = w.max_correction[0];
     for (Octet *counts : {eight.projections, eight.skips, eight.reduced}) eight.at(counts, lane) = 0.0;
@@ -111,7 +111,7 @@ inline void give_history(const Run &run, Eight &eight, int64_t lane) {
     for (int64_t j = 0; j < 4; ++j) eight.give(one.sums + j * one.pitch, lane, eight.sums + j * one.half, one.half);
     eight.give(w.sigma, lane, eights.sigma, w.m);
     eight.give(w.memory, lane, eights.memory, MEMORIES * run.options.blocks.count);
-    eight.give(w.max_defect, lane, eights.max_defect, w.l);
+    eight.give(w.max_residual, lane, eights.max_residual, w.l);
     eight.at(eights.max_correction, lane) = w.max_correction[0];
 }
 
@@ -336,7 +336,7 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
         members.t[k] = s.span.t_bound;
         members.max_correction[k] = eight.at(w.max_correction, lane);
         eight.take(eight.y, lane, members.y + k * w.n, w.n);
-        eight.take(w.max_defect, lane, members.max_defect + k * w.l, w.l);
+        eight.take(w.max_residual, lane, members.max_residual + k * w.l, w.l);
         eight.take(w.trust, lane, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
         copy(eight.suspect(lane), members.suspects + k * w.suspect_size(), w.suspect_size());
         count_of(eight, lane, w.counters, members.counters + k * N_COUNTERS);

@@ -21,13 +21,13 @@ constexpr double LEAST_RATE = 1e-8, LEAST_BALANCE_RATE = 1e-10, RATE_GROWTH = 2.
 // LEAST_CHANGE of the largest change at least.
 constexpr double LEAST_ERROR = 3e-3, CLEAR_ERROR = 0.1, ERROR_GROWTH = 2.0, LEAST_CHANGE = 1e-2;
 
-// Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
-// whether anything is left to project. Invariants with given targets are then corrected by all of their defects: where their
+// Residuals w.g = values - target and their dead bands; inside its band a residual is set to 0, `raw` keeps all. Returns
+// whether anything is left to project. Invariants with given targets are then corrected by all of their residuals: where their
 // gradients are nearly dependent, what is left of them counts in units of the distance from the singular position, and
 // derivatives may hold on the targets only. `terms`: sums of |G_k y_k|, else they are taken at `y`; then, where the step's
 // errors are known, w.worth = sums of |G_k err_k| too.
 template <class Value, class W>
-inline Truth<Value> defects(const double *terms, const Value *y, const Options &o, const W &w, Value *raw) {
+inline Truth<Value> residuals(const double *terms, const Value *y, const Options &o, const W &w, Value *raw) {
     const bool measured = o.watched && w.counters[HAVE_ERROR] && !terms;
     const double band = 1.0 / o.per_band;
     Truth<Value> outside{};
@@ -74,8 +74,8 @@ inline void start_figures(const Value *y, const Value *f, double tau, const Meth
     }
 }
 
-// Terms of invariant i to measure a defect by: those now, at most the largest of a state that was on the manifold. A
-// state that blows up carries terms as large as its defect. TINY, for what underflows.
+// Terms of invariant i to measure a residual by: those now, at most the largest of a state that was on the manifold. A
+// state that blows up carries terms as large as its residual. TINY, for what underflows.
 template <class W>
 inline auto own_terms(int64_t i, const Options &o, const W &w) {
     const auto *figures = w.figures(i);
@@ -110,7 +110,7 @@ inline auto own_terms(int64_t i, const Options &o, const W &w) {
     return moved <= STILL * size;
 }
 
-// The terms by which a defect is measured that is large in units of `own`. `y`, the state at the step's start, must be
+// The terms by which a residual is measured that is large in units of `own`. `y`, the state at the step's start, must be
 // on the manifold: a state that blows up has large terms too. It is null where no such state is available. Components
 // whose units are unknown have no orientation that could hide anything.
 inline double generous_terms(int64_t i, double own, const double *y, const Options &o, const Work &w) {
@@ -120,36 +120,36 @@ inline double generous_terms(int64_t i, double own, const double *y, const Optio
     return std::abs(w.figures(i)[LEFT]) <= LARGE_SHARE * found ? std::max(own, found) : own;
 }
 
-// Note the defects; whether all are finite and none has grown beyond what round-off explains: FAILURE_BANDS dead bands, or
+// Note the residuals; whether all are finite and none has grown beyond what round-off explains: FAILURE_BANDS dead bands, or
 // as many roundings where bands are smaller.
 template <class Value, class W>
-inline Truth<Value> defects_held(const Value *before, const Options &o, const W &w) {
+inline Truth<Value> residuals_held(const Value *before, const Options &o, const W &w) {
     const double bands = FAILURE_BANDS * std::max(1.0, EPS * o.per_band);
     Truth<Value> bad{};
     for (int64_t i = 0; i < w.l; ++i) {
-        w.defect[i] = w.values[i] - w.target[i];
-        const Value size = abs(w.defect[i]);
+        w.residual[i] = w.values[i] - w.target[i];
+        const Value size = abs(w.residual[i]);
         bad = bad | !(size < ENDLESS) | ((size > abs(before[i])) & (size > bands * w.band[i]));
     }
     return !bad;
 }
 
-// True if no defect is more than o.limit times its invariant's terms.
+// True if no residual is more than o.limit times its invariant's terms.
 template <class W>
 inline auto small_shares(const Options &o, const W &w) {
     Truth<typename W::Value> bad{};
-    for (int64_t i = 0; i < w.l; ++i) bad = bad | !(abs(w.defect[i]) <= o.limit * own_terms(i, o, w));
+    for (int64_t i = 0; i < w.l; ++i) bad = bad | !(abs(w.residual[i]) <= o.limit * own_terms(i, o, w));
     return !bad;
 }
 
-// Return whether the defects hold in units of the terms that the orientation of the axes does not hide, and of their
+// Return whether the residuals hold in units of the terms that the orientation of the axes does not hide, and of their
 // rounding.
 [[gnu::cold, gnu::noinline]] inline bool held_generously(const double *before, const double *y_old, const Options &o,
                                                          const Work &w) {
     const double bands = FAILURE_BANDS * std::max(1.0, EPS * o.per_band);
     bool bad = false;
     for (int64_t i = 0; i < w.l; ++i) {
-        const double size = std::abs(w.defect[i]), own = generous_terms(i, own_terms(i, o, w), y_old, o, w);
+        const double size = std::abs(w.residual[i]), own = generous_terms(i, own_terms(i, o, w), y_old, o, w);
         const double rounding =
             bands * std::max(w.band[i], norm_products(w.gradient(i), w.y_hat, o.kinds) / o.per_band);
         bad = bad || !(size < ENDLESS) || (size > std::abs(before[i]) && size > rounding) || !(size <= o.limit * own);
@@ -157,11 +157,11 @@ inline auto small_shares(const Options &o, const W &w) {
     return !bad;
 }
 
-// Note the defects after a projection. It has failed where something is not finite, or a defect has grown and stands
+// Note the residuals after a projection. It has failed where something is not finite, or a residual has grown and stands
 // above FAILURE_BANDS dead bands and roundings, or is more than the limit. y_old: the state at the step's start, or null.
 template <class W>
 inline Code judge(const double *before, const double *y_old, const double *y, const Options &o, const W &w) {
-    const bool held = defects_held(before, o, w);
+    const bool held = residuals_held(before, o, w);
     if (!all_finite(y, w.m)) return FAILED_PROJECTION;
     return (held && small_shares(o, w)) || held_generously(before, y_old, o, w) ? OK : FAILED_PROJECTION;
 }
@@ -286,7 +286,7 @@ inline auto is_rough(const Value &share, const Value *figures) {
     suspect(LARGE_ERROR, step, w);
 }
 
-// A defect that is large compared with the terms of its invariant.
+// A residual that is large compared with the terms of its invariant.
 inline void note_share(double share, double t, double *figures, Figure largest_so_far, Figure at) {
     if (share > figures[largest_so_far]) {
         figures[largest_so_far] = share;
@@ -324,7 +324,7 @@ inline bool weigh_change(double size, double expected, double t, double *figures
     return true;
 }
 
-// Records an accepted projection: its defects, and whether the errors of the steps explain its corrections.
+// Records an accepted projection: its residuals, and whether the errors of the steps explain its corrections.
 //
 // An invariant's local errors since the last projection are worth `errors` times w.worth, their rounding `rounding` times
 // its terms; with errors = 0 nothing is known of them. y_old: the state at the step's start, or null.
@@ -333,8 +333,8 @@ inline void note(const Step &step, double errors, double rounding, const double 
     const double t = step.t_new;
     for (int64_t i = 0; i < w.l; ++i) {
         double *figures = w.figures(i);
-        const double size = std::abs(w.defect[i]), raw = std::abs(w.before[i]);
-        w.max_defect[i] = std::max(w.max_defect[i], size);
+        const double size = std::abs(w.residual[i]), raw = std::abs(w.before[i]);
+        w.max_residual[i] = std::max(w.max_residual[i], size);
         const double terms = o.per_band * w.band[i];
         double own = own_terms(i, o, w);
         if (raw > o.distant * own || size > LARGE_SHARE * own) own = generous_terms(i, own, y_old, o, w);
@@ -362,7 +362,7 @@ inline void note(const Step &step, double errors, double rounding, const double 
                 if (figures[AT] == t) suspect(LARGE_CORRECTION, step, w);
             }
         }
-        figures[LEFT] = w.defect[i];
+        figures[LEFT] = w.residual[i];
     }
     if (w.suspected() != NOTHING) [[unlikely]]
         keep_accepted(step, w);
@@ -372,7 +372,7 @@ inline void note(const Step &step, double errors, double rounding, const double 
 // errors of these steps may nevertheless add up, hence the factor.
 template <class W>
 inline void take_note(const Step &step, const double *y_old, const Options &o, const W &w) {
-    if (!o.watched) return raise_to(w.defect, w.max_defect, w.l);
+    if (!o.watched) return raise_to(w.residual, w.max_residual, w.l);
     const double waited = w.counters[WAITED];
     double rounding = EPS, errors = w.counters[HAVE_ERROR] ? 1.0 : 0.0;
     if (waited > 0) {
@@ -396,9 +396,9 @@ inline auto tells_more(const W &w) {
     return more;
 }
 
-// Per row, twice the defects of all rows in its own unit: what a projection of lower rank may move between them. Twice,
+// Per row, twice the residuals of all rows in its own unit: what a projection of lower rank may move between them. Twice,
 // because what one row loses to second order another may gain.
-inline void shared_defects(const Work &w, double *shared) {
+inline void shared_residuals(const Work &w, double *shared) {
     double total = 0.0;
     for (int64_t i = 0; i < w.l; ++i) total += std::abs(w.before[i]) * w.inverse_norms[i];
     for (int64_t i = 0; i < w.l; ++i)

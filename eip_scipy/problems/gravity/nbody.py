@@ -166,7 +166,7 @@ def nbody(
         invariants=kept,
         blocks=3,
         component_names=component_names(masses.size, bodies),
-        frame=recoil(masses) if balances is None else common_shift(masses),
+        linear_invariants=recoil(masses) if balances is None else common_shift(masses),
         units=units,
         source=source,
         reference=reference,

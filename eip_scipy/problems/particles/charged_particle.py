@@ -136,7 +136,7 @@ def charged_particle(
     >>> mirror = ParticleField(lambda x, y, z: (-y / 2 * (1 + z * z), x / 2 * (1 + z * z), 0.0), axisymmetric=True)
     >>> problem = charged_particle(mirror, [0.1, 0, 0], [0, 0.1, 0.05], t_span=(0, 20), h=0.1)
     >>> run = integrate(problem, method=EIPRK4)
-    >>> [item.name for item in problem.invariants], bool(run.max_defect.max() < 1e-12)
+    >>> [item.name for item in problem.invariants], bool(run.max_residual.max() < 1e-12)
     (['H', 'L'], True)
     """
     if not isinstance(field, ParticleField):

@@ -91,7 +91,7 @@ def hamiltonian(
     >>> from eip_scipy import EIPDOP853, hamiltonian, integrate
     >>> problem = hamiltonian("(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3")
     >>> run = integrate(problem, (0, 100), [0.0, 0.1, 0.5, 0.0], method=EIPDOP853, rtol=1e-10, atol=1e-10)
-    >>> bool(run.max_defect[0] < 1e-14)
+    >>> bool(run.max_residual[0] < 1e-14)
     True
     """
     with _sympy("hamiltonian"):
@@ -246,7 +246,7 @@ def mechanics(
     >>> L = (x.diff() ** 2 + y.diff() ** 2) / 2 - 9.81 * y
     >>> rod = mechanics(LagrangesMethod(L, [x, y], hol_coneqs=[x**2 + y**2 - 1]), {}, [1, 0], [0, 0])
     >>> run = integrate(rod, (0, 10), method=EIPDOP853, rtol=1e-8, atol=1e-8)
-    >>> bool(run.max_defect.max() < 1e-13)
+    >>> bool(run.max_residual.max() < 1e-13)
     True
     """
     with _sympy("mechanics"):

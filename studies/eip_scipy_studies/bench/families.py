@@ -186,7 +186,7 @@ def toda(rng: np.random.Generator) -> System:
         Quantity("P", lambda t, y: float(y[n:].sum()), lambda t, y: np.array([*np.zeros(n), *np.ones(n)])),
         Quantity("third", third, third_gradient),
     )
-    return second_order("toda", lambda t, x: -slope(x), q, v, kept, frame=(C, C.T.copy()))
+    return second_order("toda", lambda t, x: -slope(x), q, v, kept, linear_invariants=(C, C.T.copy()))
 
 
 MOMENTUM = Quantity("L", lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]))
@@ -271,7 +271,7 @@ def random_system(rng: np.random.Generator) -> System:
 
 def described(system: System, t0: float = 0.0, unit: Array | None = None) -> System:
     """Return the same motion with its clock set to t0, or with y = unit z; velocities keep their positions' unit."""
-    fun, acc, exact, frame = system.fun, system.acc, system.exact, system.frame
+    fun, acc, exact, frame = system.fun, system.acc, system.exact, system.linear_invariants
     scale = np.ones(system.y0.size) if unit is None else unit
     if acc is not None:
         scale = np.tile(scale[: scale.size // 2], 2)
@@ -297,7 +297,7 @@ def described(system: System, t0: float = 0.0, unit: Array | None = None) -> Sys
         exact=exact and (lambda t: exact(t - t0) / scale),
         y0=system.y0 / scale,
         kept=tuple(map(quantity, system.kept)),
-        frame=frame and (frame[0] * scale, frame[1] / scale[:, None]),
+        linear_invariants=frame and (frame[0] * scale, frame[1] / scale[:, None]),
         t0=system.t0 + t0,
         unit=system.unit if unit is None else scale,
         notes=(*system.notes, note),

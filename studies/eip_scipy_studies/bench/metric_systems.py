@@ -168,7 +168,7 @@ def of_users() -> Iterator[Case]:
     yield of("charged particle", (np.pi / 10,), (EIPRK4,), known=known, measured=lambda run: centre(run.y[:, -1]))
     yield of("Robertson", (1e-3, 1e-5), (EIPRadau,), True, options={"atol": 1e-6})
     bodies = CASES["ten bodies, 100 years"]
-    options: dict[str, Any] = {"every": 10, "blocks": 3, "frame": common_shift(bodies.gm)}
+    options: dict[str, Any] = {"every": 10, "blocks": 3, "linear_invariants": common_shift(bodies.gm)}
     seen: dict[str, Any] = {"known": bodies.end[3:6], "measured": at(slice(3, 6))}
     yield of(bodies.name, (0.02,), (EIPRKN12,), options=options, **seen)
     for name in ("perturbed Kepler", "Hénon-Heiles", "double pendulum", "halo orbit", "rigid body"):

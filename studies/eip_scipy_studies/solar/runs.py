@@ -171,7 +171,9 @@ def methods(scene: Scene, method: type[EIPSolver], metric: str, rebound: Rebound
         Method("EIPRKN12", by_us(scene, EIPRKN12, **KEPT), *high),
         Method("EIPGJ14", by_us(scene, EIPGJ14), *multistep),
         Method(
-            "EIPGJ14 (balances)", by_us(scene, EIPGJ14, invariants=orbits.invariants, frame=orbits.frame), *multistep
+            "EIPGJ14 (balances)",
+            by_us(scene, EIPGJ14, invariants=orbits.invariants, linear_invariants=orbits.linear_invariants),
+            *multistep,
         ),
     ]
     if rebound is not None:

@@ -170,7 +170,9 @@ def _single(run: Run, problem: Problem, options: dict[str, Any]) -> Outcome:
         record = Diagnostics()
         own: dict[str, Any] = {"invariants": problem.invariants, "diagnostics": record}
         own |= {
-            key: getattr(problem, key) for key in ("metric", "blocks", "frame") if getattr(problem, key) is not None
+            key: getattr(problem, key)
+            for key in ("metric", "blocks", "linear_invariants")
+            if getattr(problem, key) is not None
         }
         own |= {} if {"h", "rtol"} & options.keys() else {"h": problem.h}
         found = solve_ivp(problem.fun, problem.t_span, problem.y0, method=run.method, **own | options)
