@@ -14,6 +14,8 @@ from .core.inputs import is_number, reals, shown
 from .core.names import nearest
 from .core.options import ProjectionOptions
 from .core.results import Diagnostics
+from .run.continuation import continued
+from .run.fields import rows
 from .run.integrate import integrate
 from .run.prepare import Request, prepared
 from .run.results import IntegrationResult
@@ -161,7 +163,7 @@ def _segments(
         if run is None:
             following = integrate(**{**arguments, "t_span": (t0, bound)}, variations=Q)
         else:
-            following = run.continue_to(bound, variations=Q)
+            following = continued(run, bound, {"variations": Q})
         found = following.variations[-1]
         finite = bool(np.isfinite(found).all())
         new, R = np.linalg.qr(found) if finite else (Q, np.full((Q.shape[1],) * 2, np.nan))
@@ -174,9 +176,7 @@ def _segments(
         yield run, Q, R
         if run.status != 0:
             return
-        for name in ("t", "y", "invariants"):  # only the last row is needed from here on
-            run[name] = run[name][..., -1:]
-        run["variations"] = run.variations[-1:]
+        run.update(rows(run, slice(-1, None)))  # only the last row is needed from here on
 
 
 def _orthonormal(n: int, k: int) -> Array:

@@ -32,6 +32,7 @@ __all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_v
 FORMAT, SCHEMA = "eip_scipy checkpoint", 1
 HEADER = "header.json"
 LEFT_OVER = 3600.0
+SAME = 1e-9  # relative difference allowed between values of the same function
 
 
 class CheckpointError(Exception):
@@ -156,6 +157,24 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
         f"the checkpoint {_name(path)} belongs to another run: {what}. Resume with the arguments of that run, or use "
         "another file for a new run."
     )
+
+
+def changed_function(
+    invariants: Any, t: float, y: np.ndarray, there: np.ndarray, f: np.ndarray
+) -> tuple[str, complex, complex] | None:
+    """Compare functions at the state (t, y) with their values `there`: the derivative and then the invariants.
+
+    Return the name of the first function that differs, its value there and its value here; None if all are the same.
+    `f` is the derivative here. Differences of rounding are allowed, for instance on another machine.
+    """
+    here = np.concatenate([f, invariants.values(t, y)])
+    sizes = np.concatenate([np.full(f.size, np.abs(f).max(initial=0.0)), invariants.term_sizes(t, y, f)])
+    with np.errstate(invalid="ignore"):
+        same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
+    for k in np.flatnonzero(~same)[:1].tolist():
+        name = "fun" if k < f.size else f"invariant {invariants.names[k - f.size]!r}"
+        return name, complex(there[k]), complex(here[k])
+    return None
 
 
 def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, Any], *, stacklevel: int) -> None:

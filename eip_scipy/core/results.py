@@ -9,7 +9,16 @@ import numpy as np
 from ..engine import data
 from ..engine.trust import ProjectionWarning, Trust
 
-__all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning", "joined_sums", "slowness"]
+__all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning", "slowness"]
+
+
+def _count(place: int, text: str) -> property:
+    """Return a property of `Diagnostics` that reads one of the engine's counters."""
+
+    def read(self: Diagnostics) -> int:
+        return int(self._counters[place])
+
+    return property(read, doc=text)
 
 
 class Diagnostics:
@@ -17,106 +26,75 @@ class Diagnostics:
 
     Attributes
     ----------
-    names : tuple of str
-        Names of the l invariants, in order.
-    max_residual, last_residual : ndarray, shape (l,)
-        Largest and last invariant error ``|I - target|`` after a projection, in the unit of each invariant.
-    n_projections, n_skipped : int
-        Number of projections made, and of projections omitted because every invariant error was round-off.
-    n_rank_reduced : int
-        Number of projections in which gradients were (nearly) dependent or zero, so that the rank was reduced.
-    n_rejected_projections : int
-        Number of projections that failed.
-    max_correction : float
-        Largest correction in units of the local error of the step: at most about 5 in a correct run; nan if the run has
-        no error estimate (the euclidean metric with fixed steps). If round-off exceeds the local errors, as in
-        compensated runs, it may be thousands and is meaningless; `worst` takes round-off into account.
-    trusted : bool
-        True if no step failed, no check of the invariants found an error, and the errors of the steps explain all
-        corrections. It says nothing about the accuracy of the trajectory.
-    message : str
-        Reason why the run is not to be trusted; "" if there is none.
+    max_residual : ndarray, shape (l,)
+        Largest invariant error ``|I - target|`` after a projection, in the unit of each invariant.
     moved : str
         How far ``project_initial=True`` moved y0; "" if it did not.
     remarks : tuple of str
         The number of linear invariants that were found and are kept, and which invariants of particles are missing.
-    worst : (str, float, float) or None
-        Invariant, time and size of the largest correction, in units of the local error including round-off: below 5 in
-        most correct runs. None if no correction was measured.
-    corrections : ndarray, shape (l,)
-        Largest correction of each invariant, in the unit of `worst`; nan if none was measured.
-    slowness : ndarray, shape (l,)
-        Rate of change of each `Balance`: the mean of its rate divided by the mean of the terms of ``grad @ f``, both
-        taken at some of the projections. It is the larger of this ratio over the whole run and over about the last
-        eighth of the run. The error of a balance is about this fraction of the error of an invariant; above 0.05 a
-        balance hardly helps. nan for invariants, and with ``check=False``.
     """
 
     def __init__(self) -> None:
-        none, trust = np.zeros(0), Trust((), np.zeros((0, data.N_FIGURES)))
-        self._attach(none, none, np.zeros(1), np.zeros(data.N_COUNTERS, np.int64), trust, estimated=False)
+        none = np.zeros(0)
+        self.max_residual, self._residual, self._max_correction = none, none, np.zeros(1)
+        self._counters, self._estimated = np.zeros(data.N_COUNTERS, np.int64), False  # True with an error estimate
+        self._trust = Trust((), np.zeros((0, data.N_FIGURES)))
+        self.moved, self.remarks = "", tuple[str, ...]()
+        self._slow = np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))  # indices of the balances, and their sums
 
-    def _attach(
-        self,
-        max_residual: np.ndarray,
-        last_residual: np.ndarray,
-        max_correction: np.ndarray,
-        counters: np.ndarray,
-        trust: Trust,
-        *,
-        estimated: bool,
-        moved: str = "",
-        remarks: tuple[str, ...] = (),
-        slow: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:
-        """Keep the buffers of a run, from which the attributes are computed when they are read.
+    def _attach(self, **buffers: Any) -> None:
+        """Keep the buffers of a run, from which the attributes are computed when they are read."""
+        vars(self).update(buffers)
 
-        `estimated` is False if the run has no error estimate. `slow` holds the indices of the balances and the sums
-        (`N_SLOW`, b) of their rates and terms.
-        """
-        self.names = trust.names
-        self._trust = trust
-        self.max_residual = max_residual
-        self._residual = last_residual
-        self._max_correction = max_correction
-        self._counters = counters
-        self._estimated = estimated
-        self.moved, self.remarks = moved, remarks
-        self._slow = (np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))) if slow is None else slow
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the l invariants, in order."""
+        return self._trust.names
+
+    def followed_by(self, other: Diagnostics) -> Diagnostics:
+        """Return the record of this run and of the run with the record `other`, which continued it, together."""
+        both = Diagnostics()
+        both._attach(
+            max_residual=np.maximum(self.max_residual, other.max_residual),
+            _residual=other._residual.copy(),
+            _max_correction=np.maximum(self._max_correction, other._max_correction),
+            _counters=self._counters + other._counters,
+            _trust=self._trust.followed_by(other._trust),
+            _estimated=self._estimated and other._estimated,
+            moved=self.moved or other.moved,
+            remarks=tuple(dict.fromkeys(self.remarks + other.remarks)),
+            _slow=(other._slow[0], _joined_sums(self._slow[1], other._slow[1])),
+        )
+        return both
 
     @property
     def last_residual(self) -> np.ndarray:
-        """Last invariant errors ``|I - target|``, (l,)."""
+        """Last invariant errors ``|I - target|`` after a projection, (l,)."""
         return np.abs(self._residual)
 
-    @property
-    def n_projections(self) -> int:
-        """Number of projections."""
-        return int(self._counters[data.PROJECTIONS])
-
-    @property
-    def n_skipped(self) -> int:
-        """Number of projections omitted because all invariant errors were round-off."""
-        return int(self._counters[data.SKIPPED])
-
-    @property
-    def n_rank_reduced(self) -> int:
-        """Number of projections of reduced rank."""
-        return int(self._counters[data.RANK_REDUCED])
-
-    @property
-    def n_rejected_projections(self) -> int:
-        """Number of projections that failed."""
-        return int(self._counters[data.REJECTED])
+    n_projections = _count(data.PROJECTIONS, "Number of projections.")
+    n_skipped = _count(data.SKIPPED, "Number of projections omitted because all invariant errors were round-off.")
+    n_rank_reduced = _count(
+        data.RANK_REDUCED,
+        "Number of projections whose rank was reduced, because gradients were (nearly) dependent or zero.",
+    )
+    n_rejected_projections = _count(data.REJECTED, "Number of projections that failed.")
 
     @property
     def max_correction(self) -> float:
-        """Largest correction in units of the local error of the step; nan without an error estimate."""
+        """Largest correction in units of the local error of the step: at most about 5 in a correct run.
+
+        It is nan without an error estimate (the euclidean metric with fixed steps). If round-off exceeds the local
+        errors, as in compensated runs, it may be thousands and is meaningless; `worst` takes round-off into account.
+        """
         return float(self._max_correction[0]) if self._estimated else float("nan")
 
     @property
     def trusted(self) -> bool:
-        """True if no step failed and no check found an error; it says nothing about the accuracy of the trajectory."""
+        """True if no step failed, no check found an error, and the errors of the steps explain all corrections.
+
+        It says nothing about the accuracy of the trajectory.
+        """
         return self._trust.trusted
 
     @property
@@ -126,19 +104,24 @@ class Diagnostics:
 
     @property
     def worst(self) -> tuple[str, float, float] | None:
-        """Invariant, time and size of the largest correction, in units of the local error; None if not measured."""
+        """Invariant, time and size of the largest correction, in units of the local error including round-off.
+
+        The size is below 5 in most correct runs. None if no correction was measured.
+        """
         return self._trust.worst
 
     @property
     def corrections(self) -> np.ndarray:
-        """Largest correction of each invariant in units of the local error, (l,); nan if none was measured."""
+        """Largest correction of each invariant, (l,), in the unit of `worst`; nan if none was measured."""
         return self._trust.corrections
 
     @property
     def slowness(self) -> np.ndarray:
-        """Mean rate of each balance, divided by the mean of the terms of ``grad @ f``, (l,); nan for invariants.
+        """Rate of change of each `Balance`, (l,): its mean rate divided by the mean of the terms of ``grad @ f``.
 
-        It is the larger of the ratios for the whole run and for about the last eighth of its samples.
+        Both are taken at some of the projections; it is the larger of the ratios for the whole run and for about the
+        last eighth of it. The error of a balance is about this fraction of the error of an invariant; above 0.05 a
+        balance hardly helps. nan for invariants, and with ``check=False``.
         """
         places, sums = self._slow
         found = np.full(len(self.names), np.nan)
@@ -176,7 +159,7 @@ def slowness(sums: np.ndarray) -> np.ndarray:
     return np.max(np.where(known, rates, np.nan) / np.where(known, terms, 1.0), axis=0)
 
 
-def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+def _joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     """Return the sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation together."""
     both = one + two
     late = [data.LATE_RATES, data.LATE_TERMS]

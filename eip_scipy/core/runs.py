@@ -104,15 +104,15 @@ class Run:
             raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
         w = self.work
         diagnostics._attach(
-            w.max_residual,
-            w.residual,
-            w.max_correction,
-            w.counters,
-            self.trust,
-            estimated=self.options.metric == BY_ERROR,
+            max_residual=w.max_residual,
+            _residual=w.residual,
+            _max_correction=w.max_correction,
+            _counters=w.counters,
+            _trust=self.trust,
+            _estimated=self.options.metric == BY_ERROR,
             moved=self.moved,
             remarks=self.conserved.remarks,
-            slow=(self.invariants.balances.places, w.slow),
+            _slow=(self.invariants.balances.places, w.slow),
         )
 
     @property

@@ -5,27 +5,25 @@ from __future__ import annotations
 import os
 import time
 import warnings
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from .. import checkpoint
 from ..checkpoint import CheckpointError
+from ..checkpoint.encoding import decoded, encoded
 from ..checkpoint.locks import Lock
 from ..core.callers import users_level
+from ..run.prepare import Prepared
 from .chunks import Chunk
-from .happened import Flat, flattened, unflattened
-from .saving import expanded, shortened
-from .tasks import LISTS, Members, Plan
+from .tasks import Members, Plan
 
 __all__ = ["EnsembleFile"]
 
 KIND = "ensemble"
-# Relative difference allowed between values of the same function, also on another machine.
-SAME = 1e-9
 # Writing takes at most 5 % of the time.
 LEAST_RATIO = 19.0
-FIELDS = [name for name in Members._fields if name not in LISTS]
 
 
 class EnsembleFile:
@@ -42,7 +40,7 @@ class EnsembleFile:
         self.finished, self.members = 0, plan.empty(0)
         self.reduced: np.ndarray | None = None
         self._waiting: tuple[int, Members, np.ndarray | None] | None = None
-        self._seen: dict[str, Any] = {}
+        self._known_by: np.ndarray | None = None
         self._lock = Lock(path)
         self.path = self._lock.name
         try:
@@ -64,66 +62,48 @@ class EnsembleFile:
         self.finished = int(header["finished"])
         if not self.finished:
             return
+        expected = self._plan.empty(self.finished, self._plan.held)
         try:
-            flat = Flat(*(arrays[f"events_{name}"] for name in Flat._fields))
-            fields = {name: arrays[f"members_{name}"] for name in FIELDS}
-            message, place = expanded(header["messages"], self.finished), header["seen"]
+            found = {name: decoded(header["members"][name], arrays) for name in Members._fields}
+            wrong = [name for name, value in found.items() if _shape(value) != _shape(getattr(expected, name))]
+            known_by = arrays["known_by"]
         except KeyError as error:
-            raise self._other(f"{error} is missing") from error
-        plan = self._plan
-        empty = Members.empty(self.finished, plan.size, plan.dtype, len(plan.names), plan.held)
-        for name, array in fields.items():
-            if array.shape != getattr(empty, name).shape:
-                raise self._other(f"{name} has the shape {array.shape}, expected {getattr(empty, name).shape}")
-        self.members = Members(**fields, message=message, happened=unflattened(flat))
-        self.reduced = arrays.get("reduced")
-        if place is not None:
-            self._seen = {"place": place, "f": arrays["seen_f"]}
-            self._require_same_functions(place, arrays["seen_f"])
-        checkpoint.warn_of_other_versions(self.path, header, stacklevel=users_level())
-
-    def _other(self, why: str) -> CheckpointError:
-        return CheckpointError(
-            f"{self.path!r} was written by another version of eip_scipy, or is damaged: {why}. Use another file for a "
-            "new ensemble."
-        )
-
-    def _require_same_functions(self, k: int, f: np.ndarray) -> None:
-        """Raise CheckpointError if the present functions differ at the last state of member `k`, where fun was `f`."""
-        members = self.members
-        t, y = float(members.t[k]), members.y[k].copy()
-        ready = self._plan.task.prepared(self._everyone.y0s[k], self._everyone.params[k])
-        here, values = ready.system.derivative(t, y.copy()), ready.run.invariants.values(t, y)
-        sizes = ready.run.invariants.term_sizes(t, y, here)
-        names = [f"invariant {name!r}" for name in self._plan.names]
-        same = [np.abs(values - members.values[k]) <= SAME * sizes]
-        same.append(np.abs(here - f).max(keepdims=True, initial=0.0) <= SAME * np.abs(f).max(initial=0.0))
-        wrong = [name for name, right in zip([*names, "fun"], np.concatenate(same), strict=True) if not right]
+            wrong = [str(error)]
         if wrong:
             raise CheckpointError(
-                f"the checkpoint {self.path!r} belongs to another ensemble: {wrong[-1]} has another value at the end "
+                f"{self.path!r} was written by another version of eip_scipy, or is damaged: {wrong[0]} is missing or "
+                "has another shape. Use another file for a new ensemble."
+            )
+        self.members, self.reduced, self._known_by = Members(**found), arrays.get("reduced"), known_by
+        if known_by.size:
+            self._require_same_functions(known_by)
+        checkpoint.warn_of_other_versions(self.path, header, stacklevel=users_level())
+
+    def _end(self, members: Members) -> tuple[int, Prepared, float, np.ndarray, np.ndarray]:
+        """Return number, run, end (t, y) and derivative there of the first member that did not fail."""
+        k = int(np.flatnonzero(members.status >= 0)[0])
+        ready = self._plan.task.prepared(self._everyone.y0s[k], self._everyone.params[k])
+        t, y = float(members.t[k]), members.y[k].copy()
+        return k, ready, t, y, ready.system.derivative(t, y.copy())
+
+    def _require_same_functions(self, known_by: np.ndarray) -> None:
+        k, ready, t, y, f = self._end(self.members)
+        if changed := checkpoint.changed_function(ready.run.invariants, t, y, known_by, f):
+            raise CheckpointError(
+                f"the checkpoint {self.path!r} belongs to another ensemble: {changed[0]} has another value at the end "
                 f"of member {k}. Resume with the functions of that ensemble, or use another file for a new one."
             )
 
     def write(self, done: int, whole: Members, reduced: np.ndarray | None) -> None:
         """Record that the first `done` members of `whole` are finished; write the file if it is time to do so."""
         self._waiting = done, whole, reduced
-        if not self._seen:
-            self._see(whole.status[:done], whole)
+        if self._known_by is None and (whole.status[:done] >= 0).any():
+            self._known_by = np.zeros(0)
+            with suppress(Exception):  # a function may raise an error there; the members are stored all the same
+                _, ready, t, y, f = self._end(whole)
+                self._known_by = np.concatenate([f, ready.run.invariants.values(t, y)])
         if time.perf_counter() - self._written >= max(self._every, LEAST_RATIO * self._cost):
             self.flush()
-
-    def _see(self, status: np.ndarray, whole: Members) -> None:
-        """Evaluate fun at the last state of the first member that did not fail, to recognise it later."""
-        for k in np.flatnonzero(status >= 0)[:1].tolist():
-            self._seen = {"place": None, "f": np.zeros(0)}
-            try:
-                ready = self._plan.task.prepared(self._everyone.y0s[k], self._everyone.params[k])
-                f = ready.system.derivative(float(whole.t[k]), whole.y[k].copy())
-            except Exception:  # a function may raise an error there; the members are stored all the same
-                return
-            if np.isfinite(f).all() and np.isfinite(whole.values[k]).all():
-                self._seen = {"place": k, "f": f}
 
     def flush(self) -> None:
         """Write new results; an error, such as a full disk, only causes a warning, and the previous file is kept."""
@@ -131,15 +111,12 @@ class EnsembleFile:
             return
         begin = time.perf_counter()
         done, whole, reduced = self._waiting
-        header = {"kind": KIND, "settings": self._identity, "finished": done, "seen": self._seen.get("place")}
-        header["messages"] = shortened(whole.message[:done])
-        happened = whole.happened[:done]
-        flat = flattened(happened, self._plan.events, self._plan.size, self._plan.dtype)
-        arrays = {f"members_{name}": getattr(whole, name)[:done] for name in FIELDS}
-        arrays |= {f"events_{name}": value for name, value in flat._asdict().items()}
-        arrays["seen_f"] = self._seen.get("f", np.zeros(0))
+        arrays = {"known_by": np.zeros(0) if self._known_by is None else self._known_by}
+        fields = whole._asdict().items()
+        members = {name: encoded(f"members_{name}", value[:done], arrays) for name, value in fields}
         if reduced is not None:
             arrays["reduced"] = reduced[:done]
+        header = {"kind": KIND, "settings": self._identity, "finished": done, "members": members}
         try:
             checkpoint.write(self.path, header, arrays)
         except CheckpointError as error:
@@ -151,6 +128,10 @@ class EnsembleFile:
     def close(self) -> None:
         """Release the lock."""
         self._lock.close()
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    return value.shape if isinstance(value, np.ndarray) else None
 
 
 def _identity(plan: Plan, everyone: Chunk) -> dict[str, Any]:

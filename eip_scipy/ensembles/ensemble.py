@@ -31,16 +31,18 @@ from ..core.linear import confirmed
 from ..core.names import nearest
 from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
-from ..core.problem import Problem, component_names
+from ..core.problem import Problem
 from ..core.solvers import EIPRK4, EIPSolver
 from ..core.states import states
 from ..core.tangent_vectors import TangentVectors
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
+from ..run.fields import Field, component_names, distinct, time_name
+from ..run.figures import steps
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
-from ..run.results import WithColumns
-from ..run.tables import dataset, default_names, to_dataframe
+from ..run.results import Result
+from ..run.tables import dataset
 from .checkpoints import EnsembleFile
 from .chunks import Chunk, Part, Pool, cores, run_elsewhere, thread_pool
 from .reduction import placed
@@ -61,6 +63,8 @@ SHOWN = 5
 # Fields of a request that an ensemble handles itself, those that it does not have, and its own parameters.
 HANDLED = {"fun", "acceleration", "t_span", "params", "callback", "max_bytes", "progress"}
 ALONE = HANDLED | {"y0", "diagnostics", "projection"}
+# Fields of `Members` that are fields of the result.
+SAME = ("y", "t", "status", "message", "max_residual", "max_correction", "side_by_side", "trusted", "target")
 OWN = ("y0s", "executor", "reduce", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(HANDLED))
 
 
@@ -83,7 +87,21 @@ class EnsembleKeywords(ProjectionDetails, total=False):
     symplectic: bool | None
 
 
-class EnsembleResult(WithColumns):
+FIELDS = {
+    "y": Field(("member", "component")),
+    "t": Field(("member",), table="t_end"),
+    "target": Field(("member", "invariant")),
+    "max_residual": Field(("member", "invariant")),
+    "trajectories": Field(("member", "component", "time"), table="states"),
+    "invariants": Field(("member", "invariant", "time")),
+    **dict.fromkeys(("status", "message", "trusted", "max_correction"), Field(("member",))),
+    **dict.fromkeys(("nfev", "njev", "nlu", "n_rejected_projections"), Field(("member",))),
+    **dict.fromkeys(("method", "h", "success", "stopped", "wall_time"), Field(())),
+}
+END_INVARIANTS = Field(("member", "invariant"), table="end_invariants")  # if trajectories are not saved
+
+
+class EnsembleResult(Result):
     """Result of `ensemble`; fields are accessible by attribute or by key, as in SciPy's results.
 
     Attributes
@@ -147,12 +165,9 @@ class EnsembleResult(WithColumns):
         Step size; None for adaptive steps.
     chunk : int
         Number of members in a chunk.
-    component_names : tuple of str
-        Names of the components from the `Problem`, or "y0", "y1" and so on.
     """
 
-    y: np.ndarray
-    t: np.ndarray
+    COMPONENTS = 1
     status: np.ndarray
     message: np.ndarray
     failed: np.ndarray
@@ -181,12 +196,6 @@ class EnsembleResult(WithColumns):
     h: float | None
     chunk: int
 
-    @property
-    def component_names(self) -> tuple[str, ...]:
-        """Names of the components of the state, (n,)."""
-        given = self.get("component_names")
-        return default_names(self.y.shape[1]) if given is None else tuple(given)
-
     def to_xarray(self, names: Any = None) -> Any:
         """Return the members as an `xarray.Dataset`.
 
@@ -208,36 +217,19 @@ class EnsembleResult(WithColumns):
         ImportError
             If xarray is missing: ``pip install "eip_scipy[xarray]"``.
         """
-        by_member = ("status", "trusted", "max_correction", "nfev", "njev", "nlu", "n_rejected_projections")
-        variables: dict[str, Any] = {name: (("member",), self[name]) for name in by_member}
-        variables["y"] = ("member", "component"), self.y
-        variables["t_end"] = ("member",), self.t
-        variables["message"] = ("member",), self.message.astype(str)
-        variables["max_residual"] = ("member", "invariant"), self.max_residual
-        variables["target"] = ("member", "invariant"), self.target
-        if self.invariants.ndim == 2:
-            variables["end_invariants"] = ("member", "invariant"), self.invariants
-        coordinates: dict[str, Any] = {
+        components = component_names(self, names, self.y.shape[1])
+        coordinates = {
             "member": self.first + np.arange(self.t.size),
-            "component": list(component_names(self.component_names if names is None else names, self.y.shape[1])),
-            "invariant": list(self.names),
+            "component": list(components),
+            "invariant": distinct(self.names),
         }
-        if self.trajectories is not None:
-            variables["states"] = ("member", "component", "time"), self.trajectories
-            variables["invariants"] = ("member", "invariant", "time"), self.invariants
-            coordinates["time"] = self.times
-        attributes = {name: self[name] for name in ("method", "h", "success", "stopped", "wall_time")}
-        return dataset(variables, coordinates, attributes)
-
-    def to_dataframe(self, names: Any = None) -> Any:
-        """Return the members as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
-        return to_dataframe(self, names)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`."""
-        from ..run.saving import save
-
-        save(self, path)
+        if self.trajectories is None:
+            data = dataset(self, FIELDS | {"invariants": END_INVARIANTS}, coordinates)
+        else:
+            data = dataset(self, FIELDS, coordinates | {"time": self.times})
+        if (time := time_name(components)) != "t":
+            data = data.rename({"t_end": f"{time}_end", **({"time": time} if "time" in data.dims else {})})
+        return data
 
     def plot(self, names: Any = None) -> Any:
         """Draw the ensemble: its states, the errors of the invariants, and how its members ended.
@@ -250,44 +242,28 @@ class EnsembleResult(WithColumns):
         Returns
         -------
         matplotlib.figure.Figure
-            For each component the median of all members in time, with bands that contain 50 % and 90 % of them; if no
-            states are saved, the distribution of the last states. Further panels show the largest error
-            of each invariant in each member, and how many members reached the end, were ended by an event, are not to
-            be trusted, failed or did not run. A notebook shows the figure automatically.
+            For each component the median of the members in time, with bands that contain 50 % and 90 % of them; if some
+            end early, of those that are still running, as the legend says. If no states are saved, the distribution of
+            the last states. Further panels show the largest error of each invariant in each member, and how many
+            members reached the end, were ended by an event, are not to be trusted, failed or did not run. A notebook
+            shows the figure automatically.
 
         Raises
         ------
         ImportError
             If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
         """
-        from .figures import plot
+        from ..plotting.ensembles import ensemble_figure
 
-        return plot(self, names)
-
-    def _packed(self) -> dict[str, Any]:
-        """Return the fields in the form that `eip_scipy.results.save` accepts."""
-        from .saving import packed
-
-        return packed(self)
-
-    @classmethod
-    def _unpacked(cls, fields: dict[str, Any]) -> EnsembleResult:
-        """Return a result from the output of `_packed`."""
-        from .saving import unpacked
-
-        return cls(unpacked(fields))
-
-    def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "plot", "save", "to_dataframe", "to_xarray"]
+        return ensemble_figure(self, names)
 
     def __repr__(self) -> str:
         ran = int(np.count_nonzero(self.status != NOT_RUN))
-        step = "adaptive steps" if self.h is None else f"h = {self.h:g}"
         members, n = self.y.shape
         lines = [
-            f"Ensemble: {members} members of {n} components, {self.method}, {step}; {ran} ran in "
+            f"Ensemble: {members} members of {n} components, {steps(self)}; {ran} ran in "
             f"{self.wall_time:.3g} s, {np.count_nonzero(self.side_by_side)} vectorised, "
-            f"{self.failed.size} failed",
+            f"{self.failed.size} failed"
         ]
         if self.one_by_one:
             lines.append(f"  not vectorised: {self.one_by_one}")
@@ -496,7 +472,7 @@ class _Gathered:
     ) -> None:
         self.plan, self.everyone, self.chunk, self.file, self.callback = plan, everyone, chunk, file, callback
         self.method = plan.task.request.method.__name__
-        self.whole = Members.empty(len(everyone.y0s), plan.size, plan.dtype, len(plan.names), plan.held)
+        self.whole = plan.empty(len(everyone.y0s), plan.held)
         self.reduced: np.ndarray | None = None
         self.stopped, self.one_by_one = False, ""
         self._begin = time.perf_counter()
@@ -546,22 +522,13 @@ class _Gathered:
     def _of(self, members: Members, reduced: np.ndarray | None, first: int) -> EnsembleResult:
         plan, counters = self.plan, members.counters
         trajectories = members.saved.swapaxes(1, 2) if plan.held else None
-        none = [(np.zeros(0), np.zeros((0, plan.size), plan.dtype))] * plan.events  # of a member that did not run
-        events = [found or none for found in members.happened]
         if reduced is None and plan.task.reduce is not None:  # all members failed
             reduced = np.full(len(members.t), np.nan)
         result = EnsembleResult(
-            y=members.y,
-            t=members.t,
-            status=members.status,
-            message=np.array(members.message, dtype=object),
+            {name: getattr(members, name) for name in SAME},
             failed=np.flatnonzero(members.status == FAILED),
             success=bool((members.status >= 0).all()),
-            max_residual=members.max_residual,
-            max_correction=members.max_correction,
-            side_by_side=members.side_by_side,
             one_by_one=self.one_by_one,
-            trusted=members.trusted,
             names=plan.names,
             nfev=counters[:, NFEV],
             njev=counters[:, NJEV],
@@ -570,9 +537,8 @@ class _Gathered:
             times=plan.times if plan.is_saving else np.zeros(0),
             trajectories=trajectories,
             invariants=members.values if trajectories is None else members.saved_values.swapaxes(1, 2),
-            target=members.target,
-            t_events=[[t for t, _ in member] for member in events] if plan.events else None,
-            y_events=[[y for _, y in member] for member in events] if plan.events else None,
+            t_events=members.t_events if plan.events else None,
+            y_events=members.y_events if plan.events else None,
             reduced=reduced,
             first=first,
             stopped=self.stopped,

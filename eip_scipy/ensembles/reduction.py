@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.inputs import shown
-from ..engine.data import NFEV, NJEV, NLU
+from ..run.integrate import assembled
 from ..run.results import IntegrationResult
 from .tasks import Members, Plan
 
@@ -63,33 +63,19 @@ def _member(plan: Plan, members: Members, k: int) -> IntegrationResult:
     if plan.ready.schedule.t_eval.size == 0 and members.t[k] not in t[-1:]:
         t, y = np.append(t, members.t[k]), np.concatenate([y, members.y[k : k + 1]])
         values = np.concatenate([values, members.values[k : k + 1]])
-    events, problem = members.happened[k] if plan.events else None, plan.ready.problem
-    result = IntegrationResult(
+    return assembled(
+        plan.ready,
+        y,
+        (members.t_events[k], members.y_events[k]) if plan.events else None,
+        members.counters[k],
         t=t,
-        y=y.T,
         invariants=values.T,
         target=members.target[k],
         max_residual=members.max_residual[k],
-        t_events=None if events is None else [times for times, _ in events],
-        y_events=None if events is None else [states for _, states in events],
-        nfev=int(members.counters[k, NFEV]),
-        njev=int(members.counters[k, NJEV]),
-        nlu=int(members.counters[k, NLU]),
         status=int(members.status[k]),
         message=members.message[k],
         success=True,
         trusted=bool(members.trusted[k]),
         compiled=plan.why_not is None,
-        method=plan.ready.label,
         h=plan.h,
-        component_names=plan.ready.component_names,
-        units="" if problem is None else problem.units,
-        epoch=None if problem is None else problem.epoch,
     )
-    if plan.variations is not None:
-        tangents = plan.ready.tangents
-        own, result["variations"] = tangents.split(y)
-        result["y"], result["columns"] = own.T, plan.ready.described_columns
-        if events is not None:
-            result["y_events"] = [tangents.state(states) for _, states in events]
-    return result

@@ -26,11 +26,9 @@ from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
 from ..run.prepare import Prepared, Request, prepared
-from ..run.resume import Keeper
-from .happened import Happened, happened
 from .side_by_side import need_compiling, octet_functions, why_one_by_one
 
-__all__ = ["FAILED", "LISTS", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
+__all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
 
 FAILED, NOT_RUN = -1, -2
 # Number of steps in the first call of the engine, and the target duration of a call.
@@ -41,7 +39,7 @@ BY_MEMBER = (
     *("figures", "suspects"),
 )
 LEAST_WORK = 3e7  # floats times steps, one or two seconds: compiling functions for eight members takes as long
-LISTS = "message", "happened"  # fields of Members that are lists; the others are arrays
+Events = list[list[np.ndarray]]  # for each member, an array for each event
 
 
 class StoppedError(Exception):
@@ -69,7 +67,7 @@ class Members(NamedTuple):
     y: np.ndarray  # (m, n): last states
     t: np.ndarray  # (m,): their times
     status: np.ndarray  # (m,): 0 or 1, as in `integrate`, `FAILED`, or `NOT_RUN`
-    message: list[str]
+    message: np.ndarray  # (m,): str
     max_residual: np.ndarray  # (m, l)
     counters: np.ndarray  # (m, N_COUNTERS): the engine's, such as that of the evaluations of f (index `NFEV`)
     max_correction: np.ndarray  # (m,)
@@ -79,16 +77,18 @@ class Members(NamedTuple):
     saved_values: np.ndarray  # (m, times, l): values of the invariants in the saved states
     values: np.ndarray  # (m, l): values of the invariants in the last states
     target: np.ndarray  # (m, l)
-    happened: list[Happened]  # times and states of the events of each member
+    t_events: Events  # times (k,) of each event; an empty list instead of all members if there are no events
+    y_events: Events  # states (k, n)
 
     @classmethod
-    def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
+    def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int, events: int) -> Members:
         """Return the results of `m` members that did not run, for states with `n` components at `times` times."""
+        no_events = range(m if events else 0)
         return cls(
             y=np.full((m, n), np.nan, dtype),
             t=np.full(m, np.nan),
             status=np.full(m, NOT_RUN),
-            message=["not run"] * m,
+            message=np.full(m, "not run", object),
             max_residual=np.full((m, invariants), np.nan),
             counters=np.zeros((m, N_COUNTERS), np.int64),
             max_correction=np.full(m, np.nan),
@@ -98,7 +98,8 @@ class Members(NamedTuple):
             saved_values=np.full((m, times, invariants), np.nan),
             values=np.full((m, invariants), np.nan),
             target=np.full((m, invariants), np.nan),
-            happened=[[] for _ in range(m)],
+            t_events=[[np.zeros(0)] * events for _ in no_events],
+            y_events=[[np.zeros((0, n), dtype)] * events for _ in no_events],
         )
 
 
@@ -133,7 +134,7 @@ class Plan:
     def compile(self, *, progress: bool = False) -> Plan:
         """Compile the functions, before threads start and would each compile them, and return the plan itself."""
         ready, invariants = self.ready, self.ready.run.invariants
-        loop = Loop(replace(ready, request=ready.request._replace(progress=progress)), Keeper())
+        loop = Loop(replace(ready, request=ready.request._replace(progress=progress)))
         own_targets = any(item.target is not None for item in invariants.items)
         reasons = {
             "the runs have derivatives": self.variations is not None,
@@ -152,9 +153,10 @@ class Plan:
             self.one_by_one, self._idle = sweeper.one_by_one, [sweeper]
         return self
 
-    def empty(self, m: int) -> Members:
-        """Return buffers for `m` members."""
-        return Members.empty(m, self.size, self.dtype, len(self.names), self.times.size)
+    def empty(self, m: int, rows: int | None = None) -> Members:
+        """Return buffers for `m` members with `rows` saved states, by default those that a member saves."""
+        rows = self.times.size if rows is None else rows
+        return Members.empty(m, self.size, self.dtype, len(self.names), rows, self.events)
 
     @contextmanager
     def driver(self) -> Iterator[Sweeper | None]:
@@ -166,7 +168,7 @@ class Plan:
             mine = self._idle.pop()
         except IndexError:
             request = self.task.request
-            mine = Sweeper(Loop(self.task.prepared(request.y0, request.params), Keeper()), self.task.members)
+            mine = Sweeper(Loop(self.task.prepared(request.y0, request.params)), self.task.members)
         yield mine
         self._idle.append(mine)
 
@@ -227,7 +229,7 @@ class _Watch:
 def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
     """Run member `k` as `integrate` does, and store its results in `out`."""
     try:
-        loop = Loop(plan.task.prepared(y0, params), Keeper())
+        loop = Loop(plan.task.prepared(y0, params))
     except Exception as error:
         out.y[k], out.t[k] = plan.ready.tangents.with_state(out.y[k], y0), plan.t0
         out.status[k], out.message[k] = FAILED, _reason(error)
@@ -250,10 +252,9 @@ def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members,
     schedule = loop.driver.schedule
     after = loop.driver.t[:rows] != schedule.span.t0
     _cover(out, slice(k, k + 1), out.saved_values[k, :rows][None, after], schedule)
-    out.happened[k] = [
-        (np.array(t), np.array(y, plan.dtype).reshape(len(t), plan.size))
-        for t, y in zip(loop.events.t, loop.events.y, strict=True)
-    ]
+    if plan.events:
+        out.t_events[k] = [np.array(t) for t in loop.events.t]
+        out.y_events[k] = [np.array(y, plan.dtype).reshape(len(y), plan.size) for y in loop.events.y]
 
 
 def _cover(out: Members, those: slice, rows: np.ndarray, schedule: Schedule) -> None:
@@ -406,7 +407,9 @@ class Sweeper:
             self._arrived(np.arange(those.start + first, those.start + done), each, out)
             failed = reason is not None or code != OK
             if plan.events and (failed or done > first):
-                out.happened[those.start + first] = happened(plan.events, *self.loop.driver.interpolants.roots())
+                which, t, y = self.loop.driver.interpolants.roots()
+                out.t_events[those.start + first] = [t[which == k].copy() for k in range(plan.events)]
+                out.y_events[those.start + first] = [y[which == k].copy() for k in range(plan.events)]
             if failed:
                 self._look_at(plan, those.start + done, code, reason, each, out, watch)
                 where[:] = done + 1, 0

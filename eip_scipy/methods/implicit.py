@@ -55,9 +55,9 @@ class ScipySolverAdapter(Method):
 
     Entry (p, j) of `polynomials` (k, k) is the coefficient of x^(p + 1), x = (t - t_old) / h, in the interpolant, which
     multiplies the j-th row that `_describe` fills. `scipy_solver` is the solver of a run, which `begin` makes.
-    `not_finite_at` is a time at which the right-hand side had a value that is not finite in the last step, or None. The
-    engine reads `b`, `c`, `exponent` and `multistep`, as those of a tableau; the array work.K has one row more than `b`
-    has entries.
+    `start_calls` is the number of evaluations that it took, for a Jacobian. `not_finite_at` is a time at which the
+    right-hand side had a value that is not finite in the last step, or None. The engine reads `b`, `c`, `exponent` and
+    `multistep`, as those of a tableau; the array work.K has one row more than `b` has entries.
     """
 
     in_python = drives = True
@@ -76,6 +76,7 @@ class ScipySolverAdapter(Method):
         self.b = self.c = np.zeros(len(self.polynomials) + 1)
         self.not_finite_at: float | None = None
         self.scipy_solver: Any
+        self.start_calls = 0
         self._before: dict[str, Any] = {}
         self._counted = dict.fromkeys(COUNTERS, 0)
 
@@ -119,7 +120,8 @@ class ScipySolverAdapter(Method):
             fun, t, y, span.t_bound, max_step=span.max_step, rtol=float(rtol.max(initial=0.0)),
             atol=spec.stepping.atol, first_step=length or None, **jacobian._asdict(),
         )  # fmt: skip
-        spec.uncount(calls[0])  # those of its Jacobian
+        self.start_calls = calls[0]
+        spec.uncount(self.start_calls)
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
         lacking = [name for name in PRIVATE[self.solver] if not hasattr(solver, name)]

@@ -6,8 +6,10 @@ Needs ``pip install "eip_scipy[plot]"``. The figures of runs and ensembles are d
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 try:
     from matplotlib.ticker import LogLocator, NullFormatter
@@ -18,7 +20,7 @@ except ModuleNotFoundError as error:
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["FLOOR", "MARKERS", "PALETTE", "log_errors", "method_styles", "typeset"]
+__all__ = ["FLOOR", "MARKERS", "PALETTE", "draw_errors", "log_errors", "method_styles", "typeset"]
 
 # Colours of Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and
 # wine and olive of Tol.
@@ -74,3 +76,18 @@ def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") ->
     axis.set_xlabel(x)
     axis.set_ylabel(y)
     axis.grid(which="major", alpha=0.3)
+
+
+def draw_errors(axis: Axes, x: Any, errors: Mapping[str, Any], styles: Mapping[str, Any], sizes: Any) -> None:
+    """Draw errors by name for a log axis, which has no place for 0: errors of 0 are drawn below all others, and marked.
+
+    `sizes` are those of the quantities with these errors; 0 is drawn below their rounding errors.
+    """
+    values = np.concatenate(list(errors.values()))
+    size = np.max(np.abs(sizes), where=np.isfinite(sizes), initial=0.0)
+    zero = np.min(values, where=values > 0, initial=FLOOR * (size or 1.0))
+    for name, row in errors.items():
+        axis.plot(x, np.where(row == 0, zero, row), **styles[name])
+    if np.any(values == 0):
+        across = axis.get_yaxis_transform()
+        axis.text(1.0, zero, "error 0 ", transform=across, ha="right", va="top", fontsize="x-small")

@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from copy import copy
 from typing import Any, Unpack
 
 import numpy as np
@@ -30,7 +31,7 @@ from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver
 from .prepare import DEFAULT, Prepared, Request, prepared, started_at
-from .results import IntegrationResult, Origin
+from .results import IntegrationResult, Origin, described
 
 __all__ = ["integrate"]
 
@@ -237,13 +238,13 @@ class Loop:
     An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
-    def __init__(self, prepared: Prepared, keeper: _resume.Keeper) -> None:
+    def __init__(self, prepared: Prepared, keeper: _resume.Keeper | None = None) -> None:
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
         self.events, self.diagnostics = system.events, prepared.diagnostics
         self.callback, self.progress = request.callback, request.progress
-        if keeper.keeps:
+        if keeper is not None:
             if run.tableau.drives:
                 raise ValueError(
                     f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
@@ -263,9 +264,10 @@ class Loop:
                 keeps_steps=request.dense_output,
                 max_bytes=request.max_bytes,
             )
-        keeper.begin(self.driver)
+        if keeper is not None:
+            keeper.begin(self.driver)
         self._slowed = wanted is None and _slowed_by_invariants(system.fun, functions, run)
-        self.wall_time = keeper.seconds
+        self.wall_time = 0.0 if keeper is None else keeper.seconds
         self.chunk = FIRST_CHUNK
         self._seconds = 0.0
         self.told = self._doubtful = self._event_ended = False
@@ -276,10 +278,12 @@ class Loop:
         try:
             with _bar(self.progress, driver.schedule, self.method) as bar:
                 status, message = self.steps(bar)
-            self.keeper.end(status, message)
+            if self.keeper is not None:
+                self.keeper.end(status, message)
         except BaseException as error:
             self.wall_time += time.perf_counter() - begin
-            self.keeper.interrupted(error)  # first, because a batch system may kill the process soon after SIGTERM
+            if self.keeper is not None:
+                self.keeper.interrupted(error)  # first, because a batch system may kill the process soon after SIGTERM
             driver.run.trust.failed = True
             driver.save_now()
             partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
@@ -318,7 +322,8 @@ class Loop:
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
-            self.keeper.keep()
+            if self.keeper is not None:
+                self.keeper.keep()
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
             steps = self._chunk(self.chunk)
             code = driver.advance(k + steps)
@@ -416,23 +421,21 @@ class Loop:
         return False
 
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
-        driver, problem, tangents = self.driver, self.prepared.problem, self.prepared.tangents
-        rows, counters, events = driver.rows, driver.run.work.counters, self.events
+        driver, events, tangents = self.driver, self.events, self.prepared.tangents
+        rows = driver.rows
         values, target = self._values(broken), driver.run.invariants.fixed_target
         driver.note(values, target)
-        result = IntegrationResult(
+        result = assembled(
+            self.prepared,
+            driver.y[:rows],
+            (events.t, events.y) if events.functions else None,
+            driver.run.work.counters,
             t=driver.t[:rows],
-            y=tangents.state(driver.y[:rows]).T,
             invariants=values,
             target=target,
             max_residual=driver.run.work.max_residual,
             diagnostics=self.diagnostics,
-            t_events=[np.asarray(t) for t in events.t] if events.functions else None,
-            y_events=[tangents.state(np.asarray(y)) for y in events.y] if events.functions else None,
             sol=self._solution(),
-            nfev=int(counters[NFEV]),
-            njev=int(counters[NJEV]),
-            nlu=int(counters[NLU]),
             status=status,
             message=self.explained(message),
             success=status >= 0,
@@ -440,19 +443,16 @@ class Loop:
             wall_time=self.wall_time,
             compiled=self.why_not is None,
             calls=self.prepared.system.calls(driver.run, driver.functions),
-            method=self.method,
             h=abs(driver.schedule.span.h) or None,
-            component_names=self.prepared.component_names,
-            units="" if problem is None else problem.units,
-            epoch=None if problem is None else problem.epoch,
         )
         t, y = events.last if self._event_ended else driver.now
+        last, values_at = (np.array([t]), y[None].copy()), driver.values_at
         asked, variations = self.prepared.asked, self.prepared.variations
         if variations is not None:
-            result["variations"] = tangents.split(driver.y[:rows])[1]
-            result["columns"] = self.prepared.described_columns
             asked = asked._replace(variations=tangents.restarted(y))
-        origin = Origin(asked, t, tangents.state(y.copy()), driver.schedule.span.sign, self._kept)
+        y, sign = tangents.state(y.copy()), driver.schedule.span.sign
+        asked = asked._replace(params=copy(asked.params))  # the user may change the array
+        origin = Origin(asked, t, y, sign, self._kept, lambda: values_at(*last)[0], message, self.notes)
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 
@@ -469,20 +469,21 @@ class Loop:
         return StateSolution(found, self.prepared.tangents)
 
     def explained(self, message: str) -> str:
-        """Return the message with remarks: on a start that was moved and on doubts about the run.
+        """Return the message with remarks: on a start that was moved, on doubts about the run, and notes."""
+        return described(message, self.diagnostics, self.notes)
 
-        Notes on checkpoints, functions that were not compiled and gradients by differences follow in parentheses.
-        """
-        notes = [*self.keeper.notes, *([] if self.why_not is None else [self.why_not])]
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return notes on checkpoints, functions that were not compiled and gradients by differences."""
+        notes = [] if self.keeper is None else list(self.keeper.notes)
+        notes += [] if self.why_not is None else [self.why_not]
         if labels := self.driver.run.invariants.by_differences:
             names = ", ".join(map(repr, labels))
             notes.append(
                 f"the gradient of {names} is computed by differences: a function for it would be faster and exact"
             )
-        run = self.driver.run
-        notes += [str(run.conserved.missing)] if run.conserved.missing else []
-        message = "; ".join(filter(None, (message, run.moved, run.trust.message)))
-        return f"{message} ({'; '.join(notes)})" if notes else message
+        missing = self.driver.run.conserved.missing
+        return (*notes, *([] if missing is None else [str(missing)]))
 
     def _values(self, broken: bool) -> np.ndarray:
         """Return the invariants (l, m) of the saved states; NaN if an error has `broken` the run and occurs again."""
@@ -492,6 +493,32 @@ class Loop:
             if not broken:
                 raise
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
+
+
+def assembled(prepared: Prepared, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
+    """Return a result with the given `fields` and those that follow from the run `prepared`.
+
+    `y` (m, n) are the saved states, with the tangent vectors that follow them, and `events` the times and states of
+    each event; None without events. `counters` are those of the engine.
+    """
+    problem, tangents = prepared.problem, prepared.tangents
+    result = IntegrationResult(
+        fields,
+        y=tangents.state(y).T,
+        t_events=None if events is None else [np.asarray(t) for t in events[0]],
+        y_events=None if events is None else [tangents.state(np.asarray(states)) for states in events[1]],
+        nfev=int(counters[NFEV]),
+        njev=int(counters[NJEV]),
+        nlu=int(counters[NLU]),
+        method=prepared.label,
+        component_names=prepared.component_names,
+        units="" if problem is None else problem.units,
+        epoch=None if problem is None else problem.epoch,
+    )
+    if prepared.variations is not None:
+        result["variations"] = tangents.split(y)[1]
+        result["columns"] = prepared.described_columns
+    return result
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:

@@ -31,7 +31,6 @@ from .integrate import Loop, integrate
 from .interpreted_functions import interpreted
 from .prepare import Request, evaluation_times, prepared
 from .results import IntegrationResult
-from .resume import Keeper
 
 __all__ = ["Recommendation", "Trial", "recommend"]
 
@@ -388,7 +387,7 @@ class _Search:
         ready = prepared(Request.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further}))
         is_implicit, system = options["method"].TABLEAU.drives, ready.system
         if is_implicit:
-            calls, fun = count(int(ready.run.work.counters[NFEV])), system.fun
+            calls, fun = count(int(ready.run.work.counters[NFEV]) + ready.run.method.start_calls), system.fun
 
             def counted(*args: Any) -> Any:
                 if next(calls) > self.most:
@@ -396,7 +395,7 @@ class _Search:
                 return fun(*args)
 
             system.fun, system.rhs = counted, interpreted(system.form, counted, system.extra, ready.run.y0)
-        run = Loop(ready, Keeper()).run()
+        run = Loop(ready).run()
         return run, next(calls) if is_implicit else run.nfev
 
     def _run(self, options: Mapping[str, Any]) -> tuple[np.ndarray, int, float, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -12,9 +12,9 @@ from scipy.optimize import OptimizeResult
 
 from ..core.problem import Problem
 from ..core.results import Diagnostics, Multipliers
-from .tables import default_names, to_dataframe, to_xarray
+from .tables import to_dataframe, to_xarray
 
-__all__ = ["Fields", "IntegrationResult", "Origin", "WithColumns"]
+__all__ = ["Fields", "IntegrationResult", "Origin", "Result", "described"]
 
 
 class Origin(NamedTuple):
@@ -25,6 +25,15 @@ class Origin(NamedTuple):
     y: np.ndarray  # (n,): last state of the run, saved or not
     sign: float  # direction of time, 1 or -1
     kept: Callable[[], Any]  # returns the invariants of the run, with the kept values as their targets
+    values: Callable[[], np.ndarray]  # returns the invariants (l,) in the last state, as their functions are now
+    ended: str  # reason for the end of the run
+    notes: tuple[str, ...]  # remarks at the end of its message
+
+
+def described(ended: str, diagnostics: Diagnostics, notes: Sequence[str]) -> str:
+    """Return a message: the reason for the end, remarks on the start and on doubts, and `notes` in parentheses."""
+    message = "; ".join(filter(None, (ended, diagnostics.moved, diagnostics.message)))
+    return f"{message} ({'; '.join(notes)})" if notes else message
 
 
 if TYPE_CHECKING:
@@ -42,9 +51,12 @@ OBSERVED = ("outputs", "multipliers")  # computed when they are first requested
 UNSET = ("units", "epoch")  # fields that are printed only if they are set
 
 
-class WithColumns(Fields):
-    """Base class of results of runs that may have integrated derivatives of the state (``variations=``)."""
+class Result(Fields):
+    """Base class of the results of runs and ensembles, which may have derivatives of the state (``variations=``)."""
 
+    COMPONENTS = 0  # axis of `y`
+    t: np.ndarray
+    y: np.ndarray
     variations: np.ndarray
     columns: dict[str, Any]
 
@@ -81,16 +93,48 @@ class WithColumns(Fields):
             raise AttributeError(ABSENT["sensitivities"])
         return self.variations[..., self.variations.shape[-1] - count :]
 
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components from the `Problem`, or "y0", "y1" and so on; other names can be assigned."""
+        names = self.get("component_names")
+        return tuple(f"y{k}" for k in range(self.y.shape[self.COMPONENTS])) if names is None else tuple(names)
+
+    def to_xarray(self, names: Any = None) -> Any:
+        """Return the run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
+        return to_xarray(self, names)
+
+    def to_dataframe(self, names: Any = None) -> Any:
+        """Return the run as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
+        return to_dataframe(self, names)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`."""
+        from .saving import save
+
+        save(self, path)
+
+    def _observe(self) -> None:
+        """Compute the fields for outputs and multipliers if the problem has them and they have not been computed."""
+        origin = vars(self).get("_origin")
+        if origin is None or any(name in self for name in OBSERVED) or not isinstance(origin.request.fun, Problem):
+            return
+        self.update(origin.request.fun.observed(self.t, self.y, origin.request.params))
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
+
     if not TYPE_CHECKING:  # type checkers would accept any attribute name
 
         def __getattr__(self, name: str) -> Any:
             # The __getattr__ of OptimizeResult would replace the error that a property has just raised.
+            if name in OBSERVED:
+                self._observe()
             if name in ABSENT and name not in self:
                 raise AttributeError(ABSENT[name])
             return OptimizeResult.__getattr__(self, name)
 
 
-class IntegrationResult(WithColumns):
+class IntegrationResult(Result):
     """Result of `integrate`; fields are accessible by attribute or by key, as in SciPy's results.
 
     Attributes
@@ -146,8 +190,6 @@ class IntegrationResult(WithColumns):
         "parameters", the number of derivatives with respect to parameters, and "names", the names of these parameters;
         "symplectic", True if the matrix was kept symplectic; "source", the origin of the products with the Jacobian:
         "problem", "jvp", "dual numbers" or "complex steps".
-    component_names : tuple of str
-        Names of the components from the `Problem`, or "y0", "y1" and so on; other names can be assigned.
     units : str
         Units of the `Problem`; "" without one.
     epoch : (float, float) or None
@@ -165,8 +207,6 @@ class IntegrationResult(WithColumns):
     projected, because that needs the functions; in a loaded result it is None.
     """
 
-    t: np.ndarray
-    y: np.ndarray
     invariants: np.ndarray
     target: np.ndarray
     max_residual: np.ndarray
@@ -188,61 +228,8 @@ class IntegrationResult(WithColumns):
     h: float | None
     units: str
     epoch: tuple[float, float] | None
-
-    @property
-    def component_names(self) -> tuple[str, ...]:
-        """Names of the components of the state, (n,)."""
-        given = self.get("component_names")
-        return default_names(len(self.y)) if given is None else tuple(given)
-
-    @property
-    def outputs(self) -> dict[str, np.ndarray]:
-        """Outputs of a mechanical system at the saved times.
-
-        Raises
-        ------
-        AttributeError
-            If the problem has no outputs.
-        """
-        return self._observed("outputs")
-
-    @property
-    def multipliers(self) -> Multipliers:
-        """Lagrange multipliers at the saved times.
-
-        Raises
-        ------
-        AttributeError
-            If the problem has no constraints.
-        """
-        return self._observed("multipliers")
-
-    def _observed(self, name: str) -> Any:
-        self._observe()
-        if name not in self:
-            raise AttributeError(ABSENT[name])
-        return self[name]
-
-    def _observe(self) -> None:
-        """Compute the fields for outputs and multipliers if the problem has them and they have not been computed."""
-        origin = vars(self).get("_origin")
-        if origin is None or any(name in self for name in OBSERVED) or not isinstance(origin.request.fun, Problem):
-            return
-        self.update(origin.request.fun.observed(self.t, self.y, origin.request.params))
-
-    def to_xarray(self, names: Any = None) -> Any:
-        """Return the run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
-        return to_xarray(self, names)
-
-    def to_dataframe(self, names: Any = None) -> Any:
-        """Return the run as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
-        return to_dataframe(self, names)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`."""
-        from .saving import save
-
-        save(self, path)
+    outputs: dict[str, np.ndarray]
+    multipliers: Multipliers
 
     def plot(self, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
         """Draw the run, see `eip_scipy.results.plot`."""
@@ -258,25 +245,30 @@ class IntegrationResult(WithColumns):
         t : float
             New end of the run, beyond the present one in its direction.
         **options
-            Options of `integrate` that change. `t_eval` is not repeated: pass new times, otherwise the states at both
-            ends are saved. Events keep their counts: an event with ``terminal = 3`` that happened twice before ends the
-            run when it happens once more, and an event that ended the run ends it again when it happens next;
-            ``events=None`` removes all events. New events start to count at 0. If they are not the same functions in
-            the same order, `t_events` and `y_events` contain those of the second run only.
+            Options of `integrate` that change: method, h, rtol, atol, first_step, max_step, save_every, t_eval, events,
+            callback, progress, compiled, max_bytes, checkpoint, checkpoint_every, resume, check and project_initial.
+            `t_eval` is not repeated: pass new times, otherwise the states at both ends are saved. Events keep their
+            counts: an event with ``terminal = 3`` that happened twice before ends the run when it happens once more,
+            and an event that ended the run ends it again when it happens next; ``events=None`` removes all events. New
+            events start to count at 0, and may happen at once. If they are not the same functions in the same order,
+            `t_events` and `y_events` contain those of the second run only.
 
         Returns
         -------
         IntegrationResult
             Both runs combined: rows, events and interpolants in order, counts and seconds added, invariant errors and
-            corrections the larger of both, `trusted` if both are; status, message, method and h are those of the second
-            run.
+            corrections the larger of both, `trusted` if both are, with the reasons of both in `message`; status,
+            method and h are those of the second run. Fields that were added to the first result are left out.
 
         Raises
         ------
         ValueError
-            If `t` is not beyond the end, if the result was loaded, unpickled or copied, or if at the last state
-            the error of an invariant exceeds 1e-8 of the terms of this invariant, as after an unreliable run or one
-            without checks; ``project_initial=True`` then projects the state first.
+            If another option of `integrate` is given, because a value of the first part belongs to it: the targets of
+            the invariants to `params`, derivatives to the first start. If an invariant has another value in the last
+            state than before, because something that its function uses has changed. If `t` is not beyond the end, or
+            the result was loaded, unpickled or copied. If at the last state the error of an invariant with a given
+            target exceeds 1e-8 of the terms of this invariant, as after an unreliable run or one without checks;
+            ``project_initial=True`` then projects the state first.
 
         Notes
         -----
@@ -295,42 +287,18 @@ class IntegrationResult(WithColumns):
         >>> float(longer.t[-1]), bool((longer.max_residual < 1e-11).all())
         (20.0, True)
         """
-        from .continuation import continued
+        from .continuation import continue_to
 
-        return continued(self, t, options)
+        return continue_to(self, t, options)
 
     def __repr__(self) -> str:
         """Return the fields as text, without `units` and `epoch` if they are not set."""
         return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
 
-    def _packed(self) -> dict[str, Any]:
-        """Return the fields in the form that `eip_scipy.results.save` accepts."""
-        self._observe()
-        found = dict(self)
-        if (outputs := found.pop("outputs", None)) is not None:
-            found |= {"outputs.names": list(outputs), "outputs.values": np.array(list(outputs.values()))}
-        if (multipliers := found.pop("multipliers", None)) is not None:
-            found |= {f"multipliers.{name}": value for name, value in multipliers._asdict().items()}
-        return found
-
-    @classmethod
-    def _unpacked(cls, fields: dict[str, Any]) -> IntegrationResult:
-        """Return a result from the output of `_packed`."""
-        found = dict(fields)
-        if "outputs.names" in found:
-            found["outputs"] = dict(zip(found.pop("outputs.names"), found.pop("outputs.values"), strict=True))
-        if "multipliers.names" in found:
-            parts = {name: found.pop(f"multipliers.{name}") for name in Multipliers._fields}
-            found["multipliers"] = Multipliers(**(parts | {"names": tuple(parts["names"])}))
-        return cls(found)
-
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Compute outputs and multipliers, for which an unpickled result has no functions; return what is pickled."""
         self._observe()
         return super().__reduce_ex__(protocol)
-
-    def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
 
     def __getstate__(self) -> None:
         """Return None: a pickle excludes attributes that are not fields, such as the functions of the run."""

@@ -31,8 +31,6 @@ KIND = "integrate"
 SNAPSHOT_SECONDS = 0.2
 # Smallest ratio of run time to the time for copying or writing, so that each takes at most 5 % for any size of state.
 LEAST_RATIO = 19.0
-# Relative difference allowed between values of the same function at the same point, also on another machine.
-SAME = 1e-9
 SHORT = 16
 STEP = 0
 
@@ -40,46 +38,16 @@ Arrays = dict[str, np.ndarray]
 Derivative = Callable[[float, np.ndarray], np.ndarray]
 
 
-class Keeper:
-    """Interface between a run and its checkpoint. This class stores nothing; it serves runs without a checkpoint."""
-
-    keeps = False
-    seconds = 0.0
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Additions to the message of the result."""
-        return ()
-
-    def identify(self, settings: dict[str, Any], run: Run, derivative: Derivative, events: Events) -> None:
-        """Record what identifies the run, before anything is compiled: its settings and functions.
-
-        A run that is resumed must agree with its file, otherwise CheckpointError is raised.
-        """
-
-    def begin(self, driver: Any) -> None:
-        """Store the driver, whose buffers hold the start; if a run is resumed, fill the buffers and the events."""
-
-    def keep(self) -> None:
-        """Store a snapshot or write the file if it is due; called between two chunks of steps."""
-
-    def end(self, status: int, message: str) -> None:
-        """Record that the run has ended regularly."""
-
-    def interrupted(self, error: BaseException) -> None:
-        """Record that `error` has ended the run."""
-
-
 @contextmanager
-def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper]:
-    """Yield the keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`."""
+def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper | None]:
+    """Yield the keeper for the options ``checkpoint``, ``checkpoint_every``, ``resume``; None without a checkpoint."""
     flag("resume", resume)
     if not is_number(every, "checkpoint_every") or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     if path is None:
         if resume:
             raise ValueError("resume=True needs a file to resume from: pass checkpoint=path.")
-        yield Keeper()
+        yield None
         return
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
@@ -95,7 +63,7 @@ def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[K
             found = checkpoint.read(lock.name, KIND)
         elif resume:
             origin = "there was no checkpoint: started at the beginning"
-        yield _FileKeeper(lock.name, float(every), found, origin)
+        yield Keeper(lock.name, float(every), found, origin)
 
 
 def settings(
@@ -160,15 +128,15 @@ class _Snapshot(NamedTuple):
     seconds: float
 
 
-class _FileKeeper(Keeper):
-    """Checkpoints in the file `name`, written every `every` seconds; `found` is the content of an existing file.
+class Keeper:
+    """The checkpoint of a run in the file `name`, written every `every` seconds.
 
-    `origin` is a note for the message of the result if a run that should be resumed has no file, otherwise "".
-    The file always contains the last snapshot, never the current buffers, because an interruption may come inside a
-    step. Saved rows and events only grow, so a snapshot needs only their number.
+    `found` is the content of an existing file. `origin` is a note for the message of the result if a run that should be
+    resumed has no file, otherwise "". The file always contains the last snapshot, never the current buffers, because an
+    interruption may come inside a step. Saved rows and events only grow, so a snapshot needs only their number.
     """
 
-    keeps = True
+    seconds = 0.0  # run time before the run was resumed
 
     def __init__(self, name: str, every: float, found: tuple[dict[str, Any], Arrays] | None, origin: str) -> None:
         self._name, self._every, self._read = name, every, found
@@ -177,6 +145,7 @@ class _FileKeeper(Keeper):
         self._ended: Any = None
 
     def identify(self, settings: dict[str, Any], run: Run, derivative: Derivative, events: Events) -> None:
+        """Record what identifies the run, before it is compiled; raise CheckpointError if the file has another run."""
         self._settings, self._run, self._derivative, self._events = settings, run, derivative, events
         self._names = run.invariants.names
         if self._read is None:
@@ -194,21 +163,15 @@ class _FileKeeper(Keeper):
         return {"state_f": self._derivative(t, y.copy()), "state_values": self._run.invariants.values(t, y)}
 
     def _require_same_functions(self, arrays: Arrays) -> None:
-        known_by = self._known_by(arrays)
-        self._require_fitting(arrays, known_by)
-        there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
-        t, f = float(arrays["clock"][TIME]), known_by["state_f"]
-        terms = self._run.invariants.term_sizes(t, arrays["y"], f)
-        sizes = np.concatenate([np.full(f.size, np.abs(f).max(initial=0.0)), terms])
-        with np.errstate(invalid="ignore"):
-            same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
-        if not same.all():
-            k = int(np.flatnonzero(~same)[0])
-            label = "fun" if k < f.size else f"invariant {self._names[k - f.size]!r}"
+        self._require_fitting(arrays, known_by := self._known_by(arrays))
+        t, there = float(arrays["clock"][TIME]), np.concatenate([arrays[name] for name in known_by])
+        changed = checkpoint.changed_function(self._run.invariants, t, arrays["y"], there, known_by["state_f"])
+        if changed:
+            name, old, new = changed
             raise CheckpointError(
-                f"the checkpoint {self._name!r} belongs to another run: {label} was {_number(there[k])} at "
-                f"t = {t:.10g}, where it was saved, and is {_number(here[k])} now. Resume with the functions of that "
-                "run, or use another file for a new run."
+                f"the checkpoint {self._name!r} belongs to another run: {name} was {_number(old)} at t = {t:.10g}, "
+                f"where it was saved, and is {_number(new)} now. Resume with the functions of that run, or use another "
+                "file for a new run."
             )
 
     def _require_fitting(self, arrays: Arrays, expected: Arrays) -> None:
@@ -221,6 +184,7 @@ class _FileKeeper(Keeper):
                 )
 
     def begin(self, driver: Any) -> None:
+        """Store the driver, whose buffers hold the start; if a run is resumed, fill the buffers and the events."""
         self._driver = driver
         found, self._read = self._read, None
         if found is not None:
@@ -261,9 +225,11 @@ class _FileKeeper(Keeper):
 
     @property
     def notes(self) -> tuple[str, ...]:
+        """Additions to the message of the result."""
         return tuple(note for note in (self._origin, self._failure) if note)
 
     def keep(self) -> None:
+        """Store a snapshot or write the file if it is due; called between two chunks of steps."""
         now = time.perf_counter()
         if now >= min(self._due, self._next_snapshot):
             self._take_snapshot()
@@ -271,6 +237,7 @@ class _FileKeeper(Keeper):
             self._write_or_warn(None, "running")
 
     def end(self, status: int, message: str) -> None:
+        """Record that the run has ended regularly."""
         if status == 0:
             self._take_snapshot()
         step = int(self._snapshot.arrays["place"][STEP])
@@ -278,6 +245,7 @@ class _FileKeeper(Keeper):
             self._write_or_warn(status, message)
 
     def interrupted(self, error: BaseException) -> None:
+        """Record that `error` has ended the run."""
         try:
             self._write(None, f"interrupted by {type(error).__name__}")
         except CheckpointError as failure:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.problem import component_names as checked
+from ..core.results import Multipliers
+from .fields import FIELDS, Field, component_names, label, labels, time_name
 
 if TYPE_CHECKING:
     from pandas import DataFrame
     from xarray import Dataset
 
-__all__ = ["component_names", "dataset", "default_names", "invariant_rows", "of_members", "to_dataframe", "to_xarray"]
+__all__ = ["dataset", "invariant_errors", "to_dataframe", "to_xarray"]
 
 TABLES = {"xarray": "xarray", "pandas": "dataframe"}
-# Fields that describe the whole run, in the order of the attributes.
-DESCRIBED = (
-    "method", "h", "message", "trusted", "status", "success", "nfev", "njev", "nlu", "wall_time", "compiled", "units",
-)  # fmt: skip
 
 
 def to_xarray(result: Any, names: Any = None) -> Dataset:
@@ -41,7 +38,8 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
         If it has derivatives, also ``variations`` (t, component, column); a column is named after the component of the
         initial state or the parameter with respect to which it is the derivative, or 0, 1 and so on. A mechanical
         system adds ``outputs`` (output, t), ``multipliers`` (constraint, t) and ``constraint_rank`` (t,). Attributes
-        are method, h (nan for adaptive steps), message, trusted (1 or 0) and others that the result has.
+        are method, h (nan for adaptive steps), message, trusted (1 or 0) and others that the result has. If a component
+        is the time "t", as in `time_transformed`, the dimension of the saved states is "s", and ``t`` (s,) is the time.
 
     Raises
     ------
@@ -59,30 +57,19 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     >>> data.y.dims, data.component.values.tolist(), data.attrs["method"]
     (('component', 't'), ['x', 'y', 'vx', 'vy'], 'EIPRK4')
     """
-    if of_members(result):
+    if hasattr(result, "trajectories"):
         return result.to_xarray(names)
-    variables: dict[str, Any] = {"y": (("component", "t"), np.asarray(result.y))}
-    coordinates: dict[str, Any] = {"t": np.asarray(result.t), "component": list(component_names(result, names))}
-    rows = invariant_rows(result)
-    if rows:
-        coordinates["invariant"] = list(rows)
-        both = np.array(list(rows.values()))
-        variables["invariants"] = (("invariant", "t"), both[:, 0])
-        variables["invariant_errors"] = (("invariant", "t"), both[:, 1])
-        variables["max_residual"] = (("invariant",), np.asarray(result.max_residual))
-    if "variations" in result:
-        coordinates["column"] = column_names(result, coordinates["component"])
-        variables["variations"] = (("t", "component", "column"), np.asarray(result.variations))
-    outputs, multipliers = getattr(result, "outputs", None), getattr(result, "multipliers", None)
-    if outputs is not None:
-        coordinates["output"] = list(outputs)
-        variables["outputs"] = (("output", "t"), np.array(list(outputs.values())))
-    if multipliers is not None:
-        coordinates["constraint"] = list(multipliers.names)
-        variables["multipliers"] = (("constraint", "t"), multipliers.values)
-        variables["constraint_rank"] = (("t",), multipliers.rank)
-    attributes = {name: result[name] for name in DESCRIBED if name in result}
-    return dataset(variables, coordinates, attributes)
+    known = labels(result, names)
+    time = time_name(known["component"])
+    data = dataset(result, FIELDS, {"t": np.asarray(result.t), **known})
+    if "invariant" in known:
+        data["invariant_errors"] = ("invariant", "t"), invariant_errors(result)
+    if "constraint" in known:
+        data["constraint_rank"] = ("t",), result.multipliers.rank
+    if time != "t":
+        data = data.rename(t=time)
+        data["t"] = (time,), data.y.sel(component="t").values
+    return data
 
 
 def to_dataframe(result: Any, names: Any = None) -> DataFrame:
@@ -96,13 +83,13 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     Returns
     -------
     pandas.DataFrame
-        Table indexed by ``t``, with a column for each component, then two for each invariant: for one named H, its
-        value "H" and its error "H error" (the value minus the target). If a component is also named H, the columns are
-        "invariant H" and "invariant H error". Columns of derivatives follow, such as "dx/dvy" of x with respect to the
-        initial vy; see `to_xarray` for the names. A mechanical system adds its outputs, "output x" if there is a column
-        x, and its multipliers, such as "multiplier g1'". The table of an ensemble is indexed by ``member``: a column
-        for each component of the last state, then "t_end", "status", "message", "trusted", and "H max_residual" for
-        each invariant.
+        Table indexed by ``t`` (by "s" if a component is named "t"), with a column for each component, then two for each
+        invariant: for one named H, its value "H" and its error "H error" (the value minus the target). If a component
+        is also named H, the columns are "invariant H" and "invariant H error". Columns of derivatives follow, such as
+        "dx/dvy" of x with respect to the initial vy; see `to_xarray` for the names. A mechanical system adds its
+        outputs, "output x" if there is a column x, and its multipliers, such as "multiplier g1'". Names that would
+        still be equal get a number. The table of an ensemble is indexed by ``member``: a column for each component of
+        the last state, then "t_end", "status", "message", "trusted", and "H max_residual" for each invariant.
 
     Raises
     ------
@@ -123,73 +110,73 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         import pandas
     except ModuleNotFoundError as error:
         raise _missing("pandas", error) from error
-    if of_members(result):
-        columns = dict(zip(component_names(result, names, result.y.shape[1]), result.y.T, strict=True))
-        columns |= {"t_end": result.t, "status": result.status, "message": result.message, "trusted": result.trusted}
-        columns |= {f"{name} max_residual": result.max_residual[:, k] for k, name in enumerate(result.names)}
-        members = pandas.Index(result.first + np.arange(len(result.y)), name="member")
-        return pandas.DataFrame(columns, index=members)
-    columns = dict(zip(component_names(result, names), np.asarray(result.y), strict=True))
-    for name, (values, errors) in invariant_rows(result).items():
-        label = f"invariant {name}" if name in columns else name
-        columns |= {label: values, f"{label} error": errors}
-    if "variations" in result:
-        components = component_names(result, names)
-        for k, by in enumerate(column_names(result, components)):
-            columns |= {f"d{name}/d{by}": result.variations[:, i, k] for i, name in enumerate(components)}
-    for name, row in (getattr(result, "outputs", None) or {}).items():
-        columns[f"output {name}" if name in columns else name] = row
-    if (multipliers := getattr(result, "multipliers", None)) is not None:
-        columns |= {f"multiplier {name}": row for name, row in zip(multipliers.names, multipliers.values, strict=True)}
-    return pandas.DataFrame(columns, index=pandas.Index(result.t, name="t"))
+    if hasattr(result, "trajectories"):
+        return _table_of_members(result, names, pandas)
+    known = labels(result, names)
+    components = known["component"]
+    time = time_name(components)
+    columns: dict[str, Any] = dict(zip(components, np.asarray(result.y), strict=True))
+    used = {time, *components}
+
+    def add(name: str, values: np.ndarray, kind: str = "") -> str:
+        columns[found := label(name, used, kind)] = values
+        used.add(found)
+        return found
+
+    if "invariant" in known:
+        for k, (name, errors) in enumerate(zip(known["invariant"], invariant_errors(result), strict=True)):
+            add(f"{add(name, result.invariants[k], 'invariant')} error", errors)
+    for k, by in enumerate(known.get("column", ())):
+        for i, name in enumerate(components):
+            add(f"d{name}/d{by}", result.variations[:, i, k])
+    for name in known.get("output", ()):
+        add(name, result.outputs[name], "output")
+    for name, values in zip(known.get("constraint", ()), getattr(result, "multipliers", (0, ()))[1], strict=True):
+        add(f"multiplier {name}", values)
+    return pandas.DataFrame(columns, index=pandas.Index(result.t, name=time))
 
 
-def of_members(result: Any) -> bool:
-    """Return True if a result is that of an ensemble, whose states are (members, components)."""
-    return "trajectories" in result
+def _table_of_members(result: Any, names: Any, pandas: Any) -> DataFrame:
+    components = component_names(result, names, result.y.shape[1])
+    columns: dict[str, Any] = dict(zip(components, result.y.T, strict=True))
+    ends = {f"{time_name(components)}_end": result.t, "status": result.status, "message": result.message}
+    ends |= {"trusted": result.trusted}
+    for name, values in ends.items():
+        columns[label(name, columns, "member")] = values
+    for name, values in zip(result.names, result.max_residual.T, strict=True):
+        columns[label(f"{name} max_residual", columns)] = values
+    return pandas.DataFrame(columns, index=pandas.Index(result.first + np.arange(len(result.y)), name="member"))
 
 
-def invariant_rows(result: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return values and errors (m,) of each invariant at the saved times; the keys are distinct names."""
-    if "invariants" not in result:
-        return {}
-    rows: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for k, (name, values) in enumerate(zip(result.diagnostics.names, result.invariants, strict=True)):
-        rows[f"{name} ({k})" if name in rows else name] = values, values - result.target[k]
-    return rows
+def invariant_errors(result: Any) -> np.ndarray:
+    """Return the errors (l, m) of the invariants at the saved times; NaN for a `Balance`."""
+    return result.invariants - np.asarray(result.target)[:, None]
 
 
-def column_names(result: Any, components: Sequence[str]) -> list[str]:
-    """Return the name of each column of derivatives: a component, a parameter, or the column's number."""
-    known = result.get("columns", {})
-    names = [*(components if known.get("state") else ()), *known.get("names", ())]
-    count = result.variations.shape[2]
-    return names if len(names) == count else [str(k) for k in range(count)]
+def dataset(result: Any, fields: Mapping[str, Field], coordinates: dict[str, Any]) -> Dataset:
+    """Return the `xarray.Dataset` of a result with `fields`, for the dimensions that have `coordinates`.
 
-
-def component_names(result: Any, names: Any = None, n: int | None = None) -> tuple[str, ...]:
-    """Return the `n` names of components: `names`, by default those of the result, else "y0", "y1" and so on.
-
-    By default `n` is len(result.y). ValueError is raised if `names` are not `n` different names.
+    If xarray is missing, ImportError says how to install it.
     """
-    n = len(result.y) if n is None else n
-    if names is None:
-        names = getattr(result, "component_names", None)
-    return default_names(n) if names is None else checked(names, n)
-
-
-def default_names(n: int) -> tuple[str, ...]:
-    """Return the names y0, y1 and so on."""
-    return tuple(f"y{k}" for k in range(n))
-
-
-def dataset(variables: dict[str, Any], coordinates: dict[str, Any], attributes: dict[str, Any]) -> Dataset:
-    """Return an `xarray.Dataset`; if xarray is missing, raise ImportError that says how to install it."""
     try:
         import xarray
     except ModuleNotFoundError as error:
         raise _missing("xarray", error) from error
-    return xarray.Dataset(variables, coordinates, {name: _attribute(value) for name, value in attributes.items()})
+    variables: dict[str, Any] = {}
+    for name, field in fields.items():
+        value = getattr(result, name, None) if field.dims else None
+        if value is not None and field.dims and name not in coordinates and coordinates.keys() >= set(field.dims):
+            variables[field.table or name] = field.dims, _array(value)
+    whole = [name for name, field in fields.items() if field.dims == () and name in result]
+    return xarray.Dataset(variables, coordinates, {name: _attribute(result[name]) for name in whole})
+
+
+def _array(value: Any) -> np.ndarray:
+    """Return the numbers or texts of a field as one array."""
+    if isinstance(value, Multipliers):
+        return value.values
+    found = np.array(list(value.values())) if isinstance(value, dict) else np.asarray(value)
+    return found.astype(str) if found.dtype == object else found
 
 
 def _attribute(value: Any) -> Any:

@@ -443,7 +443,8 @@ def test_what_was_found_before_a_checkpoint_is_known_after_it(tmp_path):
         first = integrate(fun, (0, 10), REST, **steps)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProjectionWarning)
-        assert not first.continue_to(20).trusted
+        longer = first.continue_to(20)
+    assert (longer.trusted, "not to be trusted: " in longer.message) == (False, True)
     steps |= {"save_every": 10, "callback": lambda t, y, residuals: False}
     kept = {"checkpoint": tmp_path / "run.npz", "checkpoint_every": 1e-9}
     with pytest.warns(ProjectionWarning):

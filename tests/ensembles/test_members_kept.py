@@ -211,15 +211,6 @@ def test_saved_and_loaded_and_run_elsewhere(case, tmp_path):
         np.testing.assert_array_equal(file["y"], run.y)
 
 
-def test_datasets_hold_the_invariants():
-    pytest.importorskip("xarray")
-    run = ensemble(PROBLEM, SPAN, STARTS, save_every=50, **STEPS)
-    data = run.to_xarray()
-    assert data.invariants.dims == ("member", "invariant", "time")
-    np.testing.assert_array_equal(data.invariants, run.invariants)
-    assert ensemble(PROBLEM, SPAN, STARTS, **STEPS).to_xarray().end_invariants.dims == ("member", "invariant")
-
-
 # Figures.
 
 
@@ -231,6 +222,7 @@ def test_a_figure_of_members_in_time(tmp_path):
     run = ensemble(PROBLEM, SPAN, STARTS, save_every=20, **STEPS)
     *fans, errors, counts = drawn(run)
     assert [axis.get_ylabel() for axis in fans] == ["x", "y", "vx", "vy"]
+    assert fans[0].get_legend().get_title().get_text() == "of members still running: at least 20 of 21"
     median = np.nanmedian(run.trajectories[:, 0], axis=0)
     np.testing.assert_allclose(fans[0].lines[0].get_ydata(), median, rtol=1e-15)
     assert [line.get_label() for line in errors.lines] == ["H", "L", "failed"]

@@ -19,15 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from numpy.lib import format as npy
 from systems import H_USES_F, H, L, orbit, pericentre, refuse, same
 
-from eip_scipy import (
-    EIPRK4,
-    EIPRK5,
-    EIPRK45,
-    EIPRKN12,
-    Invariant,
-    checkpoint,
-    integrate,
-)
+from eip_scipy import EIPRK4, EIPRK5, EIPRK45, EIPRKN12, Invariant, checkpoint, integrate
 from eip_scipy.checkpoint import CheckpointError
 
 Y0 = pericentre(0.6)
