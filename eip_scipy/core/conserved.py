@@ -28,6 +28,7 @@ NEAR, FAR = 3, 5
 NEAR_DISTANCE, FAR_DISTANCE = 1e-2, 0.5
 
 Array = np.ndarray
+Derivative = Callable[[float, Array], Array]
 
 
 class Conserved(NamedTuple):
@@ -59,13 +60,7 @@ class Samples:
     evaluations of ``rhs(t, y)``.
     """
 
-    def __init__(
-        self,
-        rhs: Callable[[float, Array], Array],
-        start: Any,
-        invariants: InvariantSet,
-        tangents: TangentVectors,
-    ) -> None:
+    def __init__(self, rhs: Derivative, start: Any, invariants: InvariantSet, tangents: TangentVectors) -> None:
         self._rhs, self._start, self.invariants, self._tangents = rhs, start, invariants, tangents
         self.y0, self.f0, self.G0 = map(tangents.state, (start.y, start.f, invariants.start_gradients))
         self.near, self.far, self.calls = NEAR, 0, 0
