@@ -117,8 +117,8 @@ class ScipySolverAdapter(Method):
         make: Any = self.solver
         jacobian = spec.jacobian() or Jacobian()
         self.scipy_solver = solver = make(
-            fun, t, y, span.t_bound, max_step=span.max_step, rtol=float(rtol.max(initial=0.0)),
-            atol=spec.stepping.atol, first_step=length or None, **jacobian._asdict(),
+            fun, t, y, span.t_bound, max_step=span.max_step, rtol=float(rtol[0]) if rtol.size else 1e-3,
+            atol=spec.stepping.atol, first_step=min(length, abs(span.t_bound - t)) or None, **jacobian._asdict(),
         )  # fmt: skip
         self.start_calls = calls[0]
         spec.uncount(self.start_calls)
