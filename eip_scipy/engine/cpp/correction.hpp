@@ -89,12 +89,12 @@ template <class Value, class W>
 }
 
 // Return f at the raw result, or nearly so: what the stages make of it where the step does not evaluate it. Null where
-// corrections are not examined for a shift in time, see `remove_shift`.
+// it is not needed.
 template <class AnyRun>
 inline auto *flow_at_raw(const AnyRun &run, const Step &step) {
     const auto &m = run.method;
     const auto &w = run.work;
-    if (run.options.metric != BY_ERROR || !each_component_alone(run.options.blocks)) return decltype(w.last())(nullptr);
+    if (!removes_shift(run.options)) return decltype(w.last())(nullptr);
     const bool in_python = run.hooks && run.hooks->raw;
     if (in_python && !w.counters[F_AT_RAW]) {
         run.system.rhs(w, step.t_new, as_floats(w.y_hat), as_floats(w.last()));
@@ -347,8 +347,7 @@ inline Moved move(const AnyRun &run, const Step &step) {
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);
     move_along(o, w, w.Q, step.y_new);
-    if (o.metric == BY_ERROR && each_component_alone(o.blocks) && o.direction == NEW)
-        subtract_shift(w, 1.0, step.y_new);
+    if (removes_shift(o) && o.direction == NEW) subtract_shift(w, 1.0, step.y_new);
     return true;
 }
 

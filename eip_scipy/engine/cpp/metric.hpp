@@ -12,8 +12,10 @@ constexpr double SHORT_MEMORY = 0.8, LONG_MEMORY = 0.999;
 // A shift in time of which less than this share, squared, changes no invariant is rounding.
 constexpr double LEAST_SHIFT = 1e-12;
 
-// Return whether each block is one component, real or complex.
-inline bool each_component_alone(const Blocks &blocks) { return blocks.members == blocks.count * blocks.width; }
+// Return whether a shift in time is removed from corrections: if each block is one component, real or complex.
+inline bool removes_shift(const auto &o) {
+    return o.metric == BY_ERROR && o.blocks.members == o.blocks.count * o.blocks.width;
+}
 
 inline int64_t blocks_of(const Options &o, int64_t m) { return o.blocks.size == 1 ? m : o.blocks.count; }
 
@@ -222,8 +224,7 @@ inline Value remembered_errors(const Kept &kept, const Options &o, const W &w) {
         now.error[b] = max(ratio[b] * scale[b], kept.brief * old.error[b]);
         w.remembered[b] = now.error[b] * inverse[b];
     }
-    for (int64_t b = 0; each_component_alone(o.blocks) && b < n; ++b)
-        now.lasting[b] = max(ratio[b], kept.lasting * old.lasting[b]);
+    for (int64_t b = 0; removes_shift(o) && b < n; ++b) now.lasting[b] = max(ratio[b], kept.lasting * old.lasting[b]);
     return largest_ratio;
 }
 
@@ -285,8 +286,7 @@ inline double relative_errors(const double *y, const AnyRun &run) {
 // Remember the errors of a step that is accepted.
 template <class W>
 inline void remember_errors(const Options &o, const W &w) {
-    if (o.metric == BY_ERROR)
-        copy(w.memory_new, w.memory, (each_component_alone(o.blocks) ? MEMORIES : 2) * blocks_of(o, w.m));
+    if (o.metric == BY_ERROR) copy(w.memory_new, w.memory, (removes_shift(o) ? MEMORIES : 2) * blocks_of(o, w.m));
 }
 
 // Compute the flow f with each component in proportion to the square of its share in the lasting errors, and w.unit, the
