@@ -258,7 +258,7 @@ class Problem:
             return [name for name in names if getattr(self, name) is not None]
 
         n = MOST if self.y0 is None else np.size(self.y0)
-        names = self.component_names or tuple(f"y{k}" for k in range(min(n, MOST + 1)))
+        names = self.component_names or component_names(None, min(n, MOST + 1))
         state = ", ".join(names[:MOST]) + (", ..." if len(names) > MOST else "")
         start = "without a start" if self.y0 is None else f"{n} components, {np.asarray(self.y0).dtype}"
         interval = [] if self.t_span is None else ["t from {:g} to {:g}".format(*self.t_span)]
@@ -277,7 +277,9 @@ class Problem:
 
 
 def component_names(names: Any, n: int | None) -> tuple[str, ...]:
-    """Return the names of n components from a sequence or from text such as "x y"; `n` may be None for any number."""
+    """Return names of n components, of any number if n is None: from a sequence, text such as "x y", or y0, y1 ...."""
+    if names is None and n is not None:
+        return tuple(f"y{k}" for k in range(n))
     if isinstance(names, str):
         names = names.replace(",", " ").split()
     if not isinstance(names, Iterable):

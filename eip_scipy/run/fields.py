@@ -116,8 +116,7 @@ def component_names(result: Any, names: Any = None, n: int | None = None) -> tup
     By default `n` is len(result.y). ValueError is raised if `names` are not `n` different names.
     """
     n = len(result.y) if n is None else n
-    names = getattr(result, "component_names", None) if names is None else names
-    return tuple(f"y{k}" for k in range(n)) if names is None else checked(names, n)
+    return checked(getattr(result, "component_names", None) if names is None else names, n)
 
 
 def labels(result: Any, names: Any = None) -> dict[str, list[str]]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.integrate import OdeSolution
 from scipy.optimize import OptimizeResult
 
-from ..core.problem import Problem
+from ..core.problem import Problem, component_names
 from ..core.results import Diagnostics, Multipliers
 from .tables import to_dataframe, to_xarray
 
@@ -97,7 +97,7 @@ class Result(Fields):
     def component_names(self) -> tuple[str, ...]:
         """Names of the components from the `Problem`, or "y0", "y1" and so on; other names can be assigned."""
         names = self.get("component_names")
-        return tuple(f"y{k}" for k in range(self.y.shape[self.COMPONENTS])) if names is None else tuple(names)
+        return component_names(None, self.y.shape[self.COMPONENTS]) if names is None else tuple(names)
 
     def to_xarray(self, names: Any = None) -> Any:
         """Return the run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
@@ -121,7 +121,8 @@ class Result(Fields):
         self.update(origin.request.fun.observed(self.t, self.y, origin.request.params))
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
+        methods = ("continue_to", "plot", "save", "to_dataframe", "to_xarray")
+        return [*super().__dir__(), *(name for name in methods if hasattr(type(self), name))]
 
     if not TYPE_CHECKING:  # type checkers would accept any attribute name
 

@@ -13,7 +13,7 @@ import numpy as np
 from ...core.inputs import count, is_number, reals, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_jitted
-from ...core.problem import Problem
+from ...core.problem import Problem, component_names
 from .polynomials import Term, functions, written
 from .search import Search, Surroundings
 
@@ -113,7 +113,7 @@ def find_invariants(
     further = [_term(item, k, name) for k, (name, item) in enumerate(given)]
     field = fun.fun if isinstance(fun, Problem) else fun
     like = fun.rhs or field if isinstance(fun, Problem) else fun
-    names = getattr(fun, "component_names", None) or [f"y{k}" for k in range(start.size)]
+    names = getattr(fun, "component_names", None) or component_names(None, start.size)
     with np.errstate(all="ignore"):  # of points where the field is not defined
         found = Search(Surroundings(field, start.astype(float), further, t, seed), degree, rtol).found
     return [
