@@ -1,4 +1,4 @@
-"""What a system conserves besides the given invariants: linear invariants, and momenta of particles."""
+"""Search for what a system conserves in addition to the given invariants: linear invariants, momenta of particles."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def conserved(samples: Samples, projection: ProjectionOptions, method: Method, n
     may_keep = given is None and (not method.in_python or method.drives)  # a user's step need not keep any
     known = next((item.linear for item in invariants.items if item.linear is not None), None)
     names = names and not all(isinstance(item.function, LibraryFunction) for item in invariants.items)
-    found, count = Conserved()[:2]
+    found, count, _, missing = Conserved()
     with np.errstate(all="ignore"):
         if may_keep and projection.is_searched and n <= MOST_COMPONENTS:
             samples.near, samples.far = max(n, NEAR), FAR
@@ -132,7 +132,6 @@ def conserved(samples: Samples, projection: ProjectionOptions, method: Method, n
             count = len(found.C)
         if count:
             found = found.only(undetermined(found.C, samples.gradients, samples.sizes))
-        missing = None
         # Momentum is among what a search finds. Gradients by differences take long.
         if names and (count or not samples.far) and not (n > MOST_COMPONENTS and invariants.by_values.any()):
             missing = missing_particles(samples, found.C.reshape(-1, n) if given is None else np.atleast_2d(given[0]))

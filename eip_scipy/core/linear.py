@@ -80,7 +80,7 @@ def confirmed(y: Array, f: Array, given: LinearInvariants) -> Array:
 
 
 def undetermined(C: Array, gradients: Array, sizes: Array) -> Array:
-    """Return a mask (k,) of the rows of C (k, n) that are no part of a combination of the gradients.
+    """Return a mask (k,) of the rows of C (k, n) that do not occur in a combination of the gradients.
 
     `gradients` (m, l, n) are those of the invariants at m states, and `sizes` (n,) those of the components. If the rows
     were kept whose combination is a combination of the gradients, no correction could change that combination of the

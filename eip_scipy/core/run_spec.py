@@ -111,9 +111,7 @@ class RunSpec(NamedTuple):
         invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
         y, f = map(self.tangents.state, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
-        depends_on_time = (
-            method is not PROJECTION_ONLY and invariants.size > 0 and invariants.add_rounding_of_time(start.y)
-        )
+        depends_on_time = method is not PROJECTION_ONLY and invariants.add_rounding_of_time(start.y)
         options, sigma, identity = projection.settled(method, self.stepping, y, f, invariants)
         samples = Samples(self.rhs, start, invariants, self.tangents)
         found = unless_error(conserved, samples, projection, method, tell and options.watched)

@@ -49,7 +49,7 @@ class Run:
     the steps. `identity`: see `settled`. `called` is the argument that gave the right-hand side, and `left_out` a
     possible cause of NaN in its value, for messages. `looked` is the step at which the invariants were checked last.
     `depends_on_time` is True if an invariant depends on time; its scale then depends on the start. `conserved` is what
-    the system conserves besides the invariants.
+    the system conserves in addition to the invariants.
     """
 
     begin: Start

@@ -179,7 +179,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         t0, t_bound = interval((t0, t_bound))
         start = initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN is no bound, as in SciPy
+        longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN sets no bound, as in SciPy
         steps = StepOptions(h=h, first_step=first_step, max_step=longest, rtol=rtol, atol=atol)
         n = self._TANGENTS.state(start).size
         stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)

@@ -40,7 +40,7 @@ class First(NamedTuple):
 
 
 class Unaugmented(NamedTuple):
-    """What the engine calls for an invariant or event of augmented states: a function of the state (n,) alone.
+    """A function of the state (n,) alone, which the engine calls for an invariant or event of augmented states.
 
     `function` is the `Invariant` or the event. If `parameters` parameters are in the augmented state,
     ``by_parameters(t, y, params)`` returns the derivatives of an invariant with respect to them.

@@ -263,7 +263,7 @@ def from_event_to_event(start, method, events, end, **options):
 @pytest.mark.parametrize("start", [integrate, ensemble, solve_ivp], ids=lambda start: start.__name__)
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853, EIPRKN12, EIPGJ12, EIPRadau])
 def test_a_run_begins_at_the_event_that_ended_another(start, method):
-    """Where the state was exact or off by rounding, to either side; see `test_a_run_goes_on_from_event_to_event`."""
+    """The state is exact, or off by rounding to either side; see `test_a_run_goes_on_from_event_to_event`."""
     step = {"h": 0.05} if method in (EIPRK4, EIPGJ12) else {"rtol": 1e-7, "atol": 1e-7}
     for level, end in ((0.0, 20), (0.3, -20), (0.5, 20)):
         times = from_event_to_event(start, method, reaching(level, terminal=True), end, invariants=ENERGY, **step)

@@ -127,7 +127,7 @@ AUTO = {"method": EIPRK4, "h": 0.02, "linear_invariants": "auto"}
 
 
 def test_only_what_the_invariants_determine_is_left_out():
-    """Of two masses, the one that is given may be changed, as all velocities of a free particle by its energy."""
+    """The given one of two masses may be changed, as the energy of a free particle changes all of its velocities."""
 
     def decays(t, y):
         a, b = y[0] ** 2 - y[1], y[2] * y[3] - y[3] ** 2

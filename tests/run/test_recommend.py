@@ -112,7 +112,7 @@ STIFF = {
 
 @pytest.mark.parametrize("name", STIFF)
 def test_stiff_equations_get_an_implicit_method(name):
-    """It is run over the whole interval, and all its evaluations are counted."""
+    """The method is run over the whole interval, and all of its evaluations are counted."""
     fun, end, y0, kept = STIFF[name]
     calls = itertools.count()
     choice = recommend(lambda t, y: fun(t, y) if next(calls) < 2e5 else None, (0, end), y0, invariants=kept, error=1e-4)
