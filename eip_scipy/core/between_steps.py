@@ -28,7 +28,6 @@ class Settings(NamedTuple):
     rtol: Any
     atol: Any
     nfev: int
-    fun: Any
     t_bound: float
     direction: float
     max_step: float

@@ -15,7 +15,8 @@ from ..checkpoint import CheckpointError
 from ..checkpoint.encoding import decoded, encoded
 from ..checkpoint.locks import Lock
 from ..core.callers import users_level
-from ..run.prepare import Prepared
+from ..core.runs import Run
+from ..run.prepare import identity
 from .chunks import Chunk
 from .tasks import Members, Plan
 
@@ -79,16 +80,16 @@ class EnsembleFile:
             self._require_same_functions(known_by)
         checkpoint.warn_of_other_versions(self.path, header, stacklevel=users_level())
 
-    def _end(self, members: Members) -> tuple[int, Prepared, float, np.ndarray, np.ndarray]:
+    def _end(self, members: Members) -> tuple[int, Run, float, np.ndarray, np.ndarray]:
         """Return number, run, end (t, y) and derivative there of the first member that did not fail."""
         k = int(np.flatnonzero(members.status >= 0)[0])
         ready = self._plan.task.prepared(self._everyone.y0s[k], self._everyone.params[k])
         t, y = float(members.t[k]), members.y[k].copy()
-        return k, ready, t, y, ready.system.derivative(t, y.copy())
+        return k, ready, t, y, ready.problem.derivative(t, y.copy())
 
     def _require_same_functions(self, known_by: np.ndarray) -> None:
         k, ready, t, y, f = self._end(self.members)
-        if changed := checkpoint.changed_function(ready.run.invariants, t, y, known_by, f):
+        if changed := checkpoint.changed_function(ready.invariants, t, y, known_by, f):
             raise CheckpointError(
                 f"the checkpoint {self.path!r} belongs to another ensemble: {changed[0]} has another value at the end "
                 f"of member {k}. Resume with the functions of that ensemble, or use another file for a new one."
@@ -101,7 +102,7 @@ class EnsembleFile:
             self._known_by = np.zeros(0)
             with suppress(Exception):  # a function may raise an error there; the members are stored all the same
                 _, ready, t, y, f = self._end(whole)
-                self._known_by = np.concatenate([f, ready.run.invariants.values(t, y)])
+                self._known_by = np.concatenate([f, ready.invariants.values(t, y)])
         if time.perf_counter() - self._written >= max(self._every, LEAST_RATIO * self._cost):
             self.flush()
 
@@ -138,4 +139,4 @@ def _identity(plan: Plan, everyone: Chunk) -> dict[str, Any]:
     """Return all settings except functions that determine the result, by users' names, in a form for JSON."""
     reduce = plan.task.reduce
     name = None if reduce is None else getattr(reduce, "__qualname__", type(reduce).__qualname__)
-    return plan.ready.identity(everyone.y0s, everyone.params) | {"reduce": name}
+    return identity(plan.ready, everyone.y0s, everyone.params) | {"reduce": name}

@@ -415,12 +415,13 @@ def ensemble(
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
     common["acceleration"] = acceleration
     request = Request.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
-    request = request.with_own_events().with_pointers()
+    request = request.with_pointers()
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
     plan = _first_that_starts(Task(request, total, reduce), everyone)
     everyone = everyone._replace(y0s=np.ascontiguousarray(everyone.y0s, plan.dtype))
-    size = _chunk_size(plan, total, request.function) if chunk is None else count("chunk", chunk)
+    given = fun if acceleration is None else acceleration
+    size = _chunk_size(plan, total, given) if chunk is None else count("chunk", chunk)
     _check_memory(plan, total, max_bytes)
     file = None if checkpoint is None else EnsembleFile(checkpoint, checkpoint_every, resume, plan, everyone)
     with nullcontext() if file is None else sigterm_as_ctrl_c(), nullcontext() if file is None else closing(file):
@@ -546,11 +547,11 @@ class _Gathered:
             method=self.method,
             h=plan.h,
             chunk=self.chunk,
-            component_names=plan.ready.component_names,
+            component_names=plan.ready.problem.component_names,
         )
         if plan.variations is not None:
             _separate(result, plan.ready.tangents)
-            result["columns"] = plan.ready.described_columns
+            result["columns"] = plan.ready.problem.described_columns
         return result
 
 
@@ -660,8 +661,8 @@ def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
         except Exception as error:
             first = first or error
         else:
-            if found := ready.run.trust.message:
-                ready.run.trust.doubts.clear()
+            if found := ready.trust.message:
+                ready.trust.doubts.clear()
                 tried = dataclasses.replace(tried, doubt=(params[k].copy(), found))
             return _with_common_constraints(Plan(tried, ready), everyone)
     assert first is not None
@@ -677,7 +678,7 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
 
     If one of them does not hold for the parameters of some member, no member keeps any.
     """
-    task, found = plan.task, plan.ready.run.conserved
+    task, found = plan.task, plan.ready.conserved
     if found.found is None:
         return plan
     C = found.linear.C
@@ -689,17 +690,17 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
 
 def _hold(plan: Plan, everyone: Chunk) -> bool:
     """Return True if the linear invariants of the first member hold for the parameters of all members."""
-    ready, own = plan.ready, plan.ready.system.parameters.copy()
+    ready, own = plan.ready, plan.ready.problem.parameters.copy()
     first = np.unique(everyone.params, axis=0, return_index=True)[1]
-    if len(first) == 1 or ready.variations is not None:
+    if len(first) == 1 or ready.problem.variations is not None:
         return len(first) == 1
     y = everyone.y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size)))
     f = np.full(y.shape, np.nan)
     for k, member in enumerate(first):
-        ready.system.parameters[:] = everyone.params[member]
-        f[k] = unless_error(ready.system.derivative, plan.t0, y[k])
-    ready.system.parameters[:] = own
-    return bool(confirmed(y, f, ready.run.conserved.linear).all())
+        ready.problem.parameters[:] = everyone.params[member]
+        f[k] = unless_error(ready.problem.derivative, plan.t0, y[k])
+    ready.problem.parameters[:] = own
+    return bool(confirmed(y, f, ready.conserved.linear).all())
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
@@ -742,7 +743,7 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
     if isinstance(executor, Executor):
         return Pool(executor, run, partial(_workers, executor))
     if executor == "dask" or type(executor).__module__.partition(".")[0] == "distributed":
-        if pointers := plan.ready.pointers:
+        if pointers := plan.ready.problem.pointers(plan.ready):
             raise pointers[0].unpicklable()  # Dask's own message for it is very long
         # Imported by name, because the integrations depend on this package and need further libraries.
         found, workers, end = import_module("eip_scipy.integrations.dask").connected(executor)

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..core.failures import failure
 from ..core.jitted import NotCompilableError
+from ..core.runs import Run
 from ..core.stepping import UNBOUNDED, saved_steps
 from ..engine import data
 from ..engine.data import DOUBTFUL, N_COUNTERS, NFEV, OK, PAUSE, Schedule
@@ -25,7 +26,7 @@ from ..engine.native import BUILD
 from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
-from ..run.prepare import Prepared, Request, prepared
+from ..run.prepare import Request, prepared
 from .side_by_side import need_compiling, octet_functions, why_one_by_one
 
 __all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
@@ -55,7 +56,7 @@ class Task:
     reduce: Callable[[Any], Any] | None = None  # function of the result of a member, whose value replaces saved states
     doubt: tuple[np.ndarray, str] | None = None  # parameters for which the checks at the start found the given fault
 
-    def prepared(self, y0: np.ndarray, params: np.ndarray | None, *, check_start: bool = False) -> Prepared:
+    def prepared(self, y0: np.ndarray, params: np.ndarray | None, *, check_start: bool = False) -> Run:
         """Return the run of one member, prepared as `integrate` does; without parameters if the request has none."""
         params = None if self.request.params is None else params
         return prepared(self.request._replace(y0=y0, params=params), check_start=check_start)
@@ -110,11 +111,11 @@ class Plan:
     they run one after the other, "" if they are vectorised; both are known after compilation.
     """
 
-    def __init__(self, task: Task, ready: Prepared | None = None) -> None:
+    def __init__(self, task: Task, ready: Run | None = None) -> None:
         """Create the plan; `ready` is the run of the member of `task`, if it has been prepared already."""
         self.task = task
         self.ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
-        schedule, run = self.ready.schedule, self.ready.run
+        schedule, run = self.ready.schedule, self.ready
         self.why_not: str | None = None
         self.one_by_one = ""
         self.names = tuple(run.invariants.names)
@@ -126,24 +127,24 @@ class Plan:
         self.held = self.times.size if task.reduce is None else 0  # number of saved states that results keep
         if task.reduce is not None and not self.is_saving:
             self.times = np.array([self.t0])
-        self.events = len(self.ready.system.events.functions)
-        self.variations = self.ready.variations
+        self.events = len(self.ready.problem.events.functions)
+        self.variations = self.ready.problem.variations
         self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
         self._together, self._idle = False, list[Sweeper]()
 
     def compile(self, *, progress: bool = False) -> Plan:
         """Compile the functions, before threads start and would each compile them, and return the plan itself."""
-        ready, invariants = self.ready, self.ready.run.invariants
-        loop = Loop(replace(ready, request=ready.request._replace(progress=progress)))
+        ready, invariants = self.ready, self.ready.invariants
+        loop = Loop(ready, self.task.request._replace(progress=progress))
         own_targets = any(item.target is not None for item in invariants.items)
         reasons = {
             "the runs have derivatives": self.variations is not None,
             "the runs have balances": invariants.balances.items,
             # The shifts of the differences depend on the start.
             "the gradient of an invariant is computed by differences": invariants.by_differences,
-            "the scale of an invariant that depends on time depends on the start": self.ready.run.depends_on_time,
+            "the scale of an invariant that depends on time depends on the start": self.ready.depends_on_time,
             "the start of each member is projected, or an invariant has a target": own_targets
-            or ready.run.identity()["project_initial"],
+            or ready.identity()["project_initial"],
         }
         self.why_not = loop.why_not
         self.one_by_one = self.why_not or next((reason for reason, holds in reasons.items() if holds), "")
@@ -168,7 +169,7 @@ class Plan:
             mine = self._idle.pop()
         except IndexError:
             request = self.task.request
-            mine = Sweeper(Loop(self.task.prepared(request.y0, request.params)), self.task.members)
+            mine = Sweeper(Loop(self.task.prepared(request.y0, request.params), request), self.task.members)
         yield mine
         self._idle.append(mine)
 
@@ -229,7 +230,7 @@ class _Watch:
 def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
     """Run member `k` as `integrate` does, and store its results in `out`."""
     try:
-        loop = Loop(plan.task.prepared(y0, params))
+        loop = Loop(plan.task.prepared(y0, params), plan.task.request)
     except Exception as error:
         out.y[k], out.t[k] = plan.ready.tangents.with_state(out.y[k], y0), plan.t0
         out.status[k], out.message[k] = FAILED, _reason(error)
@@ -510,7 +511,7 @@ class Sweeper:
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
         """Set the parameters of the driver to those of a member, and return the right-hand side."""
         self.loop.driver.params[:] = params
-        return self.loop.prepared.system.derivative
+        return self.loop.problem.derivative
 
 
 def _part(each: data.Members, those: slice) -> data.Members:

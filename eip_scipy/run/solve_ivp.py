@@ -236,7 +236,7 @@ def _solve(
     if variations is not None:
         augmented = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
         function, y0 = augmented.derivative, augmented.tangents.augmented(initial_state(y0), NOTHING)
-        method = _subclass(method, _TANGENTS=augmented.tangents)
+        method = _subclass(method, _VARIATIONS=augmented)
         options["invariants"] = augmented.invariants
         if (events := common["events"]) is not None:
             common["events"] = [augmented.event(event) for event in ((events,) if callable(events) else events)]
