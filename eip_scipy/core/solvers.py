@@ -8,7 +8,7 @@ import inspect
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from operator import is_
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import scipy.integrate
@@ -36,6 +36,7 @@ from .results import Diagnostics
 from .runs import Run, Start
 from .states import initial_state
 from .stepping import ATOL, StepOptions, Stepping, interval
+from .variations import Variations
 
 __all__ = [
     "EIPBDF", "EIPDOP853", "EIPGJ12", "EIPGJ14", "EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPRK23",
@@ -49,6 +50,18 @@ DERIVED = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_engine
 # Options of SciPy's other solvers, which code that runs several of them passes to all.
 OF_OTHERS = {"jac", "jac_sparsity", "lband", "uband", "min_step"}
 OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnostics", *ProjectionOptions.names())
+
+
+class Context(NamedTuple):
+    """What `eip_scipy.solve_ivp` shares with the solver that SciPy makes for it.
+
+    The solver writes the state from which it starts to `start`, the initial state of SciPy's loop, and itself to
+    `solvers`. `variations` are the functions of an augmented state.
+    """
+
+    start: np.ndarray
+    solvers: list[Any]
+    variations: Variations | None = None
 
 
 class SolverClass(type):
@@ -122,7 +135,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     TABLEAU: ClassVar[Method]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
-    _VARIATIONS: ClassVar[Any] = None
     order: Any = NotImplemented
     error_estimator_order: Any = NotImplemented
     n_stages: Any = NotImplemented
@@ -160,16 +172,17 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     ) -> None:
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
+        start = initial_state(y0)
+        context = options.pop("_context", None) or Context(start.copy(), [])
         jacobians = _jacobians(self.TABLEAU, options)
         own, extraneous = ProjectionOptions.split(options)
         projection = ProjectionOptions(**own | {"invariants": as_invariants(own.get("invariants", ()))})
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
         t0, t_bound = interval((t0, t_bound))
-        start = initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        problem = BoundProblem(fun, start, variations=self._VARIATIONS, vectorized=vectorized, **jacobians)
-        n = start.size if self._VARIATIONS is None else self._VARIATIONS.tangents.n
+        problem = BoundProblem(fun, start, variations=context.variations, vectorized=vectorized, **jacobians)
+        n = start.size if context.variations is None else context.variations.tangents.n
         longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN sets no bound, as in SciPy
         steps = StepOptions(h=h, first_step=first_step, max_step=longest, rtol=rtol, atol=atol)
         stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)
@@ -191,6 +204,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._noted, self._warned = 0, False
         self._count()
         self._settle()
+        context.start[:] = self.y
+        context.solvers.append(self)
 
     @classmethod
     def _takes_scipys_steps(cls, options: Mapping[str, Any]) -> bool:
