@@ -43,8 +43,9 @@ __all__ = [
     "EIPRK45", "EIPRKN8", "EIPRKN12", "EIPRadau", "EIPSolver", "eip_method",
 ]  # fmt: skip
 
-# The attributes that a step of SciPy's solver reads.
-HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
+# The attributes that a step of SciPy's solver reads: those that control the step, and the others.
+CONTROL = ("t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
+HANDED = ("t", "y", "f", *CONTROL)
 # Attributes that a copy of a solver makes again.
 DERIVED = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_engine", "_interpolants", "diagnostics"}
 # Options of SciPy's other solvers, which code that runs several of them passes to all.
@@ -327,7 +328,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
         fresh = run.projection.settled(run.tableau, run.stepping, run.y0, run.start.f, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
-        run.tableau.begin(run, here)
+        if self.TABLEAU.drives and not new_function:
+            for name in (*CONTROL, "status"):
+                setattr(run.method.scipy_solver, name, getattr(self, name))
+        else:
+            run.tableau.begin(run, here)
         work.rates[0] = np.nan if new_function else work.rates[-1]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -464,8 +469,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if self._kept is not None and not is_state(y, self._kept):  # y was changed in place since the last step
             y = np.frombuffer(self._kept, y.dtype) if isinstance(self._kept, bytes) else self._kept
         if self._scipy is not None:
-            out = ExactEnds(self._scipy.dense_output(), self.y_old, y)
+            out: DenseOutput = ExactEnds(self._scipy.dense_output(), self.y_old, y)
             self.nfev = self._run.problem.count
+        elif self.TABLEAU.drives and not self._run.invariants.size:
+            out = ExactEnds(self._run.method.scipy_solver.dense_output(), self.y_old, y)
         else:
             ends = (self._raw_old, self._raw) if self._run.shows else (self.y_old, y)
             out = self._sampled().over(self.t_old, ends[0], t, ends[1])
