@@ -180,7 +180,7 @@ class ProjectionOptions:
             block_atol = np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
         check, distant = flag("check", self.check), data.DISTANT
         if stepping.h is None:
-            distant = float(np.clip(FAR_IN_TOLERANCES * np.max(rtol, initial=0.0), data.DISTANT, MOST_FAR))
+            distant = min(max(FAR_IN_TOLERANCES * float(rtol.max(initial=0.0)), data.DISTANT), MOST_FAR)
         options = Options(
             rtol=rtol.repeat(width),
             atol=atol,

@@ -219,7 +219,7 @@ def _projection(given: Request, own: Problem | None, fun: Any, method: Method, e
         options = brought | options
     items = as_invariants(options.get("invariants", ()))
     if any(item.args for item in items):
-        known = [extra, (own.params,)] if own is not None and own.params is not None else [extra]
+        known = [(own.params,), extra] if own is not None and own.params is not None else [extra]
         items = tuple(_without_own(item, known) for item in items)
     if is_compiled(fun) or isinstance(fun, PointerFunction):
         items = compiled_items(items)
