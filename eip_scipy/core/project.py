@@ -20,7 +20,7 @@ from .options import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
 from .runs import Run
 from .states import initial_state
-from .stepping import Stepping
+from .step_control import StepControl
 
 __all__ = ["project"]
 
@@ -104,7 +104,7 @@ def project(
         iterations=iterations,
         check=False,
     )
-    stepping = Stepping.at_rest(t, n)
+    stepping = StepControl.without_steps(t, n)
     run = Run(BoundProblem(_field(f, t, y), y), "project", PROJECTION_ONLY, stepping, given).start_at(y)
     known, work = run.invariants, run.work
     if known.uses_f and f is None:

@@ -37,7 +37,7 @@ from .invariants import TARGET_TOLERANCE, InvariantSet
 from .linear import confirmed
 from .options import ProjectionOptions
 from .results import Diagnostics, slowness
-from .stepping import Stepping
+from .step_control import StepControl
 from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class Run:
         problem: BoundProblem,
         name: str,
         method: Method,
-        stepping: Stepping,
+        stepping: StepControl,
         projection: ProjectionOptions,
         *,
         level: bool = False,

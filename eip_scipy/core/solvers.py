@@ -22,7 +22,7 @@ from ..methods.implicit import BDF, RADAU, Jacobian
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.one_step import OneStep, OneStepMethod
 from ..methods.runge_kutta import ATTRIBUTES, DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau, is_same, tableau_of
-from .between_steps import Settings, checked_stepping, checked_vector, is_state, kept_state, settings_of
+from .between_steps import Settings, changed_control, checked_vector, is_state, kept_state, settings_of
 from .bound_problem import BoundProblem
 from .callers import users_level
 from .dense import ExactEnds, Interpolants
@@ -35,7 +35,7 @@ from .options import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
 from .runs import Run, Start
 from .states import initial_state
-from .stepping import ATOL, StepOptions, Stepping, interval
+from .step_control import ATOL, StepControl, interval
 from .variations import Variations
 
 __all__ = [
@@ -185,9 +185,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         problem = BoundProblem(fun, start, variations=context.variations, vectorized=vectorized, **jacobians)
         n = start.size if context.variations is None else context.variations.tangents.n
         longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN sets no bound, as in SciPy
-        steps = StepOptions(h=h, first_step=first_step, max_step=longest, rtol=rtol, atol=atol)
-        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)
-        self._run = run = Run(problem, type(self).__name__, self.TABLEAU, stepping, projection, level=True)
+        name, control = type(self).__name__, {"h": h, "first_step": first_step, "max_step": longest}
+        stepping = StepControl.of(name, self.TABLEAU, (t0, t_bound), n, **control, rtol=rtol, atol=atol)
+        self._run = run = Run(problem, name, self.TABLEAU, stepping, projection, level=True)
         self._bound_fun = self.fun
         self._take_stepping(stepping, rtol, atol)
         if self.h is None and stepping.first_step is None:
@@ -225,7 +225,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
                 if name not in vars(cls):
                     setattr(cls, name, value)
 
-    def _take_stepping(self, stepping: Stepping, rtol: Any, atol: Any) -> None:
+    def _take_stepping(self, stepping: StepControl, rtol: Any, atol: Any) -> None:
         """Store options of the step control that have been checked; numbers stay numbers, as in SciPy."""
         self._run.stepping = stepping
         self.h, self.max_step = stepping.h, stepping.span.max_step
@@ -283,7 +283,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _apply_changes(self) -> None:
         """Apply the attributes that were set between two steps, as the notes of `EIPSolver` describe."""
         was, run, like, problem = self._was, self._run, self._run.y0, self._run.problem
-        stepping = checked_stepping(self, self.TABLEAU, was, stacklevel=5)
+        stepping = changed_control(self, self.TABLEAU, was)
         y = self.y if self.y is was.y else checked_vector("y", self.y, like)
         f = self.f if self.f is was.f else checked_vector("f", self.f, like)
         self.y, self.f = y, f

@@ -10,7 +10,7 @@ from ..core.jitted import NotCompilableError
 from ..core.native_functions import Native
 from ..core.options import Options
 from ..core.pointers import PointerFunction
-from ..core.stepping import UNBOUNDED
+from ..core.step_control import UNBOUNDED
 from ..engine.data import AUTO, NEW, Multistep, Schedule
 from ..engine.native import LibraryFunction, NativeFunctions, OctetFunctions
 

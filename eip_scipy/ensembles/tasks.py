@@ -19,7 +19,7 @@ import numpy as np
 from ..core.failures import failure
 from ..core.jitted import NotCompilableError
 from ..core.runs import Run
-from ..core.stepping import UNBOUNDED, saved_steps
+from ..core.step_control import UNBOUNDED, saved_steps
 from ..engine import data
 from ..engine.data import DOUBTFUL, N_COUNTERS, NFEV, OK, PAUSE, Schedule
 from ..engine.native import BUILD

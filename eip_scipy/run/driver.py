@@ -14,7 +14,7 @@ from ..core.dense import Interpolants, ManifoldDenseOutput, solution
 from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
 from ..core.runs import Run
-from ..core.stepping import UNBOUNDED
+from ..core.step_control import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from .memory import most_bytes

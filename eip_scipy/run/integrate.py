@@ -24,7 +24,7 @@ from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver
-from ..core.stepping import UNBOUNDED
+from ..core.step_control import UNBOUNDED
 from ..core.tangent_vectors import StateSolution
 from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, OK, PAUSE, ROW, STEP, TIME, Schedule
 from ..engine.native import PythonFunctions

@@ -25,7 +25,7 @@ from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.states import initial_state
-from ..core.stepping import ATOL, StepOptions, interval
+from ..core.step_control import ATOL, StepControl, interval
 from ..core.tangent_vectors import tangent_vectors
 from ..core.variations import First, Variations, augmented_rhs
 from ..engine.data import NFEV, Schedule, Span
@@ -101,17 +101,16 @@ class Request(NamedTuple):
         no_bound = isinstance(self.max_step, float) and self.max_step == np.inf
         return not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
 
-    def steps(self, own: Problem | None, method: Method) -> StepOptions:
+    def steps(self, own: Problem | None, method: Method) -> dict[str, Any]:
         """Return the options of the step size: the step of the problem, or the defaults, for what was not given."""
         fixed = own is not None and not self.adaptive and not method.drives
-        h = (own.h if fixed and own is not None else None) if self.h is DEFAULT else self.h
-        return StepOptions(
-            h=h,
-            first_step=self.first_step,
-            max_step=self.max_step,
-            rtol=1e-3 if self.rtol is DEFAULT else self.rtol,
-            atol=ATOL if self.atol is DEFAULT else self.atol,
-        )
+        return {
+            "h": (own.h if fixed and own is not None else None) if self.h is DEFAULT else self.h,
+            "first_step": self.first_step,
+            "max_step": self.max_step,
+            "rtol": 1e-3 if self.rtol is DEFAULT else self.rtol,
+            "atol": ATOL if self.atol is DEFAULT else self.atol,
+        }
 
 
 def prepared(given: Request, *, check_start: bool = True) -> Run:
@@ -121,9 +120,9 @@ def prepared(given: Request, *, check_start: bool = True) -> Run:
     method = _method(solver)
     _check_choices(given)
     problem, projection = as_problem(given, method, solver)
-    t0, t_bound = _span(given, own, problem.events)
+    ends = t0, _ = _span(given, own, problem.events)
     n = problem.y0.size if problem.variations is None else problem.variations.tangents.n
-    stepping = given.steps(own, method).checked(solver.__name__, method, t0, t_bound, n, stacklevel=4)
+    stepping = StepControl.of(solver.__name__, method, ends, n, **given.steps(own, method))
     run = Run(problem, solver.__name__, method, stepping, projection).start_at(problem.y0, check=check_start)
     run.schedule = schedule = _schedule(stepping.span, run.start.tau, given, problem.events)
     check_memory(saved_rows(schedule), run, given.max_bytes)

@@ -24,7 +24,7 @@ from ..core.problem import Problem, bind
 from ..core.results import ProjectionWarning
 from ..core.solvers import EIPBDF, EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, EIPRadau
 from ..core.states import initial_state
-from ..core.stepping import UNBOUNDED, interval
+from ..core.step_control import UNBOUNDED, interval
 from ..engine.data import EPS, NFEV
 from ..methods.nystrom import depends_on_velocity
 from .integrate import Loop, integrate

@@ -29,7 +29,7 @@ from ..core.solvers import (
     eip_method,
 )  # fmt: skip
 from ..core.states import initial_state
-from ..core.stepping import interval
+from ..core.step_control import interval
 from ..core.tangent_vectors import StateSolution, TangentVectors, tangent_vectors
 from ..core.variations import First, Variations, augmented_rhs
 
