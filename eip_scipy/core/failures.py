@@ -9,7 +9,7 @@ from scipy.integrate import OdeSolver
 
 from ..engine import data
 from ..engine.data import Work
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 from .runs import Run
 
 __all__ = ["failure", "projection_failure"]

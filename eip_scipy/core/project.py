@@ -14,7 +14,7 @@ from ..engine.trust import ProjectionWarning
 from ..methods.base import PROJECTION_ONLY
 from .failures import projection_failure
 from .inputs import as_vector, count, is_number, reals, shown
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 from .options import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
 from .run_spec import RunSpec

@@ -17,7 +17,7 @@ from .failures import projection_failure
 from .frame import frame_rows, spanned
 from .gradients import unless_error
 from .invariant_checks import Complaint, reported
-from .invariants import TARGET_TOLERANCE, InvariantSet
+from .invariant_set import TARGET_TOLERANCE, InvariantSet
 from .options import ProjectionOptions
 from .runs import Run, Start
 from .stepping import Stepping

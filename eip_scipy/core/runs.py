@@ -19,7 +19,7 @@ from .callers import users_level
 from .conserved import Conserved
 from .examination import Derivative, Examiner, is_check_due, unresolved
 from .invariant_checks import listed
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 from .linear import confirmed
 from .options import Options
 from .results import Diagnostics, slowness

@@ -32,7 +32,8 @@ from .dense import ExactEnds, Interpolants
 from .examination import is_check_due
 from .failures import failure
 from .inputs import is_number, numbers, shown
-from .invariants import InvariantSet, as_invariants
+from .invariant_set import InvariantSet
+from .invariants import as_invariants
 from .jitted import compiled_call
 from .names import nearest
 from .options import ProjectionOptions, takes_projection_options
