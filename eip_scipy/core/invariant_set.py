@@ -6,6 +6,7 @@ import math
 import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
@@ -24,7 +25,7 @@ from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import PointerFunction
 from .states import states
 
-__all__ = ["BalanceSet", "InvariantSet", "check_gradient"]
+__all__ = ["BalanceSet", "InvariantSet", "check_gradient", "with_duals"]
 
 Array = np.ndarray
 FLOAT = np.dtype(float)
@@ -116,17 +117,23 @@ def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple,
     require_arguments(fun, given, what, advice)
 
 
-def _by_duals(make: str, item: Invariant, n: int, shape: tuple[int, ...], extra: tuple) -> Any:
-    """Return what the function `make` of `jitted_gradients` compiles for an invariant; None if it is not jitted.
+def with_duals(item: Any, kind: str, n: int, shape: tuple[int, ...], extra: tuple) -> Any:
+    """Return an invariant with a compiled "gradient" or "rate", the `kind`; itself if it is not jitted, or has args.
 
     The state is real and has n components. Raise NotCompilableError if dual numbers cannot do what the invariant does.
     """
     types = scalars(extra)
     if item.args or types is None or not is_jitted(item.function) or jit_is_off():
-        return None
+        return item
     from . import jitted_gradients  # which loads Numba
 
-    return getattr(jitted_gradients, make)(item.function, n, shape, bool(extra), types)
+    made = getattr(jitted_gradients, f"{kind}_by_duals")(item.function, n, shape, bool(extra), types)
+    item = copied(item)
+    if kind == "gradient":
+        item.gradient, item.in_place = made, True
+    else:
+        item.rate_function, item.rate_uses_f = made, True
+    return item
 
 
 class BalanceSet:
@@ -150,7 +157,8 @@ class BalanceSet:
         for k, item in self.items.items():
             is_given, shape = item.rate_function is not None, known.shapes[k]
             if not is_given and known.dtype == FLOAT:
-                self.items[k] = item = _with_rate(item, y.size, shape, known.extra)
+                with suppress(NotCompilableError):  # the gradient and differences in time take its place
+                    self.items[k] = item = with_duals(item, "rate", y.size, shape, known.extra)
             rate, args, what = item.rate_function, item.args + known.extra, f"rate of balance {known.labels[k]!r}"
             found = None if rate is None else _real_call(rate, args, what, shape, takes_f=item.rate_uses_f)
             self.calls.append(found)
@@ -168,18 +176,6 @@ class BalanceSet:
             states = (y.copy(), f.copy()) if rate.takes_f else (y.copy(),)
             rates[place] = rate.convert(rate.fun(t, *states, *rate.args), t)
         return rates
-
-
-def _with_rate(item: Any, n: int, shape: tuple[int, ...], extra: tuple) -> Any:
-    """Return a balance with a compiled rate; itself if there is none: the gradient and differences take its place."""
-    try:
-        rate = _by_duals("rate_by_duals", item, n, shape, extra)
-    except NotCompilableError:
-        return item
-    if rate is not None:
-        item = copied(item)
-        item.rate_function, item.rate_uses_f = rate, True
-    return item
 
 
 class InvariantSet:
@@ -255,16 +251,11 @@ class InvariantSet:
 
     def _with_gradient(self, item: Invariant, k: int) -> Invariant:
         """Return item k with a compiled gradient if it can have one; if not, store the reason in `why_not`."""
-        gradient = None
-        if item.gradient is None:
-            try:
-                gradient = _by_duals("gradient_by_duals", item, self.shape[1], self.shapes[k], self.extra)
-            except NotCompilableError as error:
-                self.why_not[self.labels[k]] = str(error)
-        if gradient is not None:
-            item = copied(item)
-            item.gradient, item.in_place = gradient, True
-        return item
+        try:
+            return item if item.gradient else with_duals(item, "gradient", self.shape[1], self.shapes[k], self.extra)
+        except NotCompilableError as error:
+            self.why_not[self.labels[k]] = str(error)
+            return item
 
     def _spread(self, name: str, out: Array) -> Array:
         """Write the targets or the scales of the items, whichever has this `name`, to those entries of `out` (l,)."""
@@ -331,10 +322,11 @@ class InvariantSet:
         return _real_call(item.function, item.args + self.extra, f"invariant {self.labels[k]!r}", self.shapes[k])
 
     def _gradient_call(self, k: int) -> Call:
-        item, shape, what = self.items[k], (*self.shapes[k], self.shape[1]), f"gradient of invariant {self.labels[k]!r}"
+        item, what, dtype = self.items[k], f"gradient of invariant {self.labels[k]!r}", self.dtype
+        shape = (*self.shapes[k], self.shape[1])
 
         def convert(found: Any, t: float) -> Array:
-            return np.array(_gradient(found, what, t, shape, self.dtype), self.dtype, order="C")
+            return np.array(_gradient(found, what, t, shape, dtype), dtype, order="C")
 
         if item.gradient is None:
             return call(self.grads[k], self.extra, shape, convert)

@@ -12,7 +12,7 @@ from .dual_arrays import for_duals, inside
 from .dual_numbers import put_slope, seed, slope, value_of
 from .jitted_gradients import compiled_for, dual_along, gradient_by_duals, new_state
 
-__all__ = ["parameter_gradient", "rearranged", "rhs_by_duals", "rhs_by_products"]
+__all__ = ["parameter_gradient", "rhs_by_duals", "rhs_by_products"]
 
 # Augmented states have the order (y, p, first vector, second vector, ...) here: the parameters p that derivatives are
 # taken by follow the n components as constants, so that each vector has size = n + len(p) numbers.
@@ -120,23 +120,6 @@ def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, count: int) -> Any:
             out[n * k : n * (k + 1)] = jvp(t, y, Y[n * k : n * (k + 1)], *extra)
 
     return njit(rhs)
-
-
-@lru_cache(maxsize=256)
-def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
-    """Return the in-place right-hand side of a state that is that of `rhs` at `places` and constant elsewhere."""
-    order = np.array(places, np.int64)
-
-    def in_place(t, Y, out, *extra):
-        packed, found = np.empty(order.size), np.empty(order.size)
-        for j in range(order.size):
-            packed[j] = Y[order[j]]
-        rhs(t, packed, found, *extra)
-        out[:] = 0.0
-        for j in range(order.size):
-            out[order[j]] = found[j]
-
-    return njit(in_place)
 
 
 @lru_cache(maxsize=256)

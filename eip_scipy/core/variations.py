@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +13,9 @@ from ..engine.native import BUILD, LibraryFunction
 from .arguments import scalars
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
 from .inputs import filled, require_arguments, shown
+from .invariant_set import with_duals
 from .invariants import Invariant, copied
-from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off, jitted_call
+from .jitted import NotCompilableError, compiled_like, is_compiled, is_jitted, jit_is_off, jitted_call
 from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import as_derivative
 from .tangent_vectors import TangentVectors
@@ -131,20 +133,25 @@ def augmented_rhs(
 
 def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
     """Return the in-place right-hand side of a state that is that of `rhs` at `places` and constant elsewhere."""
-    if np.array_equal(places.ravel(), np.arange(places.size)):
+    order = tuple(places.ravel().tolist())
+    if order == tuple(range(len(order))):
         return rhs
-    if is_jitted(jitted_call(rhs)) and not jit_is_off():
-        from .jitted_tangents import rearranged
+    called = jitted_call(rhs)
+    keeps = is_jitted(called) and not jit_is_off()  # what has been compiled, which takes seconds
+    return (_at_places if keeps else _at_places.__wrapped__)(called if keeps else rhs, order)
 
-        return rearranged(jitted_call(rhs), tuple(places.ravel().tolist()))
 
-    def in_place(t: float, Y: Array, out: Array, *extra: Any) -> None:
+@lru_cache(maxsize=256)
+def _at_places(rhs: Callable[..., Any], order: tuple[int, ...]) -> Callable[..., Any]:
+    places = np.array(order, np.int64)
+
+    def in_place(t, Y, out, *extra):  # type: ignore[no-untyped-def] # may be compiled
         found = np.empty(places.size)
-        rhs(t, Y[places].ravel(), found, *extra)
+        rhs(t, Y[places], found, *extra)
         out[:] = 0.0
-        out[places] = found.reshape(places.shape)
+        out[places] = found
 
-    return in_place
+    return compiled_like(in_place, rhs)
 
 
 class _Products:
@@ -367,15 +374,11 @@ def _unaugmented(
     item: Invariant, n: int, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
 ) -> Unaugmented | None:
     """Return what the engine calls for an invariant; None if it would have to call Python for it."""
-    own, slopes, numbers = copied(item), None, scalars(extra)
-    has_slopes = not parameters or is_jitted(own.function)
-    if item.args or numbers is None or not (_has_address(own.function) and has_slopes):
+    slopes, has_slopes = None, not parameters or is_jitted(item.function)
+    if item.args or scalars(extra) is None or not (_has_address(item.function) and has_slopes):
         return None
     try:
-        if own.gradient is None and is_jitted(own.function):
-            from .jitted_gradients import gradient_by_duals
-
-            own.gradient, own.in_place = gradient_by_duals(own.function, n, shape, bool(extra), numbers), True
+        own = with_duals(item, "gradient", n, shape, extra) if item.gradient is None else item
         if parameters:
             from .jitted_tangents import parameter_gradient
 
