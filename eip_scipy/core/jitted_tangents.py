@@ -12,7 +12,7 @@ from .dual_arrays import for_duals, inside
 from .dual_numbers import put_slope, seed, slope, value_of
 from .jitted_gradients import compiled_for, dual_along, gradient_by_duals, new_state
 
-__all__ = ["parameter_gradient", "rhs_by_duals", "rhs_by_products"]
+__all__ = ["parameter_gradient", "rhs_by_duals"]
 
 # Augmented states have the order (y, p, first vector, second vector, ...) here: the parameters p that derivatives are
 # taken by follow the n components as constants, so that each vector has size = n + len(p) numbers.
@@ -75,29 +75,6 @@ def rhs_by_duals(
                     out[start + offset + i] = slope(f[i], lane)
 
     return compiled_for(fill, 1, has_params, scalars)
-
-
-@lru_cache(maxsize=256)
-def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, count: int) -> Any:
-    """Return the in-place right-hand side of a state (n,) with `count` tangent vectors, from a jitted `fun`.
-
-    `form` is that of `fun`, see `native_functions`. ``jvp(t, y, dy, ...)`` returns the derivative (n,) along dy.
-    """
-    taken = n // 2 if form.startswith("acceleration") else n
-    offset, in_place = n - taken, form.endswith("place")
-
-    def rhs(t, Y, out, *extra):
-        y = Y[:n]
-        for i in range(offset):
-            out[i] = y[taken + i]
-        if in_place:
-            fun(t, y[:taken], out[offset:n], *extra)
-        else:
-            out[offset:n] = fun(t, y[:taken], *extra)
-        for k in range(1, count + 1):
-            out[n * k : n * (k + 1)] = jvp(t, y, Y[n * k : n * (k + 1)], *extra)
-
-    return njit(rhs)
 
 
 @lru_cache(maxsize=256)
