@@ -152,18 +152,18 @@ class GaussJackson(Method):
         few steps for a history.
         """
         n_steps, balanced = spec.stepping.span.n_steps, run.work.level.size > 0
-        brief = n_steps - 1 < self.order
-        if brief and balanced and n_steps > 0:
+        shorter = n_steps - 1 < self.order
+        if shorter and balanced and n_steps > 0:
             raise ValueError(
                 f"{spec.name} carries a Balance in its history, which needs more than {self.order} steps, but this run "
                 f"has {n_steps}. Take a shorter step, or a Runge-Kutta method such as EIPDOP853."
             )
-        corrected = slice(0, 0) if brief else _System(self, spec, start).corrected(check=run.options.limit < math.inf)
+        corrected = slice(0, 0) if shorter else _System(self, spec, start).corrected(check=run.options.limit < math.inf)
         # The engine takes balances with the room of a history, also in a run without steps.
-        history = self._history(run, spec, corrected, brief=brief and not balanced)
+        history = self._history(run, spec, corrected, shorter_than_history=shorter and not balanced)
         run.method = run.method._replace(multistep=history)
 
-    def _history(self, run: Run, spec: RunSpec, corrected: slice, *, brief: bool) -> Multistep:
+    def _history(self, run: Run, spec: RunSpec, corrected: slice, *, shorter_than_history: bool) -> Multistep:
         """Return the record and the buffers of the history; `corrected` are the floats that the Jacobian corrects."""
         order, half, span = self.order, run.work.err.size // 2, spec.stepping.span
         pitch = -(-half // 4) * 4  # whole vectors
@@ -173,7 +173,7 @@ class GaussJackson(Method):
             **weights(order)._asdict(),
             growth=max(SMOOTH, min(SMOOTH_LOW * limit**order, 2.0 ** (order - 2))),
             middle=order // 2,
-            brief=brief,
+            brief=shorter_than_history,
             level=spec.level,
             uses_v=self.velocities,
             t0=span.t0,
