@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from . import solvers as solvers
     from .core.balances import Balance
     from .core.config import show_config
-    from .core.invariants import Invariant, check_gradient
+    from .core.invariant_set import check_gradient
+    from .core.invariants import Invariant
     from .core.particles import particle_invariants
     from .core.project import project
     from .core.results import Diagnostics, ProjectionWarning
@@ -88,7 +89,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "Diagnostics": "core.results",
     "Invariant": "core.invariants",
     "ProjectionWarning": "core.results",
-    "check_gradient": "core.invariants",
+    "check_gradient": "core.invariant_set",
     "ensemble": "ensembles.ensemble",
     "equations": "problems.symbolic",
     "find_invariants": "problems.invariant_search",

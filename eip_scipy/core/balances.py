@@ -43,7 +43,7 @@ class Balance(Invariant):
         The components of the state that the projection onto this balance may move. The k components of a row move by
         the same amount. Balances with the same components and weights are projected together, as a group. Each group is
         projected separately, from the same state, without the corrections of other groups. Afterwards all components
-        together restore the linear invariants of `frame`. Either all invariants of a run have components, or none has.
+        together restore the given `linear_invariants`. Either all invariants of a run have components, or none has.
         `metric`, `direction` and `iterations` must be omitted if there are components.
     weights : array_like of float, shape (s,), optional
         Weights of the components, or of the rows of components, such as their typical sizes. The correction is the

@@ -11,7 +11,7 @@ import numpy as np
 from ..engine.native import LibraryFunction
 from ..methods.base import PROJECTION_ONLY, Method
 from .gradients import time_of_motion, typical_sizes, unless_error
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 from .linear import LinearInvariants, confirmed, found_invariants, undetermined
 from .options import ProjectionOptions
 from .particles import Particles, missing_particles

@@ -10,16 +10,17 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.legendre import legint, legval
-from numpy.polynomial.polynomial import polyder, polyint, polyval
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..engine import data
-from ..engine.data import Dense, Work
-from ..engine.native import Engine
-from ..methods.base import DenseForm
+from ..engine.data import NO_METHOD, Dense, Work
+from ..engine.native import Call, Engine, PythonFunctions
+from ..methods.base import PROJECTION_ONLY, DenseForm
+from .bound_problem import BoundProblem
 from .inputs import reals, shown
+from .options import ProjectionOptions
 from .runs import Run
+from .step_control import StepControl
 
 __all__ = ["ExactEnds", "Interpolants", "ManifoldDenseOutput", "solution"]
 
@@ -29,7 +30,17 @@ ITERATIONS = 5
 MOST_ROOTS, ROOT_NUMBERS = 1024, 2**17
 
 
-class Interpolants:
+class _Immutable:
+    """Mixin of objects that are their own copies, because they do not change."""
+
+    def __copy__(self) -> Any:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        return self
+
+
+class Interpolants(_Immutable):
     """Interpolants of a run, created and evaluated by its engine, whose dense output is switched on.
 
     If the run does not project each step, the states after unprojected steps are returned as projected copies.
@@ -40,7 +51,8 @@ class Interpolants:
     levels.
 
     The engine's loop looks for the roots of `events` functions. ``errors()`` returns a context manager that replaces
-    the engine's error in a compiled function by the user's exception, such as `Driver.own_errors`.
+    the engine's error in a compiled function by the user's exception, such as `Driver.own_errors`. The `form` is that
+    of the run's method by default. A pickle has the form alone, without the functions and the invariants of the run.
     """
 
     def __init__(
@@ -49,27 +61,33 @@ class Interpolants:
         engine: Engine,
         events: int = 0,
         errors: Callable[[], AbstractContextManager[None]] = nullcontext,
+        form: DenseForm | None = None,
     ) -> None:
-        self._form = run.tableau.dense_form(run.method)
+        self._form, self._method = form or run.tableau.dense_form(run.method), run.method
         self.record = _record(run, self._form, events)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # all threads share one buffer
         engine.sample(self.record)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Interpolants:
-        return self  # it is immutable
+    def __reduce__(self) -> Any:
+        return _without_functions, (self._form, self._method.b.size, self._method.multistep, self._n, self._dtype)
 
     @property
     def floats(self) -> int:
         """Number of floats in an interpolant."""
         return self.record.piece.size
 
+    @property
+    def pickled_floats(self) -> int:
+        """Number of the floats that do not belong to invariants, which precede the others."""
+        return 3 + (3 + self._form.rows) * self._n * (self._dtype.itemsize // 8)
+
     def over(self, t_old: float, y_old: Array, t: float, y: Array) -> ManifoldDenseOutput:
         """Return the dense output over the last step, from (t_old, y_old) to (t, y)."""
-        piece = np.empty(self.floats)
+        segment = np.empty(self.floats)
         with self._lock, self._errors():
-            self._engine.describe(t_old, y_old, t, y, piece)
-        return ManifoldDenseOutput(self, piece)
+            self._engine.describe(t_old, y_old, t, y, segment)
+        return ManifoldDenseOutput(self, segment)
 
     def shown(self, t: float, y: Array) -> Array:
         """Return a copy of the last state `y` at `t` as the run saves it: projected if its step left it unprojected."""
@@ -78,20 +96,13 @@ class Interpolants:
             self._engine.show(t, y, out)
         return out
 
-    def states(self, piece: Array, times: Array) -> Array:
-        """Return the states (n, m) at times (m,) from `piece`, the floats of an interpolant."""
+    def states(self, segment: Array, times: Array) -> Array:
+        """Return the states (n, m) at times (m,) from `segment`, the floats of an interpolant."""
         out = np.empty((times.size, self._n), self._dtype)
         with self._lock, self._errors():
-            self._engine.interpolate(piece, times, out)
+            self._engine.interpolate(segment, times, out)
         self.warn()
         return out.T
-
-    def unprojected(self, piece: Array) -> UnprojectedDenseOutput:
-        """Return the interpolant without the functions of the run, from its floats."""
-        kind, rows, weights, *_ = self._form
-        m = self._n * self._dtype.itemsize // 8
-        parts = piece[3 : 3 + (2 + rows) * m].reshape(2 + rows, m).copy()
-        return UnprojectedDenseOutput(float(piece[0]), float(piece[1]), kind, parts, weights, self._dtype)
 
     def roots(self) -> tuple[Array, Array, Array]:
         """Return indices (k,), times (k,) and states (k, n) of the events found since the last call of `roots`."""
@@ -121,30 +132,28 @@ class Interpolants:
             )
 
 
-def _record(run: Run, shape: DenseForm, events: int) -> Dense:
+def _record(run: Run, form: DenseForm, events: int) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
-    kind, rows, weights, A, c, own_slopes = shape
-    stages = run.method.b.size
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
-    carried = run.invariants.balances.places.size
+    balances, stages = run.invariants.balances.places.size, run.method.b.size
     options = run.options._replace(
         metric=data.GIVEN, direction=data.NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False,
         limit=math.inf, target=np.zeros(invariants),
     )  # fmt: skip
-    width = 2 if dtype.kind == "c" else 1
+    width, further = dtype.itemsize // 8, form.c.size
     return Dense(
-        kind=kind,
-        weights=weights.copy("C"),
-        A=A.copy("C"),
-        c=c.copy(),
-        own_slopes=own_slopes,
+        kind=form.kind,
+        weights=form.weights.copy("C"),
+        A=form.A.copy("C"),
+        c=form.c.copy(),
+        own_slopes=form.own_slopes,
         shows=run.shows,
         by_travel=invariants > 0 and run.options.metric == data.BY_ERROR,
         options=options,
-        work=Work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1, carried),
+        work=Work(n, dtype, stages + further if further else 1, invariants, options.groups.start.size - 1, balances),
         missed=np.zeros(2),
         waiting=np.zeros(2, np.int64),
-        piece=np.zeros(3 + (3 + rows) * n * width + 2 * invariants + (2 + rows) * carried),
+        piece=np.zeros(3 + (3 + form.rows) * n * width + 2 * invariants + (2 + form.rows) * balances),
         event=np.zeros(roots, np.int64),
         t=np.zeros(roots),
         y=np.zeros((roots, n), dtype),
@@ -153,6 +162,24 @@ def _record(run: Run, shape: DenseForm, events: int) -> Dense:
         pending_event=np.zeros(data.MOST_CROSSINGS * events, np.int64),
         pending_t=np.zeros(data.MOST_CROSSINGS * events),
     )
+
+
+def _without_functions(form: DenseForm, stages: int, history: Any, n: int, dtype: np.dtype) -> Interpolants:
+    """Return the interpolants of a run without invariants and without steps, which evaluate those of another run."""
+    method, options = PROJECTION_ONLY, ProjectionOptions(invariants=(), check=False)
+    problem = BoundProblem(lambda t, y: y, start := np.zeros(n, dtype))
+    run = Run(problem, "dense output", method, StepControl.without_steps(0.0, n), options).start_at(start)
+    if history is not None:
+        rows = len(history.rates)
+        history = history._replace(
+            corrected_count=0, levels=np.zeros((3, 0)), rates=np.zeros((rows, 0)), rate_sums=np.zeros((2, 0))
+        )
+    none, A = np.zeros(stages), np.zeros((stages, stages))
+    run.method = NO_METHOD._replace(A=A, b=none, b_low=none, b_v=none, b_v_low=none, c=none, multistep=history)
+    run.work = Work(n, dtype, stages, 0, run.options.groups.start.size - 1)
+    functions = PythonFunctions(Call(problem.fun, (), (n,), lambda value, t: value), (), (), (), second_order=False)
+    engine = Engine(run.method, run.options._replace(compensated=history is not None), run.work, functions)
+    return Interpolants(run, engine, form=form)
 
 
 class AtRealTimes(DenseOutput):
@@ -178,114 +205,43 @@ class ExactEnds(AtRealTimes):
         return np.where(t == self.t, self._y[column], out)
 
 
-class UnprojectedDenseOutput(AtRealTimes):
-    """The interpolant of a step without its projection, which needs no functions: the content of a pickle.
-
-    `parts` are the floats of the states at both ends, and of the further rows of an interpolant of this `kind`, with
-    its `weights`, see `DenseForm`. The engine has the same formulas.
-    """
-
-    def __init__(self, t_old: float, t: float, kind: int, parts: Array, weights: Array, dtype: np.dtype) -> None:
-        super().__init__(t_old, t)
-        self._kind, self._parts, self._weights, self._dtype = kind, parts, weights, dtype
-
-    def __reduce__(self) -> Any:
-        arguments = self.t_old, self.t, self._kind, self._parts, self._weights, self._dtype
-        return UnprojectedDenseOutput, arguments
-
-    def _call_impl(self, t: Array) -> Array:
-        times = np.array(t, float, ndmin=1)
-        out = self._floats((times - self.t_old) / (self.t - self.t_old))
-        for end, state in ((self.t_old, self._parts[0]), (self.t, self._parts[1])):
-            out[:, times == end] = state[:, None]
-        found = np.ascontiguousarray(out.T).view(self._dtype).T
-        return found[:, 0] if t.ndim == 0 else found
-
-    def _floats(self, s: Array) -> Array:
-        """Return the floats (m, k) of the states at the shares s (k,) of the step."""
-        h, start, rows = self.t - self.t_old, self._parts[0][:, None], self._parts[2:]
-        rest, half = 1.0 - s, self._parts.shape[1] // 2
-        if self._kind == data.CUBIC:
-            r = rows[..., None]
-            return start + s * (r[0] + rest * (rest * r[1] - s * r[2]))
-        if self._kind == data.QUINTIC:
-            place = rows.reshape(6, half)
-            return np.concatenate([polyval(s, place), polyval(s, polyder(place)) / h])
-        if self._kind == data.SEVENTH:
-            out = np.zeros((start.size, s.size))
-            for k, row in enumerate(rows[::-1]):
-                out = (out + row[:, None]) * (rest if k % 2 else s)
-            return start + out
-        if self._kind == data.POLYNOMIAL:
-            return polyval(s, np.vstack([start.T, rows[:-1]])) + _share(s) * rows[-1][:, None]
-        if self._kind == data.NYSTROM:  # accelerations in Legendre polynomials of the step
-            a = rows[:-1].reshape(-1, half)[: len(self._weights)]
-            v, q = (legval(2 * s - 1, legint(a, k, lbnd=-1, scl=0.5)) for k in (1, 2))
-            return self._moved(h * s, h * h * q, h * v) + _share(s) * rows[-1][:, None]
-        back, nodes = int(rows[-1, 0]), rows[-1, 1]  # accelerations at nodes, and the step in units of their distance
-        h = h / nodes
-        order = self._weights.shape[1]
-        a = self._weights[back * order : (back + 1) * order].T @ rows[:-2].reshape(-1, half)[:order]
-        v, q = (polyval(s * nodes, polyint(a, k)) for k in (1, 2))
-        return self._moved(h * nodes * s, h * h * q, h * v) + _share(s) * rows[-2][:, None]
-
-    def _moved(self, passed: Array, q: Array, v: Array) -> Array:
-        """Return the state after a time `passed`, in which accelerations add q to positions and v to velocities."""
-        start, half = self._parts[0][:, None], self._parts.shape[1] // 2
-        return np.concatenate([start[:half] + passed * start[half:] + q, start[half:] + v])
-
-
-def _share(s: Array) -> Array:
-    """Return the share, at the shares s of a step, of what an interpolant misses at the end of the step."""
-    return s * s * (3.0 - 2.0 * s)
-
-
-class ManifoldDenseOutput(AtRealTimes):
-    """An interpolant over one step, see `Interpolants`; `piece` are the floats of the interpolant.
+class ManifoldDenseOutput(_Immutable, AtRealTimes):
+    """An interpolant over one step, see `Interpolants`; `segment` are the floats of the interpolant.
 
     A pickle does not hold the functions of the run: samples of an unpickled interpolant are not projected, so that they
     are as accurate as SciPy's and do not meet the invariants; the states at both ends are the same. A copy by
     `copy.deepcopy` shares the functions.
     """
 
-    def __init__(self, interpolants: Interpolants, piece: Array) -> None:
-        super().__init__(float(piece[0]), float(piece[1]))
-        self._interpolants, self._piece = interpolants, piece
-
-    def __copy__(self) -> ManifoldDenseOutput:
-        return self  # it is immutable
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> ManifoldDenseOutput:
-        return self
+    def __init__(self, interpolants: Interpolants, segment: Array) -> None:
+        super().__init__(float(segment[0]), float(segment[1]))
+        self._interpolants, self._segment = interpolants, segment
 
     def __reduce__(self) -> Any:
-        return self._interpolants.unprojected(self._piece).__reduce__()
+        return ManifoldDenseOutput, (self._interpolants, self._segment[: self._interpolants.pickled_floats])
 
     def _call_impl(self, t: Array) -> Array:
         times = np.array(t, float, ndmin=1)
-        out = self._interpolants.states(self._piece, times)
+        out = self._interpolants.states(self._segment, times)
         return out[:, 0] if t.ndim == 0 else out
 
 
-class _Pieces(Sequence[ManifoldDenseOutput]):
-    """Sequence of interpolants, made when requested from `pieces` (m, floats), whose rows are their floats."""
+class _Segments(_Immutable, Sequence[ManifoldDenseOutput]):
+    """Sequence of interpolants, made when requested from `segments` (m, floats), whose rows are their floats."""
 
-    def __init__(self, interpolants: Interpolants, pieces: Array) -> None:
-        self._interpolants, self._pieces = interpolants, pieces
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> _Pieces:
-        return self  # it is immutable
+    def __init__(self, interpolants: Interpolants, segments: Array) -> None:
+        self._interpolants, self._segments = interpolants, segments
 
     def __reduce__(self) -> Any:
-        return list, ([self._interpolants.unprojected(piece) for piece in self._pieces],)
+        return _Segments, (self._interpolants, self._segments[:, : self._interpolants.pickled_floats])
 
     def __len__(self) -> int:
-        return len(self._pieces)
+        return len(self._segments)
 
     def __getitem__(self, k: Any) -> Any:
         if isinstance(k, slice):
-            return [ManifoldDenseOutput(self._interpolants, piece) for piece in self._pieces[k]]
-        return ManifoldDenseOutput(self._interpolants, self._pieces[k])
+            return [ManifoldDenseOutput(self._interpolants, segment) for segment in self._segments[k]]
+        return ManifoldDenseOutput(self._interpolants, self._segments[k])
 
 
 class _AtRest(AtRealTimes):
@@ -299,14 +255,13 @@ class _AtRest(AtRealTimes):
         return self._y.copy() if t.ndim == 0 else np.repeat(self._y[:, None], t.size, axis=1)
 
 
-def solution(interpolants: Interpolants, pieces: Array, t_end: float, y_end: Array) -> OdeSolution:
+def solution(interpolants: Interpolants, segments: Array, t_end: float, y_end: Array) -> OdeSolution:
     """Return the dense output over a run, which ends at (t_end, y_end), from the interpolants of its steps (m, floats).
 
     If an event ended the run at the beginning of a step, the dense output extends to the end of that step.
     """
-    if not len(pieces):
+    if not len(segments):
         return OdeSolution([t_end, t_end], [_AtRest(t_end, y_end)])
-    if len(pieces) and pieces[-1, 0] == t_end:
-        t_end = pieces[-1, 1]
-    ts = np.append(pieces[:, 0], t_end)
-    return OdeSolution(ts, _Pieces(interpolants, pieces))
+    if segments[-1, 0] == t_end:
+        t_end = segments[-1, 1]
+    return OdeSolution(np.append(segments[:, 0], t_end), _Segments(interpolants, segments))

@@ -59,7 +59,6 @@ class Events:
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
         self._happened = items.happened if isinstance(items, ContinuedEvents) else (None,) * len(items)
-        self._before = [0 if times is None else len(times) for times in self._happened]
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
         self.last: tuple[float, np.ndarray] = math.nan, np.zeros(0)
@@ -67,7 +66,7 @@ class Events:
     @property
     def terminal(self) -> bool:
         """True if an event can end the run."""
-        return any(math.isfinite(allowed) for allowed in self._allowed)
+        return any(map(math.isfinite, self._allowed))
 
     @property
     def calls(self) -> tuple[Call, ...]:
@@ -83,15 +82,15 @@ class Events:
         """Return the direction of each event and the number of times after which it ends the run."""
         return list(zip(self.directions.tolist(), self._allowed, strict=True))
 
-    def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
-        """Record that event `k` has happened in this run at the times `t` (m,) in the states `y` (m, n)."""
-        self.t[k], self.y[k] = t.tolist(), list(y)
-
     @property
     def left(self) -> list[float]:
         """Return for each event after how many further times it ends the run; infinity if it never does."""
-        counts = zip(self._allowed, self._before, self.t, strict=True)
-        return [allowed - before - len(times) for allowed, before, times in counts]
+        counts = zip(self._allowed, self._happened, self.t, strict=True)
+        return [allowed - len(() if before is None else before) - len(times) for allowed, before, times in counts]
+
+    def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
+        """Record that event `k` has happened in this run at the times `t` (m,) in the states `y` (m, n)."""
+        self.t[k], self.y[k] = t.tolist(), list(y)
 
     def take(self, which: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
         """Record events that the loop has found, by their indices, times and states, in the order of their times."""

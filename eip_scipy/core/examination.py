@@ -20,7 +20,7 @@ from ..engine.native import BUILD
 from ..methods.runge_kutta import DOP853, RK4
 from .gradients import random_directions, unless_error
 from .invariant_checks import complaints
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 
 __all__ = ["Examiner", "is_check_due", "steps_to_check", "unresolved"]
 

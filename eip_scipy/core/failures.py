@@ -10,7 +10,7 @@ from scipy.integrate import OdeSolver
 
 from ..engine import data
 from ..engine.data import Work
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 
 if TYPE_CHECKING:
     from .runs import Run

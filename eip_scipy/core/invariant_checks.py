@@ -21,7 +21,7 @@ from .gradients import DIFFERENCE_WEIGHTS, random_directions, time_of_motion
 from .inputs import converted_from_single
 
 if TYPE_CHECKING:
-    from .invariants import InvariantSet
+    from .invariant_set import InvariantSet
 
 __all__ = ["Complaint", "complaints", "listed", "reported", "time_derivative"]
 

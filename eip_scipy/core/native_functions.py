@@ -10,7 +10,7 @@ import numpy as np
 
 from ..engine.native import LibraryFunction, NativeFunctions, Rates
 from .arguments import Packed
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import PointerFunction
 

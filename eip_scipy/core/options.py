@@ -21,7 +21,8 @@ from ..methods.base import PROJECTION_ONLY, Method
 from .blocks import blocks_of, kinds_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
-from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet
+from .invariant_set import TARGET_TOLERANCE, InvariantSet
+from .invariants import Invariant
 from .step_control import StepControl
 
 __all__ = [

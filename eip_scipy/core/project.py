@@ -15,7 +15,7 @@ from ..methods.base import PROJECTION_ONLY
 from .bound_problem import BoundProblem
 from .failures import projection_failure
 from .inputs import as_vector, count, is_number, reals, shown
-from .invariants import InvariantSet
+from .invariant_set import InvariantSet
 from .options import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
 from .runs import Run
@@ -95,23 +95,20 @@ def project(
     if not is_number(t, "t") or not math.isfinite(t):
         raise ValueError(f"project: t must be a finite number, got {shown(t)}.")
     t, y = float(t), initial_state(y_hat, "y_hat")
-    n = y.size
     iterations = count("iterations", iterations, MOST_ITERATIONS)
     given = ProjectionOptions(
         invariants=invariants,
-        metric=None if sigma is None else weights("sigma", sigma, n),  # None: the euclidean metric
+        metric=None if sigma is None else weights("sigma", sigma, y.size),  # None: the euclidean metric
         linear_invariants=linear_invariants,
         iterations=iterations,
         check=False,
     )
-    stepping = StepControl.without_steps(t, n)
-    run = Run(BoundProblem(_field(f, t, y), y), "project", PROJECTION_ONLY, stepping, given).start_at(y)
+    problem, control = BoundProblem(_field(f, t, y), y), StepControl.without_steps(t, y.size)
+    run = Run(problem, "project", PROJECTION_ONLY, control, given).start_at(y)
     known, work = run.invariants, run.work
-    if known.uses_f and f is None:
-        raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
-    if known.uses_f and iterations > 1 and not callable(f):
+    if known.uses_f and (f is None or (iterations > 1 and not callable(f))):
         raise ValueError(
-            "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
+            "project: a gradient uses f; pass f=, the derivative at y_hat, or with iterations > 1 a function f(t, y)."
         )
     options = run.options._replace(
         target=_targets(known, target, start, t),
@@ -143,6 +140,7 @@ def _field(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.
 
 
 def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarray:
+    """Return the target values (l,): the `target`, or those of the invariants and, for the others, those at `start`."""
     if target is not None:
         if start is not None:
             raise ValueError("project: give target or start, not both; an invariant may also have its own target.")
@@ -155,22 +153,20 @@ def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarr
             raise ValueError(
                 f"project: balance {label!r} changes and has no value to keep. Pass the target values as target=."
             )
-    lacking = [item.target is None for item in known.items]
-    if start is None:
-        if any(lacking):
-            label = known.labels[lacking.index(True)]
+        if item.target is None and start is None:
             raise ValueError(
                 f"project: invariant {label!r} has no target. Set its target, pass target=, or pass start=, a state at "
                 "which it has the target value."
             )
+    if start is None:
         return known.target
     state = initial_state(start, "start")
     if state.shape != known.shape[1:] or (state.dtype.kind == "c" and known.dtype.kind != "c"):
         raise ValueError(
             f"project: start must be a state with {known.shape[1]} components, as y_hat, got {shown(start)}."
         )
-    sizes = np.diff(known.starts)
-    values = np.where(np.repeat(lacking, sizes), known.values(t, state.astype(known.dtype)), known.target)
+    lacking = known.of_values([item.target is None for item in known.items])
+    values = np.where(lacking, known.values(t, state.astype(known.dtype)), known.target)
     if not np.isfinite(values).all():
         raise ValueError(f"project: {known.names[int(np.argmin(np.isfinite(values)))]!r} is not finite at start.")
     return values

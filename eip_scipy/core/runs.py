@@ -33,7 +33,7 @@ from .failures import projection_failure
 from .frame import frame_rows, spanned
 from .gradients import unless_error
 from .invariant_checks import Complaint, listed, reported
-from .invariants import TARGET_TOLERANCE, InvariantSet
+from .invariant_set import TARGET_TOLERANCE, InvariantSet
 from .linear import confirmed
 from .options import ProjectionOptions
 from .results import Diagnostics, slowness

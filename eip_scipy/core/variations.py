@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +13,9 @@ from ..engine.native import BUILD, LibraryFunction
 from .arguments import scalars
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
 from .inputs import filled, require_arguments, shown
+from .invariant_set import with_duals
 from .invariants import Invariant, copied
-from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off, jitted_call
+from .jitted import NotCompilableError, compiled_like, is_compiled, is_jitted, jit_is_off, jitted_call
 from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import as_derivative
 from .tangent_vectors import TangentVectors
@@ -131,20 +133,47 @@ def augmented_rhs(
 
 def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
     """Return the in-place right-hand side of a state that is that of `rhs` at `places` and constant elsewhere."""
-    if np.array_equal(places.ravel(), np.arange(places.size)):
+    order = tuple(places.ravel().tolist())
+    if order == tuple(range(len(order))):
         return rhs
-    if is_jitted(jitted_call(rhs)) and not jit_is_off():
-        from .jitted_tangents import rearranged
+    called = jitted_call(rhs)
+    keeps = is_jitted(called) and not jit_is_off()  # what has been compiled, which takes seconds
+    return (_at_places if keeps else _at_places.__wrapped__)(called if keeps else rhs, order)
 
-        return rearranged(jitted_call(rhs), tuple(places.ravel().tolist()))
 
-    def in_place(t: float, Y: Array, out: Array, *extra: Any) -> None:
+@lru_cache(maxsize=256)
+def _at_places(rhs: Callable[..., Any], order: tuple[int, ...]) -> Callable[..., Any]:
+    places = np.array(order, np.int64)
+
+    def in_place(t, Y, out, *extra):  # type: ignore[no-untyped-def] # may be compiled
         found = np.empty(places.size)
-        rhs(t, Y[places].ravel(), found, *extra)
+        rhs(t, Y[places], found, *extra)
         out[:] = 0.0
-        out[places] = found.reshape(places.shape)
+        out[places] = found
 
-    return in_place
+    return compiled_like(in_place, rhs)
+
+
+@lru_cache(maxsize=256)
+def _by_products(fun: Any, form: str, jvp: Any, n: int, count: int) -> Any:
+    """Return the in-place right-hand side of a state (n,) with `count` tangent vectors; jitted if `fun` and `jvp` are.
+
+    `form` is that of `fun`, see `native_functions`. ``jvp(t, y, dy, ...)`` returns the derivative (n,) along dy.
+    """
+    taken = n // 2 if form.startswith("acceleration") else n
+    offset, in_place = n - taken, form.endswith("place")
+
+    def rhs(t, Y, out, *extra):  # type: ignore[no-untyped-def] # may be compiled
+        y = Y[:n]
+        out[:offset] = y[taken:]
+        if in_place:
+            fun(t, y[:taken], out[offset:n], *extra)
+        else:
+            out[offset:n] = fun(t, y[:taken], *extra)
+        for k in range(1, count + 1):
+            out[n * k : n * (k + 1)] = jvp(t, y, Y[n * k : n * (k + 1)], *extra)
+
+    return compiled_like(rhs, fun, jvp)
 
 
 class _Products:
@@ -171,13 +200,13 @@ class _Products:
         if not callable(jvp):
             raise TypeError(f"jvp must be a function jvp(t, y, dy, ...) -> (n,), got {shown(jvp)}.")
 
-        def products(t: float, y: Array, M: Array, extra: tuple) -> Array:
-            found = np.empty_like(M)
-            for out, row in zip(found, M, strict=True):  # each value is copied, because jvp may return the same array
-                out[:] = as_derivative(jvp(t, y.copy(), row.copy(), *extra), self.n, y.dtype, t, "jvp")
-            return found
+        def fun(t: float, y: Array, *extra: Any) -> Array:
+            return as_derivative(self.derivative(t, y, extra), self.n, y.dtype, t)
 
-        rhs = self._interpreted(products)
+        def product(t: float, y: Array, dy: Array, *extra: Any) -> Array:
+            return as_derivative(jvp(t, y.copy(), dy.copy(), *extra), self.n, y.dtype, t, "jvp")
+
+        rhs = _by_products.__wrapped__(fun, "value", product, self.n, self.tangents.count)
         try:
             wrong = self.wrong(rhs, "jvp")
         except TypeError:
@@ -187,10 +216,9 @@ class _Products:
         if wrong is not None:
             along = f"along {shown(self.way)}"
             raise ValueError(f"jvp is not the Jacobian of the right-hand side times dy {along}: {wrong}. Correct jvp.")
-        if is_jitted(jitted_call(self.fun)) and is_jitted(jvp) and not jit_is_off():
-            from .jitted_tangents import rhs_by_products
-
-            return rhs_by_products(jitted_call(self.fun), self.form, jvp, self.n, self.tangents.count)
+        called = jitted_call(self.fun)
+        if is_jitted(called) and is_jitted(jvp) and not jit_is_off():
+            return _by_products(called, self.form, jvp, self.n, self.tangents.count)
         return rhs
 
     def by_numbers(self) -> tuple[Any, str]:
@@ -213,14 +241,13 @@ class _Products:
                 raise
             except Exception as error:  # the function itself raises none at the start
                 reason = f"it raises {type(error).__name__} with dual numbers"
-        rhs = self._interpreted(self._by_complex_steps)
-        if not unless_error(lambda: self.wrong(rhs, "complex steps") is None):
+        if not unless_error(lambda: self.wrong(self._by_complex_steps, "complex steps") is None):
             raise ValueError(
                 "variations: the derivatives of the right-hand side cannot be computed: it does not belong to a "
                 f"problem with derivatives, {reason}, and it does not support complex steps. Give jvp=..., a function "
                 "jvp(t, y, dy) that returns the product of the Jacobian with dy."
             )
-        return rhs, "complex steps"
+        return self._by_complex_steps, "complex steps"
 
     def derivative(self, t: float, y: Array, extra: tuple) -> Array:
         """Return the derivative (n,) of a real or complex state y."""
@@ -241,29 +268,20 @@ class _Products:
             extra = (params,)
         return self.derivative(t, y + shift[: self.n], extra)
 
-    def _interpreted(self, products: Callable[[float, Array, Array, tuple], Array]) -> Callable[..., None]:
-        """Return the right-hand side with products (k, n) of the Jacobian and the rows of M, ``(t, y, M, extra)``."""
-        n, size = self.n, self.tangents.size
-
-        def rhs(t: float, Y: Array, out: Array, *extra: Any) -> None:
-            rows, found = Y.reshape(-1, size), out.reshape(-1, size)
-            y = rows[0, :n]
-            found[:, n:] = 0.0
-            found[0, :n] = as_derivative(self.derivative(t, y, extra), n, Y.dtype, t)
-            found[1:, :n] = products(t, y, rows[1:], extra)
-
-        return rhs
-
-    def _by_complex_steps(self, t: float, y: Array, M: Array, extra: tuple) -> Array:
-        """Return the products (k, n) of the Jacobian and the rows of M by complex steps."""
+    def _by_complex_steps(self, t: float, Y: Array, out: Array, *extra: Any) -> None:
+        """Compute the right-hand side with products by complex steps, in place."""
+        rows, found = (a.reshape(-1, self.tangents.size) for a in (Y, out))
+        y, M = rows[0, : self.n], rows[1:]
+        found[:, self.n :] = 0.0
+        found[0, : self.n] = as_derivative(self.derivative(t, y, extra), self.n, Y.dtype, t)
         # Rows of a size below 2, because complex steps have to be small. Powers of two change them without rounding.
         sizes = 2.0 ** (np.frexp(np.abs(M).max(axis=1, keepdims=True))[1] - 1)
-        rows = M / sizes
+        vectors = M / sizes
 
         def along(t: float, shares: Array) -> Array:
-            return self._shifted(t, y, shares @ rows, extra)
+            return self._shifted(t, y, shares @ vectors, extra)
 
-        return BUILD.gradients.complex_step(along, t, np.zeros(len(rows)), (), COMPLEX_STEP).T * sizes
+        found[1:, : self.n] = BUILD.gradients.complex_step(along, t, np.zeros(len(M)), (), COMPLEX_STEP).T * sizes
 
     def wrong(self, rhs: Callable[..., Any], source: str) -> str | None:
         """Return a clause about a wrong product in `rhs`, from the `source`, along the test direction; None if right.
@@ -367,15 +385,11 @@ def _unaugmented(
     item: Invariant, n: int, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
 ) -> Unaugmented | None:
     """Return what the engine calls for an invariant; None if it would have to call Python for it."""
-    own, slopes, numbers = copied(item), None, scalars(extra)
-    has_slopes = not parameters or is_jitted(own.function)
-    if item.args or numbers is None or not (_has_address(own.function) and has_slopes):
+    slopes, has_slopes = None, not parameters or is_jitted(item.function)
+    if item.args or scalars(extra) is None or not (_has_address(item.function) and has_slopes):
         return None
     try:
-        if own.gradient is None and is_jitted(own.function):
-            from .jitted_gradients import gradient_by_duals
-
-            own.gradient, own.in_place = gradient_by_duals(own.function, n, shape, bool(extra), numbers), True
+        own = with_duals(item, "gradient", n, shape, extra) if item.gradient is None else item
         if parameters:
             from .jitted_tangents import parameter_gradient
 

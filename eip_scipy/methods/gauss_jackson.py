@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 __all__ = [
     "GaussJackson",
     "Weights",
-    "damping_limit",
     "jacobian_product",
     "longest_stable",
     "stability_limit",
@@ -152,18 +151,18 @@ class GaussJackson(Method):
         few steps for a history.
         """
         n_steps, balanced = run.stepping.span.n_steps, run.work.level.size > 0
-        brief = n_steps - 1 < self.order
-        if brief and balanced and n_steps > 0:
+        shorter = n_steps - 1 < self.order
+        if shorter and balanced and n_steps > 0:
             raise ValueError(
                 f"{run.name} carries a Balance in its history, which needs more than {self.order} steps, but this run "
                 f"has {n_steps}. Take a shorter step, or a Runge-Kutta method such as EIPDOP853."
             )
-        corrected = slice(0, 0) if brief else _System(self, run, start).corrected(check=run.options.limit < math.inf)
+        corrected = slice(0, 0) if shorter else _System(self, run, start).corrected(check=run.options.limit < math.inf)
         # The engine takes balances with the room of a history, also in a run without steps.
-        history = self._history(run, corrected, brief=brief and not balanced)
+        history = self._history(run, corrected, shorter_than_history=shorter and not balanced)
         run.method = run.method._replace(multistep=history)
 
-    def _history(self, run: Run, corrected: slice, *, brief: bool) -> Multistep:
+    def _history(self, run: Run, corrected: slice, *, shorter_than_history: bool) -> Multistep:
         """Return the record and the buffers of the history; `corrected` are the floats that the Jacobian corrects."""
         order, half, span = self.order, run.work.err.size // 2, run.stepping.span
         pitch = -(-half // 4) * 4  # whole vectors
@@ -173,7 +172,7 @@ class GaussJackson(Method):
             **weights(order)._asdict(),
             growth=max(SMOOTH, min(SMOOTH_LOW * limit**order, 2.0 ** (order - 2))),
             middle=order // 2,
-            brief=brief,
+            brief=shorter_than_history,
             level=run.level,
             uses_v=self.velocities,
             t0=span.t0,
@@ -205,43 +204,30 @@ class GaussJackson(Method):
 
 
 @cache
-def _inverse_powers(power: int, terms: int) -> Series:
+def _inverse_powers(power: int, terms: int) -> Array:
     """Return the first `terms` coefficients of the series of L^-power in x; `GaussJackson` defines L and x."""
     inverse = [Fraction(1)]
     for k in range(1, terms):
         # The coefficients of L are 1, 1/2, 1/3 ...
         inverse.append(-sum((x / (k - j + 1) for j, x in enumerate(inverse)), Fraction(0)))
-    return inverse if power == 1 else _product(inverse, _inverse_powers(power - 1, terms))
-
-
-def _product(a: Series, b: Series) -> Series:
-    return [sum((a[j] * b[k - j] for j in range(k + 1)), Fraction(0)) for k in range(len(a))]
-
-
-def _shifted(series: Series, back: int) -> Series:
-    """Return the series times (1 - x)^back, which shifts it back by `back` steps; back = -1 is one step ahead."""
-    binomial = [Fraction((-1) ** k * comb(back, k) if back >= 0 else 1) for k in range(len(series))]
-    return _product(series, binomial)
-
-
-def _ordinates(series: Series) -> Series:
-    """Return the coefficients of a_n, a_(n-1), ... for a sum over backward differences of a_n."""
-    n = len(series)
-    return [(-1) ** j * sum((series[k] * comb(k, j) for k in range(j, n)), Fraction(0)) for j in range(n)]
+    return np.array(inverse) if power == 1 else np.convolve(inverse, _inverse_powers(power - 1, terms))[:terms]
 
 
 def _series(power: int, back: int, terms: int) -> Series:
     """Return `terms` coefficients of the series in x of the position or velocity `back` steps before the newest node.
 
-    `power` is 2 for the position and 1 for the velocity. The first `power` coefficients of the series, 1 and -1 - back,
-    are left out, see `GaussJackson`.
+    `power` is 2 for the position and 1 for the velocity. The factor (1 - x)^back shifts a series back; back = -1 is one
+    step ahead. The first `power` coefficients of the series, 1 and -1 - back, are left out, see `GaussJackson`.
     """
-    return _shifted(_inverse_powers(power, terms + power), back)[power:]
+    n = terms + power
+    shift = [Fraction((-1) ** k * comb(back, k) if back >= 0 else 1) for k in range(n)]
+    return np.convolve(_inverse_powers(power, n), shift)[power:n].tolist()
 
 
 def _weights(power: int, back: int, order: int) -> Series:
     """Return the weights of a_n, a_(n-1), ... in the position or velocity `back` steps before the newest node n."""
-    return _ordinates(_series(power, back, order))
+    series = _series(power, back, order)  # over backward differences of a_n
+    return [(-1) ** j * sum((series[k] * comb(k, j) for k in range(j, order)), Fraction(0)) for j in range(order)]
 
 
 position_series, velocity_series = partial(_series, 2), partial(_series, 1)
@@ -275,17 +261,16 @@ def weights(order: int) -> Weights:
 
     The difference that has the shape of the errors is one order higher for velocities than for positions.
     """
-    back = range(order)
-    estimate = min(ESTIMATE, order - 2)
+    back, estimate = range(order), min(ESTIMATE, order - 2)
 
     def difference(k: int) -> Array:
-        return _oldest_first([(-1) ** j * Fraction(comb(k, j)) for j in range(order + 1)])
+        return np.array([float((-1) ** j * comb(k, j)) for j in reversed(range(order + 1))])
 
     return Weights(
         predict_q=_balanced(position_weights(-1, order))[::-1].copy(),
         predict_v=_balanced(velocity_weights(-1, order))[::-1].copy(),
-        states_q=np.array([_oldest_first(position_weights(k, order)) for k in back]),
-        states_v=np.array([_oldest_first(velocity_weights(k, order)) for k in back]),
+        states_q=np.array([position_weights(k, order)[::-1] for k in back], float),
+        states_v=np.array([velocity_weights(k, order)[::-1] for k in back], float),
         correction=_balanced(correction_weights(order))[::-1].copy(),
         shape_q=difference(estimate),
         shape_v=difference(estimate + 1),
@@ -310,10 +295,6 @@ def _balanced(exact: Series) -> Array:
     choices = np.arange(2 ** len(exact))[:, None] >> np.arange(len(exact)) & 1
     left = np.abs(moments @ (missed - choices * gap).T).sum(axis=0)
     return np.asarray(np.where(choices[np.argmin(left)], other, nearest))
-
-
-def _oldest_first(values: Series) -> Array:
-    return np.array([float(value) for value in reversed(values)])
 
 
 @cache
@@ -365,45 +346,31 @@ def _growth(order: int, corrected: bool, square: float, damping: complex) -> flo
     return float(np.abs(np.roots(polynomial)).max())
 
 
-def _is_stable(order: int, corrected: bool, fast: float, damped: float = 0.0) -> bool:
-    """Return True if the solution of no mode grows; the arguments are those of `longest_stable`.
-
-    No root of the characteristic polynomial has a modulus above 1 + `GROWTH`, including the two roots of the solution.
-    """
-    return all(_growth(order, corrected, fast**2, w) <= 1.0 + GROWTH for w in {damped, 1j * damped})
-
-
 def longest_stable(order: int, corrected: bool, fast: float, damped: float) -> float:
     """Return the largest part of a step h, at most 1, with which a method is stable.
 
     `fast` is h omega, for q'' = -omega^2 q, and `damped` h c, for the additional term -c v (friction) or i c v
-    (rotation). `order` and `corrected` are those of `GaussJackson`.
+    (rotation). `order` and `corrected` are those of `GaussJackson`. The method is stable if no root of the
+    characteristic polynomial has a modulus above 1 + `GROWTH`, including the two roots of the solution.
     """
 
     def stable(part: float) -> bool:
-        return _is_stable(order, corrected, part * fast, part * damped)
+        square, damping = (part * fast) ** 2, part * damped
+        return all(_growth(order, corrected, square, w) <= 1.0 + GROWTH for w in {damping, 1j * damping})
 
-    return 1.0 if stable(1.0) else _largest(stable, 1.0)
-
-
-@cache
-def damping_limit(order: int) -> float:
-    """Return the largest h c for which the method is stable without other forces; see `longest_stable` for c."""
-    return _largest(lambda x: _is_stable(order, False, 0.0, x))
+    if stable(1.0):
+        return 1.0
+    low, high = 0.0, 1.0
+    while high - low > 1e-6 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
 
 
 @cache
 def stability_limit(order: int, corrected: bool) -> float:
     """Return the largest h omega for which the method is stable without forces that depend on velocities."""
-    return _largest(lambda x: _is_stable(order, corrected, x))
-
-
-def _largest(stable: Callable[[float], bool], high: float = 2.0) -> float:
-    low = 0.0
-    while high - low > 1e-6 * high:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low
+    return 2.0 * longest_stable(order, corrected, 2.0, 0.0)
 
 
 def jacobian_product(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Array, Array], Array]:

@@ -178,8 +178,7 @@ class ScipySolverAdapter(Method):
         h = solver.t - t
         w.y_hat[:] = solver.y
         w.err[:] = self._error(h).view(float)
-        self._describe(h, w.K[1:-1])
-        w.K[-1] = self._slope(w.K[1:-1])
+        self._describe(h, w.K[1:-1], w.K[-1])
         return float(solver.t), float(solver.h_abs)
 
     def count(self, w: Work) -> None:
@@ -216,12 +215,8 @@ class ScipySolverAdapter(Method):
         """Return the error estimate of each component in the last step, of length h."""
         raise NotImplementedError
 
-    def _describe(self, h: float, rows: Array) -> None:
-        """Fill `rows` with the vectors that the `polynomials` combine into the last step's interpolant."""
-        raise NotImplementedError
-
-    def _slope(self, rows: Array) -> Array:
-        """Return the derivative (n,) of the state at the end of the step; `_describe` has filled the `rows` before."""
+    def _describe(self, h: float, rows: Array, slope: Array) -> None:
+        """Fill `rows` with the vectors that `polynomials` combine, and `slope` with the derivative after the step."""
         raise NotImplementedError
 
 
@@ -253,12 +248,9 @@ class _Radau(ScipySolverAdapter):
     def _error(self, h: float) -> Array:
         return self._solved  # an accepted step ends with the linear system whose solution is the error estimate
 
-    def _describe(self, h: float, rows: Array) -> None:
+    def _describe(self, h: float, rows: Array, slope: Array) -> None:
         np.divide(self.scipy_solver.Z, h, out=rows)
-
-    def _slope(self, rows: Array) -> Array:
-        slope: Array = self.scipy_solver.f
-        return slope
+        slope[:] = self.scipy_solver.f
 
 
 class _BDF(ScipySolverAdapter):
@@ -287,7 +279,7 @@ class _BDF(ScipySolverAdapter):
             difference = difference / (solver.h_abs / abs(h)) ** (order + 1)
         return np.asarray(solver.error_const[order] * difference)
 
-    def _describe(self, h: float, rows: Array) -> None:
+    def _describe(self, h: float, rows: Array, slope: Array) -> None:
         """Fill `rows` with the coefficients of x, x^2, ... in the interpolant, divided by h, where x = (t - t_old) / h.
 
         The solver has already changed its differences D to the length of the next step. Therefore x - 1 is scaled
@@ -297,9 +289,7 @@ class _BDF(ScipySolverAdapter):
         ratio = (abs(h) / self.scipy_solver.h_abs) ** np.arange(MOST_ORDER + 1)
         powers = (SHIFTED * ratio) @ NEWTON[:, : order + 1]
         np.divide(powers[1:] @ self.scipy_solver.D[: order + 1], h, out=rows)
-
-    def _slope(self, rows: Array) -> Array:
-        return np.arange(1, MOST_ORDER + 1) @ rows
+        slope[:] = np.arange(1, MOST_ORDER + 1) @ rows
 
 
 # Column k contains the coefficients of 1, s, s^2, ... in s (s + 1) ... (s + k - 1) / k!.

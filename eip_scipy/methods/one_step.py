@@ -26,8 +26,8 @@ __all__ = ["OneStep", "OneStepMethod"]
 SHORT, SHORTER, MOST_STEPS = 1e-4, 1 / 16, 5
 # Largest difference of the rate in a short step from the derivative, in units of both. A difference above it is that of
 # two equations if it is the same in the next step up to the share SAME, and larger by CLEAR than the change of the
-# derivative in the step and than its rounding, that is its change between states that differ by BLUR roundings.
-DIFFERS, SAME, CLEAR, BLUR = 1e-3, 0.01, 10.0, 4.0
+# derivative in the step and than its rounding, that is its change between states that differ by PERTURBATION roundings.
+DIFFERS, SAME, CLEAR, PERTURBATION = 1e-3, 0.01, 10.0, 4.0
 
 Array = np.ndarray
 
@@ -176,8 +176,8 @@ class OneStep(Method):
             stays = (norms(difference - last) <= SAME * sizes) & (sizes > CLEAR * change)
             wrong = differs & stays & (norms(end - y) > 0)
             if wrong.any():
-                blurred = [y + BLUR * EPS * np.abs(y) * d for d in random_directions(y.size, not is_real)]
-                wrong &= sizes > CLEAR * np.max([norms(rhs(t, state) - f) for state in blurred], axis=0)
+                perturbed = [y + PERTURBATION * EPS * np.abs(y) * d for d in random_directions(y.size, not is_real)]
+                wrong &= sizes > CLEAR * np.max([norms(rhs(t, state) - f) for state in perturbed], axis=0)
             if wrong.any():
                 k = int(np.argmax(np.abs(difference) * np.repeat(wrong, y.size // parts)))
                 return k, difference[k] + f[k], f[k], h

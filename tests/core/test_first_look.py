@@ -7,7 +7,7 @@ from systems import oscillator
 from eip_scipy import Invariant
 from eip_scipy.core.gradients import random_directions
 from eip_scipy.core.invariant_checks import complaints
-from eip_scipy.core.invariants import InvariantSet
+from eip_scipy.core.invariant_set import InvariantSet
 
 SIZES = [0.0, *10.0 ** np.arange(-13.0, 0.5, 0.5)]
 TAU = 0.1

@@ -10,7 +10,7 @@ from systems import jit_momentum as momentum
 from systems import jit_orbit as fun
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, ensemble, integrate
-from eip_scipy.core.invariants import InvariantSet
+from eip_scipy.core.invariant_set import InvariantSet
 
 numba = pytest.importorskip("numba")
 njit = numba.njit

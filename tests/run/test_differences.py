@@ -7,7 +7,7 @@ from numba import njit
 from systems import pericentre
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
-from eip_scipy.core.invariants import LARGE, InvariantSet
+from eip_scipy.core.invariant_set import LARGE, InvariantSet
 
 # In C, and in Python for complex steps.
 FUNCTIONS = {
