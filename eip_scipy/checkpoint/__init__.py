@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import io
 import json
-import math
 import os
 import platform
 import secrets
@@ -27,7 +27,7 @@ from numpy.lib import format as npy
 
 from ..core.versions import VERSION, installed
 
-__all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_versions", "write"]
+__all__ = ["CheckpointError", "read", "require_same", "warn_of_other_versions", "write"]
 
 FORMAT, SCHEMA = "eip_scipy checkpoint", 1
 HEADER = "header.json"
@@ -72,19 +72,30 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     ('example', array([0, 1, 2]))
     """
     target = Path(os.path.realpath(path))
-    own = {"format": FORMAT, "schema": SCHEMA, "arrays": list(arrays), **origin()}
+    # The version of Numba only if it is loaded: otherwise it has compiled no function of the run.
+    versions = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
+    own = {"format": FORMAT, "schema": SCHEMA, "arrays": list(arrays), "versions": versions, "machine": _machine()}
     text = json.dumps({**header, **own}, indent=1, allow_nan=False).encode()
     temporary = target.with_name(f".{target.name}-{secrets.token_hex(4)}.tmp")
     try:
         try:
             with open(temporary, "xb") as stream:
-                _fill(stream, text, arrays)
+                with zipfile.ZipFile(stream, "w") as archive:
+                    # A ZipInfo has a fixed date, so that equal contents give equal files.
+                    archive.writestr(zipfile.ZipInfo(HEADER), text)
+                    for name, value in arrays.items():
+                        with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                            array = np.asarray(value, order="C")
+                            npy.write_array(member, array, version=(1, 0), allow_pickle=False)
                 stream.flush()
                 os.fsync(stream.fileno())
             os.replace(temporary, target)
         finally:
             temporary.unlink(missing_ok=True)
-        _remove_leftovers(target)
+        for leftover in target.parent.glob(f".{glob.escape(target.name)}-*.tmp"):
+            with contextlib.suppress(OSError):  # another process may have removed it; the checkpoint is written
+                if time.time() - leftover.stat().st_mtime > LEFT_OVER:
+                    leftover.unlink()
     except OSError as error:
         raise CheckpointError(f"cannot write the checkpoint {_name(path)}: {reason(error)}") from error
 
@@ -147,16 +158,19 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
     CheckpointError
         If settings differ; the message names each of them, with both values if they are short.
     """
-    here = json.loads(json.dumps(here))
-    there = there if isinstance(there, dict) else {}
-    names = [name for name in (*here, *(there.keys() - here.keys())) if here.get(name) != there.get(name)]
-    if not names:
-        return
-    what = "; ".join(_difference(name, there.get(name), here.get(name)) for name in names)
-    raise CheckpointError(
-        f"the checkpoint {_name(path)} belongs to another run: {what}. Resume with the arguments of that run, or use "
-        "another file for a new run."
-    )
+    here, there = json.loads(json.dumps(here)), there if isinstance(there, dict) else {}
+    differences = []
+    for name in dict.fromkeys([*here, *there]):
+        old, new = json.dumps(there.get(name)), json.dumps(here.get(name))
+        if there.get(name) != here.get(name):
+            long = len(old) + len(new) > 120
+            values = "differs" if long else f"is {old} in the checkpoint and {new} in this run"
+            differences.append(f"{name} {values}")
+    if differences:
+        raise CheckpointError(
+            f"the checkpoint {_name(path)} belongs to another run: {'; '.join(differences)}. Resume with the arguments "
+            "of that run, or use another file for a new run."
+        )
 
 
 def changed_function(
@@ -184,11 +198,7 @@ def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, An
     """
     there = {**(header.get("versions") or {}), "machine": header.get("machine")}
     here = {**_versions(), "machine": _machine()}
-    other = [
-        f"{name} {there.get(name)}, here {here[name]}"
-        for name in here
-        if there.get(name) != here[name] and (name in there or name != "numba")
-    ]
+    other = [f"{name} {there[name]}, here {here[name]}" for name in here if there.get(name, here[name]) != here[name]]
     if other:
         warnings.warn(
             f"the checkpoint {_name(path)} was written with {'; '.join(other)}: the last bits may differ from those of "
@@ -196,13 +206,6 @@ def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, An
             UserWarning,
             stacklevel=stacklevel + 1,
         )
-
-
-def _difference(name: str, there: Any, here: Any) -> str:
-    values = [json.dumps(value) for value in (there, here)]
-    if sum(map(len, values)) > 120:
-        return f"{name} differs"
-    return f"{name} is {values[0]} in the checkpoint and {values[1]} in this run"
 
 
 def _name(path: str | os.PathLike[str]) -> str:
@@ -222,30 +225,6 @@ def _versions() -> dict[str, str | None]:
 
 def _machine() -> str:
     return f"{platform.system()} {platform.machine()}"
-
-
-def origin() -> dict[str, Any]:
-    """Return the entries of a checkpoint's header on versions, of Numba only if it is loaded, and on the machine."""
-    # The version of Numba only if it is loaded: otherwise it has compiled no function of the run.
-    decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
-    return {"versions": decide, "machine": _machine()}
-
-
-def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write the header `text` and the arrays to `stream` as a zip archive."""
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr(zipfile.ZipInfo(HEADER), text)  # with a fixed date, so that equal contents give equal files
-        for name, value in arrays.items():
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
-                npy.write_array(member, np.asarray(value, order="C"), version=(1, 0), allow_pickle=False)
-
-
-def _remove_leftovers(target: Path) -> None:
-    """Remove temporary files of `write` for `target` whose processes were killed: those unchanged for an hour."""
-    for leftover in target.parent.glob(f".{glob.escape(target.name)}-*.tmp"):
-        with contextlib.suppress(OSError):  # another process may have removed it; the checkpoint is already written
-            if time.time() - leftover.stat().st_mtime > LEFT_OVER:
-                leftover.unlink()
 
 
 def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -273,19 +252,14 @@ def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, An
             )
         if names != [HEADER, *(f"{name}.npy" for name in header["arrays"])]:  # the directory has no checksum
             raise ValueError(f"its members are {names[:10]}, which are not the arrays that its header names")
-        return header, dict(zip(header["arrays"], (_array(archive, m) for m in members[1:]), strict=True))
+        return header, {name: _array(f"{name}.npy", archive.read(f"{name}.npy")) for name in header["arrays"]}
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    with archive.open(member) as stream:
-        if npy.read_magic(stream) != (1, 0):
-            raise ValueError(f"{member.filename} does not have version 1.0 of the npy format")
-        shape, fortran, dtype = npy.read_array_header_1_0(stream)
-        if dtype.kind not in "biufc" or fortran or any(k < 0 for k in shape):
-            raise ValueError(f"{member.filename} holds {dtype} of shape {shape}, expected numbers in C order")
-        n_bytes = math.prod(shape) * dtype.itemsize
-        if n_bytes != member.file_size - stream.tell():
-            raise ValueError(f"{member.filename} declares {n_bytes} bytes and has {member.file_size - stream.tell()}")
-    with archive.open(member) as stream:  # opened again, because zipfile compares no checksum after seeking back
-        found: np.ndarray = npy.read_array(stream, allow_pickle=False)
-        return found
+def _array(name: str, member: bytes) -> np.ndarray:
+    stream = io.BytesIO(member)
+    if npy.read_magic(stream) != (1, 0):
+        raise ValueError(f"{name} does not have version 1.0 of the npy format")
+    shape, fortran, dtype = npy.read_array_header_1_0(stream)
+    if dtype.kind not in "biufc" or fortran:
+        raise ValueError(f"{name} holds {dtype} of shape {shape}, expected numbers in C order")
+    return np.ndarray(shape, dtype, member, stream.tell()).copy()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,19 @@ from ..engine.trust import Trust
 
 __all__ = ["decoded", "encoded"]
 
-RECORDS = {record.__name__: record for record in (Diagnostics, Trust)}
+
+def _record(kind: type, fields: dict[str, Any]) -> Any:
+    found: Any = object.__new__(kind)
+    vars(found).update(fields)
+    return found
+
+
+# Values with named fields: type, and the functions that return their fields and make them from their fields.
+KINDS: dict[str, tuple[type, Callable[[Any], dict[str, Any]], Callable[[dict[str, Any]], Any]]] = {
+    "dict": (dict, dict, dict),
+    "multipliers": (Multipliers, Multipliers._asdict, lambda fields: Multipliers(**fields)),
+    **{record.__name__: (record, vars, partial(_record, record)) for record in (Diagnostics, Trust)},
+}
 
 
 def encoded(name: str, value: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -25,25 +38,34 @@ def encoded(name: str, value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """
     if isinstance(value, np.generic):
         value = value.item()
-    if value is None or isinstance(value, (str, bool, int)) or (isinstance(value, float) and math.isfinite(value)):
+    if value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    if isinstance(value, np.ndarray):
-        if value.dtype == object and value.ndim == 1 and value.size and all(isinstance(item, str) for item in value):
-            return {"texts": _texts(value)}
-        return {"array": _added(name, value, arrays)}
-    if type(value) in RECORDS.values():
-        return {type(value).__name__: _items(name, vars(value), arrays)}
-    if isinstance(value, Multipliers):
-        return {"multipliers": _items(name, value._asdict(), arrays)}
-    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return {"dict": _items(name, value, arrays)}
-    if isinstance(value, list) and (lengths := _lengths(value)) is not None:
-        parts = np.concatenate([_numbers(name, leaf) for leaf in _leaves(value)])
-        return {"parts": [_added(name, parts, arrays), _added(f"{name}.lengths", lengths, arrays)]}
+    if _has_numbers(value):
+        arrays[name] = value
+        return {"array": name}
+    if (
+        isinstance(value, np.ndarray)
+        and value.dtype == object
+        and value.ndim
+        and all(isinstance(text, str) for text in value)
+    ):
+        texts, arrays[name] = np.unique(value, return_inverse=True)  # most messages of members are equal
+        return {"texts": [texts.tolist(), name]}
+    for kind, (known, fields, _) in KINDS.items():
+        if isinstance(value, known) and all(isinstance(key, str) for key in fields(value)):
+            # Numbers instead of keys, which may contain any character, in the names of arrays.
+            items = enumerate(fields(value).items())
+            return {kind: {key: encoded(f"{name}.{k}", item, arrays) for k, (key, item) in items}}
+    if isinstance(value, list) and _are_alike(leaves := _leaves(value)):  # as the events of many members
+        arrays[name] = np.concatenate(leaves)
+        return {"parts": [name, _nested(len, value)]}
     if isinstance(value, (list, tuple)):
-        items = [encoded(f"{name}.{k}", item, arrays) for k, item in enumerate(value)]
-        return items if isinstance(value, list) else {"tuple": items}
-    raise TypeError(f"save: the field {name!r} is {shown(value)}, which cannot be saved. Delete it or convert it.")
+        found = [encoded(f"{name}.{k}", item, arrays) for k, item in enumerate(value)]
+        return found if isinstance(value, list) else {"tuple": found}
+    raise TypeError(
+        f"save: the field {name!r} is {shown(value)}, which would not be loaded as it is. Delete it, or convert it, "
+        "for instance to a plain array of numbers, without a mask or a unit."
+    )
 
 
 def decoded(value: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -56,66 +78,34 @@ def decoded(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if kind == "array":
         return arrays[content]
     if kind == "texts":
-        usual, others, size = content
-        return np.array([others.get(str(k), usual) for k in range(size)], dtype=object)
+        return np.array(content[0], dtype=object)[arrays[content[1]]]
     if kind == "parts":
-        joined, lengths = (arrays[name] for name in content)
-        parts = np.split(joined, np.cumsum(lengths)[:-1])
-        rows, columns = lengths.shape if lengths.ndim == 2 else (1, lengths.size)
-        found = [parts[k * columns : (k + 1) * columns] for k in range(rows)]
-        return found if lengths.ndim == 2 else found[0]
+        name, lengths = content
+        parts = iter(np.split(arrays[name], np.cumsum(_leaves(lengths))))
+        return _nested(lambda _: next(parts), lengths)
     if kind == "tuple":
         return tuple(decoded(content, arrays))
-    items = {key: decoded(item, arrays) for key, item in content.items()}
-    if kind == "multipliers":
-        return Multipliers(**items)
-    if kind == "dict":
-        return items
-    record = object.__new__(RECORDS[kind])
-    vars(record).update(items)
-    return record
+    return KINDS[kind][2]({key: decoded(item, arrays) for key, item in content.items()})
 
 
-def _items(name: str, items: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    # Numbers instead of keys, which may contain any character, in the names of arrays.
-    return {key: encoded(f"{name}.{k}", item, arrays) for k, (key, item) in enumerate(items.items())}
+def _has_numbers(value: Any) -> bool:
+    """Return True for an array of numbers; another one may be more than its numbers, for instance masked."""
+    return type(value) in (np.ndarray, np.memmap) and value.dtype.kind in "biufc"
 
 
-def _added(name: str, value: np.ndarray, arrays: dict[str, np.ndarray]) -> str:
-    arrays[name] = _numbers(name, value)
-    return name
+def _nested(function: Callable[[Any], Any], items: list[Any]) -> list[Any]:
+    """Return the values of a function for the leaves of nested lists, in the same lists."""
+    return [_nested(function, item) if isinstance(item, list) else function(item) for item in items]
 
 
-def _numbers(name: str, array: np.ndarray) -> np.ndarray:
-    """Return an array of numbers; TypeError is raised for another one, and for one that is more than its numbers."""
-    if array.dtype.kind not in "biufc":
-        raise TypeError(f"save: the field {name!r} has dtype {array.dtype}, expected numbers. Delete it or convert it.")
-    if type(array) not in (np.ndarray, np.memmap):
-        raise TypeError(
-            f"save: the field {name!r} is a {type(array).__name__}, of which only the numbers would be saved, without "
-            "a mask or a unit. Delete it or convert it to a plain array."
-        )
-    return array
+def _leaves(items: list[Any]) -> list[Any]:
+    found: list[Any] = []
+    _nested(found.append, items)
+    return found
 
 
-def _texts(texts: np.ndarray) -> list[Any]:
-    """Return texts, most of which are equal: the usual one, the others by their place, and the number of texts."""
-    usual = Counter(texts.tolist()).most_common(1)[0][0]
-    return [usual, {str(k): text for k, text in enumerate(texts) if text != usual}, texts.size]
-
-
-def _leaves(nested: list[Any]) -> list[Any]:
-    """Return the items of a list, or of a list of lists, in order."""
-    return [leaf for item in nested for leaf in (item if isinstance(item, list) else [item])]
-
-
-def _lengths(nested: list[Any]) -> np.ndarray | None:
-    """Return the lengths of arrays in a list (m,) or in m lists (m, k); None if they are not alike except for these."""
-    leaves = _leaves(nested)
-    if not leaves or not all(isinstance(leaf, np.ndarray) and leaf.ndim for leaf in leaves):
-        return None
-    rows = {len(item) if isinstance(item, list) else 0 for item in nested}
-    if len(rows) > 1 or len({(leaf.dtype, leaf.shape[1:]) for leaf in leaves}) > 1:
-        return None
-    lengths = np.array([len(leaf) for leaf in leaves])
-    return lengths.reshape(len(nested), -1) if rows.pop() else lengths
+def _are_alike(leaves: list[Any]) -> bool:
+    """Return True for arrays that differ in their lengths and values only."""
+    return all(_has_numbers(leaf) and leaf.ndim for leaf in leaves) and (
+        len({(leaf.dtype, leaf.shape[1:]) for leaf in leaves}) == 1
+    )

@@ -1,4 +1,4 @@
-"""A lock on a file or folder to which only one run at a time may write; it ends with the process that holds it."""
+"""Exclusive use of a file by one run at a time, until its process ends, and SIGTERM, by which batch systems end it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import contextlib
 import errno
 import os
 import platform
+import signal
 import sys
+import threading
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -15,33 +18,31 @@ from filelock import FileLock, Timeout
 from ..core.callers import users_level
 from . import CheckpointError, reason
 
-__all__ = ["Lock", "absolute"]
+__all__ = ["Lock", "absolute", "sigterm_as_ctrl_c"]
 
 NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class Lock:
-    """Exclusive right to write to a file or folder, until `close` or the end of the process.
+    """Exclusive right to write to the file at `name`, an absolute path, until `close` or the end of the process.
 
-    The lock is held on a separate file next to the place, because a checkpoint is replaced by another file each time it
-    is written. The lock file contains the name of the process that holds the lock, and `close` removes it. Processes
-    that are started or forked do not inherit the lock. A file system without locks causes a RuntimeWarning. If the user
-    has no right to create the lock file, nothing is locked. CheckpointError is raised if another run holds the lock, in
+    The lock is held on a separate file next to it, because a checkpoint is replaced by another file each time it is
+    written. The lock file contains the name of the process that holds the lock, and `close` removes it. Processes that
+    are started or forked do not inherit the lock. A file system without locks causes a RuntimeWarning. If the user has
+    no right to create the lock file, nothing is locked. CheckpointError is raised if another run holds the lock, in
     this process or another, or the file cannot be opened or created for another reason than missing rights.
-
-    `place`, the file or folder, need not exist; `name` is its absolute path, and `path` that with links resolved.
     """
 
-    def __init__(self, place: str | os.PathLike[str]) -> None:
-        self.name = absolute(place)
-        self.path = Path(os.path.realpath(self.name))
-        self._file = self.path.with_name(f".{self.path.name}.eip_scipy-lock")
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.name = absolute(path)
+        target = Path(os.path.realpath(self.name))
+        self._file = target.with_name(f".{target.name}.eip_scipy-lock")
         self._lock = FileLock(
             self._file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=_write_holder
         )
         try:
-            os.stat(self.path.parent)  # filelock would create a missing folder
+            os.stat(target.parent)  # filelock would create a missing folder
             self._lock.acquire()
         except Timeout:
             raise CheckpointError(
@@ -79,20 +80,37 @@ def absolute(path: str | os.PathLike[str]) -> str:
         ) from error
 
 
-def _myself() -> str:
-    return f"process {os.getpid()} on {platform.node()}"
+def _myself() -> bytes:
+    return f"process {os.getpid()} on {platform.node()}".encode()
 
 
 def _write_holder(descriptor: int) -> None:
     with contextlib.suppress(OSError):  # on a full disk the holder's name is missing, not the lock
         os.ftruncate(descriptor, 0)
-        os.write(descriptor, _myself().encode())
+        os.write(descriptor, _myself())
 
 
 def _holder(file: Path) -> str:
     """Return the name of the process that holds the lock, read from its file; "another process" if that fails."""
     try:
-        found = file.read_text(errors="replace")
+        found = file.read_bytes()
     except OSError:  # Windows does not allow reading it, and the holder may just have removed it
-        found = ""
-    return f"{found}, this one" if found == _myself() else found or "another process"
+        found = b""
+    return found.decode(errors="replace") + ", this one" * (found == _myself()) or "another process"
+
+
+@contextlib.contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt in the block, so that the checkpoint is written; not outside the main thread.
+
+    A handler that the user has installed stays in place.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -222,9 +222,9 @@ def integrate(
             others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
     request = Request(*map(asked.__getitem__, Request._fields))
-    keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
+    opened = _resume.opened(checkpoint, checkpoint_every, resume, dense_output)
     begin = time.perf_counter()
-    with keeping as keeper:
+    with opened as keeper:
         try:
             return Loop(prepared(request), keeper).run()
         except BaseException as error:
@@ -238,20 +238,17 @@ class Loop:
     An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
-    def __init__(self, prepared: Prepared, keeper: _resume.Keeper | None = None) -> None:
+    def __init__(self, prepared: Prepared, keeper: _resume.Checkpointer | None = None) -> None:
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
         self.events, self.diagnostics = system.events, prepared.diagnostics
         self.callback, self.progress = request.callback, request.progress
-        if keeper is not None:
-            if run.tableau.drives:
-                raise ValueError(
-                    f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
-                    "needs. Omit checkpoint, or save the last state of a run and start another run from it."
-                )
-            identity = prepared.identity(run.begin.y, system.parameters)
-            keeper.identify(identity, run, system.derivative, system.events)
+        if keeper is not None and run.tableau.drives:
+            raise ValueError(
+                f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
+                "needs. Omit checkpoint, or save the last state of a run and start another run from it."
+            )
         wanted = request.compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
@@ -265,7 +262,8 @@ class Loop:
                 max_bytes=request.max_bytes,
             )
         if keeper is not None:
-            keeper.begin(self.driver)
+            identity = prepared.identity(run.begin.y, system.parameters)
+            keeper.begin(self.driver, identity, system.derivative, system.events)
         self._slowed = wanted is None and _slowed_by_invariants(system.fun, functions, run)
         self.wall_time = 0.0 if keeper is None else keeper.seconds
         self.chunk = FIRST_CHUNK
