@@ -12,13 +12,14 @@ import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
 from ..core.callers import users_level
-from . import CheckpointError, reason
+from . import CheckpointError, existing, read, reason
 
-__all__ = ["Lock", "absolute", "sigterm_as_ctrl_c"]
+__all__ = ["Lock", "absolute", "held", "sigterm_as_ctrl_c"]
 
 NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -68,6 +69,21 @@ class Lock:
                 with contextlib.suppress(OSError):  # the folder may be gone, or no longer writable
                     self._file.unlink()  # before others can lock it
             self._lock.release()
+
+
+@contextlib.contextmanager
+def held(
+    path: str | os.PathLike[str], kind: str, what: str, resume: bool
+) -> Iterator[tuple[str, tuple[dict[str, Any], dict[str, Any]] | None]]:
+    """Lock the checkpoint of a run or ensemble (`what`); yield its absolute path, and the content of an existing file.
+
+    The header must have the `kind`. CheckpointError is raised if the file exists and `resume` is False.
+    """
+    with sigterm_as_ctrl_c(), contextlib.closing(Lock(path)) as lock:
+        exists = os.path.exists(lock.name)
+        if exists and not resume:
+            raise existing(lock.name, what)
+        yield lock.name, read(lock.name, kind) if exists else None
 
 
 def absolute(path: str | os.PathLike[str]) -> str:

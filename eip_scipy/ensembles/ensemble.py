@@ -252,7 +252,7 @@ class EnsembleResult(Result):
         ImportError
             If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
         """
-        from ..plotting.ensembles import ensemble_figure
+        from ..plotting.results import ensemble_figure
 
         return ensemble_figure(self, names)
 

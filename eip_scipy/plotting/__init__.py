@@ -9,8 +9,6 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 try:
     from matplotlib.ticker import LogLocator, NullFormatter
 except ModuleNotFoundError as error:
@@ -20,7 +18,7 @@ except ModuleNotFoundError as error:
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["FLOOR", "MARKERS", "PALETTE", "draw_errors", "log_errors", "method_styles", "typeset"]
+__all__ = ["FLOOR", "MARKERS", "PALETTE", "draw_lines", "log_errors", "method_styles", "typeset"]
 
 # Colours of Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and
 # wine and olive of Tol.
@@ -65,7 +63,7 @@ def typeset(text: str) -> str:
 
 def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") -> None:
     """Give the axis `along` a log scale with few ticks over two powers of ten at least, and label both axes."""
-    axis.set(**{f"{along}scale": "log"})
+    axis.set(**{f"{along}scale": "log"}, xlabel=x, ylabel=y)
     low, high = axis.get_ylim() if along == "y" else axis.get_xlim()
     # A range below two powers of ten would have too few labelled ticks.
     if high / low < 100:
@@ -73,21 +71,16 @@ def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") ->
     shown = axis.yaxis if along == "y" else axis.xaxis
     shown.set_major_locator(LogLocator(numticks=9 if along == "y" else 5))
     shown.set_minor_formatter(NullFormatter())
-    axis.set_xlabel(x)
-    axis.set_ylabel(y)
     axis.grid(which="major", alpha=0.3)
 
 
-def draw_errors(axis: Axes, x: Any, errors: Mapping[str, Any], styles: Mapping[str, Any], sizes: Any) -> None:
-    """Draw errors by name for a log axis, which has no place for 0: errors of 0 are drawn below all others, and marked.
-
-    `sizes` are those of the quantities with these errors; 0 is drawn below their rounding errors.
-    """
-    values = np.concatenate(list(errors.values()))
-    size = np.max(np.abs(sizes), where=np.isfinite(sizes), initial=0.0)
-    zero = np.min(values, where=values > 0, initial=FLOOR * (size or 1.0))
-    for name, row in errors.items():
-        axis.plot(x, np.where(row == 0, zero, row), **styles[name])
-    if np.any(values == 0):
-        across = axis.get_yaxis_transform()
-        axis.text(1.0, zero, "error 0 ", transform=across, ha="right", va="top", fontsize="x-small")
+def draw_lines(
+    axis: Axes, x: Any, curves: Mapping[str, Any], styles: Mapping[str, Any] | None = None, loc: str = "best"
+) -> None:
+    """Draw curves by name, in the `styles` of their names, with a legend if there are several styles."""
+    styles = method_styles(curves) if styles is None else styles
+    for name, values in curves.items():
+        axis.plot(x, values, lw=1.1, **styles[name] | {"marker": None})
+    axis.grid(alpha=0.2)
+    if len(styles) > 1:
+        axis.legend(fontsize="small", loc=loc)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import weakref
 from typing import Any
 
 from matplotlib import pyplot, rcParams
@@ -34,69 +33,46 @@ class ShownFigure(Figure):
 
     def _repr_png_(self) -> bytes | None:
         """Return the picture for a notebook; None for a figure that has a window or a widget."""
-        if _is_open(self):
+        if self.canvas.manager is not None and pyplot.fignum_exists(self.canvas.manager.num):
             return None
         stream = io.BytesIO()
         self.savefig(stream, format="png")
         return stream.getvalue()
 
     def _ipython_display_(self) -> None:
-        """Show the figure in a notebook with the inline backend, which then does not show it again after the cell.
+        """Close the figure in a notebook with the inline backend, which shows it now and not again after the cell.
 
         Raises
         ------
         NotImplementedError
-            If the backend is another one; IPython then uses another representation.
+            Always: IPython then uses another representation.
         """
-        if INLINE not in _backend():
-            raise NotImplementedError
-        from IPython import get_ipython
-        from IPython.display import publish_display_data
-
-        pyplot.close(self)
-        formatters = get_ipython().display_formatter.formatters
-        found = {kind: formatter(self) for kind, formatter in formatters.items()}
-        publish_display_data({kind: picture for kind, picture in found.items() if picture is not None})
-
-
-_windows: list[weakref.ref[ShownFigure]] = []
+        if INLINE in _backend():
+            pyplot.close(self)
+        raise NotImplementedError
 
 
 def shown_figure(width: float, height: float) -> ShownFigure:
     """Create an empty figure of a size in inches, which pyplot shows if the backend can show figures."""
-    backend = _backend()
+    backend, dpi = _backend(), DPI
     if backend in backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE):
         return ShownFigure(figsize=(width, height), dpi=DPI, layout="constrained")
-    inline = INLINE in backend
-    if not inline:  # in a notebook the end of the cell closes its figures
+    if INLINE not in backend:  # in a notebook the end of the cell closes its figures
+        dpi = rcParams["figure.dpi"]  # a window of 160 dots per inch would leave the screen
         _close_oldest()
-    dpi = DPI if inline else rcParams["figure.dpi"]  # a window of 160 dots per inch would leave the screen
-    most = rcParams["figure.max_open_warning"]
-    # rc_context is not used, because pyplot may load its backend now, whose settings must not be reset afterwards.
-    rcParams["figure.max_open_warning"] = 0 if inline else most
-    try:
-        figure = pyplot.figure(FigureClass=ShownFigure, figsize=(width, height), dpi=dpi, layout="constrained")
-    finally:
-        rcParams["figure.max_open_warning"] = most
+    figure = pyplot.figure(FigureClass=ShownFigure, figsize=(width, height), dpi=dpi, layout="constrained")
     assert isinstance(figure, ShownFigure)
-    _windows.append(weakref.ref(figure))
     return figure
+
+
+def _close_oldest() -> None:
+    """Close the oldest figures of this package in pyplot before it warns about too many; they can still be saved."""
+    most, numbers = rcParams["figure.max_open_warning"], pyplot.get_fignums()
+    own = [number for number in numbers if isinstance(pyplot.figure(number), ShownFigure)]
+    for number in own[: max(0, len(numbers) - most + 1) if most > 0 else 0]:
+        pyplot.close(number)
 
 
 def _backend() -> str:
     """Return the name of pyplot's backend, which is chosen now if it has not been chosen before."""
     return str(pyplot.get_backend()).lower()
-
-
-def _is_open(figure: Figure) -> bool:
-    """Return True if pyplot manages a figure."""
-    return figure.canvas.manager is not None and pyplot.fignum_exists(figure.canvas.manager.num)
-
-
-def _close_oldest() -> None:
-    """Close the oldest figures of this package in pyplot before it warns about too many; they can still be saved."""
-    mine = [figure for figure in (window() for window in _windows) if figure is not None and _is_open(figure)]
-    most = rcParams["figure.max_open_warning"]
-    while mine and 0 < most <= len(pyplot.get_fignums()):
-        pyplot.close(mine.pop(0))
-    _windows[:] = map(weakref.ref, mine)

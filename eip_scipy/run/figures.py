@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-__all__ = ["described", "plain", "plot", "real_rows", "steps"]
+__all__ = ["plot", "steps"]
 
 
 def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
@@ -59,31 +58,11 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
         if ax is not None or orbit is not None:
             raise TypeError("plot: the figure of an ensemble takes neither ax nor orbit; omit them.")
         return result.plot(names)
-    from ..plotting.runs import draw
+    from ..plotting.results import run_figure
 
-    return draw(result, names, orbit, ax)
-
-
-def plain(text: str) -> str:
-    """Return text that matplotlib draws as it is, though it contains $ or begins with _, which legends leave out."""
-    text = text.replace("$", r"\$")
-    return f" {text}" if not text or text.startswith("_") else text
-
-
-def real_rows(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return real values by their labels in figures: of complex ones the magnitude, with the label |name|."""
-    if np.iscomplexobj(values):
-        names, values = [f"|{name}|" for name in names], np.abs(values)
-    return {plain(name): row for name, row in zip(names, values, strict=True)}
+    return run_figure(result, names, orbit, ax)
 
 
 def steps(result: Any) -> str:
     """Return the method and the step of a run or an ensemble."""
     return f"{result.method}, " + ("adaptive steps" if result.h is None else f"h = {result.h:g}")
-
-
-def described(result: Any) -> str:
-    """Return the method, the step and a remark if the run is not reliable; no text if the result names no method."""
-    if "method" not in result:
-        return ""
-    return steps(result) + ("" if result.trusted else ": not to be trusted")

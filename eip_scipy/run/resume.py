@@ -8,14 +8,14 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 
 from .. import checkpoint
 from ..checkpoint import CheckpointError
-from ..checkpoint.locks import Lock, sigterm_as_ctrl_c
+from ..checkpoint.locks import held
 from ..core.callers import users_level
 from ..core.events import Events
 from ..core.inputs import flag, is_number, shown
@@ -53,13 +53,9 @@ def opened(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Ch
         raise ValueError(
             "a checkpoint does not store dense output; omit dense_output=True and use t_eval or save_every."
         )
-    with sigterm_as_ctrl_c(), closing(Lock(path)) as lock:
-        exists = os.path.exists(lock.name)
-        if exists and not resume:
-            raise checkpoint.existing(lock.name, "run")
-        found = checkpoint.read(lock.name, KIND) if exists else None
+    with held(path, KIND, "run", resume) as (name, found):
         note = "there was no checkpoint: started at the beginning" if resume else ""
-        yield Checkpointer(lock.name, float(every), found, note)
+        yield Checkpointer(name, float(every), found, note)
 
 
 def settings(
