@@ -14,11 +14,12 @@ __all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning"
 
 def _count(place: int, text: str) -> property:
     """Return a property of `Diagnostics` that reads one of the engine's counters."""
+    return property(lambda self: int(self._counters[place]), doc=text)
 
-    def read(self: Diagnostics) -> int:
-        return int(self._counters[place])
 
-    return property(read, doc=text)
+def _of_trust(name: str, text: str) -> property:
+    """Return a property of `Diagnostics` that is the attribute `name` of its `Trust`."""
+    return property(lambda self: getattr(self._trust, name), doc=text)
 
 
 class Diagnostics:
@@ -46,10 +47,7 @@ class Diagnostics:
         """Keep the buffers of a run, from which the attributes are computed when they are read."""
         vars(self).update(buffers)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the l invariants, in order."""
-        return self._trust.names
+    names = _of_trust("names", "Names of the l invariants, in order.")
 
     def followed_by(self, other: Diagnostics) -> Diagnostics:
         """Return the record of this run and of the run with the record `other`, which continued it, together."""
@@ -89,31 +87,24 @@ class Diagnostics:
         """
         return float(self._max_correction[0]) if self._estimated else float("nan")
 
-    @property
-    def trusted(self) -> bool:
+    trusted = _of_trust(
+        "trusted",
         """True if no step failed, no check found an error, and the errors of the steps explain all corrections.
 
         It says nothing about the accuracy of the trajectory.
-        """
-        return self._trust.trusted
-
-    @property
-    def message(self) -> str:
-        """Reason why the run is not to be trusted; "" if there is none."""
-        return self._trust.message
-
-    @property
-    def worst(self) -> tuple[str, float, float] | None:
+        """,
+    )
+    message = _of_trust("message", 'Reason why the run is not to be trusted; "" if there is none.')
+    worst = _of_trust(
+        "worst",
         """Invariant, time and size of the largest correction, in units of the local error including round-off.
 
         The size is below 5 in most correct runs. None if no correction was measured.
-        """
-        return self._trust.worst
-
-    @property
-    def corrections(self) -> np.ndarray:
-        """Largest correction of each invariant, (l,), in the unit of `worst`; nan if none was measured."""
-        return self._trust.corrections
+        """,
+    )
+    corrections = _of_trust(
+        "corrections", "Largest correction of each invariant, (l,), in the unit of `worst`; nan if none was measured."
+    )
 
     @property
     def slowness(self) -> np.ndarray:
@@ -141,10 +132,7 @@ class Diagnostics:
         if self.worst is not None:
             name, t, size = self.worst
             lines.append(f"  largest correction: {size:.3g} local errors, of {name} at t={t:.6g}")
-        lines += [f"  {remark}" for remark in (self.moved, *self.remarks) if remark]
-        if self.message:
-            lines.append(f"  {self.message}")
-        return "\n".join(lines)
+        return "\n".join(lines + [f"  {remark}" for remark in (self.moved, *self.remarks, self.message) if remark])
 
 
 def slowness(sums: np.ndarray) -> np.ndarray:

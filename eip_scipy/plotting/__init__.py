@@ -75,7 +75,11 @@ def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") ->
 
 
 def draw_lines(
-    axis: Axes, x: Any, curves: Mapping[str, Any], styles: Mapping[str, Any] | None = None, loc: str = "best"
+    axis: Axes,
+    x: Any,
+    curves: Mapping[str, Any],
+    styles: Mapping[str, Any] | None = None,
+    loc: Literal["best", "upper right"] = "best",
 ) -> None:
     """Draw curves by name, in the `styles` of their names, with a legend if there are several styles."""
     styles = method_styles(curves) if styles is None else styles

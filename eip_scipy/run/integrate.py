@@ -449,8 +449,9 @@ class Loop:
         if variations is not None:
             asked = asked._replace(variations=tangents.restarted(y))
         y, sign = tangents.state(y.copy()), driver.schedule.span.sign
-        asked = asked._replace(params=copy(asked.params))  # the user may change the array
-        origin = Origin(asked, t, y, sign, self._kept, lambda: values_at(*last)[0], message, self.notes)
+        arguments = asked._asdict() | {"params": copy(asked.params)}  # the user may change the array
+        arguments |= arguments.pop("projection")
+        origin = Origin(arguments, t, y, sign, self._kept, lambda: values_at(*last)[0], message, self.notes)
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 

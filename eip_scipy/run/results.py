@@ -20,7 +20,7 @@ __all__ = ["Fields", "IntegrationResult", "Origin", "Result", "described"]
 class Origin(NamedTuple):
     """Origin of a result, from which its run can be continued."""
 
-    request: Any  # `Request`: the arguments of `integrate`
+    arguments: dict[str, Any]  # the keyword arguments of `integrate`
     t: float  # time of the last state
     y: np.ndarray  # (n,): last state of the run, saved or not
     sign: float  # direction of time, 1 or -1
@@ -116,9 +116,9 @@ class Result(Fields):
     def _observe(self) -> None:
         """Compute the fields for outputs and multipliers if the problem has them and they have not been computed."""
         origin = vars(self).get("_origin")
-        if origin is None or any(name in self for name in OBSERVED) or not isinstance(origin.request.fun, Problem):
-            return
-        self.update(origin.request.fun.observed(self.t, self.y, origin.request.params))
+        problem = None if origin is None else origin.arguments["fun"]
+        if isinstance(problem, Problem) and not any(name in self for name in OBSERVED):
+            self.update(problem.observed(self.t, self.y, origin.arguments["params"]))
 
     def __dir__(self) -> list[str]:
         methods = ("continue_to", "plot", "save", "to_dataframe", "to_xarray")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 __all__ = ["dataset", "invariant_errors", "to_dataframe", "to_xarray"]
-
-TABLES = {"xarray": "xarray", "pandas": "dataframe"}
 
 
 def to_xarray(result: Any, names: Any = None) -> Dataset:
@@ -106,46 +105,37 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     >>> list(run.to_dataframe().columns)
     ['x', 'y', 'vx', 'vy', 'H', 'H error', 'L', 'L error']
     """
-    try:
-        import pandas
-    except ModuleNotFoundError as error:
-        raise _missing("pandas", error) from error
-    if hasattr(result, "trajectories"):
-        return _table_of_members(result, names, pandas)
-    known = labels(result, names)
+    pandas = _library("pandas", "to_dataframe")
+    of_members = hasattr(result, "trajectories")
+    known = {"component": component_names(result, names, result.y.shape[1])} if of_members else labels(result, names)
     components = known["component"]
     time = time_name(components)
-    columns: dict[str, Any] = dict(zip(components, np.asarray(result.y), strict=True))
+    columns: dict[str, Any] = dict(zip(components, result.y.T if of_members else np.asarray(result.y), strict=True))
     used = {time, *components}
 
-    def add(name: str, values: np.ndarray, kind: str = "") -> str:
+    def add(name: str, values: Any, kind: str = "") -> str:
         columns[found := label(name, used, kind)] = values
         used.add(found)
         return found
 
+    if of_members:
+        add(f"{time}_end", result.t, "member")
+        for name in ("status", "message", "trusted"):
+            add(name, result[name], "member")
+        for name, values in zip(result.names, result.max_residual.T, strict=True):
+            add(f"{name} max_residual", values)
+        return pandas.DataFrame(columns, pandas.Index(result.first + np.arange(len(result.y)), name="member"))
     if "invariant" in known:
-        for k, (name, errors) in enumerate(zip(known["invariant"], invariant_errors(result), strict=True)):
-            add(f"{add(name, result.invariants[k], 'invariant')} error", errors)
+        for name, values, errors in zip(known["invariant"], result.invariants, invariant_errors(result), strict=True):
+            add(f"{add(name, values, 'invariant')} error", errors)
     for k, by in enumerate(known.get("column", ())):
         for i, name in enumerate(components):
             add(f"d{name}/d{by}", result.variations[:, i, k])
     for name in known.get("output", ()):
         add(name, result.outputs[name], "output")
-    for name, values in zip(known.get("constraint", ()), getattr(result, "multipliers", (0, ()))[1], strict=True):
-        add(f"multiplier {name}", values)
-    return pandas.DataFrame(columns, index=pandas.Index(result.t, name=time))
-
-
-def _table_of_members(result: Any, names: Any, pandas: Any) -> DataFrame:
-    components = component_names(result, names, result.y.shape[1])
-    columns: dict[str, Any] = dict(zip(components, result.y.T, strict=True))
-    ends = {f"{time_name(components)}_end": result.t, "status": result.status, "message": result.message}
-    ends |= {"trusted": result.trusted}
-    for name, values in ends.items():
-        columns[label(name, columns, "member")] = values
-    for name, values in zip(result.names, result.max_residual.T, strict=True):
-        columns[label(f"{name} max_residual", columns)] = values
-    return pandas.DataFrame(columns, index=pandas.Index(result.first + np.arange(len(result.y)), name="member"))
+    for k, name in enumerate(known.get("constraint", ())):
+        add(f"multiplier {name}", result.multipliers.values[k])
+    return pandas.DataFrame(columns, pandas.Index(result.t, name=time))
 
 
 def invariant_errors(result: Any) -> np.ndarray:
@@ -158,17 +148,15 @@ def dataset(result: Any, fields: Mapping[str, Field], coordinates: dict[str, Any
 
     If xarray is missing, ImportError says how to install it.
     """
-    try:
-        import xarray
-    except ModuleNotFoundError as error:
-        raise _missing("xarray", error) from error
-    variables: dict[str, Any] = {}
+    variables, attributes = {}, {}
     for name, field in fields.items():
-        value = getattr(result, name, None) if field.dims else None
-        if value is not None and field.dims and name not in coordinates and coordinates.keys() >= set(field.dims):
-            variables[field.table or name] = field.dims, _array(value)
-    whole = [name for name, field in fields.items() if field.dims == () and name in result]
-    return xarray.Dataset(variables, coordinates, {name: _attribute(result[name]) for name in whole})
+        if field.dims and name not in coordinates and coordinates.keys() >= set(field.dims):
+            if (value := getattr(result, name, None)) is not None:
+                variables[field.table or name] = field.dims, _array(value)
+        elif field.dims == () and name in result:
+            value = result[name]  # NetCDF stores neither None nor booleans
+            attributes[name] = np.nan if value is None else int(value) if isinstance(value, bool | np.bool_) else value
+    return _library("xarray", "to_xarray").Dataset(variables, coordinates, attributes)
 
 
 def _array(value: Any) -> np.ndarray:
@@ -179,14 +167,10 @@ def _array(value: Any) -> np.ndarray:
     return found.astype(str) if found.dtype == object else found
 
 
-def _attribute(value: Any) -> Any:
-    """Return an attribute in a form that NetCDF can store: NaN for None, and 1 or 0 for a boolean."""
-    if value is None:
-        return np.nan
-    return int(value) if isinstance(value, (bool, np.bool_)) else value
-
-
-def _missing(library: str, error: ModuleNotFoundError) -> ImportError:
-    if error.name != library:
-        raise error
-    return ImportError(f'to_{TABLES[library]} needs {library}: pip install "eip_scipy[{library}]"', name=library)
+def _library(name: str, table: str) -> Any:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise ImportError(f'{table} needs {name}: pip install "eip_scipy[{name}]"', name=name) from error
