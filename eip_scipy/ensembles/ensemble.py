@@ -36,12 +36,10 @@ from ..core.states import states
 from ..core.tangent_vectors import TangentVectors
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
-from ..run.fields import Field, component_names, distinct, time_name
-from ..run.figures import steps
+from ..run.fields import Field, component_names, dataset, distinct, time_name
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
-from ..run.results import Result
-from ..run.tables import dataset
+from ..run.results import Result, steps
 from .checkpoints import EnsembleFile
 from .chunks import Chunk, Part, Pool, cores, run_elsewhere, thread_pool
 from .reduction import placed

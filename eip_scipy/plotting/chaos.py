@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import draw_lines, typeset
-from .shown import shown_figure
+from . import draw_lines, shown_figure, typeset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..run.fields import component_names, distinct, labels, time_name
-from ..run.figures import steps
-from ..run.tables import invariant_errors
-from . import FLOOR, PALETTE, draw_lines, log_errors, method_styles
-from .shown import shown_figure
+from ..run.fields import component_names, distinct, invariant_errors, labels, time_name
+from ..run.results import steps
+from . import FLOOR, PALETTE, draw_lines, log_errors, method_styles, shown_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
