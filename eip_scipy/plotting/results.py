@@ -81,9 +81,7 @@ def _run_panels(result: Any, known: Mapping[str, Any], title: str, count: int) -
         axis = figure.add_subplot(places[1])
         lines = {name: style | {"marker": None, "lw": 1.1} for name, style in styles.items()}
         _draw_errors(axis, result.t, errors, result.invariants, lines)
-        log_errors(axis, time_name(known["component"]), "|I - target|")
-        axis.locator_params(axis="x", nbins=TICKS)
-        axis.legend(fontsize="small", loc="best")
+        axis.set(xlabel=time_name(known["component"]), ylabel="|I - target|")
     if corrections:
         _draw_corrections(figure.add_subplot(places[-1]), corrections, [styles[name]["color"] for name in corrections])
     return figure, axes
@@ -231,7 +229,7 @@ def _draw_last(axis: Axes, components: Mapping[str, Any]) -> None:
 
 
 def _draw_errors(axis: Axes, x: Any, errors: Mapping[str, Any], sizes: Any, styles: Mapping[str, Any]) -> None:
-    """Draw errors by name for a log axis, which has no place for 0: errors of 0 are drawn below all others, and marked.
+    """Draw errors by name on a log axis, which has no place for 0: errors of 0 are drawn below all others, and marked.
 
     `sizes` are those of the quantities with these errors; 0 is drawn below their rounding errors.
     """
@@ -243,20 +241,21 @@ def _draw_errors(axis: Axes, x: Any, errors: Mapping[str, Any], sizes: Any, styl
     if np.any(values == 0):
         across = axis.get_yaxis_transform()
         axis.text(1.0, zero, "error 0 ", transform=across, ha="right", va="top", fontsize="x-small")
+    log_errors(axis, "", "")
+    axis.locator_params(axis="x", nbins=TICKS, integer=True)
+    axis.legend(fontsize="small", loc="best")
 
 
 def _draw_corrections(axis: Axes, corrections: Mapping[str, float], colors: Sequence[str]) -> None:
     """Draw the largest correction of each invariant, and the size that most correct runs do not exceed."""
-    for k, (size, color) in enumerate(zip(corrections.values(), colors, strict=True)):
-        axis.barh(k, size if np.isfinite(size) else 0.0, height=0.6, color=color)
-        if size == 0 or np.isinf(size):  # a log axis cannot show it
-            axis.text(0.02, k, f"{size:g}", transform=axis.get_yaxis_transform(), va="center", fontsize="x-small")
-    axis.set(yticks=range(len(corrections)), yticklabels=list(corrections), ylim=(len(corrections) + 0.1, -0.6))
-    axis.axvline(USUAL, color="0.4", lw=1.0, ls=":")
+    sizes = np.array(list(corrections.values()))
+    axis.barh(list(corrections), np.where(np.isfinite(sizes), sizes, 0.0), height=0.6, color=colors)
+    for k in np.flatnonzero((sizes == 0) | np.isinf(sizes)).tolist():  # a log axis cannot show them
+        axis.text(0.02, k, f"{sizes[k]:g}", transform=axis.get_yaxis_transform(), va="center", fontsize="x-small")
+    axis.axvline(USUAL, color="0.4", lw=1.0, ls=":", label="most correct runs stay below")
+    axis.set_ylim(sizes.size + 0.1, -0.6)
     log_errors(axis, "largest correction\n[local errors]", "", along="x")
-    low, high = np.log(axis.get_xlim())
-    side = "right" if np.log(USUAL) > 0.5 * (low + high) else "left"
-    axis.text(USUAL, len(corrections) - 0.1, "most correct runs stay below", va="center", ha=side, fontsize="x-small")
+    axis.legend(fontsize="x-small", loc="lower right")
 
 
 def _draw_largest_errors(axis: Axes, result: Any) -> None:
@@ -265,18 +264,15 @@ def _draw_largest_errors(axis: Axes, result: Any) -> None:
     drawn = np.unique(np.linspace(0, total - 1, min(total, AT_MOST)).round().astype(int))
     members, failed, residuals = result.first + drawn, result.status[drawn] == -1, result.max_residual[drawn].T
     errors = {_plain(name): row[~failed] for name, row in zip(distinct(result.names), residuals, strict=True)}
-    small = 4.0 if members.size <= 300 else 2.0
-    look: dict[str, Any] = {"ls": "", "ms": small, "mew": 0, "alpha": 0.8}
+    look: dict[str, Any] = {"ls": "", "ms": 4.0 if members.size <= 300 else 2.0, "mew": 0, "alpha": 0.8}
     styles = {name: style | look for name, style in method_styles(errors).items()}
-    _draw_errors(axis, members[~failed], errors, result.target[drawn][~failed], styles)
     if failed.any():  # at the bottom, because their errors are meaningless
         bottom = np.full(np.count_nonzero(failed), 0.03)
         look |= {"marker": "x", "ms": 6, "mew": 1.4, "color": ENDS["failed"], "label": "failed"}
         axis.plot(members[failed], bottom, transform=axis.get_xaxis_transform(), **look)
-    x = "member" if drawn.size == total else f"member ({drawn.size} of {total} are drawn)"
-    log_errors(axis, x, "largest |I - target|")
-    axis.locator_params(axis="x", nbins=TICKS, integer=True)
-    axis.legend(fontsize="small", loc="best", markerscale=1.6 if small < 4 else 1.0)
+    _draw_errors(axis, members[~failed], errors, result.target[drawn][~failed], styles)
+    axis.set_ylabel("largest |I - target|")
+    axis.set_xlabel("member" if drawn.size == total else f"member ({drawn.size} of {total} are drawn)")
 
 
 def _draw_ends(axis: Axes, result: Any) -> None:

@@ -372,11 +372,10 @@ class IntegrationResult(Result):
         **options
             Options of `integrate` that change: method, h, rtol, atol, first_step, max_step, save_every, t_eval, events,
             callback, progress, compiled, max_bytes, checkpoint, checkpoint_every, resume, check and project_initial.
-            `t_eval` is not repeated: pass new times, otherwise the states at both ends are saved. Events keep their
-            counts: an event with ``terminal = 3`` that happened twice before ends the run when it happens once more,
-            and an event that ended the run ends it again when it happens next; ``events=None`` removes all events. New
-            events start to count at 0, and may happen at once. If they are not the same functions in the same order,
-            `t_events` and `y_events` contain those of the second run only.
+            `t_eval` is not repeated: without new times the states at both ends are saved. Events keep their counts: one
+            with ``terminal = 3`` that happened twice before ends the run when it happens once more, and one that ended
+            the run ends it again when it happens next; ``events=None`` removes all. New events start to count at 0, and
+            may happen at once; `t_events` and `y_events` are then those of the second run only.
 
         Returns
         -------
@@ -388,20 +387,18 @@ class IntegrationResult(Result):
         Raises
         ------
         ValueError
-            If another option of `integrate` is given, because a value of the first part belongs to it: the targets of
-            the invariants to `params`, derivatives to the first start. If an invariant has another value in the last
-            state than before, because something that its function uses has changed. If `t` is not beyond the end, or
-            the result was loaded, unpickled or copied. If at the last state the error of an invariant with a given
-            target exceeds 1e-8 of the terms of this invariant, as after an unreliable run or one without checks;
-            ``project_initial=True`` then projects the state first.
+            If another option of `integrate` is given, because a value of the first part belongs to it, such as the
+            targets of the invariants to `params`; if something that an invariant uses has changed, so that it has
+            another value in the last state; if `t` is not beyond the end; if the result was loaded, unpickled or
+            copied; or if the last state misses a given target by more than 1e-8 of the terms of the invariant, as after
+            an unreliable run or one without checks: ``project_initial=True`` then projects the state first.
 
         Notes
         -----
         The second run agrees bit by bit with an `integrate` from the last state, except that each invariant keeps the
-        value of the first start, so that errors do not add up. It does not agree bit by bit with an uninterrupted run:
-        `save_every` counts from the new start, adaptive steps begin with a first step again, and compensated sums and
-        the history of multistep methods start again, which costs a rounding error and a new start of the method. Use a
-        checkpoint (``checkpoint=``, ``resume=True``) for a run with the same bits.
+        value of the first start, so that errors do not add up. It agrees only to rounding with an uninterrupted run:
+        `save_every`, the first step of adaptive steps, compensated sums and the history of multistep methods start
+        again. Use a checkpoint (``checkpoint=``, ``resume=True``) for the same bits.
 
         Examples
         --------
