@@ -142,14 +142,6 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
     return header, arrays
 
 
-def existing(name: str, what: str) -> CheckpointError:
-    """Return the error for a run or ensemble (`what`) without ``resume=True`` whose file or group `name` exists."""
-    return CheckpointError(
-        f"{name!r} exists. Pass resume=True to continue the {what} that it holds; for a new {what}, use another "
-        "place or delete this one."
-    )
-
-
 def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, Any]) -> None:
     """Compare the settings `there` in a checkpoint with the settings `here` of the run that resumes it.
 

@@ -17,58 +17,12 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from ..core.callers import users_level
-from . import CheckpointError, existing, read, reason
+from . import CheckpointError, read, reason
 
-__all__ = ["Lock", "absolute", "held", "sigterm_as_ctrl_c"]
+__all__ = ["absolute", "held", "sigterm_as_ctrl_c"]
 
 NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
-
-
-class Lock:
-    """Exclusive right to write to the file at `name`, an absolute path, until `close` or the end of the process.
-
-    The lock is held on a separate file next to it, because a checkpoint is replaced by another file each time it is
-    written. The lock file contains the name of the process that holds the lock, and `close` removes it. Processes that
-    are started or forked do not inherit the lock. A file system without locks causes a RuntimeWarning. If the user has
-    no right to create the lock file, nothing is locked. CheckpointError is raised if another run holds the lock, in
-    this process or another, or the file cannot be opened or created for another reason than missing rights.
-    """
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.name = absolute(path)
-        target = Path(os.path.realpath(self.name))
-        self._file = target.with_name(f".{target.name}.eip_scipy-lock")
-        self._lock = FileLock(
-            self._file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=_write_holder
-        )
-        try:
-            os.stat(target.parent)  # filelock would create a missing folder
-            self._lock.acquire()
-        except Timeout:
-            raise CheckpointError(
-                f"{self.name!r} is in use by another run ({_holder(self._file)}). Wait until that run ends, stop it, "
-                "or use another path."
-            ) from None
-        except OSError as error:
-            if error.errno in NO_LOCKS:
-                self._file.unlink(missing_ok=True)
-                warnings.warn(
-                    f"{self.name!r} could not be locked ({reason(error)}). Make sure that no other run writes there at "
-                    "the same time.",
-                    RuntimeWarning,
-                    stacklevel=users_level(),
-                )
-            elif error.errno not in NO_RIGHT or os.path.lexists(self._file):
-                raise CheckpointError(f"cannot write {self.name!r}: {reason(error)}") from error
-
-    def close(self) -> None:
-        """Release the lock; a second call does nothing."""
-        if self._lock.is_locked:
-            if sys.platform != "win32":  # filelock removes the file on Windows
-                with contextlib.suppress(OSError):  # the folder may be gone, or no longer writable
-                    self._file.unlink()  # before others can lock it
-            self._lock.release()
 
 
 @contextlib.contextmanager
@@ -77,13 +31,58 @@ def held(
 ) -> Iterator[tuple[str, tuple[dict[str, Any], dict[str, Any]] | None]]:
     """Lock the checkpoint of a run or ensemble (`what`); yield its absolute path, and the content of an existing file.
 
-    The header must have the `kind`. CheckpointError is raised if the file exists and `resume` is False.
+    The lock is held on a separate file next to it, because a checkpoint is replaced by another file each time it is
+    written. It contains the name of the process that holds it, and is removed at the end of the block. Processes that
+    are started or forked do not inherit the lock, which ends with the process. In the block SIGTERM raises
+    KeyboardInterrupt.
+
+    CheckpointError is raised if the file exists and `resume` is False, if its header does not have the `kind`, or if
+    another run holds the lock, in this process or another. A file system without locks causes a RuntimeWarning. If the
+    user has no right to create the lock file, nothing is locked.
     """
-    with sigterm_as_ctrl_c(), contextlib.closing(Lock(path)) as lock:
-        exists = os.path.exists(lock.name)
-        if exists and not resume:
-            raise existing(lock.name, what)
-        yield lock.name, read(lock.name, kind) if exists else None
+    name = absolute(path)
+    target = Path(os.path.realpath(name))
+    file = target.with_name(f".{target.name}.eip_scipy-lock")
+    lock = FileLock(file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=_write_holder)
+    with sigterm_as_ctrl_c():
+        _acquire(lock, file, name)
+        try:
+            exists = os.path.exists(name)
+            if exists and not resume:
+                raise CheckpointError(
+                    f"{name!r} exists. Pass resume=True to continue the {what} that it holds; for a new {what}, use "
+                    "another place or delete this one."
+                )
+            yield name, read(name, kind) if exists else None
+        finally:
+            if lock.is_locked:
+                if sys.platform != "win32":  # filelock removes the file on Windows
+                    with contextlib.suppress(OSError):  # the folder may be gone, or no longer writable
+                        file.unlink()  # before others can lock it
+                lock.release()
+
+
+def _acquire(lock: Any, file: Path, name: str) -> None:
+    """Acquire the lock on a file for the checkpoint at `name`, if that is possible."""
+    try:
+        os.stat(file.parent)  # filelock would create a missing folder
+        lock.acquire()
+    except Timeout:
+        raise CheckpointError(
+            f"{name!r} is in use by another run ({_holder(file)}). Wait until that run ends, stop it, or use another "
+            "path."
+        ) from None
+    except OSError as error:
+        if error.errno in NO_LOCKS:
+            file.unlink(missing_ok=True)
+            warnings.warn(
+                f"{name!r} could not be locked ({reason(error)}). Make sure that no other run writes there at the same "
+                "time.",
+                RuntimeWarning,
+                stacklevel=users_level(),
+            )
+        elif error.errno not in NO_RIGHT or os.path.lexists(file):
+            raise CheckpointError(f"cannot write {name!r}: {reason(error)}") from error
 
 
 def absolute(path: str | os.PathLike[str]) -> str:

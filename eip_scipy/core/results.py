@@ -17,11 +17,6 @@ def _count(place: int, text: str) -> property:
     return property(lambda self: int(self._counters[place]), doc=text)
 
 
-def _of_trust(name: str, text: str) -> property:
-    """Return a property of `Diagnostics` that is the attribute `name` of its `Trust`."""
-    return property(lambda self: getattr(self._trust, name), doc=text)
-
-
 class Diagnostics:
     """Record of the projections in a run; pass an empty one as ``diagnostics=`` and read it during or after the run.
 
@@ -47,7 +42,10 @@ class Diagnostics:
         """Keep the buffers of a run, from which the attributes are computed when they are read."""
         vars(self).update(buffers)
 
-    names = _of_trust("names", "Names of the l invariants, in order.")
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the l invariants, in order."""
+        return self._trust.names
 
     def followed_by(self, other: Diagnostics) -> Diagnostics:
         """Return the record of this run and of the run with the record `other`, which continued it, together."""
@@ -87,24 +85,31 @@ class Diagnostics:
         """
         return float(self._max_correction[0]) if self._estimated else float("nan")
 
-    trusted = _of_trust(
-        "trusted",
+    @property
+    def trusted(self) -> bool:
         """True if no step failed, no check found an error, and the errors of the steps explain all corrections.
 
         It says nothing about the accuracy of the trajectory.
-        """,
-    )
-    message = _of_trust("message", 'Reason why the run is not to be trusted; "" if there is none.')
-    worst = _of_trust(
-        "worst",
+        """
+        return self._trust.trusted
+
+    @property
+    def message(self) -> str:
+        """Reason why the run is not to be trusted; "" if there is none."""
+        return self._trust.message
+
+    @property
+    def worst(self) -> tuple[str, float, float] | None:
         """Invariant, time and size of the largest correction, in units of the local error including round-off.
 
         The size is below 5 in most correct runs. None if no correction was measured.
-        """,
-    )
-    corrections = _of_trust(
-        "corrections", "Largest correction of each invariant, (l,), in the unit of `worst`; nan if none was measured."
-    )
+        """
+        return self._trust.worst
+
+    @property
+    def corrections(self) -> np.ndarray:
+        """Largest correction of each invariant, (l,), in the unit of `worst`; nan if none was measured."""
+        return self._trust.corrections
 
     @property
     def slowness(self) -> np.ndarray:

@@ -98,13 +98,13 @@ def ensemble_figure(result: Any, names: Any = None) -> Figure:
     figure, places = _panels(f"{len(result.t)} members, {steps(result)}", widths, height)
     axes = _stacked(places[0], len(shown) if in_time else 1)
     if in_time:
+        left = np.count_nonzero(~np.isnan(shown[next(iter(shown))]), axis=0).min()
+        title = f"of members still running: at least {left} of {ended.size}" if left < ended.size else None
         for axis, color, (name, values) in zip(axes, PALETTE, shown.items(), strict=False):
-            _draw_fan(axis, result.times, values, color)
+            _draw_fan(axis, result.times, values, color, "90 %" if title else "90 % of members")
             axis.set_ylabel(name)
         axes[-1].set_xlabel(time_name(components))
         figure.align_ylabels(axes)
-        left = np.count_nonzero(~np.isnan(shown[next(iter(shown))]), axis=0).min()
-        title = f"members still running: at least {left} of {ended.size}" if left < ended.size else None
         look: dict[str, Any] = {"fontsize": "small", "title_fontsize": "small", "frameon": False}
         axes[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, title=title, **look)
     else:
@@ -198,14 +198,14 @@ def _by_size(components: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [group for group in (large, small) if group]
 
 
-def _draw_fan(axis: Axes, times: np.ndarray, values: Any, color: str) -> None:
-    """Draw the median of members in time, and bands that contain 50 % and 90 % of them."""
+def _draw_fan(axis: Axes, times: np.ndarray, values: Any, color: str, most: str) -> None:
+    """Draw the median of members in time, and bands that contain 50 % and 90 % (labelled `most`) of them."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # raised at times that no member reached
         low, lower, middle, upper, high = np.nanpercentile(values, BANDS, axis=0)
     axis.plot(times, middle, color=color, lw=1.2, label="median")
     axis.fill_between(times, lower, upper, color=color, alpha=0.32, lw=0, label="50 %")
-    axis.fill_between(times, low, high, color=color, alpha=0.18, lw=0, label="90 % of members")
+    axis.fill_between(times, low, high, color=color, alpha=0.18, lw=0, label=most)
     axis.grid(alpha=0.2)
 
 
@@ -266,11 +266,12 @@ def _draw_largest_errors(axis: Axes, result: Any) -> None:
     errors = {_plain(name): row[~failed] for name, row in zip(distinct(result.names), residuals, strict=True)}
     look: dict[str, Any] = {"ls": "", "ms": 4.0 if members.size <= 300 else 2.0, "mew": 0, "alpha": 0.8}
     styles = {name: style | look for name, style in method_styles(errors).items()}
+    _draw_errors(axis, members[~failed], errors, result.target[drawn][~failed], styles)
     if failed.any():  # at the bottom, because their errors are meaningless
         bottom = np.full(np.count_nonzero(failed), 0.03)
         look |= {"marker": "x", "ms": 6, "mew": 1.4, "color": ENDS["failed"], "label": "failed"}
         axis.plot(members[failed], bottom, transform=axis.get_xaxis_transform(), **look)
-    _draw_errors(axis, members[~failed], errors, result.target[drawn][~failed], styles)
+        axis.legend(fontsize="small", loc="best")
     axis.set_ylabel("largest |I - target|")
     axis.set_xlabel("member" if drawn.size == total else f"member ({drawn.size} of {total} are drawn)")
 
