@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import checkpoint
-from ..checkpoint import CheckpointError
-from ..checkpoint.encoding import decoded, encoded
-from ..checkpoint.locks import held
+from ..checkpoint import CheckpointError, decoded, encoded, held
 from ..core.callers import users_level
 from ..run.prepare import Prepared
 from .chunks import Chunk

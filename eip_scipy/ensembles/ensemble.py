@@ -18,7 +18,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checkpoint.locks import absolute, sigterm_as_ctrl_c
+from ..checkpoint import absolute, sigterm_as_ctrl_c
 from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.conserved import NEAR_DISTANCE
 from ..core.events import Events

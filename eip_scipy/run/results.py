@@ -12,8 +12,7 @@ from scipy.integrate import OdeSolution
 from scipy.optimize import OptimizeResult
 
 from .. import checkpoint
-from ..checkpoint import CheckpointError
-from ..checkpoint.encoding import decoded, encoded
+from ..checkpoint import CheckpointError, decoded, encoded
 from ..core.inputs import shown
 from ..core.problem import Problem, component_names
 from ..core.results import Diagnostics, Multipliers

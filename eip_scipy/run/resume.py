@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import checkpoint
-from ..checkpoint import CheckpointError
-from ..checkpoint.locks import held
+from ..checkpoint import CheckpointError, held
 from ..core.callers import users_level
 from ..core.events import Events
 from ..core.inputs import flag, is_number, shown

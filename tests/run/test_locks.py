@@ -6,8 +6,7 @@ import time
 
 import pytest
 
-from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.checkpoint.locks import held
+from eip_scipy.checkpoint import CheckpointError, held
 
 
 @pytest.mark.slow

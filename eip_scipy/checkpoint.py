@@ -7,25 +7,34 @@ has a checksum (CRC-32) of each member, which is compared on reading. Nothing is
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import io
 import json
+import math
 import os
 import platform
 import secrets
+import signal
 import sys
+import threading
 import time
 import warnings
 import zipfile
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from filelock import FileLock, Timeout
 from numpy.lib import format as npy
 
-from ..core.versions import VERSION, installed
+from .core.callers import users_level
+from .core.inputs import shown
+from .core.results import Diagnostics, Multipliers
+from .core.versions import VERSION, installed
+from .engine.trust import Trust
 
 __all__ = ["CheckpointError", "read", "require_same", "warn_of_other_versions", "write"]
 
@@ -33,6 +42,8 @@ FORMAT, SCHEMA = "eip_scipy checkpoint", 1
 HEADER = "header.json"
 LEFT_OVER = 3600.0
 SAME = 1e-9  # relative difference allowed between values of the same function
+NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
+NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class CheckpointError(Exception):
@@ -255,3 +266,210 @@ def _array(name: str, member: bytes) -> np.ndarray:
     if dtype.kind not in "biufc" or fortran:
         raise ValueError(f"{name} holds {dtype} of shape {shape}, expected numbers in C order")
     return np.ndarray(shape, dtype, member, stream.tell()).copy()
+
+
+# Values of results: numbers as arrays, everything else as JSON.
+
+
+def _record(kind: type, fields: dict[str, Any]) -> Any:
+    found: Any = object.__new__(kind)
+    vars(found).update(fields)
+    return found
+
+
+# Values with named fields: type, and the functions that return their fields and make them from their fields.
+KINDS: dict[str, tuple[type, Callable[[Any], dict[str, Any]], Callable[[dict[str, Any]], Any]]] = {
+    "dict": (dict, dict, dict),
+    "multipliers": (Multipliers, Multipliers._asdict, lambda fields: Multipliers(**fields)),
+    **{record.__name__: (record, vars, partial(_record, record)) for record in (Diagnostics, Trust)},
+}
+
+
+def encoded(name: str, value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """Return a field in the form that `decoded` reads: values of JSON, and the names of arrays, added to `arrays`.
+
+    A mapping with one key stands for everything that JSON does not have; its key names the kind. TypeError is raised
+    for a field that would not come back as it is.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    if _has_numbers(value):
+        arrays[name] = value
+        return {"array": name}
+    if (
+        isinstance(value, np.ndarray)
+        and value.dtype == object
+        and value.ndim
+        and all(isinstance(text, str) for text in value)
+    ):
+        texts, arrays[name] = np.unique(value, return_inverse=True)  # most messages of members are equal
+        return {"texts": [texts.tolist(), name]}
+    for kind, (known, fields, _) in KINDS.items():
+        if isinstance(value, known) and all(isinstance(key, str) for key in fields(value)):
+            # Numbers instead of keys, which may contain any character, in the names of arrays.
+            items = enumerate(fields(value).items())
+            return {kind: {key: encoded(f"{name}.{k}", item, arrays) for k, (key, item) in items}}
+    if isinstance(value, list) and _are_alike(leaves := _leaves(value)):  # as the events of many members
+        arrays[name] = np.concatenate(leaves)
+        return {"parts": [name, _nested(len, value)]}
+    if isinstance(value, (list, tuple)):
+        found = [encoded(f"{name}.{k}", item, arrays) for k, item in enumerate(value)]
+        return found if isinstance(value, list) else {"tuple": found}
+    raise TypeError(
+        f"save: the field {name!r} is {shown(value)}, which would not be loaded as it is. Delete it, or convert it, "
+        "for instance to a plain array of numbers, without a mask or a unit."
+    )
+
+
+def decoded(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """Return a field from the output of `encoded`; KeyError is raised if an array is missing."""
+    if isinstance(value, list):
+        return [decoded(item, arrays) for item in value]
+    if not isinstance(value, dict):
+        return value
+    ((kind, content),) = value.items()
+    if kind == "array":
+        return arrays[content]
+    if kind == "texts":
+        return np.array(content[0], dtype=object)[arrays[content[1]]]
+    if kind == "parts":
+        name, lengths = content
+        parts = iter(np.split(arrays[name], np.cumsum(_leaves(lengths))))
+        return _nested(lambda _: next(parts), lengths)
+    if kind == "tuple":
+        return tuple(decoded(content, arrays))
+    return KINDS[kind][2]({key: decoded(item, arrays) for key, item in content.items()})
+
+
+def _has_numbers(value: Any) -> bool:
+    """Return True for an array of numbers; another one may be more than its numbers, for instance masked."""
+    return type(value) in (np.ndarray, np.memmap) and value.dtype.kind in "biufc"
+
+
+def _nested(function: Callable[[Any], Any], items: list[Any]) -> list[Any]:
+    """Return the values of a function for the leaves of nested lists, in the same lists."""
+    return [_nested(function, item) if isinstance(item, list) else function(item) for item in items]
+
+
+def _leaves(items: list[Any]) -> list[Any]:
+    found: list[Any] = []
+    _nested(found.append, items)
+    return found
+
+
+def _are_alike(leaves: list[Any]) -> bool:
+    """Return True for arrays that differ in their lengths and values only."""
+    return all(_has_numbers(leaf) and leaf.ndim for leaf in leaves) and (
+        len({(leaf.dtype, leaf.shape[1:]) for leaf in leaves}) == 1
+    )
+
+
+# Exclusive use of a file by one run at a time, until its process ends, and SIGTERM, by which batch systems end it.
+
+
+@contextlib.contextmanager
+def held(
+    path: str | os.PathLike[str], kind: str, what: str, resume: bool
+) -> Iterator[tuple[str, tuple[dict[str, Any], dict[str, Any]] | None]]:
+    """Lock the checkpoint of a run or ensemble (`what`); yield its absolute path, and the content of an existing file.
+
+    The lock is held on a separate file next to it, because a checkpoint is replaced by another file each time it is
+    written. It contains the name of the process that holds it, and is removed at the end of the block. Processes that
+    are started or forked do not inherit the lock, which ends with the process. In the block SIGTERM raises
+    KeyboardInterrupt.
+
+    CheckpointError is raised if the file exists and `resume` is False, if its header does not have the `kind`, or if
+    another run holds the lock, in this process or another. A file system without locks causes a RuntimeWarning. If the
+    user has no right to create the lock file, nothing is locked.
+    """
+    name = absolute(path)
+    target = Path(os.path.realpath(name))
+    file = target.with_name(f".{target.name}.eip_scipy-lock")
+    lock = FileLock(file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=_write_holder)
+    with sigterm_as_ctrl_c():
+        _acquire(lock, file, name)
+        try:
+            exists = os.path.exists(name)
+            if exists and not resume:
+                raise CheckpointError(
+                    f"{name!r} exists. Pass resume=True to continue the {what} that it holds; for a new {what}, use "
+                    "another place or delete this one."
+                )
+            yield name, read(name, kind) if exists else None
+        finally:
+            if lock.is_locked:
+                if sys.platform != "win32":  # filelock removes the file on Windows
+                    with contextlib.suppress(OSError):  # the folder may be gone, or no longer writable
+                        file.unlink()  # before others can lock it
+                lock.release()
+
+
+def _acquire(lock: Any, file: Path, name: str) -> None:
+    """Acquire the lock on a file for the checkpoint at `name`, if that is possible."""
+    try:
+        os.stat(file.parent)  # filelock would create a missing folder
+        lock.acquire()
+    except Timeout:
+        raise CheckpointError(
+            f"{name!r} is in use by another run ({_holder(file)}). Wait until that run ends, stop it, or use another "
+            "path."
+        ) from None
+    except OSError as error:
+        if error.errno in NO_LOCKS:
+            file.unlink(missing_ok=True)
+            warnings.warn(
+                f"{name!r} could not be locked ({reason(error)}). Make sure that no other run writes there at the same "
+                "time.",
+                RuntimeWarning,
+                stacklevel=users_level(),
+            )
+        elif error.errno not in NO_RIGHT or os.path.lexists(file):
+            raise CheckpointError(f"cannot write {name!r}: {reason(error)}") from error
+
+
+def absolute(path: str | os.PathLike[str]) -> str:
+    """Return `path` as an absolute path; raise CheckpointError if it is relative to a folder that no longer exists."""
+    try:
+        return os.path.abspath(os.fsdecode(path))
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{os.fspath(path)!r} is relative to a folder that no longer exists; give an absolute path."
+        ) from error
+
+
+def _myself() -> bytes:
+    return f"process {os.getpid()} on {platform.node()}".encode()
+
+
+def _write_holder(descriptor: int) -> None:
+    with contextlib.suppress(OSError):  # on a full disk the holder's name is missing, not the lock
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, _myself())
+
+
+def _holder(file: Path) -> str:
+    """Return the name of the process that holds the lock, read from its file; "another process" if that fails."""
+    try:
+        found = file.read_bytes()
+    except OSError:  # Windows does not allow reading it, and the holder may just have removed it
+        found = b""
+    return found.decode(errors="replace") + ", this one" * (found == _myself()) or "another process"
+
+
+@contextlib.contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt in the block, so that the checkpoint is written; not outside the main thread.
+
+    A handler that the user has installed stays in place.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
