@@ -40,17 +40,9 @@ FLOOR = 1e-16
 
 
 def method_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Choose colour, line and marker of each method, so that methods differ by more than colour.
+    """Return keywords of ``Axes.plot`` by name: colour, line and marker, so that methods differ by more than colour.
 
-    Parameters
-    ----------
-    names : iterable of str
-        All methods in a set of figures, so that the styles agree between figures.
-
-    Returns
-    -------
-    dict
-        Keywords of ``Axes.plot`` for each name.
+    `names` are all methods in a set of figures, so that the styles agree between figures.
     """
     return {
         name: {
@@ -125,10 +117,7 @@ class ShownFigure(Figure):
     def _ipython_display_(self) -> None:
         """Close the figure in a notebook with the inline backend, which shows it now and not again after the cell.
 
-        Raises
-        ------
-        NotImplementedError
-            Always: IPython then uses another representation.
+        NotImplementedError is always raised, so that IPython uses another representation.
         """
         if INLINE in _backend():
             pyplot.close(self)

@@ -192,10 +192,11 @@ def _by_size(components: Mapping[str, Any]) -> list[dict[str, Any]]:
     sizes = {name: np.max(np.abs(values), initial=0.0) for name, values in components.items()}
     ordered = sorted(size for size in sizes.values() if 0 < size < np.inf)
     gaps = [above / below for below, above in itertools.pairwise(ordered)]
-    bar = ordered[int(np.argmax(gaps)) + 1] if max(gaps, default=0.0) >= WIDE else 0.0
+    if max(gaps, default=0.0) < WIDE:
+        return [dict(components)]
+    bar = ordered[gaps.index(max(gaps)) + 1]
     large = {name: row for name, row in components.items() if sizes[name] >= bar}
-    small = {name: row for name, row in components.items() if name not in large}
-    return [group for group in (large, small) if group]
+    return [large, {name: row for name, row in components.items() if name not in large}]
 
 
 def _draw_fan(axis: Axes, times: np.ndarray, values: Any, color: str, most: str) -> None:
@@ -285,7 +286,7 @@ def _draw_ends(axis: Axes, result: Any) -> None:
     counts = {name: ends[name] for name in ENDS if ends[name]}
     bars = axis.barh(list(counts), list(counts.values()), height=0.6, color=[ENDS[name] for name in counts])
     axis.bar_label(bars, padding=4, fontsize="small")
-    axis.set(ylim=(len(ENDS) - 0.5, -0.5), xlim=(0, 1.25 * max(1, *counts.values())), xlabel="members")
+    axis.set(ylim=(len(ENDS) - 0.5, -0.5), xlim=(0, 1.25 * max([1, *counts.values()])), xlabel="members")
     axis.tick_params(axis="y", labelsize="small")
     axis.locator_params(axis="x", nbins=4, integer=True)
     axis.grid(alpha=0.2, axis="x")

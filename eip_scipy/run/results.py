@@ -157,13 +157,6 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
         If `ax` is not one Axes, or `ax` or `orbit` is given for an ensemble.
     ValueError
         If an orbit is requested but no components have such names.
-
-    Examples
-    --------
-    >>> from eip_scipy import EIPRK4, integrate
-    >>> from eip_scipy.problems import kepler
-    >>> run = integrate(kepler(), (0, 20), method=EIPRK4, save_every=2)
-    >>> run.plot().savefig("kepler.png")  # doctest: +SKIP
     """
     if ax is not None and not hasattr(ax, "plot"):
         kind = f"{type(ax).__name__} of shape {ax.shape}" if isinstance(ax, np.ndarray) else type(ax).__name__
