@@ -31,7 +31,7 @@ from filelock import FileLock, Timeout
 from numpy.lib import format as npy
 
 from .core.callers import users_level
-from .core.inputs import shown
+from .core.inputs import flag, is_number, shown
 from .core.results import Diagnostics, Multipliers
 from .core.versions import VERSION, installed
 from .engine.trust import Trust
@@ -367,6 +367,17 @@ def _are_alike(leaves: list[Any]) -> bool:
 
 
 # Exclusive use of a file by one run at a time, until its process ends, and SIGTERM, by which batch systems end it.
+
+
+def require_place(path: Any, every: Any, resume: Any, expected: str) -> None:
+    """Check the options ``checkpoint``, ``checkpoint_every`` and ``resume``; the message names the `expected` path."""
+    flag("resume", resume)
+    if not is_number(every, "checkpoint_every") or not every > 0:
+        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+    if path is None and resume:
+        raise ValueError("resume=True needs a file to resume from: pass checkpoint=path.")
+    if path is not None and not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"checkpoint must be {expected}, got {path!r}.")
 
 
 @contextlib.contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -14,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from .. import checkpoint
-from ..checkpoint import CheckpointError, held
+from ..checkpoint import CheckpointError, held, require_place
 from ..core.callers import users_level
 from ..core.events import Events
-from ..core.inputs import flag, is_number, shown
+from ..core.inputs import is_number
 from ..core.runs import Run
 from ..engine.data import STEP, TIME
 from ..methods.gauss_jackson import Weights
@@ -38,16 +37,10 @@ Derivative = Callable[[float, np.ndarray], np.ndarray]
 @contextmanager
 def opened(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Checkpointer | None]:
     """Yield the `Checkpointer` for ``checkpoint``, ``checkpoint_every``, ``resume``; None without a checkpoint."""
-    flag("resume", resume)
-    if not is_number(every, "checkpoint_every") or not every > 0:
-        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+    require_place(path, every, resume, "the path of a file")
     if path is None:
-        if resume:
-            raise ValueError("resume=True needs a file to resume from: pass checkpoint=path.")
         yield None
         return
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
     if dense_output:
         raise ValueError(
             "a checkpoint does not store dense output; omit dense_output=True and use t_eval or save_every."
