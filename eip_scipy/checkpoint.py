@@ -186,12 +186,18 @@ def changed_function(
     """
     here = np.concatenate([f, invariants.values(t, y)])
     sizes = np.concatenate([np.full(f.size, np.abs(f).max(initial=0.0)), invariants.term_sizes(t, y, f)])
+    k = first_difference(there, here, sizes)
+    if k is None:
+        return None
+    name = "fun" if k < f.size else f"invariant {invariants.names[k - f.size]!r}"
+    return name, complex(there[k]), complex(here[k])
+
+
+def first_difference(there: np.ndarray, here: np.ndarray, sizes: np.ndarray) -> int | None:
+    """Return the index of the first value that differs by more than the rounding of terms of `sizes`; None if none."""
     with np.errstate(invalid="ignore"):
         same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
-    for k in np.flatnonzero(~same)[:1].tolist():
-        name = "fun" if k < f.size else f"invariant {invariants.names[k - f.size]!r}"
-        return name, complex(there[k]), complex(here[k])
-    return None
+    return None if same.all() else int(np.argmin(same))
 
 
 def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, Any], *, stacklevel: int) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checkpoint import SAME
+from ..checkpoint import first_difference
 from ..core.events import ContinuedEvents, as_events
 from ..core.inputs import is_number, shown
 from ..core.names import nearest
@@ -82,8 +82,8 @@ def _require_same_functions(result: IntegrationResult, origin: Origin) -> None:
         return  # the last state was not saved
     before, now = result.invariants[:, -1], origin.values()
     terms = np.maximum(np.abs(before), result.diagnostics._trust.figures[:, START])
-    changed = ~np.isnan(result.target) & (np.abs(now - before) > SAME * terms)  # balances have no target
-    for k in np.flatnonzero(changed)[:1]:
+    k = first_difference(before, now, np.where(np.isnan(result.target), np.inf, terms))  # balances have no target
+    if k is not None:
         raise ValueError(
             f"continue_to: the invariant {result.diagnostics.names[k]!r} was {before[k]:.12g} at t={origin.t:.10g} and "
             f"is {now[k]:.12g} in the same state now: its function, or a value that it uses, has changed since the "
