@@ -74,27 +74,19 @@ def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") ->
     axis.grid(which="major", alpha=0.3)
 
 
-def draw_lines(
-    axis: Axes,
-    x: Any,
-    curves: Mapping[str, Any],
-    styles: Mapping[str, Any] | None = None,
-    loc: Literal["best", "upper right"] = "best",
-) -> None:
+def draw_lines(axis: Axes, x: Any, curves: Mapping[str, Any], styles: Mapping[str, Any] | None = None) -> None:
     """Draw curves by name, in the `styles` of their names, with a legend if there are several styles."""
     styles = method_styles(curves) if styles is None else styles
     for name, values in curves.items():
         axis.plot(x, values, lw=1.1, **styles[name] | {"marker": None})
     axis.grid(alpha=0.2)
     if len(styles) > 1:
-        axis.legend(fontsize="small", loc=loc)
+        axis.legend(fontsize="small", loc="upper right")
 
 
 class ShownFigure(Figure):
     """A matplotlib Figure that a notebook shows once, also if it is not the last value of a cell.
 
-    Notes
-    -----
     If figures have windows, and in notebooks with the inline backend, the figure belongs to pyplot: ``pyplot.show()``
     and the end of a cell show it. The number of windows stays below the one at which pyplot warns. Otherwise the figure
     is freed with its last reference.

@@ -71,6 +71,7 @@ def indicator_figure(t: Any, curves: Mapping[str, Any], *, ylabel: str, level: f
     figure = shown_figure(5.6, 4.0)
     axis = figure.add_subplot()
     draw_lines(axis, t, curves)
+    axis.legend(fontsize="small", loc="best")
     if level is not None:
         axis.axhline(level, color="#777777", lw=0.8, ls=":")
     axis.set(xlabel="t", ylabel=ylabel)

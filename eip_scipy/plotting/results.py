@@ -58,7 +58,7 @@ def run_figure(result: Any, names: Any, orbit: bool | None, axis: Any) -> Any:
         _draw_paths(axes[0], directions, shown)
     else:
         for lowest, group in zip(axes, groups, strict=True):
-            draw_lines(lowest, result.t, group, method_styles(shown), loc="upper right")
+            draw_lines(lowest, result.t, group, method_styles(shown))
         axes[-1].set_xlabel(time_name(known["component"]))
     if len(curves) > MOST:
         axes[0].set_title(f"the first {MOST} of {len(curves)}", fontsize="medium")

@@ -153,10 +153,8 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
     ------
     ImportError
         If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
-    TypeError
-        If `ax` is not one Axes, or `ax` or `orbit` is given for an ensemble.
-    ValueError
-        If an orbit is requested but no components have such names.
+    TypeError, ValueError
+        If `ax` is not one Axes, `ax` or `orbit` is given for an ensemble, or no components have names of an orbit.
     """
     if ax is not None and not hasattr(ax, "plot"):
         kind = f"{type(ax).__name__} of shape {ax.shape}" if isinstance(ax, np.ndarray) else type(ax).__name__
