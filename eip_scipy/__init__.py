@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from .problems.symbolic import equations, hamiltonian
     from .run.integrate import integrate
     from .run.recommend import recommend
-    from .run.saving import load
+    from .run.results import load
     from .run.solve_ivp import solve_ivp
 
     __version__: str
@@ -95,7 +95,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "find_invariants": "problems.invariant_search",
     "hamiltonian": "problems.symbolic",
     "integrate": "run.integrate",
-    "load": "run.saving",
+    "load": "run.results",
     "particle_invariants": "core.particles",
     "project": "core.project",
     "recommend": "run.recommend",

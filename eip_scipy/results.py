@@ -2,12 +2,10 @@
 
 from .core.results import Diagnostics, Multipliers, ProjectionResult
 from .ensembles.ensemble import EnsembleResult
-from .run.figures import plot
+from .run.fields import to_dataframe, to_xarray
 from .run.recommend import Recommendation
-from .run.results import IntegrationResult
-from .run.saving import load, save
+from .run.results import IntegrationResult, load, plot, save
 from .run.solve_ivp import OdeResult
-from .run.tables import to_dataframe, to_xarray
 
 __all__ = [
     "Diagnostics",

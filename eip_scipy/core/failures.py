@@ -72,22 +72,18 @@ def _unstable(run: Run) -> str:
 def _not_finite(run: Run, t: float, h: float) -> str:
     """Return the message for a step in which a stage, the new state or the error estimate is not finite."""
     work, method = run.work, run.method
+    stages = [(work.K[i], t + method.c[i] * h) for i in range(method.b.size)]
     history = method.multistep
-    if history is not None and history.place[data.HAVE_NODES] and not np.isfinite(work.K[1]).all():
-        return _bad_value(run, work.K[1], history.t0 + (int(history.place[data.NEWEST]) + 1) * history.h)
-    for i in range(method.b.size):
-        if not np.isfinite(work.K[i]).all():
-            return _bad_value(run, work.K[i], t + method.c[i] * h)
+    if history is not None and history.place[data.HAVE_NODES]:
+        stages.insert(0, (work.K[1], history.t0 + (int(history.place[data.NEWEST]) + 1) * history.h))
+    if np.isfinite(work.y_hat).all():  # f at the end of the step is meaningless otherwise
+        stages.append((work.K[-1], t + h))
+    for f, at in stages:
+        if not np.isfinite(f).all():
+            unset = np.flatnonzero(np.isnan(f))
+            cause = run.problem.left_out
+            hint = f" (component {unset[0]} is NaN; {cause})" if cause and unset.size else ""
+            return f"{run.problem.name} returned a non-finite value at t={at:.10g}{hint}"
     if not np.isfinite(work.y_hat).all():
         return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or the step is too long"
-    if not np.isfinite(work.K[-1]).all():
-        return _bad_value(run, work.K[-1], t + h)
     return f"the error estimate is not finite at t={t + h:.10g}: it overflowed, or y and `atol` are 0 in a component"
-
-
-def _bad_value(run: Run, f: np.ndarray, t: float) -> str:
-    unset = np.flatnonzero(np.isnan(f))
-    hint = ""
-    if run.problem.left_out and unset.size:
-        hint = f" (component {unset[0]} is NaN; {run.problem.left_out})"
-    return f"{run.problem.name} returned a non-finite value at t={t:.10g}{hint}"

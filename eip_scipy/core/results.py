@@ -14,11 +14,7 @@ __all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning"
 
 def _count(place: int, text: str) -> property:
     """Return a property of `Diagnostics` that reads one of the engine's counters."""
-
-    def read(self: Diagnostics) -> int:
-        return int(self._counters[place])
-
-    return property(read, doc=text)
+    return property(lambda self: int(self._counters[place]), doc=text)
 
 
 class Diagnostics:
@@ -141,10 +137,7 @@ class Diagnostics:
         if self.worst is not None:
             name, t, size = self.worst
             lines.append(f"  largest correction: {size:.3g} local errors, of {name} at t={t:.6g}")
-        lines += [f"  {remark}" for remark in (self.moved, *self.remarks) if remark]
-        if self.message:
-            lines.append(f"  {self.message}")
-        return "\n".join(lines)
+        return "\n".join(lines + [f"  {remark}" for remark in (self.moved, *self.remarks, self.message) if remark])
 
 
 def slowness(sums: np.ndarray) -> np.ndarray:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import time
 import warnings
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import numpy as np
 
 from .. import checkpoint
-from ..checkpoint import CheckpointError
-from ..checkpoint.encoding import decoded, encoded
-from ..checkpoint.locks import Lock
+from ..checkpoint import CheckpointError, decoded, encoded, held
 from ..core.callers import users_level
 from ..core.runs import Run
 from ..run.prepare import identity
@@ -42,23 +39,21 @@ class EnsembleFile:
         self.reduced: np.ndarray | None = None
         self._waiting: tuple[int, Members, np.ndarray | None] | None = None
         self._known_by: np.ndarray | None = None
-        self._lock = Lock(path)
-        self.path = self._lock.name
+        self._lock = ExitStack()
+        self.path, content = self._lock.enter_context(held(path, KIND, "ensemble", resume))
         try:
-            self._open(resume)
+            self._open(content)
         except BaseException:
             self.close()
             raise
         self._written, self._cost = time.perf_counter(), 0.0
 
-    def _open(self, resume: bool) -> None:
-        """Read the existing file, or create one."""
-        if not os.path.lexists(self.path):
+    def _open(self, content: tuple[dict[str, Any], dict[str, np.ndarray]] | None) -> None:
+        """Read the content of an existing file, or create one."""
+        if content is None:
             checkpoint.write(self.path, {"kind": KIND, "settings": self._identity, "finished": 0}, {})
             return
-        if not resume:
-            raise checkpoint.existing(self.path, "ensemble")
-        header, arrays = checkpoint.read(self.path, KIND)
+        header, arrays = content
         checkpoint.require_same(self.path, header.get("settings"), self._identity)
         self.finished = int(header["finished"])
         if not self.finished:

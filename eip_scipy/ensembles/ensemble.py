@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 import time
 import uuid
 import warnings
@@ -18,13 +17,12 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checkpoint.locks import absolute
-from ..checkpoint.signals import sigterm_as_ctrl_c
+from ..checkpoint import absolute, require_place, sigterm_as_ctrl_c
 from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.conserved import NEAR_DISTANCE
 from ..core.events import Events
 from ..core.gradients import unless_error
-from ..core.inputs import count, flag, is_number, shown
+from ..core.inputs import count, flag, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
 from ..core.linear import confirmed
@@ -37,12 +35,10 @@ from ..core.states import states
 from ..core.tangent_vectors import TangentVectors
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
-from ..run.fields import Field, component_names, distinct, time_name
-from ..run.figures import steps
+from ..run.fields import Field, component_names, dataset, distinct, time_name
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
-from ..run.results import Result
-from ..run.tables import dataset
+from ..run.results import Result, steps
 from .checkpoints import EnsembleFile
 from .chunks import Chunk, Part, Pool, cores, run_elsewhere, thread_pool
 from .reduction import placed
@@ -253,7 +249,7 @@ class EnsembleResult(Result):
         ImportError
             If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
         """
-        from ..plotting.ensembles import ensemble_figure
+        from ..plotting.results import ensemble_figure
 
         return ensemble_figure(self, names)
 
@@ -575,13 +571,7 @@ def _check_options(options: dict[str, Any]) -> None:
 
 def _place(checkpoint: Any, every: Any, resume: Any) -> str | None:
     """Return `checkpoint` as an absolute path after checks, so that the working directory may change."""
-    if not is_number(every, "checkpoint_every") or not every > 0:
-        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
-    flag("resume", resume)
-    if checkpoint is not None and not isinstance(checkpoint, (str, os.PathLike)):
-        raise TypeError(f"checkpoint must be a path, got {checkpoint!r}.")
-    if resume and checkpoint is None:
-        raise ValueError("resume=True needs a file to resume from: pass checkpoint=.")
+    require_place(checkpoint, every, resume, "a path")
     return None if checkpoint is None else absolute(checkpoint)
 
 

@@ -1,17 +1,21 @@
-"""Styles for all figures. Only this package and the figures of `eip_scipy_studies` import matplotlib.
+"""Styles for all figures, and figures that are displayed automatically in notebooks and by ``pyplot.show``.
+
+Only this package and the figures of `eip_scipy_studies` import matplotlib.
 
 Needs ``pip install "eip_scipy[plot]"``. The figures of runs and ensembles are drawn by ``run.plot()``.
 """
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 try:
+    from matplotlib import pyplot, rcParams
+    from matplotlib.backends.registry import BackendFilter, backend_registry
+    from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 except ModuleNotFoundError as error:
     message = 'eip_scipy.plotting needs matplotlib: pip install "eip_scipy[plot]"'
@@ -20,7 +24,7 @@ except ModuleNotFoundError as error:
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["FLOOR", "MARKERS", "PALETTE", "draw_errors", "log_errors", "method_styles", "typeset"]
+__all__ = ["FLOOR", "MARKERS", "PALETTE", "draw_lines", "log_errors", "method_styles", "shown_figure", "typeset"]
 
 # Colours of Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and
 # wine and olive of Tol.
@@ -29,22 +33,16 @@ LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">")
 GREEK = {"alpha": "α", "beta": "β", "kappa": "κ", "Omega": "Ω"}
 POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
+DPI = 160
+INLINE = "inline"  # in the name of the backend of notebooks
 # An error below the spacing of floats is meaningless, and a log axis cannot show zero.
 FLOOR = 1e-16
 
 
 def method_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Choose colour, line and marker of each method, so that methods differ by more than colour.
+    """Return keywords of ``Axes.plot`` by name: colour, line and marker, so that methods differ by more than colour.
 
-    Parameters
-    ----------
-    names : iterable of str
-        All methods in a set of figures, so that the styles agree between figures.
-
-    Returns
-    -------
-    dict
-        Keywords of ``Axes.plot`` for each name.
+    `names` are all methods in a set of figures, so that the styles agree between figures.
     """
     return {
         name: {
@@ -65,7 +63,7 @@ def typeset(text: str) -> str:
 
 def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") -> None:
     """Give the axis `along` a log scale with few ticks over two powers of ten at least, and label both axes."""
-    axis.set(**{f"{along}scale": "log"})
+    axis.set(**{f"{along}scale": "log"}, xlabel=x, ylabel=y)
     low, high = axis.get_ylim() if along == "y" else axis.get_xlim()
     # A range below two powers of ten would have too few labelled ticks.
     if high / low < 100:
@@ -73,21 +71,72 @@ def log_errors(axis: Axes, x: str, y: str, *, along: Literal["x", "y"] = "y") ->
     shown = axis.yaxis if along == "y" else axis.xaxis
     shown.set_major_locator(LogLocator(numticks=9 if along == "y" else 5))
     shown.set_minor_formatter(NullFormatter())
-    axis.set_xlabel(x)
-    axis.set_ylabel(y)
     axis.grid(which="major", alpha=0.3)
 
 
-def draw_errors(axis: Axes, x: Any, errors: Mapping[str, Any], styles: Mapping[str, Any], sizes: Any) -> None:
-    """Draw errors by name for a log axis, which has no place for 0: errors of 0 are drawn below all others, and marked.
+def draw_lines(axis: Axes, x: Any, curves: Mapping[str, Any], styles: Mapping[str, Any] | None = None) -> None:
+    """Draw curves by name, in the `styles` of their names, with a legend if there are several styles."""
+    styles = method_styles(curves) if styles is None else styles
+    for name, values in curves.items():
+        axis.plot(x, values, lw=1.1, **styles[name] | {"marker": None})
+    axis.grid(alpha=0.2)
+    if len(styles) > 1:
+        axis.legend(fontsize="small", loc="upper right")
 
-    `sizes` are those of the quantities with these errors; 0 is drawn below their rounding errors.
+
+class ShownFigure(Figure):
+    """A matplotlib Figure that a notebook shows once, also if it is not the last value of a cell.
+
+    If figures have windows, and in notebooks with the inline backend, the figure belongs to pyplot: ``pyplot.show()``
+    and the end of a cell show it. The number of windows stays below the one at which pyplot warns. Otherwise the figure
+    is freed with its last reference.
     """
-    values = np.concatenate(list(errors.values()))
-    size = np.max(np.abs(sizes), where=np.isfinite(sizes), initial=0.0)
-    zero = np.min(values, where=values > 0, initial=FLOOR * (size or 1.0))
-    for name, row in errors.items():
-        axis.plot(x, np.where(row == 0, zero, row), **styles[name])
-    if np.any(values == 0):
-        across = axis.get_yaxis_transform()
-        axis.text(1.0, zero, "error 0 ", transform=across, ha="right", va="top", fontsize="x-small")
+
+    def savefig(self, fname: Any, **options: Any) -> None:
+        """Save the figure, at 160 dots per inch unless `dpi` or the rc parameter ``savefig.dpi`` is set."""
+        if rcParams["savefig.dpi"] == "figure":
+            options.setdefault("dpi", DPI)
+        super().savefig(fname, **options)
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the picture for a notebook; None for a figure that has a window or a widget."""
+        if self.canvas.manager is not None and pyplot.fignum_exists(self.canvas.manager.num):
+            return None
+        stream = io.BytesIO()
+        self.savefig(stream, format="png")
+        return stream.getvalue()
+
+    def _ipython_display_(self) -> None:
+        """Close the figure in a notebook with the inline backend, which shows it now and not again after the cell.
+
+        NotImplementedError is always raised, so that IPython uses another representation.
+        """
+        if INLINE in _backend():
+            pyplot.close(self)
+        raise NotImplementedError
+
+
+def shown_figure(width: float, height: float) -> ShownFigure:
+    """Create an empty figure of a size in inches, which pyplot shows if the backend can show figures."""
+    backend, dpi = _backend(), DPI
+    if backend in backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE):
+        return ShownFigure(figsize=(width, height), dpi=DPI, layout="constrained")
+    if INLINE not in backend:  # in a notebook the end of the cell closes its figures
+        dpi = rcParams["figure.dpi"]  # a window of 160 dots per inch would leave the screen
+        _close_oldest()
+    figure = pyplot.figure(FigureClass=ShownFigure, figsize=(width, height), dpi=dpi, layout="constrained")
+    assert isinstance(figure, ShownFigure)
+    return figure
+
+
+def _close_oldest() -> None:
+    """Close the oldest figures of this package in pyplot before it warns about too many; they can still be saved."""
+    most, numbers = rcParams["figure.max_open_warning"], pyplot.get_fignums()
+    own = [number for number in numbers if isinstance(pyplot.figure(number), ShownFigure)]
+    for number in own[: max(0, len(numbers) - most + 1) if most > 0 else 0]:
+        pyplot.close(number)
+
+
+def _backend() -> str:
+    """Return the name of pyplot's backend, which is chosen now if it has not been chosen before."""
+    return str(pyplot.get_backend()).lower()

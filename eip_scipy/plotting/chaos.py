@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import method_styles, typeset
-from .shown import shown_figure
+from . import draw_lines, shown_figure, typeset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,8 +49,7 @@ def stability_map(
     axis = figure.add_subplot()
     image = draw_stability(axis, x, y, megno, most)
     figure.colorbar(image, ax=axis, extend="max", label="mean MEGNO (2: regular)")
-    axis.set_xlabel(xlabel)
-    axis.set_ylabel(ylabel)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
     return figure
 
 
@@ -72,12 +70,9 @@ def indicator_figure(t: Any, curves: Mapping[str, Any], *, ylabel: str, level: f
     """Draw indicators at times `t` (m,), `curves` of (m,) values by name; a line marks the value `level`."""
     figure = shown_figure(5.6, 4.0)
     axis = figure.add_subplot()
-    for (name, values), style in zip(curves.items(), method_styles(curves).values(), strict=True):
-        axis.plot(t, values, lw=1.1, **style | {"marker": None, "label": name})
+    draw_lines(axis, t, curves)
+    axis.legend(fontsize="small", loc="best")
     if level is not None:
         axis.axhline(level, color="#777777", lw=0.8, ls=":")
-    axis.set_xlabel("t")
-    axis.set_ylabel(ylabel)
-    axis.legend(fontsize="small", loc="best")
-    axis.grid(alpha=0.3)
+    axis.set(xlabel="t", ylabel=ylabel)
     return figure

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checkpoint import SAME
+from ..checkpoint import first_difference
 from ..core.events import ContinuedEvents, as_events
 from ..core.inputs import is_number, shown
 from ..core.names import nearest
@@ -14,7 +14,6 @@ from ..core.options import ProjectionOptions
 from ..engine.data import START
 from .fields import joined
 from .integrate import integrate
-from .prepare import Request
 from .results import IntegrationResult, Origin, described
 
 __all__ = ["continue_to", "continued"]
@@ -27,17 +26,13 @@ CHANGING = (
     *("checkpoint", "checkpoint_every", "resume", "check", "project_initial"),
 )
 DEFINING = ("fun", "acceleration", "t_span", "y0", "invariants")
-# Arguments that follow from the end of the run, or apply to the first part only.
-OWN = {"t_span", "y0", "t_eval", "diagnostics", "projection"}
+FIRST_PART = ("t_eval", "diagnostics")  # arguments that apply to the first part only
 
 
 def continue_to(result: IntegrationResult, t: float, options: dict[str, Any]) -> IntegrationResult:
     """Continue a run to the time t, see `IntegrationResult.continue_to`."""
-    for name in options:
-        if name in CHANGING:
-            continue
-        known = {*Request._fields, *ProjectionOptions.names()} - {"projection"}
-        if name not in known:
+    for name in options.keys() - set(CHANGING):
+        if name not in {*_origin(result).arguments, *ProjectionOptions.names()}:
             raise TypeError(f"continue_to() has no option {name!r}{nearest(name, CHANGING)}")
         error = TypeError if name in DEFINING else ValueError
         raise error(
@@ -49,32 +44,36 @@ def continue_to(result: IntegrationResult, t: float, options: dict[str, Any]) ->
 
 def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> IntegrationResult:
     """Return a run and its continuation to the time t, with the `options` of `integrate` that change."""
+    origin = _origin(result)
+    if not is_number(t, "t") or not origin.sign * (t - origin.t) > 0:
+        raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
+    _require_same_functions(result, origin)
+    asked = {name: value for name, value in origin.arguments.items() if name not in FIRST_PART}
+    asked |= {"invariants": origin.kept(), "t_span": (origin.t, t), "y0": origin.y}
+    if result.t_events is not None:
+        asked["events"] = ContinuedEvents(as_events(asked["events"]), result.t_events)
+    if options.get("t_eval") is not None:
+        asked["save_every"] = None
+    asked |= options
+    if "events" in options and options["events"] is None:
+        asked["events"] = ()  # None would stand for the events of the problem
+    try:
+        return _joined(result, integrate(**asked))
+    except BaseException as error:
+        partial = getattr(error, "partial", None)
+        if isinstance(partial, IntegrationResult):  # without an origin if it failed before the first step
+            error.partial = _joined(result, partial) if "_origin" in vars(partial) else result  # type: ignore[attr-defined]
+        raise
+
+
+def _origin(result: IntegrationResult) -> Origin:
     origin: Origin | None = vars(result).get("_origin")
     if origin is None:
         raise ValueError(
             "continue_to: this result does not know its functions, because it was loaded, unpickled or copied. "
             "Continue from its last state: integrate(fun, (result.t[-1], t), result.y[:, -1], ...)."
         )
-    if not is_number(t, "t") or not origin.sign * (t - origin.t) > 0:
-        raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
-    _require_same_functions(result, origin)
-    request = origin.request
-    asked = {name: getattr(request, name) for name in Request._fields if name not in OWN}
-    asked |= {**request.projection, "invariants": origin.kept(), "t_span": (origin.t, t), "y0": origin.y}
-    if result.t_events is not None:
-        asked["events"] = ContinuedEvents(as_events(asked["events"]), result.t_events)
-    if options.get("t_eval") is not None:
-        asked["save_every"] = None
-    if "events" in options and options["events"] is None:
-        asked["events"] = ()  # None would stand for the events of the problem
-        options = {name: value for name, value in options.items() if name != "events"}
-    try:
-        return _joined(result, integrate(**(asked | options)))
-    except BaseException as error:
-        partial = getattr(error, "partial", None)
-        if isinstance(partial, IntegrationResult):  # without an origin if it failed before the first step
-            error.partial = _joined(result, partial) if "_origin" in vars(partial) else result  # type: ignore[attr-defined]
-        raise
+    return origin
 
 
 def _require_same_functions(result: IntegrationResult, origin: Origin) -> None:
@@ -83,8 +82,8 @@ def _require_same_functions(result: IntegrationResult, origin: Origin) -> None:
         return  # the last state was not saved
     before, now = result.invariants[:, -1], origin.values()
     terms = np.maximum(np.abs(before), result.diagnostics._trust.figures[:, START])
-    changed = ~np.isnan(result.target) & (np.abs(now - before) > SAME * terms)  # balances have no target
-    for k in np.flatnonzero(changed)[:1]:
+    k = first_difference(before, now, np.where(np.isnan(result.target), np.inf, terms))  # balances have no target
+    if k is not None:
         raise ValueError(
             f"continue_to: the invariant {result.diagnostics.names[k]!r} was {before[k]:.12g} at t={origin.t:.10g} and "
             f"is {now[k]:.12g} in the same state now: its function, or a value that it uses, has changed since the "
@@ -95,8 +94,11 @@ def _require_same_functions(result: IntegrationResult, origin: Origin) -> None:
 def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult:
     """Return one result for a run and its continuation."""
     first, last = vars(one)["_origin"], vars(two)["_origin"]
-    others = () if _events(first) == _events(last) else ("t_events", "y_events")
-    both = IntegrationResult(two | joined(one, two, but=others))
+    before, after = (
+        [getattr(event, "pointer", event) for event in as_events(origin.arguments["events"])]
+        for origin in (first, last)
+    )
+    both = IntegrationResult(two | joined(one, two, but=() if before == after else ("t_events", "y_events")))
     if one.status < 0:
         doubts = both.diagnostics._trust.doubts
         doubts.append(f"the part of the run up to t={first.t:.6g} did not end regularly: {first.ended}")
@@ -104,8 +106,3 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
     both["message"] = described(last.ended, both.diagnostics, last.notes)
     object.__setattr__(both, "_origin", last)
     return both
-
-
-def _events(origin: Origin) -> list[Any]:
-    """Return the event functions of a run, of C functions the pointers."""
-    return [getattr(event, "pointer", event) for event in as_events(origin.request.events)]

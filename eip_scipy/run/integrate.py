@@ -223,9 +223,9 @@ def integrate(
             others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
     request = Request(*map(asked.__getitem__, Request._fields))
-    keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
+    opened = _resume.opened(checkpoint, checkpoint_every, resume, dense_output)
     begin = time.perf_counter()
-    with keeping as keeper:
+    with opened as keeper:
         try:
             return Loop(prepared(request), request, keeper).run()
         except BaseException as error:
@@ -239,24 +239,22 @@ class Loop:
     An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
-    def __init__(self, run: Run, given: Request, keeper: _resume.Keeper | None = None) -> None:
+    def __init__(self, run: Run, given: Request, keeper: _resume.Checkpointer | None = None) -> None:
         self.given, self.keeper, self.problem = given, keeper, run.problem
         self.method, self.events, self.diagnostics = run.name, run.problem.events, run.diagnostics
         self.callback, self.progress = given.callback, given.progress
-        if keeper is not None:
-            if run.tableau.drives:
-                raise ValueError(
-                    f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
-                    "needs. Omit checkpoint, or save the last state of a run and start another run from it."
-                )
-            settings = identity(run, run.begin.y, run.problem.parameters)
-            keeper.identify(settings, run, run.problem.derivative, self.events)
+        if keeper is not None and run.tableau.drives:
+            raise ValueError(
+                f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
+                "needs. Omit checkpoint, or save the last state of a run and start another run from it."
+            )
         wanted, fun = given.compiled, run.problem.fun
         with _compiling(self.progress and wanted is not False and is_jitted(fun)):
             functions, self.why_not = run.problem.functions(run, wanted)
             self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
         if keeper is not None:
-            keeper.begin(self.driver)
+            own = identity(run, run.begin.y, run.problem.parameters)
+            keeper.begin(self.driver, own, run.problem.derivative, self.events)
         self._slowed = wanted is None and _slowed_by_invariants(fun, functions, run)
         self.wall_time = 0.0 if keeper is None else keeper.seconds
         self.chunk = FIRST_CHUNK
@@ -442,8 +440,9 @@ class Loop:
         if self.problem.variations is not None:
             asked = asked._replace(variations=tangents.restarted(y))
         y, sign = tangents.state(y.copy()), driver.schedule.span.sign
-        asked = asked._replace(params=copy(asked.params))  # the user may change the array
-        origin = Origin(asked, t, y, sign, self._kept, lambda: values_at(*last)[0], message, self.notes)
+        arguments = asked._asdict() | {"params": copy(asked.params)}  # the user may change the array
+        arguments |= arguments.pop("projection")
+        origin = Origin(arguments, t, y, sign, self._kept, lambda: values_at(*last)[0], message, self.notes)
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 

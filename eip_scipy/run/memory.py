@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import Any
 
 from ..core.inputs import is_number, shown
@@ -30,13 +31,8 @@ def most_bytes(needed: float, max_bytes: float | None) -> float:
 
 def free_memory() -> float:
     """Return an estimate of the number of bytes that a process can still allocate."""
-    try:
-        with open("/proc/meminfo") as lines:
-            for line in lines:
-                if line.startswith("MemAvailable:"):
-                    return 1024.0 * int(line.split()[1])
-    except OSError:
-        pass
+    with suppress(OSError, StopIteration), open("/proc/meminfo") as lines:
+        return 1024.0 * int(next(line for line in lines if line.startswith("MemAvailable:")).split()[1])
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         return 0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return 4e9

@@ -1,26 +1,30 @@
-"""The result of `integrate`: tables, files, figures, and the continuation of a run."""
+"""The result of `integrate`, with functions that make tables, files and figures of it, and continue the run."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import OdeSolution
 from scipy.optimize import OptimizeResult
 
+from .. import checkpoint
+from ..checkpoint import CheckpointError, decoded, encoded
+from ..core.inputs import shown
 from ..core.problem import Problem, component_names
 from ..core.results import Diagnostics, Multipliers
-from .tables import to_dataframe, to_xarray
+from . import fields
 
-__all__ = ["Fields", "IntegrationResult", "Origin", "Result", "described"]
+__all__ = ["Fields", "IntegrationResult", "Origin", "Result", "described", "load", "plot", "save", "steps"]
 
 
 class Origin(NamedTuple):
     """Origin of a result, from which its run can be continued."""
 
-    request: Any  # `Request`: the arguments of `integrate`
+    arguments: dict[str, Any]  # the keyword arguments of `integrate`
     t: float  # time of the last state
     y: np.ndarray  # (n,): last state of the run, saved or not
     sign: float  # direction of time, 1 or -1
@@ -34,6 +38,139 @@ def described(ended: str, diagnostics: Diagnostics, notes: Sequence[str]) -> str
     """Return a message: the reason for the end, remarks on the start and on doubts, and `notes` in parentheses."""
     message = "; ".join(filter(None, (ended, diagnostics.moved, diagnostics.message)))
     return f"{message} ({'; '.join(notes)})" if notes else message
+
+
+KIND = "result"
+CLASSES = ("IntegrationResult", "EnsembleResult")
+RESUMED = ("integrate", "ensemble")  # functions that continue from a checkpoint if called with the same arguments
+
+
+def save(result: Any, path: str | os.PathLike[str]) -> None:
+    """Write a result to a file that `load` reads.
+
+    Parameters
+    ----------
+    result : IntegrationResult, EnsembleResult or OdeResult
+        Result of `integrate`, `ensemble` or `scipy.integrate.solve_ivp`. All fields are saved, including those that
+        were added later, except functions: ``sol``, and the functions of the run.
+    path : path-like
+        File to write, with any name; an existing file is replaced in one step when the new one is complete. The file is
+        an npz archive, which `numpy.load` can open, with ``header.json`` for everything that is not an array.
+
+    Raises
+    ------
+    TypeError
+        If `result` is not such a result, or a field is neither numeric nor representable in JSON. An array with a mask
+        or a unit is refused as well, because only its numbers would be saved.
+    CheckpointError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from eip_scipy import EIPRK4, integrate, load
+    >>> from eip_scipy.problems import kepler
+    >>> run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=10)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     run.save(f"{folder}/kepler.npz")
+    ...     again = load(f"{folder}/kepler.npz")
+    >>> bool((again.y == run.y).all()), again.message
+    (True, 'reached the end of the interval')
+    """
+    if not isinstance(result, OptimizeResult):
+        raise TypeError(f"save: expected a result of integrate, ensemble or solve_ivp, got {shown(result)}.")
+    if isinstance(result, IntegrationResult):
+        result._observe()
+    arrays: dict[str, np.ndarray] = {}
+    found = {name: None if callable(value) else encoded(name, value, arrays) for name, value in result.items()}
+    checkpoint.write(path, {"kind": KIND, "class": type(result).__name__, "fields": found}, arrays)
+
+
+def load(path: str | os.PathLike[str]) -> Any:
+    """Read a result that `save` has written.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    IntegrationResult or EnsembleResult
+        The saved result without functions: ``sol`` is None, and `IntegrationResult.continue_to` raises an error that
+        says how to continue. A result of `solve_ivp` is returned as `scipy.optimize.OptimizeResult`, its base class.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read, for instance because it does not exist.
+    ValueError
+        If the file was not written by `save`, or is damaged.
+    """
+    name = repr(os.fspath(path))
+    try:
+        header, arrays = checkpoint.read(path)
+    except CheckpointError as error:
+        if isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None
+        raise ValueError(f"load: {name} is not a result written by save of this version: {error}") from error
+    if (kind := header.get("kind")) != KIND:
+        again = f"; {kind}(..., checkpoint={name}, resume=True) continues it" if kind in RESUMED else ""
+        raise ValueError(f"load: {name} is not a result written by save, but a checkpoint of {kind!r}{again}.")
+    found = {field: decoded(value, arrays) for field, value in header["fields"].items()}
+    if header["class"] not in CLASSES:
+        return OptimizeResult(found)
+    # Imported by name, because ensembles are built on runs.
+    return getattr(import_module("..results", __package__), header["class"])(found)
+
+
+def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
+    """Draw a run: the components or the orbit, the invariant errors, and the largest corrections.
+
+    Small invariant errors only show that the projection works and say nothing about the orbit; the panel of corrections
+    shows how much the projection had to correct.
+
+    Parameters
+    ----------
+    result : IntegrationResult, OdeResult or EnsembleResult
+        Result of `integrate`, `scipy.integrate.solve_ivp`, or `ensemble` (see `EnsembleResult.plot`). The saved states
+        are drawn: use `save_every` or `t_eval`.
+    names : sequence of str or str, optional
+        As for `to_xarray`.
+    orbit : bool, optional
+        True: draw paths in the plane instead of components in time. Default: True if real components are named x and
+        y, or x_0 and y_0, x_1 and y_1 and so on. Of paths in space, with z, the two directions in which they are
+        largest are drawn, and the label names the third.
+    ax : matplotlib.axes.Axes, optional
+        Draw only the orbit or the components, into these axes.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or matplotlib.axes.Axes
+        The figure, or `ax` if it is given. A notebook shows the figure automatically; in a script
+        ``matplotlib.pyplot.show()`` shows it, and ``figure.savefig("run.png")`` writes it to a file.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
+    TypeError, ValueError
+        If `ax` is not one Axes, `ax` or `orbit` is given for an ensemble, or no components have names of an orbit.
+    """
+    if ax is not None and not hasattr(ax, "plot"):
+        kind = f"{type(ax).__name__} of shape {ax.shape}" if isinstance(ax, np.ndarray) else type(ax).__name__
+        raise TypeError(f"plot: ax must be one matplotlib Axes, got {kind}; choose one of several, such as axes[0].")
+    if hasattr(result, "trajectories"):
+        if ax is not None or orbit is not None:
+            raise TypeError("plot: the figure of an ensemble takes neither ax nor orbit; omit them.")
+        return result.plot(names)
+    from ..plotting.results import run_figure
+
+    return run_figure(result, names, orbit, ax)
+
+
+def steps(result: Any) -> str:
+    """Return the method and the step of a run or an ensemble."""
+    return f"{result.method}, " + ("adaptive steps" if result.h is None else f"h = {result.h:g}")
 
 
 if TYPE_CHECKING:
@@ -65,12 +202,8 @@ class Result(Fields):
         """State-transition matrices at the saved times, (m, n, n), of a run with ``variations="state"``.
 
         ``run.stm[k, i, j]`` is the derivative of ``run.y[i, k]`` with respect to component j of the initial state. For
-        an ensemble the shape is (members, m, n, n), or (members, n, n) without trajectories.
-
-        Raises
-        ------
-        AttributeError
-            If the run did not integrate the state-transition matrix.
+        an ensemble the shape is (members, m, n, n), or (members, n, n) without trajectories. AttributeError is raised
+        for other runs.
         """
         if not self.get("columns", {}).get("state"):
             raise AttributeError(ABSENT["stm"])
@@ -81,12 +214,7 @@ class Result(Fields):
         """Derivatives of the state with respect to parameters, ``variations=[...]``, at the saved times, (m, n, p).
 
         p is the number of these parameters. For an ensemble the shape is (members, m, n, p), or (members, n, p)
-        without trajectories.
-
-        Raises
-        ------
-        AttributeError
-            If the run did not integrate derivatives with respect to parameters.
+        without trajectories. AttributeError is raised for other runs.
         """
         count = self.get("columns", {}).get("parameters", 0)
         if not count:
@@ -99,26 +227,16 @@ class Result(Fields):
         names = self.get("component_names")
         return component_names(None, self.y.shape[self.COMPONENTS]) if names is None else tuple(names)
 
-    def to_xarray(self, names: Any = None) -> Any:
-        """Return the run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
-        return to_xarray(self, names)
-
-    def to_dataframe(self, names: Any = None) -> Any:
-        """Return the run as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
-        return to_dataframe(self, names)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`."""
-        from .saving import save
-
-        save(self, path)
+    to_xarray = fields.to_xarray
+    to_dataframe = fields.to_dataframe
+    save = save
 
     def _observe(self) -> None:
         """Compute the fields for outputs and multipliers if the problem has them and they have not been computed."""
         origin = vars(self).get("_origin")
-        if origin is None or any(name in self for name in OBSERVED) or not isinstance(origin.request.fun, Problem):
-            return
-        self.update(origin.request.fun.observed(self.t, self.y, origin.request.params))
+        arguments = {} if origin is None else origin.arguments
+        if isinstance(arguments.get("fun"), Problem) and not any(name in self for name in OBSERVED):
+            self.update(arguments["fun"].observed(self.t, self.y, arguments["params"]))
 
     def __dir__(self) -> list[str]:
         methods = ("continue_to", "plot", "save", "to_dataframe", "to_xarray")
@@ -232,11 +350,7 @@ class IntegrationResult(Result):
     outputs: dict[str, np.ndarray]
     multipliers: Multipliers
 
-    def plot(self, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
-        """Draw the run, see `eip_scipy.results.plot`."""
-        from .figures import plot
-
-        return plot(self, names, orbit=orbit, ax=ax)
+    plot = plot
 
     def continue_to(self, t: float, **options: Any) -> IntegrationResult:
         """Continue from the last state to a later time, with the functions and options of the run.
@@ -248,11 +362,10 @@ class IntegrationResult(Result):
         **options
             Options of `integrate` that change: method, h, rtol, atol, first_step, max_step, save_every, t_eval, events,
             callback, progress, compiled, max_bytes, checkpoint, checkpoint_every, resume, check and project_initial.
-            `t_eval` is not repeated: pass new times, otherwise the states at both ends are saved. Events keep their
-            counts: an event with ``terminal = 3`` that happened twice before ends the run when it happens once more,
-            and an event that ended the run ends it again when it happens next; ``events=None`` removes all events. New
-            events start to count at 0, and may happen at once. If they are not the same functions in the same order,
-            `t_events` and `y_events` contain those of the second run only.
+            `t_eval` is not repeated: without new times the states at both ends are saved. Events keep their counts: one
+            with ``terminal = 3`` that happened twice before ends the run when it happens once more, and one that ended
+            the run ends it again when it happens next; ``events=None`` removes all. New events start to count at 0, and
+            may happen at once; `t_events` and `y_events` are then those of the second run only.
 
         Returns
         -------
@@ -264,20 +377,18 @@ class IntegrationResult(Result):
         Raises
         ------
         ValueError
-            If another option of `integrate` is given, because a value of the first part belongs to it: the targets of
-            the invariants to `params`, derivatives to the first start. If an invariant has another value in the last
-            state than before, because something that its function uses has changed. If `t` is not beyond the end, or
-            the result was loaded, unpickled or copied. If at the last state the error of an invariant with a given
-            target exceeds 1e-8 of the terms of this invariant, as after an unreliable run or one without checks;
-            ``project_initial=True`` then projects the state first.
+            If another option of `integrate` is given, because a value of the first part belongs to it, such as the
+            targets of the invariants to `params`; if something that an invariant uses has changed, so that it has
+            another value in the last state; if `t` is not beyond the end; if the result was loaded, unpickled or
+            copied; or if the last state misses a given target by more than 1e-8 of the terms of the invariant, as after
+            an unreliable run or one without checks: ``project_initial=True`` then projects the state first.
 
         Notes
         -----
         The second run agrees bit by bit with an `integrate` from the last state, except that each invariant keeps the
-        value of the first start, so that errors do not add up. It does not agree bit by bit with an uninterrupted run:
-        `save_every` counts from the new start, adaptive steps begin with a first step again, and compensated sums and
-        the history of multistep methods start again, which costs a rounding error and a new start of the method. Use a
-        checkpoint (``checkpoint=``, ``resume=True``) for a run with the same bits.
+        value of the first start, so that errors do not add up. It agrees only to rounding with an uninterrupted run:
+        `save_every`, the first step of adaptive steps, compensated sums and the history of multistep methods start
+        again. Use a checkpoint (``checkpoint=``, ``resume=True``) for the same bits.
 
         Examples
         --------

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
-from typing import Any, NamedTuple
+from contextlib import contextmanager, suppress
+from typing import Any
 
 import numpy as np
 
 from .. import checkpoint
-from ..checkpoint import CheckpointError
-from ..checkpoint.locks import Lock
-from ..checkpoint.signals import sigterm_as_ctrl_c
+from ..checkpoint import CheckpointError, held, require_place
 from ..core.callers import users_level
 from ..core.events import Events
-from ..core.inputs import flag, is_number, shown
+from ..core.inputs import is_number
 from ..core.runs import Run
-from ..engine.data import NEXT_LENGTH, TIME
+from ..engine.data import STEP, TIME
 from ..methods.gauss_jackson import Weights
 
-__all__ = ["Keeper", "keeping", "plain", "settings"]
+__all__ = ["Checkpointer", "opened", "plain", "settings"]
 
 KIND = "integrate"
 # Seconds from one snapshot to the next. A run resumes from its last snapshot; later steps are repeated.
@@ -32,38 +29,25 @@ SNAPSHOT_SECONDS = 0.2
 # Smallest ratio of run time to the time for copying or writing, so that each takes at most 5 % for any size of state.
 LEAST_RATIO = 19.0
 SHORT = 16
-STEP = 0
 
 Arrays = dict[str, np.ndarray]
 Derivative = Callable[[float, np.ndarray], np.ndarray]
 
 
 @contextmanager
-def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper | None]:
-    """Yield the keeper for the options ``checkpoint``, ``checkpoint_every``, ``resume``; None without a checkpoint."""
-    flag("resume", resume)
-    if not is_number(every, "checkpoint_every") or not every > 0:
-        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+def opened(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Checkpointer | None]:
+    """Yield the `Checkpointer` for ``checkpoint``, ``checkpoint_every``, ``resume``; None without a checkpoint."""
+    require_place(path, every, resume, "the path of a file")
     if path is None:
-        if resume:
-            raise ValueError("resume=True needs a file to resume from: pass checkpoint=path.")
         yield None
         return
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
     if dense_output:
         raise ValueError(
             "a checkpoint does not store dense output; omit dense_output=True and use t_eval or save_every."
         )
-    with sigterm_as_ctrl_c(), closing(Lock(path)) as lock:
-        found, origin = None, ""
-        if os.path.lexists(lock.path):
-            if not resume:
-                raise checkpoint.existing(lock.name, "run")
-            found = checkpoint.read(lock.name, KIND)
-        elif resume:
-            origin = "there was no checkpoint: started at the beginning"
-        yield Keeper(lock.name, float(every), found, origin)
+    with held(path, KIND, "run", resume) as (name, found):
+        note = "there was no checkpoint: started at the beginning" if resume else ""
+        yield Checkpointer(name, float(every), found, note)
 
 
 def settings(
@@ -96,19 +80,12 @@ def settings(
 def plain(value: Any) -> Any:
     """Return a value in a form that JSON can hold; long arrays are replaced by their digest."""
     if isinstance(value, np.ndarray):
-        if value.size <= SHORT:
-            return plain(value.tolist())
-        return f"{value.dtype} {value.shape} {_digest((value,))}"
+        return plain(value.tolist()) if value.size <= SHORT else f"{value.dtype} {value.shape} {_digest((value,))}"
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
     if isinstance(value, complex) or (isinstance(value, float) and not math.isfinite(value)):
         return repr(value)
     return value
-
-
-def _number(value: Any) -> str:
-    """Return the text of a real or complex number; real values are complex numbers next to a complex derivative."""
-    return f"{value if value.imag else value.real:.12g}"
 
 
 def _digest(values: Iterable[Any]) -> str:
@@ -120,73 +97,29 @@ def _digest(values: Iterable[Any]) -> str:
     return digest.hexdigest()
 
 
-class _Snapshot(NamedTuple):
-    """State of a run after an accepted step: its small arrays, how often each event has happened, and the run time."""
-
-    arrays: Arrays
-    happened: list[int]
-    seconds: float
-
-
-class Keeper:
+class Checkpointer:
     """The checkpoint of a run in the file `name`, written every `every` seconds.
 
-    `found` is the content of an existing file. `origin` is a note for the message of the result if a run that should be
-    resumed has no file, otherwise "". The file always contains the last snapshot, never the current buffers, because an
+    `found` is the content of an existing file; if there is none, the message of the result gets a `note`. The file
+    always contains the last snapshot, which was taken after an accepted step, never the current buffers, because an
     interruption may come inside a step. Saved rows and events only grow, so a snapshot needs only their number.
     """
 
     seconds = 0.0  # run time before the run was resumed
 
-    def __init__(self, name: str, every: float, found: tuple[dict[str, Any], Arrays] | None, origin: str) -> None:
-        self._name, self._every, self._read = name, every, found
-        self._origin = origin
+    def __init__(self, name: str, every: float, found: tuple[dict[str, Any], Arrays] | None, note: str) -> None:
+        self._name, self._every, self._found, self._origin = name, every, found, note
         self._failure = ""
         self._ended: Any = None
 
-    def identify(self, settings: dict[str, Any], run: Run, derivative: Derivative, events: Events) -> None:
-        """Record what identifies the run, before it is compiled; raise CheckpointError if the file has another run."""
-        self._settings, self._run, self._derivative, self._events = settings, run, derivative, events
-        self._names = run.invariants.names
-        if self._read is None:
-            return
-        header, arrays = self._read
-        checkpoint.require_same(self._name, header.get("settings"), settings)
-        self._require_fitting(arrays, {"y": run.begin.y, "clock": np.zeros(NEXT_LENGTH + 1)})
-        if "state_f" in arrays:
-            self._require_same_functions(arrays)
-        checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
+    def begin(self, driver: Any, settings: dict[str, Any], derivative: Derivative, events: Events) -> None:
+        """Create the file, or fill the buffers of the `driver` and the `events` from it.
 
-    def _known_by(self, arrays: Arrays) -> Arrays:
-        """Return the derivative and the invariants at the state in `arrays`, which identify the functions."""
-        t, y = float(arrays["clock"][TIME]), arrays["y"]
-        return {"state_f": self._derivative(t, y.copy()), "state_values": self._run.invariants.values(t, y)}
-
-    def _require_same_functions(self, arrays: Arrays) -> None:
-        self._require_fitting(arrays, known_by := self._known_by(arrays))
-        t, there = float(arrays["clock"][TIME]), np.concatenate([arrays[name] for name in known_by])
-        changed = checkpoint.changed_function(self._run.invariants, t, arrays["y"], there, known_by["state_f"])
-        if changed:
-            name, old, new = changed
-            raise CheckpointError(
-                f"the checkpoint {self._name!r} belongs to another run: {name} was {_number(old)} at t = {t:.10g}, "
-                f"where it was saved, and is {_number(new)} now. Resume with the functions of that run, or use another "
-                "file for a new run."
-            )
-
-    def _require_fitting(self, arrays: Arrays, expected: Arrays) -> None:
-        for name, a in expected.items():
-            found = arrays.get(name)
-            if found is None or (found.dtype, found.shape) != (a.dtype, a.shape):
-                what = "is missing" if found is None else f"is {found.dtype} {found.shape}"
-                raise CheckpointError(
-                    f"{self._name!r} is not a checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
-                )
-
-    def begin(self, driver: Any) -> None:
-        """Store the driver, whose buffers hold the start; if a run is resumed, fill the buffers and the events."""
-        self._driver = driver
-        found, self._read = self._read, None
+        The `settings` and the values of functions at the stored state identify the run; CheckpointError is raised if
+        the file has another one.
+        """
+        self._driver, self._settings, self._derivative, self._events = driver, settings, derivative, events
+        found, self._found = self._found, None
         if found is not None:
             self._restore(*found)
         self._begin = time.perf_counter() - self.seconds
@@ -197,31 +130,57 @@ class Keeper:
             self._write(None, "running")
 
     def _restore(self, header: dict[str, Any], arrays: Arrays) -> None:
-        """Fill the buffers of the run after all arrays have been checked."""
-        driver, events = self._driver, self._events
-        parts = driver.parts()
+        """Fill the buffers of the run after everything has been checked."""
+        driver, events, parts = self._driver, self._events, self._driver.parts()
+        checkpoint.require_same(self._name, header.get("settings"), self._settings)
         self._require_fitting(arrays, parts)
-        step, rows, pending = (int(k) for k in arrays["place"])
+        if "state_f" in arrays:
+            self._require_same_functions(arrays)
+        checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
+        step, rows, pending = arrays["place"].tolist()
         if step < 0 or rows < 0 or pending != 0 or not is_number(header.get("wall_time")):
             stored = f"step {step}, {rows} rows, pending {pending}, wall_time {header.get('wall_time')!r}"
             raise CheckpointError(f"{self._name!r} is not a checkpoint of this run: its values are wrong: {stored}.")
-        n, dtype = driver.run.y0.size, driver.run.y0.dtype
-        expected = {"saved_t": np.broadcast_to(0.0, rows), "saved_y": np.broadcast_to(dtype.type(0), (rows, n))}
-        for k in range(len(events.functions)):
-            times = f"event_{k}_t"
-            count = arrays[times].size if times in arrays else 0
-            expected[times] = np.broadcast_to(0.0, count)
-            expected[f"event_{k}_y"] = np.broadcast_to(dtype.type(0), (count, n))
-        self._require_fitting(arrays, expected)
+        names = [f"event_{k}" for k in range(len(events.functions))]
+        for name, m in {"saved": rows, **{name: np.size(arrays.get(f"{name}_t", ())) for name in names}}.items():
+            states = np.broadcast_to(driver.state, (m, driver.state.size))
+            self._require_fitting(arrays, {f"{name}_t": np.broadcast_to(0.0, m), f"{name}_y": states})
         driver.load(arrays["saved_t"], arrays["saved_y"])
         for name, part in parts.items():
             part[...] = arrays[name]
-        for k in range(len(events.functions)):
-            events.restore(k, arrays[f"event_{k}_t"], arrays[f"event_{k}_y"])
+        for k, name in enumerate(names):
+            events.restore(k, arrays[f"{name}_t"], arrays[f"{name}_y"])
         self.seconds = float(header["wall_time"])
         driver.run.trust.doubts[:] = map(str, header.get("doubts") or ())
         self._ended = (header.get("status"), header.get("message"), step)
         self._origin = f"resumed at step {step}"
+
+    def _known_by(self, arrays: Arrays) -> Arrays:
+        """Return the derivative and the invariants at the state in `arrays`, which identify the functions."""
+        t, y = float(arrays["clock"][TIME]), arrays["y"]
+        return {"state_f": self._derivative(t, y.copy()), "state_values": self._driver.run.invariants.values(t, y)}
+
+    def _require_same_functions(self, arrays: Arrays) -> None:
+        self._require_fitting(arrays, known_by := self._known_by(arrays))
+        t, there = float(arrays["clock"][TIME]), np.concatenate([arrays[name] for name in known_by])
+        invariants = self._driver.run.invariants
+        changed = checkpoint.changed_function(invariants, t, arrays["y"], there, known_by["state_f"])
+        if changed:
+            name, *values = changed
+            old, new = (f"{value if value.imag else value.real:.12g}" for value in values)
+            raise CheckpointError(
+                f"the checkpoint {self._name!r} belongs to another run: {name} was {old} at t = {t:.10g}, where it was "
+                f"saved, and is {new} now. Resume with the functions of that run, or use another file for a new run."
+            )
+
+    def _require_fitting(self, arrays: Arrays, expected: Arrays) -> None:
+        for name, a in expected.items():
+            found = arrays.get(name)
+            if found is None or (found.dtype, found.shape) != (a.dtype, a.shape):
+                what = "is missing" if found is None else f"is {found.dtype} {found.shape}"
+                raise CheckpointError(
+                    f"{self._name!r} is not a checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
+                )
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -240,7 +199,7 @@ class Keeper:
         """Record that the run has ended regularly."""
         if status == 0:
             self._take_snapshot()
-        step = int(self._snapshot.arrays["place"][STEP])
+        step = int(self._snapshot[0]["place"][STEP])
         if self._ended != (status, message, step):  # otherwise the file already contains this
             self._write_or_warn(status, message)
 
@@ -256,23 +215,15 @@ class Keeper:
             f"the checkpoint {self._name!r} holds {self._written}: the same call with resume=True continues from there"
         )
 
-    def _state(self) -> Arrays:
-        """Return the values that identify the functions at the snapshot; {} if a function raises an error."""
-        try:
-            return self._known_by(self._snapshot.arrays)
-        except Exception:  # a function may raise again what has ended the run; the checkpoint is written all the same
-            return {}
-
     def _take_snapshot(self) -> None:
         begin = time.perf_counter()
-        happened = [len(times) for times in self._events.t]
-        self._snapshot = _Snapshot(self._driver.snapshot(), happened, begin - self._begin)
-        end = time.perf_counter()
-        self._next_snapshot = end + max(SNAPSHOT_SECONDS, LEAST_RATIO * (end - begin))
+        # One assignment, so that an interruption leaves a whole snapshot: buffers, numbers of events, and run time.
+        self._snapshot = self._driver.snapshot(), [len(times) for times in self._events.t], begin - self._begin
+        self._next_snapshot = _next_time(begin, SNAPSHOT_SECONDS)
 
     def _where(self) -> str:
-        arrays = self._snapshot.arrays
-        return f"step {arrays['place'][STEP]}, t = {arrays['clock'][TIME]:.10g}"
+        parts = self._snapshot[0]
+        return f"step {parts['place'][STEP]}, t = {parts['clock'][TIME]:.10g}"
 
     def _write_or_warn(self, status: int | None, message: str) -> None:
         """Write the file; if that fails, for example because the disk is full, warn and let the run continue."""
@@ -287,29 +238,38 @@ class Keeper:
             warnings.warn(f"{self._failure}. {then}", RuntimeWarning, stacklevel=users_level())
 
     def _write(self, status: int | None, message: str) -> None:
-        driver, events, snapshot = self._driver, self._events, self._snapshot
-        y0, begin = driver.run.y0, time.perf_counter()
-        step, rows, _ = (int(k) for k in snapshot.arrays["place"])
+        driver, events, begin = self._driver, self._events, time.perf_counter()
+        parts, happened, seconds = self._snapshot
+        step, rows, _ = parts["place"].tolist()
         header = {
             "kind": KIND,
             "method": self._settings["method"],
-            "n": y0.size,
-            "invariants": self._names,
+            "n": driver.state.size,
+            "invariants": driver.run.invariants.names,
             "step": step,
-            "t": float(snapshot.arrays["clock"][TIME]),
+            "t": float(parts["clock"][TIME]),
             "rows": rows,
             "status": status,
             "message": message,
-            "wall_time": snapshot.seconds,
+            "wall_time": seconds,
             "doubts": driver.run.trust.doubts,
             "settings": self._settings,
         }
-        saved = {"saved_t": driver.t[:rows], "saved_y": driver.y[:rows]}
-        arrays = {**self._state(), **snapshot.arrays, **saved}
-        for k, count in enumerate(snapshot.happened):
-            arrays[f"event_{k}_t"] = np.array(events.t[k][:count])
-            arrays[f"event_{k}_y"] = np.array(events.y[k][:count], y0.dtype).reshape(count, y0.size)
+        arrays = dict(parts)
+        with suppress(Exception):  # a function may raise again what has ended the run; the rest is written all the same
+            arrays |= self._known_by(parts)
+        saved = {"saved": (driver.t[:rows], driver.y[:rows])}
+        for k, count in enumerate(happened):
+            saved[f"event_{k}"] = events.t[k][:count], events.y[k][:count]
+        for name, (t, y) in saved.items():
+            arrays[f"{name}_t"] = np.asarray(t, float)
+            arrays[f"{name}_y"] = np.asarray(y, driver.state.dtype).reshape(len(t), driver.state.size)
         checkpoint.write(self._name, header, arrays)
-        end = time.perf_counter()
-        self._due = end + max(self._every, LEAST_RATIO * (end - begin))
+        self._due = _next_time(begin, self._every)
         self._written = self._where()
+
+
+def _next_time(begin: float, every: float) -> float:
+    """Return the time of the next copy: `every` seconds after one that began at `begin`, or later if it was slow."""
+    now = time.perf_counter()
+    return now + max(every, LEAST_RATIO * (now - begin))

@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from eip_scipy import ProjectionWarning
-from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.checkpoint.signals import sigterm_as_ctrl_c
+from eip_scipy.checkpoint import CheckpointError, sigterm_as_ctrl_c
 
 from .report import UsageError, document, say, warn, write_csv, write_file, write_json
 

@@ -1,12 +1,12 @@
 """The lock of a checkpoint has one holder at any time."""
 
+import contextlib
 import threading
 import time
 
 import pytest
 
-from eip_scipy.checkpoint import CheckpointError
-from eip_scipy.checkpoint.locks import Lock
+from eip_scipy.checkpoint import CheckpointError, held
 
 
 @pytest.mark.slow
@@ -16,16 +16,12 @@ def test_one_holder_at_any_time(tmp_path):
 
     def compete():
         while time.monotonic() < end:
-            try:
-                lock = Lock(tmp_path / "kept")
-            except CheckpointError:
-                continue
-            inside[0] += 1
-            most[0] = max(most[0], inside[0])
-            taken[0] += 1
-            time.sleep(0)
-            inside[0] -= 1
-            lock.close()
+            with contextlib.suppress(CheckpointError), held(tmp_path / "kept", "integrate", "run", False):
+                inside[0] += 1
+                most[0] = max(most[0], inside[0])
+                taken[0] += 1
+                time.sleep(0)
+                inside[0] -= 1
 
     threads = [threading.Thread(target=compete) for _ in range(8)]
     for thread in threads:

@@ -40,14 +40,14 @@ class Bodies(NamedTuple):
 def bodies_of(run: Any) -> Bodies:
     """Return the bodies of a problem that was made by `nbody`, or of a run of it; TypeError for anything else."""
     origin = None if isinstance(run, Problem) else getattr(run, "__dict__", {}).get("_origin")
-    problem = run if origin is None else origin.request.fun
+    problem = run if origin is None else origin.arguments["fun"]
     if not (isinstance(problem, Problem) and problem.rhs in (library["gravity.rhs"], library["forces.rhs"])):
         raise TypeError(
             f"expected a problem of bodies, such as nbody(...) or solar_system(), or a result of integrate for such a "
             f"problem; got {shown(type(run).__name__)}. A result that was loaded or comes from solve_ivp does not "
             "contain the masses: give them, or pass the problem."
         )
-    given = None if origin is None else origin.request.params
+    given = None if origin is None else origin.arguments["params"]
     params = np.asarray(problem.params if given is None else given, dtype=float)
     names = problem.component_names or ()
     n = len(names) // 6
