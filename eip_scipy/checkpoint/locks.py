@@ -8,14 +8,19 @@ import os
 import platform
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
 from ..core.callers import users_level
-from . import CheckpointError, reason
+from ..core.inputs import flag, is_number, shown
+from . import CheckpointError, existing, read, reason
+from .signals import sigterm_as_ctrl_c
 
-__all__ = ["Lock", "absolute"]
+__all__ = ["Lock", "held", "require_place"]
 
 NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -67,6 +72,34 @@ class Lock:
                 with contextlib.suppress(OSError):  # the folder may be gone, or no longer writable
                     self._file.unlink()  # before others can lock it
             self._lock.release()
+
+
+def require_place(path: Any, every: Any, resume: Any, expected: str) -> None:
+    """Check the options ``checkpoint``, ``checkpoint_every`` and ``resume``; the message names the `expected` path."""
+    flag("resume", resume)
+    if not is_number(every, "checkpoint_every") or not every > 0:
+        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+    if path is None and resume:
+        raise ValueError("resume=True needs a file to resume from: pass checkpoint=path.")
+    if path is not None and not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"checkpoint must be {expected}, got {path!r}.")
+
+
+@contextmanager
+def held(
+    path: str | os.PathLike[str], kind: str, what: str, resume: bool
+) -> Iterator[tuple[str, tuple[dict[str, Any], dict[str, Any]] | None]]:
+    """Lock the checkpoint of a run or ensemble (`what`); yield its absolute path, and the content of an existing file.
+
+    The header must have the `kind`. CheckpointError is raised if the file exists and `resume` is False.
+    """
+    with sigterm_as_ctrl_c(), contextlib.closing(Lock(path)) as lock:
+        found = None
+        if os.path.lexists(lock.path):
+            if not resume:
+                raise existing(lock.name, what)
+            found = read(lock.name, kind)
+        yield lock.name, found
 
 
 def absolute(path: str | os.PathLike[str]) -> str:

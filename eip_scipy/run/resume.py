@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .. import checkpoint
 from ..checkpoint import CheckpointError
-from ..checkpoint.locks import Lock
-from ..checkpoint.signals import sigterm_as_ctrl_c
+from ..checkpoint.locks import held, require_place
 from ..core.callers import users_level
 from ..core.events import Events
-from ..core.inputs import flag, is_number, shown
+from ..core.inputs import is_number
 from ..core.runs import Run
 from ..engine.data import NEXT_LENGTH, TIME
 from ..methods.gauss_jackson import Weights
@@ -41,29 +39,17 @@ Derivative = Callable[[float, np.ndarray], np.ndarray]
 @contextmanager
 def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper | None]:
     """Yield the keeper for the options ``checkpoint``, ``checkpoint_every``, ``resume``; None without a checkpoint."""
-    flag("resume", resume)
-    if not is_number(every, "checkpoint_every") or not every > 0:
-        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+    require_place(path, every, resume, "the path of a file")
     if path is None:
-        if resume:
-            raise ValueError("resume=True needs a file to resume from: pass checkpoint=path.")
         yield None
         return
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
     if dense_output:
         raise ValueError(
             "a checkpoint does not store dense output; omit dense_output=True and use t_eval or save_every."
         )
-    with sigterm_as_ctrl_c(), closing(Lock(path)) as lock:
-        found, origin = None, ""
-        if os.path.lexists(lock.path):
-            if not resume:
-                raise checkpoint.existing(lock.name, "run")
-            found = checkpoint.read(lock.name, KIND)
-        elif resume:
-            origin = "there was no checkpoint: started at the beginning"
-        yield Keeper(lock.name, float(every), found, origin)
+    with held(path, KIND, "run", resume) as (name, found):
+        origin = "there was no checkpoint: started at the beginning" if resume and found is None else ""
+        yield Keeper(name, float(every), found, origin)
 
 
 def settings(
