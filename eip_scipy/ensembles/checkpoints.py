@@ -70,7 +70,13 @@ class EnsembleFile:
                 ) from error
             members |= {"reduced": arrays.get("reduced"), "one_by_one": ""}
             if self._known_by.size:
-                self._require_same_functions(members)
+                k, invariants, t, y, f = self._end(members)
+                if changed := checkpoint.changed_function(invariants, t, y, self._known_by, f):
+                    raise CheckpointError(
+                        f"the checkpoint {self._name!r} belongs to another ensemble: {changed[0]} has another value at "
+                        f"the end of member {k}. Resume with the functions of that ensemble, or use another file for a "
+                        "new one."
+                    )
         self.header["finished"] = finished
         checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
         return members
@@ -81,14 +87,6 @@ class EnsembleFile:
         ready = self._plan.task.prepared(self._everyone.y0s[k], self._everyone.params[k])
         t, y = float(members["t"][k]), members["y"][k].copy()
         return k, ready.run.invariants, t, y, ready.system.derivative(t, y.copy())
-
-    def _require_same_functions(self, members: dict[str, Any]) -> None:
-        k, invariants, t, y, f = self._end(members)
-        if changed := checkpoint.changed_function(invariants, t, y, self._known_by, f):
-            raise CheckpointError(
-                f"the checkpoint {self._name!r} belongs to another ensemble: {changed[0]} has another value at the end "
-                f"of member {k}. Resume with the functions of that ensemble, or use another file for a new one."
-            )
 
     def write(self, finished: int, members: dict[str, Any], *, now: bool = False) -> None:
         """Write the `finished` first of all `members` that are new, if it is time to do so, or `now`.

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,13 +68,13 @@ class Task(NamedTuple):
 class Plan:
     """A task in one process, compiled if possible, with a `BatchRunner` for each thread if members can share a run.
 
+    `ready` is the run of the member of `task`, if it has been prepared already.
     `why_not` is the reason why the members run interpreted, None if they are compiled, and `not_batched_because` the
     reason why they run one after the other, "" if they are vectorised; both are known after compilation. `saved` are
     the times of the saved states that the result has, and `times` those that a member has.
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
-        """Create the plan; `ready` is the run of the member of `task`, if it has been prepared already."""
         self.task = task
         self.ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
         self.why_not: str | None = None
@@ -175,7 +175,7 @@ class Plan:
             at_end[:] = driver.values_at(np.array([t]), y[None].copy())
         driver.note(values[: driver.rows].T, target)
         rows = min(driver.rows, self.times.size)
-        rows = _leading(driver.t[:rows] == self.times[:rows])
+        rows = int(np.cumprod(driver.t[:rows] == self.times[:rows]).sum())  # the last one may be of an early end
         padding = ((0, 0), (0, self.times.size - rows))
         found = {
             "y": y, "t": t, "status": status, "message": loop.explained(message), "target": target,
@@ -339,22 +339,16 @@ class BatchRunner:
         out["max_residual"][arrived] = errors
 
 
+@dataclass
 class _Watch:
     """Stand-in for a progress bar, which a run calls regularly; it stops the run if requested."""
 
-    n = 0.0
-
-    def __init__(self, stop: threading.Event | None) -> None:
-        self._stop = stop
+    stop: threading.Event | None
+    n: float = 0.0
 
     def update(self, amount: float = 0.0) -> None:
-        if self._stop is not None and self._stop.is_set():
+        if self.stop is not None and self.stop.is_set():
             raise StoppedError
-
-
-def _leading(mask: np.ndarray) -> int:
-    """Return how many of the first items of a mask are all True."""
-    return int(np.cumprod(mask).sum())
 
 
 def saved_times(schedule: data.Schedule) -> np.ndarray:
@@ -415,7 +409,7 @@ def placed(out: np.ndarray | None, members: int, first: int, values: np.ndarray)
 def _result(plan: Plan, members: dict[str, Any], k: int) -> IntegrationResult:
     """Return the result of member `k` as `integrate` does, with the fields that do not need the run itself."""
     states, values = (members[name][k].T for name in ("trajectories", "invariants"))
-    rows = _leading(~np.isnan(states).any(axis=1))
+    rows = np.count_nonzero(~np.isnan(states).any(axis=1))
     t, states, values = plan.times[:rows], states[:rows], values[:rows]
     if plan.ready.schedule.t_eval.size == 0 and members["t"][k] not in t[-1:]:
         ends = (t, "t"), (states, "y"), (values, "end_invariants")
