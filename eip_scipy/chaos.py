@@ -142,7 +142,7 @@ def _checked(function: str, arguments: dict[str, Any], every: Any, segments: int
         raise ValueError(
             f"every must be a time > 0, after which tangent vectors are made orthonormal again, got {shown(every)}."
         )
-    return start.n, float(span.t0), float(span.t_bound), min(float(every), length)
+    return start.tangents.state(start.y0).size, float(span.t0), float(span.t_bound), min(float(every), length)
 
 
 def _segments(

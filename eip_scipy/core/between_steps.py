@@ -10,9 +10,9 @@ import numpy as np
 from ..methods.base import Method
 from .inputs import is_number, shown
 from .states import initial_state
-from .stepping import StepOptions, Stepping, fixed_steps
+from .step_control import StepControl, fixed_steps
 
-__all__ = ["Settings", "checked_stepping", "checked_vector", "is_state", "kept_state", "settings_of"]
+__all__ = ["Settings", "changed_control", "checked_vector", "is_state", "kept_state", "settings_of"]
 
 # Up to this number of components a copy of the state is compared as bytes, which is faster for short arrays.
 SHORT = 2048
@@ -28,7 +28,6 @@ class Settings(NamedTuple):
     rtol: Any
     atol: Any
     nfev: int
-    fun: Any
     t_bound: float
     direction: float
     max_step: float
@@ -61,7 +60,7 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
     return found.astype(like.dtype)
 
 
-def checked_stepping(solver: Any, method: Method, was: Settings, stacklevel: int) -> Stepping:
+def changed_control(solver: Any, method: Method, was: Settings) -> StepControl:
     """Return the checked step control from a solver's present attributes, which were `was` after the last step."""
     _check_kind_of_steps(solver, was)
     t, t_bound, sign = (_number(name, getattr(solver, name)) for name in ("t", "t_bound", "direction"))
@@ -74,8 +73,8 @@ def checked_stepping(solver: Any, method: Method, was: Settings, stacklevel: int
             f"`t_bound` was set to {t_bound:g}, which is behind t = {t:g} in the direction {sign:+g} of the steps. Set "
             f"`direction` to {-sign:+g} too, or start a new solver."
         )
-    steps = StepOptions(h=solver.h, max_step=solver.max_step, rtol=solver.rtol, atol=solver.atol)
-    found = steps.checked(type(solver).__name__, method, t, sign * np.inf, solver.n, stacklevel=stacklevel + 1)
+    given = {"h": solver.h, "max_step": solver.max_step, "rtol": solver.rtol, "atol": solver.atol}
+    found = StepControl.of(type(solver).__name__, method, (t, sign * np.inf), solver.n, **given)
     h = found.h
     n_steps = found.span.n_steps if h is None else fixed_steps(h, t, t_bound)
     span = found.span._replace(h=sign * (h or 0.0), t_bound=t_bound, sign=sign, n_steps=n_steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.integrate import OdeSolver
@@ -10,7 +11,9 @@ from scipy.integrate import OdeSolver
 from ..engine import data
 from ..engine.data import Work
 from .invariants import InvariantSet
-from .runs import Run
+
+if TYPE_CHECKING:
+    from .runs import Run
 
 __all__ = ["failure", "projection_failure"]
 
@@ -35,14 +38,15 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     """Return the message for a failed step, from the engine's `status` and its `clock` of times and step lengths."""
     if status == data.NOT_FINITE:
         return _not_finite(run, clock[data.TIME], clock[data.LENGTH])
+    called = run.problem.name
     if status == data.TOO_SMALL:
         at = run.method.not_finite_at if run.tableau.drives else None
-        return OdeSolver.TOO_SMALL_STEP if at is None else f"{run.called} returned a non-finite value at t={at:.10g}"
+        return OdeSolver.TOO_SMALL_STEP if at is None else f"{called} returned a non-finite value at t={at:.10g}"
     if status == data.UNSTABLE:
         return _unstable(run)
     if status == data.BY_VELOCITY:
         return (
-            f"at t={clock[data.TIME]:.10g} the accelerations in {run.called} depend on the velocity, and a Nystrom "
+            f"at t={clock[data.TIME]:.10g} the accelerations in {called} depend on the velocity, and a Nystrom "
             "method does not integrate such equations; the states of the last 4 steps or so may be wrong. Use a "
             "Runge-Kutta method such as EIPDOP853, or EIPGJ12 with small steps"
         )
@@ -84,6 +88,6 @@ def _not_finite(run: Run, t: float, h: float) -> str:
 def _bad_value(run: Run, f: np.ndarray, t: float) -> str:
     unset = np.flatnonzero(np.isnan(f))
     hint = ""
-    if run.left_out and unset.size:
-        hint = f" (component {unset[0]} is NaN; {run.left_out})"
-    return f"{run.called} returned a non-finite value at t={t:.10g}{hint}"
+    if run.problem.left_out and unset.size:
+        hint = f" (component {unset[0]} is NaN; {run.problem.left_out})"
+    return f"{run.problem.name} returned a non-finite value at t={t:.10g}{hint}"

@@ -22,7 +22,7 @@ from .blocks import blocks_of, kinds_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
 from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet
-from .stepping import Stepping
+from .step_control import StepControl
 
 __all__ = [
     "Options", "ProjectionDetails", "ProjectionKeywords", "ProjectionOptions", "takes_projection_options", "weights",
@@ -150,7 +150,7 @@ class ProjectionOptions:
         return isinstance(self.linear_invariants, str) and self.linear_invariants == "auto"
 
     def settled(
-        self, method: Method, stepping: Stepping, y0: np.ndarray, f0: np.ndarray, known: InvariantSet
+        self, method: Method, stepping: StepControl, y0: np.ndarray, f0: np.ndarray, known: InvariantSet
     ) -> tuple[Options, np.ndarray | None, Callable[[], dict[str, Any]]]:
         """Check the options for a run with the `known` invariants, and return them in the form that the step needs.
 
@@ -180,7 +180,7 @@ class ProjectionOptions:
             block_atol = np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
         check, distant = flag("check", self.check), data.DISTANT
         if stepping.h is None:
-            distant = float(np.clip(FAR_IN_TOLERANCES * np.max(rtol, initial=0.0), data.DISTANT, MOST_FAR))
+            distant = min(max(FAR_IN_TOLERANCES * float(rtol.max(initial=0.0)), data.DISTANT), MOST_FAR)
         options = Options(
             rtol=rtol.repeat(width),
             atol=atol,

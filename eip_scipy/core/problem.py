@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import library
-from .events import Events
 from .inputs import real_array, shown
 from .invariants import Invariant, as_invariants
 from .names import nearest
@@ -171,7 +170,8 @@ class Problem:
         Returns
         -------
         OdeResult
-            Result of SciPy with the additional fields ``units``, ``epoch``, and ``component_names`` if there are names.
+            Result of `eip_scipy.solve_ivp` with the additional fields ``units``, ``epoch``, and ``component_names`` if
+            there are names.
 
         Examples
         --------
@@ -181,27 +181,20 @@ class Problem:
         >>> sol.success, sol.y.shape
         (True, (4, 668))
         """
-        from scipy.integrate import solve_ivp
+        from ..run.solve_ivp import solve_ivp  # which imports this module
 
         t_span, y0 = self.t_span if t_span is None else t_span, self.y0 if y0 is None else y0
         if t_span is None or y0 is None:
             missing = "t_span" if t_span is None else "y0"
             raise TypeError(f"{self.name}: the problem has no {missing}; pass {missing} to solve_ivp.")
-        brought: dict[str, Any] = {}
-        if hasattr(method, "TABLEAU"):  # an EIP method; this module does not import the solvers
-            brought = {name: value for name in BROUGHT if (value := getattr(self, name)) is not None}
+        brought: dict[str, Any] = {"events": self.events}
+        if hasattr(method, "TABLEAU"):  # an EIP method
+            brought |= {name: value for name in BROUGHT if (value := getattr(self, name)) is not None}
             if method.TABLEAU.drives:
                 brought["invariants"] = self.stiff_invariants
-            fixed = self.h is not None and not method.TABLEAU.drives
-            if fixed and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
+            elif self.h is not None and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
                 brought["h"] = self.h
-        options = {"events": self.events, **brought, **options}
-        if options["events"] is not None:
-            is_own, short = hasattr(method, "TABLEAU"), options.get("h") or 1e-3 * np.clip(t_span[1] - t_span[0], -1, 1)
-            start = (lambda t, y: (np.asarray(self.fun(t, y)), short)) if is_own else None
-            as_scipy = not is_own or method._takes_scipys_steps(options)
-            options["events"] = Events(options["events"], options.get("args") or ()).for_scipy(start, as_scipy=as_scipy)
-        sol = solve_ivp(self.fun, t_span, y0, method=method, **options)
+        sol: Any = solve_ivp(self.fun, t_span, y0, method, **{**brought, **options})
         if self.component_names is not None and len(self.component_names) == len(sol.y):
             sol.component_names = self.component_names
         sol.units, sol.epoch = self.units, self.epoch

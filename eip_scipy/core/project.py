@@ -12,14 +12,15 @@ import numpy as np
 from ..engine.data import BAND, EPS, LARGE_SHARE, LAST_RANK
 from ..engine.trust import ProjectionWarning
 from ..methods.base import PROJECTION_ONLY
+from .bound_problem import BoundProblem
 from .failures import projection_failure
 from .inputs import as_vector, count, is_number, reals, shown
 from .invariants import InvariantSet
 from .options import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
-from .run_spec import RunSpec
-from .states import as_derivative, initial_state
-from .stepping import Stepping
+from .runs import Run
+from .states import initial_state
+from .step_control import StepControl
 
 __all__ = ["project"]
 
@@ -95,7 +96,6 @@ def project(
         raise ValueError(f"project: t must be a finite number, got {shown(t)}.")
     t, y = float(t), initial_state(y_hat, "y_hat")
     n = y.size
-    derivative = _derivative(f, t, y)
     iterations = count("iterations", iterations, MOST_ITERATIONS)
     given = ProjectionOptions(
         invariants=invariants,
@@ -104,8 +104,8 @@ def project(
         iterations=iterations,
         check=False,
     )
-    stepping = Stepping.at_rest(t, n)
-    run = RunSpec(name="project", method=PROJECTION_ONLY, rhs=derivative, stepping=stepping, projection=given).build(y)
+    stepping = StepControl.without_steps(t, n)
+    run = Run(BoundProblem(_field(f, t, y), y), "project", PROJECTION_ONLY, stepping, given).start_at(y)
     known, work = run.invariants, run.work
     if known.uses_f and f is None:
         raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
@@ -113,12 +113,12 @@ def project(
         raise ValueError(
             "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
         )
-    run.options = run.options._replace(
+    options = run.options._replace(
         target=_targets(known, target, start, t),
         most_left=np.full(known.size, np.inf),  # always do all Newton steps
     )
     work.K[-1] = run.start.f
-    out, status = run.projected(derivative, t, y)
+    out, status = run.projected(t, y, options, work)
     if status != 0:
         raise ValueError(projection_failure(known, work, t))
     left = np.abs(work.residual) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
@@ -133,9 +133,11 @@ def project(
     return ProjectionResult(out, work.residual.copy(), int(work.counters[LAST_RANK]), out - y)
 
 
-def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
+def _field(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
+    """Return the derivative of the state as a function: `f`, or the constant that it is."""
     if callable(f):
-        return lambda t, state: as_derivative(f(t, state.copy()), y.size, y.dtype, t).copy()
+        field: Callable[[float, np.ndarray], np.ndarray] = f
+        return field
     fixed = np.zeros_like(y) if f is None else as_vector(f, y.size, y.dtype, "project: f has", t)
     return lambda t, state: fixed
 

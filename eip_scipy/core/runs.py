@@ -1,108 +1,304 @@
-"""A run that is ready to step: its buffers and options, and the checks during the run."""
+"""A run: its method, options, invariants and buffers, made and checked at its start, and watched while it goes on."""
 
 from __future__ import annotations
 
-import copy
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from ..engine.data import BY_ERROR, EXAMINED, NO_BALANCES, NO_METHOD, NOTHING, REASON, Schedule, Work
+from ..engine.data import (
+    BY_ERROR,
+    EPS,
+    EUCLIDEAN,
+    EXAMINED,
+    NEW,
+    NO_BALANCES,
+    NO_METHOD,
+    NOTHING,
+    REASON,
+    Schedule,
+    Work,
+)  # fmt: skip
 from ..engine.native import BUILD, Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
-from ..methods.base import Method
+from ..methods.base import PROJECTION_ONLY, Method
 from .callers import users_level
-from .conserved import Conserved
+from .conserved import Conserved, Samples, conserved
 from .examination import Derivative, Examiner, is_check_due, unresolved
-from .invariant_checks import listed
-from .invariants import InvariantSet
+from .failures import projection_failure
+from .frame import frame_rows, spanned
+from .gradients import unless_error
+from .invariant_checks import Complaint, listed, reported
+from .invariants import TARGET_TOLERANCE, InvariantSet
 from .linear import confirmed
-from .options import Options
+from .options import ProjectionOptions
 from .results import Diagnostics, slowness
-from .stepping import Stepping
+from .step_control import StepControl
+from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
 
-__all__ = ["Counted", "Run", "Start", "parts_of", "run_of"]
+if TYPE_CHECKING:
+    from .bound_problem import BoundProblem
 
-# Fields that a copy of a run makes again, copies by itself, or does not need.
-BOUND = ("tableau", "work", "invariants", "trust", "identity")
+__all__ = ["Run", "Start"]
+
+START_ITERATIONS = 50
+FRAME_DISTANCE = 1e-4
+
+# What `restore` makes again, and what a copy does not need.
+RESTORED = ("tableau", "given", "invariants", "identity", "diagnostics", "examiner")
+
+Array = np.ndarray
 
 
 class Start(NamedTuple):
     """Start of a run: time, state, derivative, and the length of the fixed or first step, which is a scale of time."""
 
     t: float
-    y: np.ndarray
-    f: np.ndarray
+    y: Array
+    f: Array
     tau: float
 
 
-@dataclass
 class Run:
-    """A run that `RunSpec.build` has made: everything that a driver needs, except the user's functions.
+    """A run of a `BoundProblem` by a method, as all interfaces use it; `start_at` makes its buffers and checks it.
 
-    The invariants were measured at `begin`; `start`, of the first step, may have been moved by `project_initial`, and
-    `moved` says how far. `tableau` is the method as it was given, and `method` the form of it that the engine uses for
-    the steps. `identity`: see `settled`. `called` is the argument that gave the right-hand side, and `left_out` a
-    possible cause of NaN in its value, for messages. `looked` is the step at which the invariants were checked last.
-    `depends_on_time` is True if an invariant depends on time; its scale then depends on the start. `conserved` is what
-    the system conserves in addition to the invariants.
+    `name` is the solver class, for messages, and `given` the method as it was given. With `level` a multistep method
+    returns the state at the newest end of its history; otherwise that in the middle.
+
+    After the start, `tableau` is the method for these equations, and `method` the form of it that the engine uses for
+    the steps. The invariants were measured at `begin`; `start`, of the first step, may have been moved by
+    `project_initial`, and `moved` says how far. ``identity()`` returns the options that determine the bits of the run.
+    `looked` is the step at which the invariants were checked last. `depends_on_time` is True if an invariant depends on
+    time; its scale then depends on the start. `conserved` is what the system conserves in addition to the invariants.
+    Whoever makes the steps sets `schedule`.
     """
 
     begin: Start
     start: Start
-    stepping: Stepping
-    tableau: Method
     method: Any
-    options: Options
+    options: Any
     work: Work
     invariants: InvariantSet
     identity: Callable[[], dict[str, Any]]
     trust: Trust
     conserved: Conserved
-    called: str = "fun"
-    left_out: str = ""
-    looked: int = -1
-    moved: str = ""
-    warned_of_balances: bool = False
-    depends_on_time: bool = False
+    schedule: Schedule
+    diagnostics: Diagnostics
+
+    def __init__(
+        self,
+        problem: BoundProblem,
+        name: str,
+        method: Method,
+        stepping: StepControl,
+        projection: ProjectionOptions,
+        *,
+        level: bool = False,
+    ) -> None:
+        self.problem, self.name, self.given, self.stepping = problem, name, method, stepping
+        self.projection, self.level, self.tableau = projection, level, method
+        known = problem.variations
+        self.tangents: TangentVectors = NO_TANGENT_VECTORS if known is None else known.tangents
+        self.looked, self.moved, self.depends_on_time, self._warned_of_balances = -1, "", False, False
 
     @property
-    def y0(self) -> np.ndarray:
+    def y0(self) -> Array:
         """Return the state at which the first step starts."""
         return self.start.y
 
-    def engine(
-        self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True
-    ) -> Engine:
+    @property
+    def uses_jacobian(self) -> bool:
+        """True if the method corrects accelerations by the Jacobian."""
+        history = self.method.multistep
+        return history is not None and history.corrected_count > 0
+
+    def start_at(
+        self,
+        y0: Array,
+        f0: Array | None = None,
+        tau: float | None = None,
+        *,
+        check: bool = True,
+        is_known: bool = False,
+    ) -> Run:
+        """Start at the state y0, after a check of the options, the functions and the invariants, and return the run.
+
+        The derivative `f0` (n,) at y0 and the length `tau` of the first step are computed if they are None. `check` is
+        False if the invariants and the steps of a user-defined method have been checked, and costs reported, at the
+        start of a similar run. `is_known` is True if the equations have been examined for the method.
+        """
+        BUILD.call(self._start_at, y0, f0, tau, check, is_known)
+        return self
+
+    def _start_at(self, y0: Array, f0: Array | None, tau: float | None, check: bool, is_known: bool) -> None:
+        f0 = self.examine(y0, f0, is_known=is_known)
+        tau = self._first_step(y0, f0) if tau is None else tau
+        self.begin = self.start = Start(self.stepping.span.t0, y0, f0, tau)
+        self._make_buffers(check)
+        if self.tableau is PROJECTION_ONLY:
+            return  # the state may be far from the targets
+        self._check(check)
+        self.tableau.begin(self, self.start)
+
+    def examine(self, y0: Array, f0: Array | None = None, *, is_known: bool = False) -> Array:
+        """Return the derivative (n,) at y0 after a check of the equations by the method, unless they are known."""
+        t0, is_second_order = self.stepping.span.t0, self.problem.is_second_order
+        try:
+            f0 = self.problem.derivative(t0, y0) if f0 is None else f0
+        except (ValueError, TypeError, IndexError) as error:
+            if self.given.of_second_order and not is_second_order:
+                hint = self.problem.hint()
+                error.add_note(f"With {self.name} too, fun(t, y) returns the derivative of y = (q, v){hint}.")
+            raise
+        if not (is_known or is_second_order):
+            self.tableau = self.given.checked(self, Start(t0, y0, f0, 0.0))
+        return f0
+
+    def _first_step(self, y0: Array, f0: Array) -> float:
+        """Return the length of the first step, chosen from the state alone, without tangent vectors."""
+        tangents = self.tangents
+        derivative = tangents.of_state(self.problem.derivative, y0)
+        return self.stepping.first(derivative, tangents.state(y0), tangents.state(f0), self.tableau)
+
+    def _make_buffers(self, tell: bool) -> None:
+        """Evaluate the invariants at the start, and make the buffers for them; `tell`: see `InvariantSet`."""
+        start, method, projection, rhs = self.start, self.tableau, self.projection, self.problem.derivative
+        self.invariants = invariants = InvariantSet(
+            projection.invariants, *start, self.problem.extra, tell=tell, t_bound=self.stepping.span.t_bound, rhs=rhs
+        )
+        y, f = map(self.tangents.state, start[1:3])
+        invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
+        self.depends_on_time = method is not PROJECTION_ONLY and invariants.add_rounding_of_time(start.y)
+        options, sigma, self.identity = projection.settled(method, self.stepping, y, f, invariants)
+        samples = Samples(rhs, start, invariants, self.tangents)
+        found = unless_error(conserved, samples, projection, method, tell and options.watched)
+        self.conserved = Conserved(calls=samples.calls) if found is None else found
+        self.problem.uncount(self.conserved.calls)
+        if len(C := self.conserved.linear.C):
+            options = options._replace(frame=frame_rows((C, C.T), y.size, 1))
+        self.options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)
+        invariants.kinds = options.kinds
+        self.method = method.for_engine(self.problem.sees_velocity)
+        carried, blocks = options.balances.place, options.groups.start.size - 1
+        size = self.method.b.size
+        self.work = work = Work(start.y.size, start.y.dtype, size, invariants.size, blocks, carried.size)
+        work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients
+        del invariants.start_gradients  # which may be large
+        if carried.size:
+            work.level[:] = invariants.target[carried]
+            work.rates[[0, -1]] = np.nan  # not known yet
+        if sigma is not None:
+            work.sigma[:] = sigma
+        self.trust = Trust(invariants.names, work.trust)
+
+    def _check(self, checks: bool) -> None:
+        """Project the start if that is requested, and check the invariants and the steps there if `checks`."""
+        if self.options.frame.products.size and (scales := self._scales()) is not self.options.scales:
+            self.options = self.options._replace(scales=scales)
+        rhs = self.problem.derivative
+        if self.projection.project_initial:
+            t0, y0, _, tau = self.begin
+            moved = self._projected_start()
+            self.moved = _moved(*map(self.tangents.state, (y0, moved, self.invariants.floors)))
+            self.start = Start(t0, moved, rhs(t0, moved), tau)
+        if violation := self.invariants.start_violation(*self.start[:3]):
+            raise ValueError(
+                f"{violation}; correct y0 or the target, or pass project_initial=True to project y0 first."
+            )
+        if self.options.watched and checks and BUILD.are_finite(self.start.f.view(float)):
+            known = (self.work.G, self.work.values) if self.start is self.begin else None
+            self.trust.doubts += self.invariants.check(*self.start[:3], self.invariants.tau, known)
+        if self.projection.check and checks:
+            text = self.tableau.contradiction(self, self.start)
+            if text is not None:
+                self.trust.doubts += reported([Complaint(False, text, "Make the method for the equation of this run")])
+
+    def _scales(self) -> Array:
+        """Return the scales (l,) of the dead bands, within which errors of the invariants are not corrected.
+
+        Invariants that are functions of C y alone, where C is the matrix of the linear invariants, get scales so large
+        that their errors stay within the dead bands. Corrections, which leave C y unchanged, could not reduce these
+        errors. The gradients are examined at two states, because a gradient may be a combination of rows of C by
+        chance.
+        """
+        (t0, y0, f0, tau), frame, invariants, G = self.begin, self.options.frame, self.invariants, self.work.G
+        held = spanned(frame, G.view(float))
+        if not np.count_nonzero(held):
+            return self.options.scales
+        away = y0 + FRAME_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
+        held &= spanned(frame, invariants.gradients(t0, away, f0).view(float))
+        return np.where(held, invariants.sizes_of_terms(y0, G, self.work.values) / EPS, self.options.scales)
+
+    def _projected_start(self) -> Array:
+        """Return the start projected onto the targets, by full Newton steps in the euclidean metric."""
+        t0, y0, f0, _ = self.begin
+        options = self.options._replace(
+            metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
+        )
+        work = Work(y0.size, y0.dtype, 0, self.invariants.size, options.groups.start.size - 1)
+        work.K[-1] = f0
+        y, status = self.projected(t0, y0, options, work)
+        if status != 0 or self.invariants.misses(t0, y, f0).any():
+            raise ValueError(projection_failure(self.invariants, work, t0))
+        return y
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the values and arrays from which a copy continues with the same bits, after `restore`."""
+        kept = {name: value for name, value in vars(self).items() if name not in RESTORED}
+        if self.tableau.in_python:
+            kept["method"] = self.method.state() if self.tableau.drives else None
+        of_copy = {"joint": self.options.joint is not None, "velocities": getattr(self.tableau, "velocities", None)}
+        return kept | {"options": self.options._replace(joint=None), "of_copy": of_copy | {"tau": self.invariants.tau}}
+
+    def restore(self, given: Method) -> None:
+        """Make again what a copy of a run by the method `given` lacks."""
+        own = vars(self).pop("of_copy")
+        self.given = self.tableau = given
+        if given.has_history:
+            self.tableau = replace(cast(Any, given), velocities=own["velocities"])
+        items, t_bound, extra = self.projection.invariants, self.stepping.span.t_bound, self.problem.extra
+        rhs = self.problem.derivative
+        self.invariants = found = InvariantSet(items, *self.begin, extra, tell=False, t_bound=t_bound, rhs=rhs)
+        found.tau, found.kinds, found.target = own["tau"], self.options.kinds, self.options.target
+        if own["joint"]:
+            self.options = self.options._replace(joint=found.items)
+        self.trust.figures = self.work.trust
+        if given.in_python:
+            state, self.method = self.method, given.for_engine()
+            if given.drives:
+                given.begin(self, self.begin)
+                self.method.resume(state)
+
+    def engine(self, functions: PythonFunctions | NativeFunctions, *, begins: bool = True) -> Engine:
         """Return the engine of the run, which it `begins` or continues; work.K[0] must hold the derivative there."""
         joint = None if functions.native else self.options.joint
         hooks = self.tableau.hooks(self.method, self.work)._replace(joint=joint)
         needed = hooks if hooks != Hooks() else None
-        engine, w = Engine(self.method, self.options, self.work, functions, schedule, needed), self.work
+        engine, w = Engine(self.method, self.options, self.work, functions, self.schedule, needed), self.work
         if self.options.watched and begins:
-            t, f = schedule.span.t0, w.K[0]
+            t, f = self.schedule.span.t0, w.K[0]
             if self.start is not self.begin:  # the buffers have the values and gradients at `begin`
                 w.values[:], w.G[:] = self.invariants.values(t, self.y0), self.invariants.gradients(t, self.y0, f)
             engine.start(self.y0, f, self.start.tau)
         return engine
 
-    def projected(self, rhs: Derivative, t: float, y: np.ndarray) -> tuple[np.ndarray, int]:
+    def projected(self, t: float, y: Array, options: Any, work: Work) -> tuple[Array, int]:
         """Return the projection of a state, and the engine's status code; work.K[-1] must hold the derivative there."""
-        derivative = Call(rhs, (), y.shape, lambda value, t: np.array(value, y.dtype))
+        derivative = Call(self.problem.derivative, (), y.shape, lambda value, t: np.array(value, y.dtype))
         functions = PythonFunctions(derivative, *self.invariants.calls, (), second_order=False)
-        engine = Engine(NO_METHOD, self.options._replace(joint=None, balances=NO_BALANCES), self.work, functions)
-        self.work.y_hat[:], out = y, np.empty_like(y)
+        engine = Engine(NO_METHOD, options._replace(joint=None, balances=NO_BALANCES), work, functions)
+        work.y_hat[:], out = y, np.empty_like(y)
         return out, engine.project(t, y, t, True, out)
 
     def attach(self, diagnostics: Any) -> None:
         """Let `diagnostics` read the run's buffers."""
         if not isinstance(diagnostics, Diagnostics):
             raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
-        w = self.work
+        self.diagnostics, w = diagnostics, self.work
         diagnostics._attach(
             max_residual=w.max_residual,
             _residual=w.residual,
@@ -120,15 +316,16 @@ class Run:
         """Return True if some steps may stay unprojected; the run then returns projected copies of their states."""
         return self.invariants.size > 0 and (self.options.every != 1 or self.tableau.has_history)
 
-    def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
+    def look(self, steps: int, ended: bool, t: float, y: Array) -> bool:
         """Examine a run after `steps` steps, or at its end (`ended`), and return True if it must be reported as faulty.
 
         Steps that the engine has marked as suspicious are examined. The invariants are checked after 10, 100, 1000, ...
-        steps, at the end, and if the corrections are too large, to find the reason. `rhs` returns a new array.
+        steps, at the end, and if the corrections are too large, to find the reason.
         """
-        return bool(BUILD.call(self._look, steps, ended, t, y, rhs))
+        return bool(BUILD.call(self._look, steps, ended, t, y))
 
-    def _look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
+    def _look(self, steps: int, ended: bool, t: float, y: Array) -> bool:
+        rhs = self.problem.derivative
         if self.trust.failed or not self.options.watched:  # a failure has its own message
             return False
         if ended:
@@ -153,13 +350,13 @@ class Run:
     def _warn_of_fast_balances(self) -> None:
         """Warn once about balances that change too fast to be useful."""
         carried = self.invariants.balances
-        if not carried.items or self.warned_of_balances:
+        if not carried.items or self._warned_of_balances:
             return
         found = slowness(self.work.slow)
         fast = np.flatnonzero(found > carried.most_slowness)
         if not fast.size:
             return
-        self.warned_of_balances = True
+        self._warned_of_balances = True
         names, bound = [self.invariants.names[place] for place in carried.places[fast]], carried.most_slowness[fast[0]]
         warnings.warn(
             f"balance {listed(names)} changes too fast to be of much use: on average its rate is "
@@ -170,7 +367,7 @@ class Run:
             stacklevel=users_level(),
         )
 
-    def _warn_of_refuted_constraints(self, t: float, y: np.ndarray, rhs: Derivative) -> None:
+    def _warn_of_refuted_constraints(self, t: float, y: Array, rhs: Derivative) -> None:
         """Warn if linear invariants that were found at the start do not hold at the state y, as in contact."""
         linear = self.conserved.linear
         if not len(linear.C) or linear.C.shape[1] != y.size:
@@ -196,51 +393,13 @@ class Run:
         return Examiner(self.invariants, self.invariants.tau, self.work.trust, resolution)
 
 
-class Counted:
-    """A right-hand side that counts its calls and returns new arrays."""
-
-    __slots__ = ("_rhs", "count")
-
-    def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray]) -> None:
-        self._rhs = rhs
-        self.count = 0
-
-    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the derivative (n,) at (t, y) as a new array, and count the call."""
-        self.count += 1
-        return self._rhs(t, y).copy()
-
-    def uncount(self, calls: int) -> None:
-        """Take back the count of some calls."""
-        self.count -= calls
-
-
-def parts_of(run: Run) -> dict[str, Any]:
-    """Return the values and arrays, by name, from which `run_of` makes a run again, apart from the invariants.
-
-    The new run continues with the same bits, in this process or another one. The values are fields of the run, a copy
-    of its buffers, and attributes of its `Trust`. If a solver of SciPy makes the steps, the attributes of that solver
-    are among them. A user-defined one-step method is not.
-    """
-    values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
-    values["options"] = run.options._replace(joint=None)
-    if run.tableau.in_python:
-        values["method"] = run.method.state() if run.tableau.drives else None
-    return values | {"work": copy.deepcopy(run.work), "doubts": list(run.trust.doubts), "failed": run.trust.failed}
-
-
-def run_of(parts: dict[str, Any], invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
-    """Return a run made from its parts, with copies of their buffers.
-
-    `invariants` is a new set of the same invariants, made at the same start. `joint` is True if the run projects them
-    with their functions `moments` and `shift`.
-    """
-    values = copy.deepcopy(parts)
-    if method.in_python:
-        values["method"] = method.for_engine()
-    if joint:
-        values["options"] = values["options"]._replace(joint=invariants.items)
-    invariants.target = values["options"].target  # those of balances change
-    trust = Trust(invariants.names, values["work"].trust)
-    trust.doubts, trust.failed = values.pop("doubts"), values.pop("failed")
-    return Run(**values, tableau=method, invariants=invariants, trust=trust, identity=dict)
+def _moved(before: Array, after: Array, floors: Array) -> str:
+    """Return a sentence on how far the projection moved the start; "" if by no more than `TARGET_TOLERANCE`."""
+    share = np.abs(after - before) / np.maximum(np.abs(before), floors)
+    count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0
+    if not count:
+        return ""
+    return (
+        f"project_initial moved {count} of {share.size} components of y0, most of all y0[{k}], from {before[k]:.6g} to "
+        f"{after[k]:.6g}"
+    )

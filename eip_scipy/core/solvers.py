@@ -7,56 +7,62 @@ import copyreg
 import inspect
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
-from functools import partial
 from operator import is_
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
-from ..engine.data import FOUND, NEXT_LENGTH, NFEV, NJEV, NLU, OK, PENDING, WAITED, Work, bare_schedule
-from ..engine.native import Call, PythonFunctions, call
+from ..engine.data import FOUND, NEXT_LENGTH, NFEV, NJEV, NLU, OK, PENDING, WAITED, bare_schedule
 from ..engine.trust import ProjectionWarning
 from ..methods.base import Method
-from ..methods.gauss_jackson import GaussJackson, jacobian_product
+from ..methods.gauss_jackson import GaussJackson
 from ..methods.implicit import BDF, RADAU, Jacobian
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.one_step import OneStep, OneStepMethod
 from ..methods.runge_kutta import ATTRIBUTES, DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau, is_same, tableau_of
-from .acceleration import BY_NAME
-from .between_steps import Settings, checked_stepping, checked_vector, is_state, kept_state, settings_of
+from .between_steps import Settings, changed_control, checked_vector, is_state, kept_state, settings_of
+from .bound_problem import BoundProblem
 from .callers import users_level
 from .dense import ExactEnds, Interpolants
 from .examination import is_check_due
 from .failures import failure
-from .inputs import is_number, numbers, shown
-from .invariants import InvariantSet, as_invariants
-from .jitted import compiled_call
+from .inputs import is_number
+from .invariants import as_invariants
 from .names import nearest
 from .options import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
-from .run_spec import RunSpec
-from .runs import Run, Start, parts_of, run_of
-from .states import as_derivative, initial_state
-from .stepping import ATOL, StepOptions, Stepping, interval
-from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
+from .runs import Run, Start
+from .states import initial_state
+from .step_control import ATOL, StepControl, interval
+from .variations import Variations
 
 __all__ = [
     "EIPBDF", "EIPDOP853", "EIPGJ12", "EIPGJ14", "EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPRK23",
     "EIPRK45", "EIPRKN8", "EIPRKN12", "EIPRadau", "EIPSolver", "eip_method",
 ]  # fmt: skip
 
-# The attributes that a step of SciPy's solver reads.
-HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
-# SHARED: attributes that a solver and its copies share; MADE: attributes that each copy makes again.
-SHARED = {"_user_fun", "_jacobian"}
-MADE = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_derivative", "_call", "_spec", "_scipy"}
-MADE |= {"_run", "_work", "_schedule", "_engine", "_interpolants", "_was", "diagnostics"}
+# The attributes that a step of SciPy's solver reads: those that control the step, and the others.
+CONTROL = ("t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
+HANDED = ("t", "y", "f", *CONTROL)
+# Attributes that a copy of a solver makes again.
+DERIVED = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_engine", "_interpolants", "diagnostics"}
 # Options of SciPy's other solvers, which code that runs several of them passes to all.
 OF_OTHERS = {"jac", "jac_sparsity", "lband", "uband", "min_step"}
 OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnostics", *ProjectionOptions.names())
+
+
+class Context(NamedTuple):
+    """What `eip_scipy.solve_ivp` shares with the solver that SciPy makes for it.
+
+    The solver writes the state from which it starts to `start`, the initial state of SciPy's loop, and itself to
+    `solvers`. `variations` are the functions of an augmented state.
+    """
+
+    start: np.ndarray
+    solvers: list[Any]
+    variations: Variations | None = None
 
 
 class SolverClass(type):
@@ -130,7 +136,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     TABLEAU: ClassVar[Method]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
-    _TANGENTS: ClassVar[TangentVectors] = NO_TANGENT_VECTORS
     order: Any = NotImplemented
     error_estimator_order: Any = NotImplemented
     n_stages: Any = NotImplemented
@@ -139,19 +144,16 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     C: Any = NotImplemented
     E: Any = NotImplemented
     P: Any = NotImplemented
+    fun: Any
     t: float
     t_old: float
     y: np.ndarray
     f: np.ndarray
     h_abs: Any
     nfev: int
-    _interpolants: Interpolants | None
-    _was: Settings
     rtol: Any
     atol: Any
-    _run: Run
-    _spec: RunSpec
-    _work: Work
+    _interpolants: Interpolants | None
 
     def __init__(
         self,
@@ -171,37 +173,40 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     ) -> None:
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
-        jacobian = _jacobian(self.TABLEAU, options)
+        start = initial_state(y0)
+        context = options.pop("_context", None) or Context(start.copy(), [])
+        jacobians = _jacobians(self.TABLEAU, options)
         own, extraneous = ProjectionOptions.split(options)
-        projection = ProjectionOptions(**own)
+        projection = ProjectionOptions(**own | {"invariants": as_invariants(own.get("invariants", ()))})
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
         t0, t_bound = interval((t0, t_bound))
-        start = initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
+        problem = BoundProblem(fun, start, variations=context.variations, vectorized=vectorized, **jacobians)
+        n = start.size if context.variations is None else context.variations.tangents.n
         longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN sets no bound, as in SciPy
-        steps = StepOptions(h=h, first_step=first_step, max_step=longest, rtol=rtol, atol=atol)
-        n = self._TANGENTS.state(start).size
-        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)
-        kept = as_invariants(projection.invariants)
-        self._jacobian = jacobian
-        self._bind(fun, [0])
-        self._spec = self._specified(stepping, replace(projection, invariants=kept))
+        name, control = type(self).__name__, {"h": h, "first_step": first_step, "max_step": longest}
+        stepping = StepControl.of(name, self.TABLEAU, (t0, t_bound), n, **control, rtol=rtol, atol=atol)
+        self._run = run = Run(problem, name, self.TABLEAU, stepping, projection, level=True)
+        self._bound_fun = self.fun
         self._take_stepping(stepping, rtol, atol)
         if self.h is None and stepping.first_step is None:
-            stepping.require_scale(self._TANGENTS.state(start))
-        self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated) or n < self.n)
+            stepping.require_scale(run.tangents.state(start))
+        plain = not (projection.invariants or projection.compensated or n < self.n)
+        self._scipy = self._scipy_solver(start) if plain else None
         self.h_previous: float | None = None
         self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
         begun = (None, None) if self._scipy is None else (self._scipy.f, float(self._scipy.h_abs or 0.0))
-        self._start(start, *begun)
-        self.h_abs = self._run.start.tau if self._scipy is None else self._scipy.h_abs
-        self._work.counters[NFEV] = self._calls[0]
-        self._drive(begins=True)
+        self._begin(run.start_at(start, *begun))
+        self.h_abs = run.start.tau if self._scipy is None else self._scipy.h_abs
+        run.work.counters[NFEV] = problem.count
+        self._make_engine(begins=True)
         self.y_old = self.y
-        self._noted, self._told = 0, False
+        self._noted, self._warned = 0, False
         self._count()
         self._settle()
+        context.start[:] = self.y
+        context.solvers.append(self)
 
     @classmethod
     def _takes_scipys_steps(cls, options: Mapping[str, Any]) -> bool:
@@ -220,70 +225,35 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
                 if name not in vars(cls):
                     setattr(cls, name, value)
 
-    def _bind(self, fun: Callable[..., Any], calls: list[int]) -> None:
-        """Use `fun` as right-hand side from now on; ``calls[0]`` counts its evaluations."""
-        self._user_fun, self._bound_fun, self._calls = fun, self.fun, calls
-        vectorized = self.vectorized and fun is not self.fun
-        self._derivative, self._call = _checked(fun, self.n, self.y.dtype, vectorized, calls)
-
-    def _take_stepping(self, stepping: Stepping, rtol: Any, atol: Any) -> None:
+    def _take_stepping(self, stepping: StepControl, rtol: Any, atol: Any) -> None:
         """Store options of the step control that have been checked; numbers stay numbers, as in SciPy."""
-        self._spec = self._spec._replace(stepping=stepping)
+        self._run.stepping = stepping
         self.h, self.max_step = stepping.h, stepping.span.max_step
         given = (rtol, stepping.rtol), (atol, stepping.atol)  # the checked arrays of an empty state have no number
         self.rtol, self.atol = (a.copy() if np.size(x) > 1 else float(np.max(a if a.size else x)) for x, a in given)
 
-    def _specified(self, stepping: Stepping, projection: ProjectionOptions) -> RunSpec:
-        """Return a `RunSpec` of the solver's present right-hand side with these options."""
-        moved = jacobian_product(self._jacobian) if callable(self._jacobian) else self._jacobian
-        return RunSpec(
-            name=type(self).__name__,
-            method=self.TABLEAU,
-            rhs=partial(_copied, self._derivative),
-            stepping=stepping,
-            projection=projection,
-            jacobian=lambda: moved,
-            level=True,
-            hint=lambda: f". If fun is the acceleration a(t, q), {BY_NAME}",
-            tangents=self._TANGENTS,
-            uncount=self._uncount,
-        )
-
-    def _uncount(self, calls: int) -> None:
-        self._calls[0] -= calls
-
-    def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:
-        """Start a run at a state and make its buffers; the arguments are those of `RunSpec.build`."""
-        run = self._spec.build(y0, f0, tau, check_start=check)
-        self._run, self._work = run, run.work
-        self._spec = self._spec._replace(method=run.tableau, is_known=True)
+    def _begin(self, run: Run) -> None:
+        """Go on with the `run`, which has been started."""
+        self._run = run
         run.attach(self.diagnostics)
         self.y, self.f = run.y0, run.start.f
         # The steps continue from `_raw`. If it waits for its projection, `y` is its projected copy.
         self._raw = self._raw_old = run.y0
         self._waits = False, False  # whether the states at both ends of the last step wait for a projection
-        self._shows = run.shows
         self._steps = 0
 
-    def _drive(self, *, begins: bool) -> None:
+    def _make_engine(self, *, begins: bool) -> None:
         """Make the engine for the present interval, options and functions; `begins` is False if a run continues."""
         self._k, self._interpolants = 0, None
         if self._scipy is not None:
             return
+        run = self._run
         if self.TABLEAU.drives:
-            self._run.method.count(self._work)
-        self._work.K[0] = self.f
-        self._schedule = bare_schedule(self._spec.stepping.span, float(self.h_abs or 0.0))
-        self._schedule.place[PENDING] = 1  # the solver shows the end of the last step
-        jacobian = None
-        if callable(self._jacobian):
-            jacobian = call(self._jacobian, (), (self.n // 2,), None, takes_f=True, in_place=True)
-        rates = self._run.invariants.rates(self._run.options.adaptive)
-        state = self.n, self.y.dtype
-        rhs = compiled_call(self._call, *state)
-        inv, grad = (tuple(compiled_call(known, *state) for known in group) for group in self._run.invariants.calls)
-        functions = PythonFunctions(rhs, inv, grad, (), second_order=False, jacobian=jacobian, rates=rates)
-        self._engine = self._run.engine(functions, self._schedule, begins=begins)
+            run.method.count(run.work)
+        run.work.K[0] = self.f
+        run.schedule = bare_schedule(run.stepping.span, float(self.h_abs or 0.0))
+        run.schedule.place[PENDING] = 1  # the solver shows the end of the last step
+        self._engine = run.engine(run.problem.in_python(run, by_address=True), begins=begins)
 
     def _settle(self) -> None:
         """Store the attributes after a step, so that the next step detects which of them the user has set."""
@@ -293,167 +263,141 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     @property
     def _untouched(self) -> bool:
         """Return True if no attribute was set since the last step."""
-        stepping = self._spec.stepping
+        stepping = self._run.stepping
         return (
             all(map(is_, settings_of(self), self._was))
+            and self.fun is self._bound_fun
             and (type(self.rtol) is float or np.array_equal(self.rtol, stepping.rtol))  # or changed in place
             and (type(self.atol) is float or np.array_equal(self.atol, stepping.atol))
             and (self._kept is None or is_state(self.y, self._kept))
         )
 
-    def _hand_on(self) -> None:
+    @property
+    def _moved(self) -> bool:
+        """Return True if the state or the time was changed since the last step."""
+        t, y = self._was.t, self._was.y
+        if self.t != t or (self._kept is not None and not is_state(self.y, self._kept)):
+            return True
+        return self.y is not y and not np.array_equal(self.y, y)
+
+    def _apply_changes(self) -> None:
         """Apply the attributes that were set between two steps, as the notes of `EIPSolver` describe."""
-        was, like = self._was, self._run.y0
-        stepping = checked_stepping(self, self.TABLEAU, was, stacklevel=5)
+        was, run, like, problem = self._was, self._run, self._run.y0, self._run.problem
+        stepping = changed_control(self, self.TABLEAU, was)
         y = self.y if self.y is was.y else checked_vector("y", self.y, like)
         f = self.f if self.f is was.f else checked_vector("f", self.f, like)
         self.y, self.f = y, f
         called = self.nfev - was.nfev
-        self._calls[0] += called
-        self._work.counters[NFEV] += called
-        refunctioned, moved = self.fun is not was.fun, self._moved
-        if refunctioned:
-            self._bind(self.fun, self._calls)
-            self._spec = self._specified(stepping, self._spec.projection)
+        problem.count += called
+        run.work.counters[NFEV] += called
+        moved, new_function = self._moved, self.fun is not self._bound_fun
+        if new_function:
+            self._bound_fun, problem.vectorized = self.fun, False
+            problem.bind(self.fun)
         self._take_stepping(stepping, self.rtol, self.atol)
         if self._scipy is not None:
-            if refunctioned:
-                self._scipy.fun = self._derivative
+            self._scipy.fun = self._evaluate
             for name in HANDED:
                 setattr(self._scipy, name, getattr(self, name))
             return
-        before = self._calls[0]
-        if (refunctioned or moved) and self.f is was.f:
-            self.f = self._derivative(self.t, self.y).copy()
+        before = problem.count
+        if (new_function or moved) and self.f is was.f:
+            self.f = problem.derivative(self.t, self.y)
         here = Start(float(self.t), self.y, self.f, float(self.h_abs or 0.0))
-        if moved:
-            self._restart(here)
-        else:
-            self._go_on(here)
-            self._work.rates[0] = np.nan if refunctioned else self._work.rates[-1]
-        self._work.counters[NFEV] += self._calls[0] - before
-        self._drive(begins=moved)
+        (self._restart if moved else self._continue)(here, new_function)
+        self._run.work.counters[NFEV] += problem.count - before
+        self._make_engine(begins=moved)
 
-    def _restart(self, here: Start) -> None:
+    def _restart(self, here: Start, new_function: bool) -> None:
         """Start a new run at `here`, a time and a state set by the user; counts and the largest residuals continue."""
         old = self._run
-        self._start(*here[1:], check=False)
-        new, counters = self._run, self._work.counters
-        counters[:] = old.work.counters
-        counters[WAITED] = 0
+        method = self.TABLEAU if new_function else old.tableau
+        new = Run(old.problem, old.name, method, old.stepping, old.projection, level=True)
+        self._begin(new.start_at(*here[1:], check=False, is_known=not new_function))
+        new.work.counters[:] = old.work.counters
+        new.work.counters[WAITED] = 0
         new.work.max_residual[:] = old.work.max_residual
         new.work.max_correction[:] = old.work.max_correction
         new.trust.doubts += [*old.trust.reasons, *old.trust.doubts]
         new.trust.failed = old.trust.failed
 
-    def _go_on(self, here: Start) -> None:
+    def _continue(self, here: Start, new_function: bool) -> None:
         """Continue from `here`, the last time and state, with other tolerances, or another interval or function."""
-        run, spec = self._run, self._spec
-        method, _ = spec.examined(here.y, here.f)
+        run, work = self._run, self._run.work
+        run.examine(here.y, here.f, is_known=not new_function)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
-        fresh = spec.projection.settled(method, spec.stepping, run.y0, run.start.f, run.invariants)[0]
+        fresh = run.projection.settled(run.tableau, run.stepping, run.y0, run.start.f, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
-        run.stepping = spec.stepping
-        method.begin(spec, run, here)
-        self._spec = spec._replace(method=method, is_known=True)
+        if self.TABLEAU.drives and not new_function:
+            for name in (*CONTROL, "status"):
+                setattr(run.method.scipy_solver, name, getattr(self, name))
+        else:
+            run.tableau.begin(run, here)
+        work.rates[0] = np.nan if new_function else work.rates[-1]
 
-    def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return two mappings for a copy of this solver: values to share, such as functions, and values to copy."""
-        shared = {name: getattr(self, name) for name in SHARED} | {"projection": self._spec.projection}
-        shared["tau"] = self._run.invariants.tau
-        was = self._was._asdict()
-        if self.fun is not self._bound_fun:  # `fun` was set since the last step
-            shared["fun"] = self.fun
-        del was["fun"]
-        copied = {
-            "attributes": {name: value for name, value in vars(self).items() if name not in MADE | SHARED},
-            "set": {name: value for name, value in was.items() if getattr(self, name) is not value},
-            "replaced": self._user_fun is self._bound_fun,
-            "velocities": getattr(self._spec.method, "velocities", None),
-            "run": parts_of(self._run),
-            "joint": self._run.options.joint is not None,
-            "clock": None if self._scipy is not None else self._schedule.clock,
-            "scipy": {name: value for name, value in vars(self._scipy).items() if not callable(value)}
-            if self._scipy is not None
-            else None,
-        }
-        return shared, copied
+    def __getstate__(self) -> dict[str, Any]:
+        own = {name: value for name, value in vars(self).items() if name not in DERIVED}
+        if self.fun is not self._bound_fun:  # it was set since the last step
+            own["fun"] = self.fun
+        own["_bound_fun"] = self._bound_fun is self._run.problem.fun  # it was set before, and is not SciPy's wrapper
+        own["_was"] = {name: x for name, x in self._was._asdict().items() if getattr(self, name) is not x}
+        if self._scipy is not None:
+            own["_scipy"] = {name: value for name, value in vars(self._scipy).items() if not callable(value)}
+        return own
 
-    def _revive(self, shared: dict[str, Any], copied: dict[str, Any]) -> None:
-        """Restore the solver from the output of `_state`."""
-        begin, user = copied["run"]["begin"], shared["_user_fun"]
-        vectorized = copied["attributes"]["vectorized"]
-        super().__init__(user, begin.t, begin.y, begin.t + 1.0, vectorized, support_complex=True)
-        if copied["replaced"]:
-            self.fun = user
-        self._jacobian, self._scipy = shared["_jacobian"], None
-        self._bind(user, [0])
-        spec = self._specified(copied["run"]["stepping"], shared["projection"])
-        if self.TABLEAU.has_history:
-            tableau: Any = self.TABLEAU
-            spec = spec._replace(method=replace(tableau, velocities=copied["velocities"]))
-        self._spec = spec._replace(is_known=True)
-        if copied["scipy"] is not None and self._SCIPY is not None:
-            fresh = partial(_copied, self._derivative)
-            self._scipy = self._SCIPY(fresh, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
-            self._scipy.fun = self._derivative
-            for name, value in copied["scipy"].items():
+    def __setstate__(self, own: dict[str, Any]) -> None:
+        run, was, scipy = own["_run"], own.pop("_was"), own.pop("_scipy")
+        problem, begin, count = run.problem, run.begin, run.problem.count
+        super().__init__(problem.fun, begin.t, begin.y, begin.t + 1.0, problem.vectorized, support_complex=True)
+        self._bound_fun = self.fun = problem.fun if own.pop("_bound_fun") else self.fun
+        self.__dict__.update(own, _scipy=None, _interpolants=None, diagnostics=Diagnostics())
+        run.restore(self.TABLEAU)
+        run.attach(self.diagnostics)
+        if scipy is None:
+            run.work.rates[0] = run.work.rates[-1]
+            self._engine = run.engine(problem.in_python(run, by_address=True), begins=False)
+        elif self._SCIPY is not None:
+            self._scipy = self._SCIPY(problem.derivative, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
+            self._scipy.fun = self._evaluate
+            for name, value in scipy.items():
                 if name.startswith("K"):  # the stages, which may be a view of another array
                     getattr(self._scipy, name)[...] = value
                 else:
                     setattr(self._scipy, name, value)
-        t_bound = copied["attributes"]["t_bound"]
-        invariants = InvariantSet(shared["projection"].invariants, *begin, tell=False, t_bound=t_bound)
-        invariants.tau = shared["tau"]
-        self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
-        if self.TABLEAU.drives:
-            self._spec.method.begin(self._spec, self._run, begin)
-            self._run.method.resume(copied["run"]["method"])
-        self._work, self.f, self.h_abs = self._run.work, begin.f, 0.0
-        self._drive(begins=False)
-        self._work.K[0], self._work.rates[0] = copied["run"]["work"].K[0], copied["run"]["work"].rates[-1]
-        if copied["clock"] is not None:
-            self._schedule.clock[:] = copied["clock"]
-        calls = self._calls
-        self.__dict__.update(copied["attributes"] | {name: shared[name] for name in SHARED})
-        calls[:], self._calls = self._calls, calls
-        self.diagnostics = Diagnostics()
-        self._run.attach(self.diagnostics)
-        now = {name: getattr(self, name) for name in Settings._fields}
-        self._was = Settings(**now | copied["set"])
-        self.fun = shared.get("fun", self.fun)
+        problem.count = count
+        self._was = Settings._make(settings_of(self))._replace(**was)
 
-    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
-        return _revived, (type(self), *self._state())
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
-        new = memo[id(self)] = type(self).__new__(type(self))
-        shared, copied = self._state()
-        new._revive(shared, copy.deepcopy(copied, memo))
-        return new
+    def __copy__(self) -> EIPSolver:
+        return copy.deepcopy(self)
 
     def _count(self) -> int:
         """Update nfev, njev and nlu, and return how many suspicious corrections and errors the engine has counted."""
-        counters = self._work.counters.tolist()
+        counters = self._run.work.counters.tolist()
         self.nfev, self.njev, self.nlu = counters[NFEV], counters[NJEV], counters[NLU]
         return int(counters[FOUND])
 
-    def _scipy_solver(self, start: np.ndarray, own_steps: bool) -> OdeSolver | None:
-        if self._SCIPY is None or self.h is not None or own_steps:
-            return None
+    def _evaluate(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Return the checked value of `fun`, and count the call: for SciPy's solver, which copies it."""
+        problem = self._run.problem
+        problem.count += 1
+        return problem.evaluate(t, y)
 
+    def _scipy_solver(self, start: np.ndarray) -> OdeSolver | None:
+        """Return a solver of SciPy that makes the steps of a run without invariants, or None if there is none."""
+        if self._SCIPY is None or self.h is not None:
+            return None
         control = {"max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
-        control["first_step"] = self._spec.stepping.first_step
-        solver = self._SCIPY(partial(_copied, self._derivative), self.t, start, self.t_bound, **control)
+        control["first_step"] = self._run.stepping.first_step
+        solver = self._SCIPY(self._run.problem.derivative, self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
-        solver.fun = self._derivative  # it replaces SciPy's two wrappers, which count and convert as it does
+        solver.fun = self._evaluate  # it replaces SciPy's two wrappers, which count and convert as it does
         return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
         # This solver's own step() does the bookkeeping, so that SciPy's step() is not needed.
         success, message = solver._step_impl()
-        self.nfev = self._calls[0]
+        self.nfev = self._run.problem.count
         if not success:
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
@@ -472,18 +416,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _step_impl(self) -> tuple[bool, str | None]:
         if not self._untouched:
-            self._hand_on()
+            self._apply_changes()
         done, message = self._own_step() if self._scipy is None else self._scipy_step(self._scipy)
         self._settle()
         return done, message
-
-    @property
-    def _moved(self) -> bool:
-        """Return True if the state or the time was changed since the last step."""
-        t, y = self._was.t, self._was.y
-        if self.t != t or (self._kept is not None and not is_state(self.y, self._kept)):
-            return True
-        return self.y is not y and not np.array_equal(self.y, y)
 
     def _own_step(self) -> tuple[bool, str | None]:
         run = self._run
@@ -491,7 +427,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         found = self._count()
         if status != OK:
             run.trust.failed = True
-            return False, failure(status, run, self._schedule.clock)
+            return False, failure(status, run, run.schedule.clock)
         if t == self.t:
             return False, self.TOO_SMALL_STEP
         self._k += 1
@@ -499,10 +435,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self.h_previous = t - self.t
         self._raw_old, self._raw = self._raw, y_new
         self.y_old = self.y
-        self.y = self._on_manifold(t, y_new) if self._shows else y_new
+        self.y = self._on_manifold(t, y_new) if run.shows else y_new
         self.t, self.f = t, f_new
         if self.h is None:
-            self.h_abs = self._schedule.clock.item(NEXT_LENGTH)
+            self.h_abs = run.schedule.clock.item(NEXT_LENGTH)
         if found != self._noted or is_check_due(self._steps) or self.t == self.t_bound:
             self._watch()
         return True, None
@@ -510,10 +446,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _watch(self, *, ended: bool = False) -> None:
         """Examine the run, and warn once if it looks faulty, at once, because the user may make no further step."""
         run, arrived = self._run, ended or self.t == self.t_bound
-        self._noted = self._work.counters[FOUND]
-        rhs = partial(_copied, self._derivative)
-        if not self._told and run.look(self._steps, arrived, self.t, self.y, rhs):
-            self._told = True
+        self._noted = run.work.counters[FOUND]
+        if not self._warned and run.look(self._steps, arrived, self.t, self.y):
+            self._warned = True
             warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=users_level())
 
     def _sampled(self) -> Interpolants:
@@ -525,7 +460,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _on_manifold(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the state of a step for the user: a projected copy if the state waits for its projection."""
-        waits = bool(t != self.t_bound if self.TABLEAU.has_history else self._work.counters[WAITED] > 0)
+        waits = bool(t != self.t_bound if self.TABLEAU.has_history else self._run.work.counters[WAITED] > 0)
         self._waits = self._waits[1], waits
         return self._sampled().shown(t, y) if waits else y
 
@@ -534,21 +469,16 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if self._kept is not None and not is_state(y, self._kept):  # y was changed in place since the last step
             y = np.frombuffer(self._kept, y.dtype) if isinstance(self._kept, bytes) else self._kept
         if self._scipy is not None:
-            out = ExactEnds(self._scipy.dense_output(), self.y_old, y)
-            self.nfev = self._calls[0]
+            out: DenseOutput = ExactEnds(self._scipy.dense_output(), self.y_old, y)
+            self.nfev = self._run.problem.count
+        elif self.TABLEAU.drives and not self._run.invariants.size:
+            out = ExactEnds(self._run.method.scipy_solver.dense_output(), self.y_old, y)
         else:
-            ends = (self._raw_old, self._raw) if self._shows else (self.y_old, y)
+            ends = (self._raw_old, self._raw) if self._run.shows else (self.y_old, y)
             out = self._sampled().over(self.t_old, ends[0], t, ends[1])
             self._count()
         self._was = self._was._replace(nfev=self.nfev)
         return out
-
-
-def _revived(solver: type[EIPSolver], shared: dict[str, Any], copied: dict[str, Any]) -> EIPSolver:
-    """Return a solver of the class `solver` from the output of `EIPSolver._state`."""
-    new = solver.__new__(solver)
-    new._revive(shared, copied)
-    return new
 
 
 def _reduced_class(made: type) -> Any:
@@ -560,19 +490,11 @@ def _reduced_class(made: type) -> Any:
 copyreg.pickle(SolverClass, _reduced_class)
 
 
-def _copied(derivative: Callable[[float, np.ndarray], np.ndarray], t: float, y: np.ndarray) -> np.ndarray:
-    """Return the derivative as a new array."""
-    return derivative(t, y).copy()
-
-
-def _jacobian(method: Any, options: dict[str, Any]) -> Any:
-    """Remove the options for the Jacobian from `options`, and return them as a method that takes them needs them."""
+def _jacobians(method: Any, options: dict[str, Any]) -> dict[str, Any]:
+    """Remove the options for the Jacobian from `options`, and return those that the method takes, by name."""
     if method.drives:
-        return Jacobian(options.pop("jac", None), options.pop("jac_sparsity", None))
-    jacobian = options.pop("jacobian", None) if method.has_history else None
-    if jacobian is not None and not callable(jacobian):
-        raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out), got {shown(jacobian)}.")
-    return jacobian
+        return {"jac": Jacobian(options.pop("jac", None), options.pop("jac_sparsity", None))}
+    return {"jacobian": options.pop("jacobian", None)} if method.has_history else {}
 
 
 def _without_effect(names: Iterable[str]) -> str:
@@ -581,39 +503,6 @@ def _without_effect(names: Iterable[str]) -> str:
     hints = ((name, nearest(name, OPTIONS).removeprefix("; ")) for name in names if name not in OF_OTHERS)
     meant = "".join(f" `{name}`: {hint}" for name, hint in hints if hint)
     return f"The following arguments have no effect for a chosen solver: {listed}.{meant}"
-
-
-def _checked(
-    fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
-) -> tuple[Callable[[float, np.ndarray], np.ndarray], Call]:
-    """Return the user's right-hand side with checks of its values: as ``derivative(t, y) -> (n,)``, and as a `Call`.
-
-    ``derivative`` counts its calls in ``calls[0]``, while the engine counts its own calls. Its value may be a buffer of
-    the user. `fun` gets a copy of the state, because it may keep or overwrite its argument.
-    """
-    shape = (n,)
-
-    def flat(t: float, y: np.ndarray) -> np.ndarray:
-        f = fun(t, y[:, None])
-        found = numbers("fun returned", f)
-        return f if found is None else np.resize(found, n) if found.size == 1 else found.reshape(-1)
-
-    called = flat if vectorized else fun
-
-    def convert(f: Any, t: float) -> np.ndarray:
-        return np.array(as_derivative(f, n, dtype, t), dtype, order="C")
-
-    def checked(t: float, y: np.ndarray) -> np.ndarray:
-        f = called(t, y.copy())
-        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
-            return f
-        return convert(f, t)
-
-    def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        calls[0] += 1
-        return checked(t, y)
-
-    return derivative, Call(called, (), shape, convert)
 
 
 class EIPRK1(EIPSolver):

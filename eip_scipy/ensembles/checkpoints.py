@@ -15,6 +15,7 @@ from ..checkpoint import CheckpointError
 from ..checkpoint.encoding import decoded, encoded
 from ..checkpoint.locks import held
 from ..core.callers import users_level
+from ..run.prepare import identity
 from .members import Chunk, Plan
 
 __all__ = ["opened"]
@@ -48,7 +49,7 @@ class EnsembleFile:
         self._name, self._every, self._plan, self._everyone = name, every, plan, everyone
         reduce = plan.task.reduce
         reduce_name = None if reduce is None else getattr(reduce, "__qualname__", type(reduce).__qualname__)
-        settings = plan.ready.identity(everyone.y0s, everyone.params) | {"reduce": reduce_name}
+        settings = identity(plan.ready, everyone.y0s, everyone.params) | {"reduce": reduce_name}
         self.header: dict[str, Any] = {"kind": KIND, "settings": settings, "finished": 0}
         self._known_by = np.zeros(0)  # derivative and invariants at the end of a member, which identify the functions
         self._written, self._cost = time.perf_counter(), 0.0
@@ -84,9 +85,9 @@ class EnsembleFile:
     def _end(self, members: dict[str, Any]) -> tuple[int, Any, float, np.ndarray, np.ndarray]:
         """Return number, invariants, end (t, y) and derivative there of the first member that did not fail."""
         k = int(np.flatnonzero(members["status"] >= 0)[0])
-        ready = self._plan.task.prepared(self._everyone.y0s[k], self._everyone.params[k])
+        run = self._plan.task.prepared(self._everyone.y0s[k], self._everyone.params[k])
         t, y = float(members["t"][k]), members["y"][k].copy()
-        return k, ready.run.invariants, t, y, ready.system.derivative(t, y.copy())
+        return k, run.invariants, t, y, run.problem.derivative(t, y.copy())
 
     def write(self, finished: int, members: dict[str, Any], *, now: bool = False) -> None:
         """Write the `finished` first of all `members` that are new, if it is time to do so, or `now`.

@@ -203,12 +203,13 @@ def ensemble(
         fun=_bare(fun), acceleration=acceleration, t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], h=h,
         method=default_method(fun) or EIPRK4 if method is None else method, save_every=save_every, t_eval=t_eval,
         **options,
-    ).with_own_events().with_pointers()  # fmt: skip
+    ).with_pointers()  # fmt: skip
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
     plan = _first_that_starts(Task(request, members, reduce), everyone)
     everyone = everyone._replace(y0s=np.ascontiguousarray(everyone.y0s, plan.dtype))
-    size = _chunk_size(plan, members, request.function) if chunk is None else count("chunk", chunk)
+    given = fun if acceleration is None else acceleration
+    size = _chunk_size(plan, members, given) if chunk is None else count("chunk", chunk)
     _check_memory(plan, members, max_bytes)
     with opened(checkpoint, checkpoint_every, resume, plan, everyone) as (finished, write):
         result = _Collector(plan, everyone, size, write, callback).run(finished, executor, progress)
@@ -281,7 +282,7 @@ class _Collector:
 
         (_, y0s, params), size = self.everyone, self.size
         chunks = (Chunk(k, y0s[k : k + size], params[k : k + size]) for k in range(done, len(y0s), size))
-        shown: dict[str, Any] = {"desc": self.plan.ready.label, "unit": "member", "unit_scale": True}
+        shown: dict[str, Any] = {"desc": self.plan.ready.name, "unit": "member", "unit_scale": True}
         with (
             tqdm(total=len(y0s), initial=done, disable=not progress, **shown) as bar,
             closing(results(executor, self.plan, chunks, progress=progress)) as parts,
@@ -319,10 +320,10 @@ class _Collector:
             first=first,
             stopped=self.stopped,
             wall_time=time.perf_counter() - self.begin,
-            method=ready.label,
-            h=ready.run.stepping.h,
+            method=ready.name,
+            h=ready.stepping.h,
             chunk=self.size,
-            component_names=ready.component_names,
+            component_names=ready.problem.component_names,
         )
         at_end = result.pop("end_invariants")
         if not plan.held:
@@ -331,8 +332,8 @@ class _Collector:
             result.update(t_events=None, y_events=None)
         if plan.task.reduce is not None and result.reduced is None:  # all members failed
             result["reduced"] = np.full(len(result.t), np.nan)
-        if ready.variations is not None:
-            tangents, result["columns"] = ready.tangents, ready.described_columns
+        if ready.problem.variations is not None:
+            tangents, result["columns"] = ready.tangents, ready.problem.described_columns
             result["y"], result["variations"] = tangents.split(result.y)
             if result.trajectories is not None:
                 rows, result["variations"] = tangents.split(result.trajectories.swapaxes(1, 2))
@@ -407,8 +408,8 @@ def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
         except Exception as error:
             errors.append(error)
             continue
-        if found := ready.run.trust.message:
-            ready.run.trust.doubts.clear()
+        if found := ready.trust.message:
+            ready.trust.doubts.clear()
             tried = tried._replace(doubt=(params[k].copy(), found))
         return _with_common_constraints(Plan(tried, ready), everyone)
     # A transposed y0s fails in the user's function, whose error may not explain that; jitted code explains nothing.
@@ -421,18 +422,18 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
 
     If one of them does not hold for the parameters of some member, no member keeps any.
     """
-    task, ready, conserved = plan.task, plan.ready, plan.ready.run.conserved
+    task, ready, conserved = plan.task, plan.ready, plan.ready.conserved
     if conserved.found is None:
         return plan
-    C, parameters = conserved.linear.C, ready.system.parameters
+    C, parameters = conserved.linear.C, ready.problem.parameters
     first = np.unique(everyone.params, axis=0, return_index=True)[1]
-    holds = len(C) > 0 and (len(first) == 1 or ready.variations is None)
+    holds = len(C) > 0 and (len(first) == 1 or ready.problem.variations is None)
     if holds and len(first) > 1:
         y = everyone.y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size)))
         f, own = np.full(y.shape, np.nan), parameters.copy()
         for k, member in enumerate(first):
             parameters[:] = everyone.params[member]
-            f[k] = unless_error(ready.system.derivative, plan.t0, y[k])
+            f[k] = unless_error(ready.problem.derivative, plan.t0, y[k])
         parameters[:] = own
         holds = bool(confirmed(y, f, conserved.linear).all())
     projection = {**task.request.projection, "linear_invariants": (C, C.T) if holds else None}

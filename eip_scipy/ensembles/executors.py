@@ -99,7 +99,7 @@ def _opened(
     if isinstance(executor, Executor):
         return executor, run, partial(_workers, executor), lambda: None
     if executor == "dask" or type(executor).__module__.partition(".")[0] == "distributed":
-        if pointers := plan.ready.pointers:
+        if pointers := plan.ready.problem.pointers(plan.ready):
             raise pointers[0].unpicklable()  # Dask's own message for it is very long
         # Imported by name, because the integrations depend on this package and need further libraries.
         pool, workers, end = import_module("eip_scipy.integrations.dask").connected(executor)

@@ -20,13 +20,14 @@ from ..core.inputs import shown
 from ..core.jitted import NotCompilableError
 from ..core.native_functions import Native
 from ..core.pointers import PointerFunction
-from ..core.stepping import UNBOUNDED, saved_steps
+from ..core.runs import Run
+from ..core.step_control import UNBOUNDED, saved_steps
 from ..engine import data
 from ..engine.native import BUILD, LibraryFunction, OctetFunctions
 from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, expected_steps
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop, assembled
-from ..run.prepare import Prepared, Request, prepared
+from ..run.prepare import Request, prepared
 from ..run.results import IntegrationResult
 from .result import COUNTERS, FAILED, FIELDS, NOT_RUN
 
@@ -59,7 +60,7 @@ class Task(NamedTuple):
     reduce: Callable[[Any], Any] | None  # function of the result of a member, whose value replaces saved states
     doubt: tuple[np.ndarray, str] | None = None  # parameters for which the checks at the start found the given fault
 
-    def prepared(self, y0: np.ndarray, params: np.ndarray, *, check_start: bool = False) -> Prepared:
+    def prepared(self, y0: np.ndarray, params: np.ndarray, *, check_start: bool = False) -> Run:
         """Return the run of one member, prepared as `integrate` does; without parameters if the request has none."""
         own = None if self.request.params is None else params
         return prepared(self.request._replace(y0=y0, params=own), check_start=check_start)
@@ -74,15 +75,15 @@ class Plan:
     the times of the saved states that the result has, and `times` those that a member has.
     """
 
-    def __init__(self, task: Task, ready: Prepared | None = None) -> None:
+    def __init__(self, task: Task, ready: Run | None = None) -> None:
         self.task = task
         self.ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
         self.why_not: str | None = None
         self.not_batched_because = ""
-        run, schedule = self.ready.run, self.ready.schedule
+        run, schedule = self.ready, self.ready.schedule
         self.names = tuple(run.invariants.names)
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
-        self.events = len(self.ready.system.events.functions)
+        self.events = len(self.ready.problem.events.functions)
         self.saved = saved_times(schedule)
         self.times = np.array([self.t0]) if task.reduce is not None and not self.saved.size else self.saved
         self.held = self.times.size if task.reduce is None else 0  # number of saved states that the result keeps
@@ -90,11 +91,11 @@ class Plan:
 
     def compile(self, *, progress: bool = False) -> Plan:
         """Compile the functions, before threads start and would each compile them, and return the plan itself."""
-        run, invariants = self.ready.run, self.ready.run.invariants
-        loop = Loop(replace(self.ready, request=self.ready.request._replace(progress=progress)))
+        run, invariants = self.ready, self.ready.invariants
+        loop = Loop(run, self.task.request._replace(progress=progress))
         own_starts = run.identity()["project_initial"] or any(item.target is not None for item in invariants.items)
         reasons: dict[str, Any] = {
-            "the runs have derivatives": self.ready.variations is not None,
+            "the runs have derivatives": run.problem.variations is not None,
             "the runs have balances": invariants.balances.items,
             # The shifts of the differences depend on the start.
             "the gradient of an invariant is computed by differences": invariants.by_differences,
@@ -151,13 +152,14 @@ class Plan:
         try:
             return self._idle.pop()
         except IndexError:
-            return BatchRunner(self, Loop(self.task.prepared(self.task.request.y0, self.task.request.params)))
+            request = self.task.request
+            return BatchRunner(self, Loop(self.task.prepared(request.y0, request.params), request))
 
     def _alone(self, y0: np.ndarray, params: np.ndarray, watch: _Watch, unset: np.ndarray) -> dict[str, Any]:
         """Run a member as `integrate` does, and return its fields; `unset` is the state of one that did not run."""
         loop = None
         try:
-            loop = Loop(self.task.prepared(y0, params))
+            loop = Loop(self.task.prepared(y0, params), self.task.request)
             status, message = loop.steps(watch)
         except Exception as error:
             status, message = FAILED, f"{type(error).__name__}: {error}"
@@ -265,7 +267,7 @@ class BatchRunner:
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
         """Set the parameters of the driver to those of a member, and return the right-hand side."""
         self._driver.params[:] = params
-        return self._loop.prepared.system.derivative
+        return self._loop.problem.derivative
 
     def _advance(self, each: data.Members, out: dict[str, Any]) -> bool:
         """Make some steps; return False if the current member must run alone, and go to the next one then."""
@@ -425,7 +427,7 @@ def _result(plan: Plan, members: dict[str, Any], k: int) -> IntegrationResult:
         success=True,
         trusted=bool(members["trusted"][k]),
         compiled=plan.why_not is None,
-        h=plan.ready.run.stepping.h,
+        h=plan.ready.stepping.h,
         **{name: members[name][k] for name in ("message", "target", "max_residual")},
     )
 

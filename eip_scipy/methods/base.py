@@ -10,7 +10,6 @@ from ..engine.data import CUBIC, NO_METHOD, Work
 from ..engine.native import Hooks
 
 if TYPE_CHECKING:
-    from ..core.run_spec import RunSpec
     from ..core.runs import Run, Start
 
 __all__ = ["PROJECTION_ONLY", "DenseForm", "Method"]
@@ -82,8 +81,8 @@ class Method:
         names = ("order", "error_estimator_order", "n_stages")
         return {name: value for name in names if (value := getattr(self, name, None)) is not None}
 
-    def checked(self, spec: RunSpec, start: Start) -> Method:
-        """Return the method for the equations of `spec`, or raise ValueError if it cannot integrate them."""
+    def checked(self, run: Run, start: Start) -> Method:
+        """Return the method for the equations of `run`, or raise ValueError if it cannot integrate them."""
         return self
 
     def for_engine(self, sees_velocity: bool = False) -> Any:
@@ -93,7 +92,7 @@ class Method:
         """
         raise NotImplementedError
 
-    def begin(self, spec: RunSpec, run: Run, start: Start) -> None:
+    def begin(self, run: Run, start: Start) -> None:
         """Prepare the steps of a run from `start`."""
 
     def hooks(self, stepper: Any, work: Work) -> Hooks:
@@ -112,8 +111,8 @@ class Method:
             "the balances."
         )
 
-    def contradiction(self, spec: RunSpec, start: Start) -> str | None:
-        """Return a sentence if the steps do not solve the equation of `spec`, as only user-defined ones may."""
+    def contradiction(self, run: Run, start: Start) -> str | None:
+        """Return a sentence if the steps do not solve the equation of `run`, as only user-defined ones may."""
         return None
 
 

@@ -22,7 +22,6 @@ from .nystrom import RKN1210, NystromTableau, depends_on_velocity
 from .runge_kutta import DOP853, Tableau
 
 if TYPE_CHECKING:
-    from ..core.run_spec import RunSpec
     from ..core.runs import Run, Start
 
 __all__ = [
@@ -133,40 +132,40 @@ class GaussJackson(Method):
         """Method that makes the first states."""
         return DOP853 if self.velocities else RKN1210
 
-    def checked(self, spec: RunSpec, start: Start) -> GaussJackson:
+    def checked(self, run: Run, start: Start) -> GaussJackson:
         """Return the method with the attribute `velocities` of a run, see `Method.checked`.
 
         Accelerations that do not depend on velocities at the start may do so later, as with drag that acts in a part of
         an orbit. Therefore `velocities` is True if they come from a function that is called with velocities.
         """
-        depends_on_velocity(spec.rhs, start, spec.name, spec.hint)  # raises an error if the state is not (q, v)
-        return replace(self, velocities=spec.sees_velocity)
+        depends_on_velocity(run, start)  # raises an error if the state is not (q, v)
+        return replace(self, velocities=run.problem.sees_velocity)
 
     def for_engine(self, sees_velocity: bool = False) -> data.Method:
         """Return the coefficients of the method that makes the first states; `begin` adds the history."""
         return self._starter.for_engine(sees_velocity)
 
-    def begin(self, spec: RunSpec, run: Run, start: Start) -> None:
+    def begin(self, run: Run, start: Start) -> None:
         """Check the step at the start, and add the history of the method to the run.
 
         Raise ValueError if the step is not stable (not checked with ``check=False``), or if a run with balances has too
         few steps for a history.
         """
-        n_steps, balanced = spec.stepping.span.n_steps, run.work.level.size > 0
+        n_steps, balanced = run.stepping.span.n_steps, run.work.level.size > 0
         brief = n_steps - 1 < self.order
         if brief and balanced and n_steps > 0:
             raise ValueError(
-                f"{spec.name} carries a Balance in its history, which needs more than {self.order} steps, but this run "
+                f"{run.name} carries a Balance in its history, which needs more than {self.order} steps, but this run "
                 f"has {n_steps}. Take a shorter step, or a Runge-Kutta method such as EIPDOP853."
             )
-        corrected = slice(0, 0) if brief else _System(self, spec, start).corrected(check=run.options.limit < math.inf)
+        corrected = slice(0, 0) if brief else _System(self, run, start).corrected(check=run.options.limit < math.inf)
         # The engine takes balances with the room of a history, also in a run without steps.
-        history = self._history(run, spec, corrected, brief=brief and not balanced)
+        history = self._history(run, corrected, brief=brief and not balanced)
         run.method = run.method._replace(multistep=history)
 
-    def _history(self, run: Run, spec: RunSpec, corrected: slice, *, brief: bool) -> Multistep:
+    def _history(self, run: Run, corrected: slice, *, brief: bool) -> Multistep:
         """Return the record and the buffers of the history; `corrected` are the floats that the Jacobian corrects."""
-        order, half, span = self.order, run.work.err.size // 2, spec.stepping.span
+        order, half, span = self.order, run.work.err.size // 2, run.stepping.span
         pitch = -(-half // 4) * 4  # whole vectors
         limit, grouped = stability_limit(order, self.corrected), run.options.balance_groups.value.size > 0
         auto = AUTO_SPACING_OF_GROUPS if grouped else AUTO_SPACING
@@ -175,7 +174,7 @@ class GaussJackson(Method):
             growth=max(SMOOTH, min(SMOOTH_LOW * limit**order, 2.0 ** (order - 2))),
             middle=order // 2,
             brief=brief,
-            level=spec.level,
+            level=run.level,
             uses_v=self.velocities,
             t0=span.t0,
             h=span.h,
@@ -422,9 +421,10 @@ def jacobian_product(jacobian: Callable[..., None], *extra: Array) -> Callable[[
 class _System:
     """A system q'' = a(t, q[, v]) at the start of a run, whose fast motions limit the step of a method."""
 
-    def __init__(self, method: GaussJackson, spec: RunSpec, start: Start) -> None:
-        self.method, self.spec, self.start, self.half = method, spec, start, start.y.size // 2
-        self.jacobian = spec.jacobian()  # (t, q, dq) -> (n/2,), the derivative of the accelerations along dq, or None
+    def __init__(self, method: GaussJackson, run: Run, start: Start) -> None:
+        self.method, self.run, self.start, self.half = method, run, start, start.y.size // 2
+        # (t, q, dq) -> (n/2,), the derivative of the accelerations along dq, or None
+        self.jacobian = run.problem.jacobian_for(method)
         self.corrects = method.corrected and self.jacobian is not None
 
     def corrected(self, *, check: bool) -> slice:
@@ -439,12 +439,12 @@ class _System:
 
     def _fastest(self) -> tuple[float, float, Array]:
         """Return the highest frequency, the largest stable product with h, and the components to correct."""
-        spec, span = self.spec, self.spec.stepping.span
+        problem, span = self.run.problem.problem, self.run.stepping.span
         plain, limit = (stability_limit(self.method.order, corrects) for corrects in (False, self.corrects))
         corrected = np.full(self.half, self.corrects)
-        if spec.frequencies is None:
+        if problem is None or problem.frequencies is None:
             return self._largest_frequency(), limit, np.flatnonzero(corrected)
-        bodies, moons = spec.frequencies(self.start.y, span.t_bound - span.t0)
+        bodies, moons = problem.frequencies(self.start.y, span.t_bound - span.t0)
         if self.corrects:
             fast = abs(span.h) * bodies > CORRECTED_SHARE * plain
             corrected = np.repeat(fast | (fast.any() & (bodies == 0.0)), self.half // bodies.size)
@@ -458,7 +458,7 @@ class _System:
 
         `strongest` is the largest modulus of an eigenvalue of the accelerations' derivative by the velocities.
         """
-        h, name = abs(self.spec.stepping.span.h), self.spec.name
+        h, name = abs(self.run.stepping.span.h), self.run.name
         if not h * fastest <= limit:
             raise ValueError(
                 f"{name}: h = {h:g} is not stable for the fastest motion at the start, of angular frequency "
@@ -495,7 +495,7 @@ class _System:
         t, y, f, _ = self.start
         length, moved = DIFFERENCE * (float(np.linalg.norm(y[part])) or 1.0), y.copy()
         moved[part] += length * d
-        return np.asarray((self.spec.rhs(t, moved)[self.half :] - f[self.half :]) / length)
+        return np.asarray((self.run.problem.derivative(t, moved)[self.half :] - f[self.half :]) / length)
 
 
 def _largest_eigenvalue(product: Callable[[Array], Array], y: Array) -> float:

@@ -21,7 +21,6 @@ from ..engine.native import BUILD, Hooks
 from .base import DenseForm, Method
 
 if TYPE_CHECKING:
-    from ..core.run_spec import RunSpec
     from ..core.runs import Run, Start
 
 __all__ = ["BDF", "RADAU", "Jacobian", "ScipySolverAdapter"]
@@ -93,11 +92,11 @@ class ScipySolverAdapter(Method):
         # The first and the last row of work.K are the derivatives at both ends of a step.
         return DenseForm(POLYNOMIAL, 1 + len(self.polynomials), np.pad(self.polynomials, ((0, 0), (1, 1))))
 
-    def begin(self, spec: RunSpec, run: Run, start: Start) -> None:
-        run.method._begin(spec, start)
+    def begin(self, run: Run, start: Start) -> None:
+        run.method._begin(run, start)
 
-    def _begin(self, spec: RunSpec, start: Start) -> None:
-        (t, y, f, length), rtol, span = start, spec.stepping.rtol, spec.stepping.span
+    def _begin(self, run: Run, start: Start) -> None:
+        (t, y, f, length), rtol, span = start, run.stepping.rtol, run.stepping.span
         if y.dtype.kind == "c" and not self.takes_complex:
             raise ValueError(
                 f"y0 is complex, but SciPy's {self.name} takes real states only. Use EIPBDF, or write the state in "
@@ -109,19 +108,19 @@ class ScipySolverAdapter(Method):
 
         def fun(t: float, y: Array) -> Array:
             calls[0] += not known
-            found = known.pop() if known else spec.rhs(t, y)
+            found = known.pop() if known else run.problem.derivative(t, y)
             if not BUILD.are_finite(found.view(float)):
                 self.not_finite_at = t
             return found
 
         make: Any = self.solver
-        jacobian = spec.jacobian() or Jacobian()
+        jacobian = run.problem.jacobian_for(self)
         self.scipy_solver = solver = make(
             fun, t, y, span.t_bound, max_step=span.max_step, rtol=float(rtol[0]) if rtol.size else 1e-3,
-            atol=spec.stepping.atol, first_step=min(length, abs(span.t_bound - t)) or None, **jacobian._asdict(),
+            atol=run.stepping.atol, first_step=min(length, abs(span.t_bound - t)) or None, **jacobian._asdict(),
         )  # fmt: skip
         self.start_calls = calls[0]
-        spec.uncount(self.start_calls)
+        run.problem.uncount(self.start_calls)
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
         lacking = [name for name in PRIVATE[self.solver] if not hasattr(solver, name)]

@@ -33,8 +33,7 @@ from .runge_kutta import (
 )
 
 if TYPE_CHECKING:
-    from ..core.run_spec import RunSpec
-    from ..core.runs import Start
+    from ..core.runs import Run, Start
 
 __all__ = ["RKN86", "RKN1210", "NystromTableau", "check_halves", "depends_on_velocity"]
 
@@ -235,10 +234,10 @@ class NystromTableau(Coefficients):
                         f"violated by {float(residual):.3g}."
                     )
 
-    def checked(self, spec: RunSpec, start: Start) -> NystromTableau:
-        if depends_on_velocity(spec.rhs, start, spec.name, spec.hint):
+    def checked(self, run: Run, start: Start) -> NystromTableau:
+        if depends_on_velocity(run, start):
             raise ValueError(
-                f"{spec.name} integrates q'' = a(t, q), but the accelerations in fun depend on the velocity; use a "
+                f"{run.name} integrates q'' = a(t, q), but the accelerations in fun depend on the velocity; use a "
                 "Runge-Kutta method such as EIPDOP853."
             )
         return self
@@ -287,25 +286,23 @@ def check_halves(n: int) -> None:
         )
 
 
-def depends_on_velocity(
-    rhs: Callable[[float, Array], Array], start: Start, name: str = "", hint: Callable[[], str] = str
-) -> bool:
+def depends_on_velocity(run: Run, start: Start) -> bool:
     """Return True if accelerations depend on v at the start; raise ValueError if the state is not (q, v).
 
-    ``rhs(t, y)`` is evaluated once more, with other velocities. `name` is that of the solver class, and ``hint()``
-    returns further advice for the message.
+    The right-hand side is evaluated once more, with other velocities.
     """
     t0, y0, f0, _ = start
     check_halves(y0.size)
     half = y0.size // 2
     other = y0.copy()
     other[half:] = 1.5 * y0[half:] + 1.0
-    f = rhs(t0, other)
+    f = run.problem.derivative(t0, other)
     if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
         raise ValueError(
-            f"{name} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be "
+            f"{run.name} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be "
             "v, the second half of the state, but are not. Use a Runge-Kutta method such as EIPDOP853, or, if the "
-            f"system is of second order, write it with the velocities as the second half of the state{hint()}."
+            "system is of second order, write it with the velocities as the second half of the state"
+            f"{run.problem.hint()}."
         )
     return not np.array_equal(f[half:], f0[half:], equal_nan=True)
 

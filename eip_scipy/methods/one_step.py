@@ -17,8 +17,7 @@ from .base import Method
 from .runge_kutta import check_integer
 
 if TYPE_CHECKING:
-    from ..core.run_spec import RunSpec
-    from ..core.runs import Start
+    from ..core.runs import Run, Start
 
 __all__ = ["OneStep", "OneStepMethod"]
 
@@ -134,8 +133,8 @@ class OneStep(Method):
             )
         return result
 
-    def contradiction(self, spec: RunSpec, start: Start) -> str | None:
-        """Return a sentence if short steps from the `start` do not solve the equation of `spec`, or None.
+    def contradiction(self, run: Run, start: Start) -> str | None:
+        """Return a sentence if short steps from the `start` do not solve the equation of `run`, or None.
 
         The rate of change in a step of a method tends to the derivative as the step becomes shorter. The two are
         compared for each half of a state (q, p), and for any other state as a whole. None is returned if the method or
@@ -143,13 +142,13 @@ class OneStep(Method):
         tolerance is larger than the step.
         """
         with np.errstate(all="ignore"):
-            found = unless_error(self._difference, spec.rhs, start, spec.stepping.span.sign)
+            found = unless_error(self._difference, run.problem.derivative, start, run.stepping.span.sign)
         if found is None:
             return None
         k, own, given, h = found
         return (
-            f"the steps of {self.name} do not solve the equation of {spec.called}: at the start, in a step of "
-            f"h={h:.2g}, component {k} changes at the rate {own:.6g}, and {spec.called} gives {given:.6g}"
+            f"the steps of {self.name} do not solve the equation of {run.problem.name}: at the start, in a step of "
+            f"h={h:.2g}, component {k} changes at the rate {own:.6g}, and {run.problem.name} gives {given:.6g}"
         )
 
     def _difference(

@@ -11,11 +11,10 @@ import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..core.dense import Interpolants, ManifoldDenseOutput, solution
-from ..core.events import Events
 from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
 from ..core.runs import Run
-from ..core.stepping import UNBOUNDED
+from ..core.step_control import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from .memory import most_bytes
@@ -29,23 +28,22 @@ FIRST_ROWS, FIRST_BYTES = 1024, 2**24
 class Driver:
     """One run: its functions, buffers and saved rows, and with `keeps_steps` the interpolants of its steps.
 
-    A row is a saved time with its state. `events` collects the times and states of the events that the engine's loop
-    finds. `max_bytes` bounds the memory of the rows and that of the interpolants, see `most_bytes`.
+    A row is a saved time with its state. `max_bytes` bounds the memory of the rows and that of the interpolants, see
+    `most_bytes`.
     """
 
     def __init__(
         self,
         run: Run,
-        schedule: Schedule,
         functions: PythonFunctions | NativeFunctions,
-        params: np.ndarray,
         *,
-        events: Events,
         keeps_steps: bool,
         max_bytes: float | None,
     ) -> None:
-        self.run, self.schedule, self.params, self._events = run, schedule, params, events
+        self.run, self.schedule, self._events = run, run.schedule, run.problem.events
+        self.params = run.problem.parameters
         self.functions: Any = functions
+        schedule = self.schedule
         self._max_bytes = max_bytes
         n, dtype = run.y0.size, run.y0.dtype
         rows = saved_rows(schedule) or _first(run.y0.nbytes)
@@ -54,7 +52,7 @@ class Driver:
         self.y = np.empty((rows + 1, n), dtype)
         self.state = run.y0.copy()
         self.new = np.empty_like(self.state)
-        self.engine = run.engine(functions, schedule)
+        self.engine = run.engine(functions)
         self._interpolants = None
         self._pieces = np.empty((0, 0))
         if schedule.t_eval.size or schedule.g.size or keeps_steps or run.shows:

@@ -22,15 +22,16 @@ from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projecti
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.results import Diagnostics
+from ..core.runs import Run
 from ..core.solvers import EIPSolver
-from ..core.stepping import UNBOUNDED
+from ..core.step_control import UNBOUNDED
 from ..core.tangent_vectors import StateSolution
 from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, OK, PAUSE, ROW, STEP, TIME, Schedule
 from ..engine.native import PythonFunctions
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver
-from .prepare import DEFAULT, Prepared, Request, prepared, started_at
+from .prepare import DEFAULT, Request, identity, prepared, started_at
 from .results import IntegrationResult, Origin, described
 
 __all__ = ["integrate"]
@@ -226,7 +227,7 @@ def integrate(
     begin = time.perf_counter()
     with keeping as keeper:
         try:
-            return Loop(prepared(request), keeper).run()
+            return Loop(prepared(request), request, keeper).run()
         except BaseException as error:
             _keep_start(error, request, time.perf_counter() - begin)
             raise
@@ -238,35 +239,25 @@ class Loop:
     An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
-    def __init__(self, prepared: Prepared, keeper: _resume.Keeper | None = None) -> None:
-        request, system, run = prepared.request, prepared.system, prepared.run
-        self.prepared, self.keeper = prepared, keeper
-        self.method = prepared.label
-        self.events, self.diagnostics = system.events, prepared.diagnostics
-        self.callback, self.progress = request.callback, request.progress
+    def __init__(self, run: Run, given: Request, keeper: _resume.Keeper | None = None) -> None:
+        self.given, self.keeper, self.problem = given, keeper, run.problem
+        self.method, self.events, self.diagnostics = run.name, run.problem.events, run.diagnostics
+        self.callback, self.progress = given.callback, given.progress
         if keeper is not None:
             if run.tableau.drives:
                 raise ValueError(
                     f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
                     "needs. Omit checkpoint, or save the last state of a run and start another run from it."
                 )
-            identity = prepared.identity(run.begin.y, system.parameters)
-            keeper.identify(identity, run, system.derivative, system.events)
-        wanted = request.compiled
-        with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
-            functions, self.why_not = system.functions(run, wanted)
-            self.driver = Driver(
-                run,
-                prepared.schedule,
-                functions,
-                system.parameters,
-                events=system.events,
-                keeps_steps=request.dense_output,
-                max_bytes=request.max_bytes,
-            )
+            settings = identity(run, run.begin.y, run.problem.parameters)
+            keeper.identify(settings, run, run.problem.derivative, self.events)
+        wanted, fun = given.compiled, run.problem.fun
+        with _compiling(self.progress and wanted is not False and is_jitted(fun)):
+            functions, self.why_not = run.problem.functions(run, wanted)
+            self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
         if keeper is not None:
             keeper.begin(self.driver)
-        self._slowed = wanted is None and _slowed_by_invariants(system.fun, functions, run)
+        self._slowed = wanted is None and _slowed_by_invariants(fun, functions, run)
         self.wall_time = 0.0 if keeper is None else keeper.seconds
         self.chunk = FIRST_CHUNK
         self._seconds = 0.0
@@ -313,7 +304,7 @@ class Loop:
     def _look(self, *, ended: bool = False) -> None:
         driver = self.driver
         t, y = driver.now
-        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy(), self.prepared.system.derivative)
+        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy())
 
     def _steps(self, bar: Any) -> tuple[int, str]:
         driver, schedule = self.driver, self.driver.schedule
@@ -415,18 +406,18 @@ class Loop:
         for row in range(first_row, driver.rows):
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
-            if self.callback(t, self.prepared.tangents.state(y), invariants.values(t, y) - invariants.fixed_target):
+            if self.callback(t, driver.run.tangents.state(y), invariants.values(t, y) - invariants.fixed_target):
                 driver.schedule.place[ROW] = row + 1
                 return True
         return False
 
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
-        driver, events, tangents = self.driver, self.events, self.prepared.tangents
+        driver, events, tangents = self.driver, self.events, self.driver.run.tangents
         rows = driver.rows
         values, target = self._values(broken), driver.run.invariants.fixed_target
         driver.note(values, target)
         result = assembled(
-            self.prepared,
+            driver.run,
             driver.y[:rows],
             (events.t, events.y) if events.functions else None,
             driver.run.work.counters,
@@ -442,13 +433,13 @@ class Loop:
             trusted=driver.run.trust.trusted,
             wall_time=self.wall_time,
             compiled=self.why_not is None,
-            calls=self.prepared.system.calls(driver.run, driver.functions),
+            calls=self.problem.calls(driver.run, driver.functions),
             h=abs(driver.schedule.span.h) or None,
         )
         t, y = events.last if self._event_ended else driver.now
         last, values_at = (np.array([t]), y[None].copy()), driver.values_at
-        asked, variations = self.prepared.asked, self.prepared.variations
-        if variations is not None:
+        asked = self.given
+        if self.problem.variations is not None:
             asked = asked._replace(variations=tangents.restarted(y))
         y, sign = tangents.state(y.copy()), driver.schedule.span.sign
         asked = asked._replace(params=copy(asked.params))  # the user may change the array
@@ -459,14 +450,14 @@ class Loop:
     def _kept(self) -> tuple[Invariant, ...]:
         """Return the invariants with the values that the run keeps as their targets."""
         kept = self.driver.run.invariants.with_targets(at_end=not self._event_ended)
-        return kept if self.prepared.variations is None else self.prepared.variations.with_targets(kept)
+        return kept if self.problem.variations is None else self.problem.variations.with_targets(kept)
 
     def _solution(self) -> Any:
         """Return the run as a function of time, or None if its steps are not stored."""
         found = self.driver.solution(self.events.last[0] if self._event_ended else self.driver.now[0])
-        if found is None or self.prepared.variations is None:
+        if found is None or self.problem.variations is None:
             return found
-        return StateSolution(found, self.prepared.tangents)
+        return StateSolution(found, self.driver.run.tangents)
 
     def explained(self, message: str) -> str:
         """Return the message with remarks: on a start that was moved, on doubts about the run, and notes."""
@@ -495,13 +486,13 @@ class Loop:
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
 
 
-def assembled(prepared: Prepared, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
-    """Return a result with the given `fields` and those that follow from the run `prepared`.
+def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
+    """Return a result with the given `fields` and those that follow from the `run`.
 
     `y` (m, n) are the saved states, with the tangent vectors that follow them, and `events` the times and states of
     each event; None without events. `counters` are those of the engine.
     """
-    problem, tangents = prepared.problem, prepared.tangents
+    problem, tangents = run.problem.problem, run.tangents
     result = IntegrationResult(
         fields,
         y=tangents.state(y).T,
@@ -510,14 +501,14 @@ def assembled(prepared: Prepared, y: np.ndarray, events: Any, counters: np.ndarr
         nfev=int(counters[NFEV]),
         njev=int(counters[NJEV]),
         nlu=int(counters[NLU]),
-        method=prepared.label,
-        component_names=prepared.component_names,
+        method=run.name,
+        component_names=run.problem.component_names,
         units="" if problem is None else problem.units,
         epoch=None if problem is None else problem.epoch,
     )
-    if prepared.variations is not None:
+    if run.problem.variations is not None:
         result["variations"] = tangents.split(y)[1]
-        result["columns"] = prepared.described_columns
+        result["columns"] = run.problem.described_columns
     return result
 
 

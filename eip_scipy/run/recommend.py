@@ -24,11 +24,10 @@ from ..core.problem import Problem, bind
 from ..core.results import ProjectionWarning
 from ..core.solvers import EIPBDF, EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, EIPRadau
 from ..core.states import initial_state
-from ..core.stepping import UNBOUNDED, interval
+from ..core.step_control import UNBOUNDED, interval
 from ..engine.data import EPS, NFEV
 from ..methods.nystrom import depends_on_velocity
 from .integrate import Loop, integrate
-from .interpreted_functions import interpreted
 from .prepare import Request, evaluation_times, prepared
 from .results import IntegrationResult
 
@@ -292,8 +291,8 @@ class _Search:
         rtol = min(max(wanted, 1e-10), 1e-4)
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
         self.first = {**common, "method": EIPDOP853, "rtol": rtol, "atol": atol}
-        self.ready = prepared(Request.of(fun=problem, **self.first))
-        missing = self.ready.run.conserved.missing
+        self.pilot = prepared(Request.of(fun=problem, **self.first))
+        missing = self.pilot.conserved.missing
         if missing is not None:
             own = particle_invariants(missing.masses, missing.dimension)
             common["invariants"] = (*as_invariants(common.get("invariants", problem.invariants)), *own)
@@ -322,11 +321,12 @@ class _Search:
 
     def _first_run(self, max_nfev: int | None) -> None:
         """Run `EIPDOP853` without projection, to see how long its steps are, what limits them, and how far it comes."""
-        system, start, options = self.ready.system, self.ready.run.start, self.first | UNPROJECTED
-        self.max_nfev = int(max_nfev or MAX_NFEV[system.functions(self.ready.run, None)[1] is None])
+        pilot, options = self.pilot, self.first | UNPROJECTED
+        start = pilot.start
+        self.max_nfev = int(max_nfev or MAX_NFEV[pilot.problem.functions(pilot, None)[1] is None])
         self.velocities: bool | None = None  # the equations are not of the form q'' = a(t, q, v)
         with suppress(ValueError):
-            self.velocities = depends_on_velocity(system.derivative, start, "")
+            self.velocities = depends_on_velocity(pilot, start)
         steps = max(self.max_nfev // (4 * EIPDOP853.TABLEAU.n_stages), 10)  # the tightest run needs several times more
         every = max(1, steps * start.y.size // 4_000_000)  # a bound on the memory
         rows = iter(range(steps // every))
@@ -384,19 +384,19 @@ class _Search:
 
     def _integrate(self, t: float, options: Mapping[str, Any], **further: Any) -> tuple[IntegrationResult, int]:
         """Run from the start to t; return the result and its evaluations, for Jacobians of implicit methods too."""
-        ready = prepared(Request.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further}))
-        is_implicit, system = options["method"].TABLEAU.drives, ready.system
+        given = Request.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further})
+        run, is_implicit = prepared(given), options["method"].TABLEAU.drives
         if is_implicit:
-            calls, fun = count(int(ready.run.work.counters[NFEV]) + ready.run.method.start_calls), system.fun
+            calls, fun = count(int(run.work.counters[NFEV]) + run.method.start_calls), run.problem.fun
 
             def counted(*args: Any) -> Any:
                 if next(calls) > self.most:
                     raise ArithmeticError(f"it takes more than {self.most} evaluations")
                 return fun(*args)
 
-            system.fun, system.rhs = counted, interpreted(system.form, counted, system.extra, ready.run.y0)
-        run = Loop(ready).run()
-        return run, next(calls) if is_implicit else run.nfev
+            run.problem.bind(counted)
+        result = Loop(run, given).run()
+        return result, next(calls) if is_implicit else result.nfev
 
     def _run(self, options: Mapping[str, Any]) -> tuple[np.ndarray, int, float, str]:
         """Return the states at `times`, evaluations, seconds and trouble of a run; exceptions propagate."""

@@ -12,7 +12,7 @@ from scipy.integrate import OdeSolution, OdeSolver
 
 from ..core.acceleration import AccelerationField
 from ..core.arguments import are_same
-from ..core.events import Events
+from ..core.events import Events, as_events, replaced
 from ..core.inputs import shown
 from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
@@ -22,14 +22,14 @@ from ..core.solvers import (
     EIPDOP853,
     EIPRK23,
     EIPRK45,
+    Context,
     EIPRadau,
     EIPSolver,
-    SolverClass,
     class_named,
     eip_method,
-)
+)  # fmt: skip
 from ..core.states import initial_state
-from ..core.stepping import interval
+from ..core.step_control import interval
 from ..core.tangent_vectors import StateSolution, TangentVectors, tangent_vectors
 from ..core.variations import First, Variations, augmented_rhs
 
@@ -203,54 +203,47 @@ def solve_ivp(
         "min_step": min_step, "variations": variations, "jvp": jvp,
     }  # fmt: skip
     options = {name: value for name, value in options.items() if value is not None} | dict(projection)
-    kept = as_invariants(options.pop("invariants", ()))
-    if kept:
+    if kept := as_invariants(options.pop("invariants", ())):
         options["invariants"] = kept
     function = _right_hand_side(fun, acceleration, t_span, y0)
-    common = {"t_eval": t_eval, "dense_output": dense_output, "events": events, "vectorized": vectorized, "args": args}
+    args, extra = _unpacked(args)
+    common = {"t_eval": t_eval, "dense_output": dense_output, "vectorized": vectorized, "args": args}
     method = _with_projection(method, [name for name in options if name in OWN])
-    if not (isinstance(method, type) and issubclass(method, EIPSolver)):
-        if events is not None:
-            common["events"] = Events(events, _unpacked(args)[1]).for_scipy(None, as_scipy=True)
-        sol = scipy.integrate.solve_ivp(function, t_span, y0, method=method, **common, **options)
-        return OdeResult(sol, trusted=bool(sol.success), diagnostics=Diagnostics())
-    return _solve(method, function, t_span, y0, common, options)
+    if isinstance(method, type) and issubclass(method, EIPSolver):
+        return _solve(method, function, t_span, y0, extra, events, common, options)
+    if events is not None:
+        common["events"] = Events(events, extra).for_scipy(None, as_scipy=True)
+    sol = scipy.integrate.solve_ivp(function, t_span, y0, method=method, **common, **options)
+    return OdeResult(sol, trusted=bool(sol.success), diagnostics=Diagnostics())
 
 
 def _solve(
-    method: type[EIPSolver], function: Any, t_span: Any, y0: Any, common: dict[str, Any], options: dict[str, Any]
+    method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, extra: tuple, events: Any, common: Any, options: Any
 ) -> OdeResult:
     """Return the result of a run with an EIP method; `common` has the options of SciPy's solve_ivp itself."""
-    common["args"], extra = _unpacked(common["args"])
-    variations, jvp = options.pop("variations", None), options.pop("jvp", None)
-    if "invariants" in options and extra:
+    start, solvers = initial_state(y0), list[Any]()
+    items = options.get("invariants", ())
+    if extra:
         # The arguments of the call follow those of an invariant, unless both are the same.
-        options["invariants"] = tuple(
-            item if are_same(item.args, extra) else with_args(item, (*item.args, *extra))
-            for item in options["invariants"]
-        )
-    if (jacobian := options.get("jacobian")) is not None and extra:
-        options["jacobian"] = lambda *first: jacobian(*first, *extra)
+        items = tuple(x if are_same(x.args, extra) else with_args(x, (*x.args, *extra)) for x in items)
+        if (jacobian := options.get("jacobian")) is not None:
+            options["jacobian"] = lambda *first: jacobian(*first, *extra)
     record = options.setdefault("diagnostics", Diagnostics())
-    augmented = None
-    if variations is not None:
-        augmented = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
-        function, y0 = augmented.derivative, augmented.tangents.augmented(initial_state(y0), NOTHING)
-        method = _subclass(method, _TANGENTS=augmented.tangents)
-        options["invariants"] = augmented.invariants
-        if (events := common["events"]) is not None:
-            common["events"] = [augmented.event(event) for event in ((events,) if callable(events) else events)]
+    asked, jvp, augmented = options.pop("variations", None), options.pop("jvp", None), None
+    if asked is not None:
+        first = First(interval(t_span)[0], start, extra)
+        tangents = tangent_vectors(asked, method, start, NOTHING)
+        rhs, source = augmented_rhs(tangents, fun, "value", first, jvp)
+        augmented = Variations.of(tangents, rhs, source, first._replace(extra=()), items, in_python=True)
+        fun, start, items = augmented.derivative, tangents.augmented(start, NOTHING), augmented.invariants
+        events = None if events is None else replaced(as_events(events), map(augmented.event, as_events(events)))
     elif jvp is not None:
         raise TypeError("solve_ivp: jvp needs variations=...; pass variations, or omit jvp.")
-    start = initial_state(y0) if options.get("project_initial") else None
-    noting, solvers = _noting(method, start)
-    if common["events"] is not None:
+    if events is not None:
         begun = lambda t, y: (solvers[0].f, solvers[0].direction * float(solvers[0].h or solvers[0].h_abs))  # noqa: E731
-        as_scipy = method._takes_scipys_steps(options)
-        common["events"] = Events(common["events"], extra).for_scipy(begun, as_scipy=as_scipy)
-    sol = scipy.integrate.solve_ivp(
-        function, t_span, y0 if start is None else start, method=noting, **common, **options
-    )
+        common["events"] = Events(events, extra).for_scipy(begun, as_scipy=method._takes_scipys_steps(options))
+    options |= {"invariants": items, "_context": Context(start, solvers, augmented)}
+    sol = scipy.integrate.solve_ivp(fun, t_span, start, method=method, **common, **options)
     if augmented is not None:
         _split(sol, augmented.tangents)
     if sol.status == 1:  # SciPy does not inform the solver that its run has ended
@@ -258,21 +251,6 @@ def _solve(
     missing = solvers[0]._run.conserved.missing
     message = "; ".join(map(str, filter(None, (sol.message, record.moved, missing, record.message))))
     return OdeResult(sol, message=message, trusted=bool(sol.success) and record.trusted, diagnostics=record)
-
-
-def _variations(
-    method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, asked: Any, extra: tuple, items: Any, jvp: Any
-) -> Variations:
-    """Return the `Variations` for the option `variations` (`asked`): functions of augmented states."""
-    first = First(interval(t_span)[0], initial_state(y0), extra)
-    tangents = tangent_vectors(asked, method, first.y, NOTHING)
-    rhs, source = augmented_rhs(tangents, fun, "value", first, jvp)
-    return Variations.of(tangents, rhs, source, first._replace(extra=()), as_invariants(items), in_python=True)
-
-
-def _subclass(method: type[EIPSolver], **attributes: Any) -> Any:
-    """Return a subclass of `method` with its name and docstring, and with these attributes."""
-    return SolverClass(method.__name__, (method,), {**attributes, "__doc__": method.__doc__})
 
 
 def _split(sol: Any, tangents: TangentVectors) -> None:
@@ -327,21 +305,3 @@ def _unpacked(args: Any) -> tuple[Any, tuple[Any, ...]]:
     except TypeError:
         return args, ()
     return None if args is None else extra, extra
-
-
-def _noting(method: type[EIPSolver], start: np.ndarray | None) -> tuple[type[EIPSolver], list[EIPSolver]]:
-    """Return a subclass of `method`, and a list to which it appends the solver that SciPy makes from it.
-
-    The state from which the solver starts is written to `start`, the initial state of SciPy's loop: it is the first of
-    the states that are returned, and the one at which the events are evaluated first.
-    """
-    solvers: list[EIPSolver] = []
-
-    def __init__(self: Any, *arguments: Any, **options: Any) -> None:  # noqa: N807
-        super(noting, self).__init__(*arguments, **options)
-        solvers.append(self)
-        if start is not None:
-            start[:] = self.y
-
-    noting = _subclass(method, __init__=__init__)
-    return noting, solvers

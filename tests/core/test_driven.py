@@ -83,6 +83,21 @@ def test_without_invariants_they_take_scipy_s_steps(method, jac):
 
 
 @both
+def test_an_end_that_is_moved_does_not_start_scipy_s_steps_again(method):
+    """As in programs that step to one event after another; the interpolants are SciPy's too."""
+    own, scipy_s = (kind(relaxing, 0.0, START, 0.1, **TIGHT) for kind in (method, SCIPY[method]))
+    for solver in (own, scipy_s):
+        while solver.t < 2.0:
+            if solver.status == "finished":
+                solver.t_bound, solver.status = solver.t + 0.1, "running"
+            solver.step()
+    np.testing.assert_array_equal(own.y, scipy_s.y)
+    t = 0.3 * own.t_old + 0.7 * own.t
+    np.testing.assert_array_equal(own.dense_output()(t), scipy_s.dense_output()(t))
+    assert (own.nfev, own.njev, own.nlu) == (scipy_s.nfev, scipy_s.njev, scipy_s.nlu)
+
+
+@both
 @pytest.mark.parametrize("t_span", [(0, 10), (2e-4, 0)])
 def test_the_invariant_holds_at_the_steps_and_between_them(method, t_span):
     record, start, times = Diagnostics(), exact(t_span[0]), np.linspace(*t_span, 301)

@@ -89,7 +89,7 @@ def one_step(y, method, h, options):
     class Recorder(method):
         def _step_impl(self):
             done = super()._step_impl()
-            seen.append((self._work.y_hat.copy(), self.y.copy()))
+            seen.append((self._run.work.y_hat.copy(), self.y.copy()))
             return done
 
     t = h * np.hypot(y[0], y[1]) ** 1.5

@@ -410,4 +410,4 @@ def test_spaced_projections_start_afresh():
     solver = EIPRK3(orbit, 0.0, START, 2.0, h=0.2, every=2, invariants=[H, L])
     for k in range(1, 7):
         solver.step()
-        assert solver._work.err_sum.any() == (k % 2 == 1)
+        assert solver._run.work.err_sum.any() == (k % 2 == 1)

@@ -28,11 +28,11 @@ def parts(method=EIPRK4, **options):
     if options.pop("dtype", None):
         fun, y0 = spin, SPIN_START
     ready = prepared(Request.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
-    functions, _ = ready.system.functions(ready.run, False)
+    functions, _ = ready.problem.functions(ready, False)
     return {
-        "method": ready.run.method,
-        "options": ready.run.options,
-        "work": ready.run.work,
+        "method": ready.method,
+        "options": ready.options,
+        "work": ready.work,
         "functions": functions,
         "schedule": ready.schedule,
     }
@@ -86,7 +86,7 @@ def test_arrays_that_do_not_fit_are_refused(case):
     records = [(given[part], part) for part in ("method", "options", "schedule")]
     if case in ("kepler", "adaptive"):
         ready = prepared(Request.of(fun=orbit, t_span=(0, 1), y0=Y0, **{"method": EIPRK4, **CASES[case]}))
-        records += [(Interpolants(ready.run, engine).record, "dense output")]
+        records += [(Interpolants(ready, engine).record, "dense output")]
     for record, part in records:
         for path in arrays(record):
             right = record

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core.inputs import is_number, real_array, shown
 from ...core.problem import Problem, bind, library_variational
-from ...core.stepping import interval
+from ...core.step_control import interval
 from ...engine.native import library
 from . import forces as _forces
 from .bodies import body_names

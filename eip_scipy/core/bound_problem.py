@@ -1,0 +1,319 @@
+"""The right-hand side of a run with its arguments: below it, no interface looks at a user's functions again."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
+from ..methods.base import Method
+from ..methods.gauss_jackson import jacobian_product
+from ..methods.implicit import Jacobian
+from ..methods.nystrom import check_halves
+from .acceleration import BY_NAME
+from .arguments import Packed, floats, names, scalars
+from .events import Events
+from .inputs import filled, numbers, require_arguments, shown
+from .jitted import NotCompilableError, compiled_call
+from .native_functions import native_functions, with_events
+from .pointers import PointerFunction
+from .problem import Problem, made
+from .states import as_derivative
+
+if TYPE_CHECKING:
+    from .runs import Run
+    from .variations import Variations
+
+__all__ = ["FORMS", "BoundProblem"]
+
+Array = np.ndarray
+FORMS = {  # (given as an acceleration, in place) -> name of the form of the user's function
+    (False, False): "value",
+    (False, True): "in place",
+    (True, False): "acceleration",
+    (True, True): "acceleration in place",
+}
+NO_JACOBIAN = Jacobian()
+CALLED = "It takes (t, y), then out if in_place=True, then the arguments from params=... or args=(...)."
+CALLED_ACCELERATION = (
+    "It takes (t, q), then out if in_place=True, then the arguments from params=... or args=(...). If accelerations "
+    "depend on the velocity, pass the right-hand side fun(t, y) of y = (q, v) instead."
+)
+
+
+class BoundProblem:
+    """A user's right-hand side `fun` of a form in `FORMS`, for states of the size and type of `y0`.
+
+    `extra` are the last arguments of all functions. `problem` is the `Problem` that was given instead of a function,
+    `acc` is the acceleration of a problem that has one, if the method needs nothing else, ``jacobian(t, q, dq, out,
+    *extra)`` is for multistep methods, and `jac` for implicit ones. `variations` are the functions of an augmented
+    state. A `vectorized` function takes states (n, 1). With `explains`, errors name the arguments of a call that fails.
+    """
+
+    def __init__(
+        self,
+        fun: Any,
+        y0: Array,
+        form: str = "value",
+        extra: tuple = (),
+        *,
+        problem: Problem | None = None,
+        events: Events | None = None,
+        acc: Any = None,
+        jacobian: Any = None,
+        jac: Jacobian = NO_JACOBIAN,
+        variations: Variations | None = None,
+        vectorized: bool = False,
+        explains: bool = False,
+    ) -> None:
+        self.y0, self.form, self.extra, self.problem = y0, form, extra, problem
+        self.events = Events(None) if events is None else events
+        self.acc, self.jacobian, self.jac, self.variations = acc, jacobian, jac, variations
+        self.vectorized, self._explains = vectorized, explains
+        self.parameters = floats(extra)
+        self.second_order, self._in_place = form.startswith("acceleration"), form.endswith("in place")
+        self.name = "acceleration" if self.second_order else "fun"
+        self.count = 0  # of the calls of `derivative`
+        self.bind(fun)
+        if jacobian is not None and not callable(jacobian):
+            raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out[, params]), got {shown(jacobian)}.")
+
+    def bind(self, fun: Any) -> None:
+        """Use `fun`, of the same form, from now on."""
+        self.fun = fun
+        make = _filled if self._in_place else _checked
+        called = _flat(fun, self.y0.size) if self.vectorized else fun
+        if not self.second_order:
+            self.evaluate = make(called, self.extra, self.y0, self.name)
+            return
+        check_halves(self.y0.size)
+        half = self.y0.size // 2
+        acc = make(called, self.extra, self.y0[:half], self.name)
+        self.evaluate = lambda t, y: np.concatenate([y[half:], acc(t, y[:half])])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("evaluate", "native_form")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.bind(self.fun)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> BoundProblem:
+        return copy.copy(self)  # with the same functions
+
+    def derivative(self, t: float, y: Array) -> Array:
+        """Return the derivative (n,) at (t, y) as a new array, and count the call."""
+        self.count += 1
+        try:
+            return self.evaluate(t, y).copy()  # the value may be a buffer that the user's function fills again
+        except TypeError:
+            if self._explains:
+                third = ("out",) if self._in_place else ()
+                state, advice = ("q", CALLED_ACCELERATION) if self.second_order else ("y", CALLED)
+                require_arguments(self.fun, ("t", state, *third, *names(self.extra)), self.name, advice)
+            raise
+
+    def uncount(self, calls: int) -> None:
+        """Take back the count of calls that are no part of ``nfev``."""
+        self.count -= calls
+
+    @property
+    def is_second_order(self) -> bool:
+        """True if the right-hand side is (v, a) by its construction."""
+        return self.second_order or self.native_form[1].startswith("acceleration")
+
+    @property
+    def sees_velocity(self) -> bool:
+        """True if accelerations come from a function that is called with velocities, on which they may depend."""
+        return not self.second_order and (self.problem is None or self.problem.acc is None)
+
+    @property
+    def left_out(self) -> str:
+        """A possible cause of NaN in the value of the function, for messages; "" if none is known."""
+        if self.variations is not None:
+            n = self.variations.tangents.n
+            return (
+                f"components from {n} on are derivatives, which overflow in long chaotic runs: shorten the "
+                " interval, or use megno or lyapunov_spectrum, which rescale them"
+            )
+        if isinstance(self.fun, PointerFunction):
+            return "components are NaN if the C function does not fill them, and all are if its status is above 0"
+        return "with in_place=True it must fill all of out" if self._in_place else ""
+
+    @property
+    def component_names(self) -> tuple[str, ...] | None:
+        """Names of the components from the problem, or None if it has none for this state."""
+        names = None if self.problem is None else self.problem.component_names
+        n = self.y0.size if self.variations is None else self.variations.tangents.n
+        return names if names is not None and len(names) == n else None
+
+    @property
+    def described_columns(self) -> dict[str, Any]:
+        """The field ``columns`` of the result of a run that carries derivatives."""
+        assert self.variations is not None
+        tangents = self.variations.tangents
+        known = {} if self.problem is None else dict(enumerate(self.problem.parameters))
+        return {
+            "state": tangents.is_transition,
+            "parameters": len(tangents.parameters),
+            "names": [known.get(k, f"params[{k}]") for k in tangents.parameters],
+            "symplectic": tangents.symplectic,
+            "source": self.variations.source,
+        }
+
+    def hint(self) -> str:
+        """Return the end of a message: how to write the equations for a method of second order."""
+        if self.problem is None:
+            return f". If fun is the acceleration a(t, q), {BY_NAME}"
+        hint = "; problem.second_order() returns this problem in that form, for a start (q, v)"
+        return hint if self.problem.has_second_order else ""
+
+    def jacobian_for(self, method: Method) -> Any:
+        """Return the Jacobian as the method needs it: a `Jacobian`, or ``product(t, q, dq)`` or None."""
+        if method.drives:
+            jac, extra = self.jac.jac, self.extra
+            return self.jac._replace(jac=lambda t, y: jac(t, y, *extra)) if callable(jac) and extra else self.jac
+        self.jacobian = made(self.jacobian)
+        return None if self.jacobian is None else jacobian_product(self.jacobian, *self.extra)
+
+    @cached_property
+    def native_form(self) -> tuple[Any, str]:
+        """The function to compile and its form: `acc` if it comes from the same library as `fun`, else `fun`."""
+        own = isinstance(self.fun, LibraryFunction) and isinstance(self.acc, LibraryFunction)
+        if own and self.fun.__name__.partition(".")[0] == self.acc.__name__.partition(".")[0]:
+            return self.acc, "acceleration"
+        return self.fun, self.form
+
+    def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
+        """Return the functions that the loop calls, and None if all are called natively.
+
+        Otherwise the second item is a text that says which functions are called from Python, and why. `wanted` is the
+        option `compiled`; if it is True, NotCompilableError is raised instead.
+        """
+        if wanted is False:
+            return self.in_python(run), "interpreted: compiled=False"
+        try:
+            functions, params = self._native(run)
+        except NotCompilableError as reason:
+            if wanted:
+                raise
+            return self.in_python(run), f"interpreted: {reason}"
+        if not self.events.functions:
+            return functions, None
+        try:
+            return with_events(functions, self.events.functions, params, run.y0), None
+        except NotCompilableError as reason:
+            if wanted:
+                raise
+            return functions._replace(python=self.in_python(run)), f"events are called from Python: {reason}"
+
+    def pointers(self, run: Run) -> list[PointerFunction]:
+        """Return the C functions of a run that were given as pointers."""
+        functions = [self.fun, *self.events.functions]
+        for item in run.invariants.items:
+            functions += [item.function, item.gradient, item.rate_function]
+        return [function for function in functions if isinstance(function, PointerFunction)]
+
+    def _native(self, run: Run) -> tuple[NativeFunctions, Packed | None]:
+        """Return the addresses of all functions but events, and the packed `extra`; else raise NotCompilableError."""
+        if run.tableau.in_python:
+            kind = "a solver" if run.tableau.drives else "a one-step method"
+            raise NotCompilableError(f"{run.tableau.name} is {kind} in Python")
+        if (types := scalars(self.extra)) is None:
+            raise NotCompilableError("args are neither numbers nor one array of floats")
+        params = Packed(self.parameters, types) if self.extra else None
+        jacobian = self.jacobian if run.uses_jacobian else None
+        return native_functions(*self.native_form, params, run, jacobian), params
+
+    def in_python(self, run: Run, *, by_address: bool = False) -> PythonFunctions:
+        """Return all functions as Python calls them, or `by_address` jitted ones that compile."""
+        n, dtype = self.y0.size, self.y0.dtype
+        size = n // 2 if self.second_order else n
+        fun = _flat(self.fun, n) if self.vectorized else self.fun
+
+        def convert(f: Any, t: float) -> Array:
+            return np.array(as_derivative(f, size, dtype, t, self.name), dtype, order="C")
+
+        rhs = call(fun, self.extra, (size,), convert, in_place=self._in_place)
+        jacobian = None
+        if run.uses_jacobian:
+            jacobian = call(self.jacobian, self.extra, (n // 2,), convert, in_place=True, takes_f=True)
+        inv, grad = run.invariants.calls
+        if by_address:
+            rhs, *both = (compiled_call(known, n, dtype) for known in (rhs, *inv, *grad))
+            inv, grad = tuple(both[: len(inv)]), tuple(both[len(inv) :])
+        rates = run.invariants.rates(run.options.adaptive)
+        return PythonFunctions(rhs, inv, grad, self.events.calls, self.second_order, jacobian, rates)
+
+    def calls(self, run: Run, functions: PythonFunctions | NativeFunctions) -> dict[str, str]:
+        """Return how each function is called, as the attribute `calls` of `IntegrationResult`."""
+
+        def kind(fun: Any, in_python: bool) -> str:
+            if in_python:
+                return "python"
+            if isinstance(fun, LibraryFunction):
+                return "native"
+            return "pointer" if isinstance(fun, PointerFunction) else "jitted"
+
+        in_python = isinstance(functions, PythonFunctions)
+        found = {self.name: kind(self.fun, in_python)}
+        for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
+            item = item if item.unaugmented is None else item.unaugmented.function
+            found[label] = kind(item.function, in_python)
+            differences = item.gradient is None and not in_python
+            found[f"gradient of {label}"] = "differences" if differences else kind(item.gradient, in_python)
+            if item.rate_function is not None:
+                found[f"rate of {label}"] = kind(item.rate_function, in_python)
+        if run.uses_jacobian:
+            found["jacobian"] = kind(self.jacobian, in_python)
+        in_python = isinstance(functions, PythonFunctions) or functions.python is not None
+        return found | {f"event {k}": kind(event, in_python) for k, event in enumerate(self.events.functions)}
+
+
+def _checked(fun: Callable[..., Any], extra: tuple, y0: Array, name: str) -> Callable[[float, Array], Array]:
+    """Return `fun` with checks of its values, which may be buffers of the user; it gets copies of the state."""
+    n, dtype, shape = y0.size, y0.dtype, y0.shape
+
+    def evaluate(t: float, y: Array) -> Array:
+        f = fun(t, y.copy(), *extra)
+        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
+            return f
+        return np.array(as_derivative(f, n, dtype, t, name), dtype, order="C")
+
+    return evaluate
+
+
+def _filled(fun: Callable[..., Any], extra: tuple, y0: Array, name: str) -> Callable[[float, Array], Array]:
+    """Return the value of an in-place function, whose first call is checked unless it is one of this package.
+
+    `out` is filled with NaN before each call: the first call raises an error if the function leaves components
+    unfilled, and later ones leave NaN there.
+    """
+    shape, dtype, is_checked = y0.shape, y0.dtype, isinstance(fun, LibraryFunction)
+
+    def evaluate(t: float, y: Array) -> Array:
+        nonlocal is_checked
+        if not is_checked:
+            is_checked = True
+            return filled(lambda out: fun(t, y.copy(), out, *extra), shape, dtype, name, t)
+        out = np.full(shape, math.nan, dtype)
+        fun(t, y.copy(), out, *extra)
+        return out
+
+    return evaluate
+
+
+def _flat(fun: Callable[..., Any], n: int) -> Callable[..., Any]:
+    """Return a vectorized function as one of a single state; SciPy broadcasts a single number."""
+
+    def flat(t: float, y: Array) -> Any:
+        f = fun(t, y[:, None])
+        found = numbers("fun returned", f)
+        return f if found is None else np.resize(found, n) if found.size == 1 else found.reshape(-1)
+
+    return flat
