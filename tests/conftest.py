@@ -49,7 +49,7 @@ def no_rebound(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def in_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Vectorise the members of ensembles however little work they have."""
-    monkeypatch.setattr("eip_scipy.ensembles.tasks.LEAST_WORK", 0.0)
+    monkeypatch.setattr("eip_scipy.ensembles.members.LEAST_WORK", 0.0)
 
 
 @pytest.fixture

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 import time
-import uuid
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Executor
-from contextlib import ExitStack, closing, nullcontext
-from functools import partial
-from importlib import import_module
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checkpoint import absolute, require_place, sigterm_as_ctrl_c
+from ..checkpoint import require_place
 from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.conserved import NEAR_DISTANCE
 from ..core.events import Events
@@ -27,41 +24,31 @@ from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
 from ..core.linear import confirmed
 from ..core.names import nearest
-from ..core.options import ProjectionDetails, ProjectionOptions
+from ..core.options import ProjectionDetails
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.solvers import EIPRK4, EIPSolver
 from ..core.states import states
-from ..core.tangent_vectors import TangentVectors
-from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
+from ..engine.data import N_COUNTERS
 from ..engine.trust import ProjectionWarning
-from ..run.fields import Field, component_names, dataset, distinct, time_name
+from ..run.driver import expected_steps
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
-from ..run.results import Result, steps
-from .checkpoints import EnsembleFile
-from .chunks import Chunk, Part, Pool, cores, run_elsewhere, thread_pool
-from .reduction import placed
-from .side_by_side import LANES
-from .tasks import FAILED, NOT_RUN, Members, Plan, Task
+from .checkpoints import opened
+from .executors import results
+from .members import LANES, Chunk, Plan, Task, placed
+from .result import FAILED, EnsembleResult
 
 __all__ = ["EnsembleResult", "ensemble"]
 
-CHUNK_STEPS = 2_000_000
-INTERPRETED_STEPS = 20_000
+# Work in a chunk: floats times steps (a state has at least four floats), of compiled and of interpreted functions.
+CHUNK_WORK, INTERPRETED_WORK = 8e6, 8e4
 UNKNOWN_STEPS = 10_000
 CHUNK_BYTES = 4e6
 LARGEST_CHUNK = 4096
 LEAST_CHUNKS = 16
-LEAST_OCTETS = 4  # of members in a chunk
-TRIED = 8
-SHOWN = 5
-# Fields of a request that an ensemble handles itself, those that it does not have, and its own parameters.
-HANDLED = {"fun", "acceleration", "t_span", "params", "callback", "max_bytes", "progress"}
-ALONE = HANDLED | {"y0", "diagnostics", "projection"}
-# Fields of `Members` that are fields of the result.
-SAME = ("y", "t", "status", "message", "max_residual", "max_correction", "side_by_side", "trusted", "target")
-OWN = ("y0s", "executor", "reduce", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(HANDLED))
+LEAST_BATCHES = 4  # in a chunk
+TRIED = 8  # members
 
 
 class EnsembleKeywords(ProjectionDetails, total=False):
@@ -81,200 +68,6 @@ class EnsembleKeywords(ProjectionDetails, total=False):
     variations: Any
     jvp: Callable[..., Any] | None
     symplectic: bool | None
-
-
-FIELDS = {
-    "y": Field(("member", "component")),
-    "t": Field(("member",), table="t_end"),
-    "target": Field(("member", "invariant")),
-    "max_residual": Field(("member", "invariant")),
-    "trajectories": Field(("member", "component", "time"), table="states"),
-    "invariants": Field(("member", "invariant", "time")),
-    **dict.fromkeys(("status", "message", "trusted", "max_correction"), Field(("member",))),
-    **dict.fromkeys(("nfev", "njev", "nlu", "n_rejected_projections"), Field(("member",))),
-    **dict.fromkeys(("method", "h", "success", "stopped", "wall_time"), Field(())),
-}
-END_INVARIANTS = Field(("member", "invariant"), table="end_invariants")  # if trajectories are not saved
-
-
-class EnsembleResult(Result):
-    """Result of `ensemble`; fields are accessible by attribute or by key, as in SciPy's results.
-
-    Attributes
-    ----------
-    y : ndarray, shape (members, n)
-        Last states: at the end of the interval, or before a member failed.
-    t : ndarray, shape (members,)
-        Times of the last states.
-    status : ndarray, shape (members,)
-        0: the end was reached; 1: an event ended the member; -1: it failed; -2: it did not run (in the partial result
-        of an interrupted ensemble).
-    message : ndarray of str, shape (members,)
-        Reason for the end of each member.
-    failed : ndarray
-        Indices of the members with status -1.
-    success : bool
-        True if all members ran and none failed.
-    max_residual : ndarray, shape (members, l)
-        Largest invariant error ``|I - target|`` after a projection; each member has its own target.
-    max_correction : ndarray, shape (members,)
-        Largest correction in units of the local error; nan if the method has no error estimate.
-    side_by_side : ndarray of bool, shape (members,)
-        True for members that ran vectorised, in a batch with others, which is several times faster; the page on
-        ensembles in the documentation lists the conditions.
-    one_by_one : str
-        Reason why members ran one after the other instead of vectorised; "" if they were vectorised. Single members
-        that a batch could not finish may have run alone even then, see `side_by_side`.
-    trusted : ndarray of bool, shape (members,)
-        True for members that did not fail and are reliable, as in `IntegrationResult`; otherwise `message` says why.
-    names : tuple of str
-        Names of the l invariants.
-    nfev, njev, nlu, n_rejected_projections : ndarray, shape (members,)
-        Evaluations of the right-hand side and of the gradients, factorisations, and rejected projections.
-    times : ndarray, shape (m,)
-        Times of the saved states; empty if no states are saved.
-    trajectories : ndarray or None, shape (members, n, m)
-        Saved states; nan after the end of a member that ended early. None if no states are saved or ``reduce=`` was
-        given.
-    invariants : ndarray, shape (members, l) or (members, l, m)
-        Values of the invariants in the saved states if `trajectories` has them, else in the last states.
-    target : ndarray, shape (members, l)
-        Values to which the invariants of each member were projected.
-    t_events, y_events : list of list of ndarray, or None
-        If there are events, ``t_events[k]`` and ``y_events[k]`` are those of member k, as in
-        `scipy.integrate.solve_ivp`: one array for each event.
-    reduced : ndarray or None, shape (members, ...)
-        Value of the function ``reduce=`` for each member, nan for members that failed or did not run. None without
-        ``reduce=``.
-    variations : ndarray, shape (members, n, k) or (members, m, n, k)
-        Columns of derivatives if ``variations=`` was given, in the saved states if `trajectories` has them, else in the
-        last states. `stm` and `sensitivities` are parts of it; `columns` is as in `IntegrationResult`.
-    first : int
-        Number of the first member; it is 0 except in the results that a `callback` receives.
-    stopped : bool
-        True if the callback stopped the ensemble.
-    wall_time : float
-        Run time in seconds.
-    method : str
-        Name of the method.
-    h : float or None
-        Step size; None for adaptive steps.
-    chunk : int
-        Number of members in a chunk.
-    """
-
-    COMPONENTS = 1
-    status: np.ndarray
-    message: np.ndarray
-    failed: np.ndarray
-    success: bool
-    max_residual: np.ndarray
-    max_correction: np.ndarray
-    side_by_side: np.ndarray
-    one_by_one: str
-    trusted: np.ndarray
-    names: tuple[str, ...]
-    nfev: np.ndarray
-    njev: np.ndarray
-    nlu: np.ndarray
-    n_rejected_projections: np.ndarray
-    times: np.ndarray
-    trajectories: np.ndarray | None
-    invariants: np.ndarray
-    target: np.ndarray
-    t_events: list[list[np.ndarray]] | None
-    y_events: list[list[np.ndarray]] | None
-    reduced: np.ndarray | None
-    first: int
-    stopped: bool
-    wall_time: float
-    method: str
-    h: float | None
-    chunk: int
-
-    def to_xarray(self, names: Any = None) -> Any:
-        """Return the members as an `xarray.Dataset`.
-
-        Parameters
-        ----------
-        names : sequence of str or str, optional
-            As for `eip_scipy.results.to_xarray`.
-
-        Returns
-        -------
-        xarray.Dataset
-            Dataset with ``y`` (member, component), ``t_end``, ``status``, ``message``, ``trusted``, ``max_correction``
-            (member), ``max_residual``, ``target`` (member, invariant), and the counts. If trajectories are in memory,
-            also ``states`` (member, component, time) and ``invariants`` (member, invariant, time); otherwise
-            ``end_invariants`` (member, invariant).
-
-        Raises
-        ------
-        ImportError
-            If xarray is missing: ``pip install "eip_scipy[xarray]"``.
-        """
-        components = component_names(self, names, self.y.shape[1])
-        coordinates = {
-            "member": self.first + np.arange(self.t.size),
-            "component": list(components),
-            "invariant": distinct(self.names),
-        }
-        if self.trajectories is None:
-            data = dataset(self, FIELDS | {"invariants": END_INVARIANTS}, coordinates)
-        else:
-            data = dataset(self, FIELDS, coordinates | {"time": self.times})
-        if (time := time_name(components)) != "t":
-            data = data.rename({"t_end": f"{time}_end", **({"time": time} if "time" in data.dims else {})})
-        return data
-
-    def plot(self, names: Any = None) -> Any:
-        """Draw the ensemble: its states, the errors of the invariants, and how its members ended.
-
-        Parameters
-        ----------
-        names : sequence of str or str, optional
-            As for `eip_scipy.results.to_xarray`.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            For each component the median of the members in time, with bands that contain 50 % and 90 % of them; if some
-            end early, of those that are still running, as the legend says. If no states are saved, the distribution of
-            the last states. Further panels show the largest error of each invariant in each member, and how many
-            members reached the end, were ended by an event, are not to be trusted, failed or did not run. A notebook
-            shows the figure automatically.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
-        """
-        from ..plotting.results import ensemble_figure
-
-        return ensemble_figure(self, names)
-
-    def __repr__(self) -> str:
-        ran = int(np.count_nonzero(self.status != NOT_RUN))
-        members, n = self.y.shape
-        lines = [
-            f"Ensemble: {members} members of {n} components, {steps(self)}; {ran} ran in "
-            f"{self.wall_time:.3g} s, {np.count_nonzero(self.side_by_side)} vectorised, "
-            f"{self.failed.size} failed"
-        ]
-        if self.one_by_one:
-            lines.append(f"  not vectorised: {self.one_by_one}")
-        width = max((len(name) for name in self.names), default=0)
-        for name, residuals in zip(self.names, self.max_residual[self.status >= 0].T, strict=True):
-            if residuals.size:
-                lines.append(
-                    f"  {name:<{width}}  largest error {residuals.max():.2e}, median {np.median(residuals):.2e}"
-                )
-        doubtful = np.flatnonzero((self.status >= 0) & ~self.trusted)
-        for those, what in ((self.failed, ".failed"), (doubtful, ".trusted")):
-            lines += [f"  member {self.first + k}: {self.message[k]}" for k in those[:SHOWN]]
-            if those.size > SHOWN:
-                lines.append(f"  ... and {those.size - SHOWN} more: {what}, .message")
-        return "\n".join(lines)
 
 
 def ensemble(
@@ -400,34 +193,36 @@ def ensemble(
     ((5, 4), True, True)
     """
     options: dict[str, Any] = dict(keywords)
-    _check_options(options)
-    _check_choices(reduce, callback, progress, max_bytes)
+    _check(options, reduce, callback, progress, max_bytes)
+    require_place(checkpoint, checkpoint_every, resume, "a path")
     if invariants is not DEFAULT:
         options["invariants"] = invariants
-    checkpoint = _place(checkpoint, checkpoint_every, resume)
     everyone = _inputs(fun, y0s, params, options)
-    total = len(everyone.y0s)
-    method = default_method(fun) or EIPRK4 if method is None else method
-    common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
-    common["acceleration"] = acceleration
-    request = Request.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
-    request = request.with_pointers()
+    members = len(everyone.y0s)
+    request = Request.of(
+        fun=_bare(fun), acceleration=acceleration, t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], h=h,
+        method=default_method(fun) or EIPRK4 if method is None else method, save_every=save_every, t_eval=t_eval,
+        **options,
+    ).with_pointers()  # fmt: skip
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
-    plan = _first_that_starts(Task(request, total, reduce), everyone)
+    plan = _first_that_starts(Task(request, members, reduce), everyone)
     everyone = everyone._replace(y0s=np.ascontiguousarray(everyone.y0s, plan.dtype))
     given = fun if acceleration is None else acceleration
-    size = _chunk_size(plan, total, given) if chunk is None else count("chunk", chunk)
-    _check_memory(plan, total, max_bytes)
-    file = None if checkpoint is None else EnsembleFile(checkpoint, checkpoint_every, resume, plan, everyone)
-    with nullcontext() if file is None else sigterm_as_ctrl_c(), nullcontext() if file is None else closing(file):
-        gathered = _Gathered(plan, everyone, size, file, callback)
-        result = gathered.run(partial(_pool, executor, plan, progress), progress)
-    _warn(result, np.flatnonzero((result.status >= 0) & ~result.trusted))
+    size = _chunk_size(plan, members, given) if chunk is None else count("chunk", chunk)
+    _check_memory(plan, members, max_bytes)
+    with opened(checkpoint, checkpoint_every, resume, plan, everyone) as (finished, write):
+        result = _Collector(plan, everyone, size, write, callback).run(finished, executor, progress)
+    _warn_of_doubtful(result)
     return result
 
 
-def _check_choices(reduce: Any, callback: Any, progress: Any, max_bytes: Any) -> None:
+def _check(options: dict[str, Any], reduce: Any, callback: Any, progress: Any, max_bytes: Any) -> None:
+    for name in options:
+        if name not in EnsembleKeywords.__annotations__:
+            known = (*inspect.signature(ensemble).parameters, *EnsembleKeywords.__annotations__)
+            raise TypeError(f"ensemble() has no option {name!r}{nearest(name, known)}")
+    Events(options.get("events"))  # raises an error if they are wrong
     for name, given, form in (("reduce", reduce, "reduce(result)"), ("callback", callback, "callback(part)")):
         if given is not None and not callable(given):
             raise TypeError(f"{name} must be a function {form}, got {shown(given)}.")
@@ -435,15 +230,14 @@ def _check_choices(reduce: Any, callback: Any, progress: Any, max_bytes: Any) ->
     check_bytes(max_bytes)
 
 
-def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
-    """Warn about the members with the indices `doubtful`, which are not to be trusted."""
+def _warn_of_doubtful(result: EnsembleResult) -> None:
+    doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
     if not doubtful.size:
         return
-    k = int(doubtful[0])
     try:
         warnings.warn(
             f"{doubtful.size} of {result.t.size} members are not to be trusted (see .trusted and .message of the "
-            f"result), the first of them member {k}: {result.message[k]}",
+            f"result), the first of them member {doubtful[0]}: {result.message[doubtful[0]]}",
             ProjectionWarning,
             stacklevel=3,
         )
@@ -452,158 +246,134 @@ def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
         raise
 
 
-class _Gathered:
+@dataclasses.dataclass
+class _Collector:
     """The finished members so far, from which the result is made.
 
-    `everyone` has the inputs of all members, `chunk` is the number of members in a chunk, and `file` is the checkpoint,
-    if there is one.
+    `everyone` has the inputs of all members, and `size` is the number of members in a chunk. ``write(done, whole)``
+    writes the checkpoint, if there is one.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        everyone: Chunk,
-        chunk: int,
-        file: EnsembleFile | None,
-        callback: Callable[[EnsembleResult], Any] | None,
-    ) -> None:
-        self.plan, self.everyone, self.chunk, self.file, self.callback = plan, everyone, chunk, file, callback
-        self.method = plan.task.request.method.__name__
-        self.whole = plan.empty(len(everyone.y0s), plan.held)
-        self.reduced: np.ndarray | None = None
-        self.stopped, self.one_by_one = False, ""
-        self._begin = time.perf_counter()
+    plan: Plan
+    everyone: Chunk
+    size: int
+    write: Callable[..., None]
+    callback: Callable[[EnsembleResult], Any] | None
+    stopped: bool = False
 
-    def run(self, pool: Callable[[], Pool], progress: bool) -> EnsembleResult:
-        """Run all chunks that are not stored yet in the pool that ``pool()`` makes, and return the result."""
+    def __post_init__(self) -> None:
+        self.begin, total = time.perf_counter(), len(self.everyone.y0s)
+        self.whole = self.plan.not_run(total, self.plan.held) | {"reduced": None, "one_by_one": ""}
+
+    def run(self, finished: dict[str, Any] | None, executor: Any, progress: bool) -> EnsembleResult:
+        """Run all chunks but those of the first members, which are `finished`, and return the result."""
+        done = 0 if finished is None else self._take(0, finished)
+        try:
+            if done < len(self.everyone.y0s):
+                self._collect(executor, progress, done)
+        except BaseException as error:
+            error.partial = self._result(self.whole, 0)  # type: ignore[attr-defined]
+            raise
+        return self._result(self.whole, 0)
+
+    def _collect(self, executor: Any, progress: bool, done: int) -> None:
+        """Run the members from number `done` on, and add their results."""
         from tqdm import tqdm
 
-        done, total = 0, len(self.whole.t)
-        if self.file is not None and self.file.finished:
-            done = self.file.finished
-            self._take(0, Part(self.file.members, self.file.reduced))
-        chunks = (self.everyone.part(first, first + self.chunk) for first in range(done, total, self.chunk))
-        shown: dict[str, Any] = {"desc": self.method, "unit": "member", "unit_scale": True, "disable": not progress}
-        try:
-            if done < total:
-                with tqdm(total=total, initial=done, **shown) as bar:
-                    self._gather(pool(), chunks, bar)
-        except BaseException as error:
-            error.partial = self._of(self.whole, self.reduced, 0)  # type: ignore[attr-defined]
-            raise
-        return self._of(self.whole, self.reduced, 0)
+        (_, y0s, params), size = self.everyone, self.size
+        chunks = (Chunk(k, y0s[k : k + size], params[k : k + size]) for k in range(done, len(y0s), size))
+        shown: dict[str, Any] = {"desc": self.plan.ready.name, "unit": "member", "unit_scale": True}
+        with (
+            tqdm(total=len(y0s), initial=done, disable=not progress, **shown) as bar,
+            closing(results(executor, self.plan, chunks, progress=progress)) as parts,
+        ):
+            try:
+                for first, part in parts:
+                    done = self._take(first, part)
+                    bar.update(done - first)
+                    self.write(done, self.whole)
+                    if self.callback is not None and self.callback(self._result(part, first)):
+                        self.stopped = True
+                        return
+            finally:  # before the executor ends, because the process may be killed soon
+                self.write(done, self.whole, now=True)
 
-    def _gather(self, pool: Pool, chunks: Iterator[Chunk], bar: Any) -> None:
-        with ExitStack() as stack:
-            stack.callback(pool.close)
-            if self.file is not None:
-                stack.callback(self.file.flush)  # first, because the process may be killed soon
-            for chunk, part in pool.in_order(chunks):
-                self._take(chunk.first, part)
-                done = chunk.first + len(part.members.t)
-                if self.file is not None:
-                    self.file.write(done, self.whole, self.reduced)
-                bar.update(len(part.members.t))
-                if self.callback is not None and self.callback(self._of(part.members, part.reduced, chunk.first)):
-                    self.stopped = True
-                    return
+    def _take(self, first: int, part: dict[str, Any]) -> int:
+        """Add the results `part` of the members from `first` on; return the number of members that are finished."""
+        whole, last = self.whole, first + len(part["t"])
+        if part["reduced"] is not None:
+            whole["reduced"] = placed(whole["reduced"], len(whole["t"]), first, part["reduced"])
+        for name in self.plan.not_run(0, 0):
+            whole[name][first:last] = part[name]
+        whole["one_by_one"] = part["one_by_one"] or whole["one_by_one"]
+        return last
 
-    def _take(self, first: int, part: Part) -> None:
-        members, last = part.members, first + len(part.members.t)
-        if part.reduced is not None:
-            self.reduced = placed(self.reduced, len(self.whole.t), slice(first, last), part.reduced)
-        for name, whole in self.whole._asdict().items():
-            whole[first:last] = getattr(members, name)
-        self.one_by_one = part.one_by_one or self.one_by_one
-
-    def _of(self, members: Members, reduced: np.ndarray | None, first: int) -> EnsembleResult:
-        plan, counters = self.plan, members.counters
-        trajectories = members.saved.swapaxes(1, 2) if plan.held else None
-        if reduced is None and plan.task.reduce is not None:  # all members failed
-            reduced = np.full(len(members.t), np.nan)
+    def _result(self, members: dict[str, Any], first: int) -> EnsembleResult:
+        """Return the result of members, which begin with number `first`."""
+        plan, ready = self.plan, self.plan.ready
         result = EnsembleResult(
-            {name: getattr(members, name) for name in SAME},
-            failed=np.flatnonzero(members.status == FAILED),
-            success=bool((members.status >= 0).all()),
-            one_by_one=self.one_by_one,
+            members,
+            failed=np.flatnonzero(members["status"] == FAILED),
+            success=bool((members["status"] >= 0).all()),
             names=plan.names,
-            nfev=counters[:, NFEV],
-            njev=counters[:, NJEV],
-            nlu=counters[:, NLU],
-            n_rejected_projections=counters[:, REJECTED],
-            times=plan.times if plan.is_saving else np.zeros(0),
-            trajectories=trajectories,
-            invariants=members.values if trajectories is None else members.saved_values.swapaxes(1, 2),
-            t_events=members.t_events if plan.events else None,
-            y_events=members.y_events if plan.events else None,
-            reduced=reduced,
+            times=plan.saved,
             first=first,
             stopped=self.stopped,
-            wall_time=time.perf_counter() - self._begin,
-            method=self.method,
-            h=plan.h,
-            chunk=self.chunk,
-            component_names=plan.ready.problem.component_names,
+            wall_time=time.perf_counter() - self.begin,
+            method=ready.name,
+            h=ready.stepping.h,
+            chunk=self.size,
+            component_names=ready.problem.component_names,
         )
-        if plan.variations is not None:
-            _separate(result, plan.ready.tangents)
-            result["columns"] = plan.ready.problem.described_columns
+        at_end = result.pop("end_invariants")
+        if not plan.held:
+            result.update(trajectories=None, invariants=at_end)
+        if not plan.events:
+            result.update(t_events=None, y_events=None)
+        if plan.task.reduce is not None and result.reduced is None:  # all members failed
+            result["reduced"] = np.full(len(result.t), np.nan)
+        if ready.problem.variations is not None:
+            tangents, result["columns"] = ready.tangents, ready.problem.described_columns
+            result["y"], result["variations"] = tangents.split(result.y)
+            if result.trajectories is not None:
+                rows, result["variations"] = tangents.split(result.trajectories.swapaxes(1, 2))
+                result["trajectories"] = rows.swapaxes(1, 2)
+            if result.y_events is not None:
+                result["y_events"] = [[tangents.state(rows) for rows in member] for member in result.y_events]
         return result
-
-
-def _separate(result: EnsembleResult, tangents: TangentVectors) -> None:
-    """Separate the states of a result from the tangent vectors, in place."""
-    result["y"], result["variations"] = tangents.split(result.y)
-    if result.trajectories is not None:
-        rows, result["variations"] = tangents.split(result.trajectories.swapaxes(1, 2))
-        result["trajectories"] = rows.swapaxes(1, 2)
-    if result.y_events is not None:
-        result["y_events"] = [[tangents.state(rows) for rows in member] for member in result.y_events]
-
-
-def _check_options(options: dict[str, Any]) -> None:
-    known = set(Request._fields) - ALONE | set(ProjectionOptions.names())
-    for name in options:
-        if name not in known:
-            raise TypeError(f"ensemble() has no option {name!r}{nearest(name, (*OWN, *known))}")
-    Events(options.get("events"))  # raises an error if they are wrong
-
-
-def _place(checkpoint: Any, every: Any, resume: Any) -> str | None:
-    """Return `checkpoint` as an absolute path after checks, so that the working directory may change."""
-    require_place(checkpoint, every, resume, "a path")
-    return None if checkpoint is None else absolute(checkpoint)
 
 
 def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any]) -> Chunk:
     """Return all members as one `Chunk`: states (m, n) and parameters (m, p), p = 0 if there are none."""
     problem = fun if isinstance(fun, Problem) else None
+    if y0s is None and problem is not None:
+        y0s = problem.y0
     if y0s is None:
-        y0s = None if problem is None else problem.y0
-        if y0s is None:
-            raise TypeError("ensemble: y0s is missing; it can be omitted only for a Problem with an initial state.")
+        raise TypeError("ensemble: y0s is missing; it can be omitted only for a Problem with an initial state.")
     starts = states("y0s", y0s)
-    if problem is not None and isinstance(params, Mapping):
-        params = problem.named_parameters(params)
-    own = None if params is None else np.atleast_1d(parameter_values(params))
-    if own is not None and own.ndim == 1 and own.size > 1 and problem is not None and _takes_one_parameter(problem):
-        own = own[:, None]  # one for each member, because they cannot be common to all
-    if starts.ndim == 1 and own is not None and own.ndim == 2:
+    if params is None:
+        brought = None if problem is None or problem.rhs is None else problem.params
+        own = np.zeros(0) if brought is None else np.asarray(brought, float).reshape(-1)
+    else:
+        if problem is not None and isinstance(params, Mapping):
+            params = problem.named_parameters(params)
+        own = np.atleast_1d(parameter_values(params))
+        takes_one = problem is not None and problem.params is not None and np.size(problem.params) == 1
+        if takes_one and own.ndim == 1 and own.size > 1:
+            own = own[:, None]  # one for each member, because they cannot be common to all
+    if starts.ndim == 1 and own.ndim == 2:
         starts = np.tile(starts, (len(own), 1))
     if starts.ndim != 2 or starts.size == 0:
         raise ValueError(
             f"y0s must have the shape (members, n), got {starts.shape}; one state (n,) is possible only if params has "
             "a row for each member."
         )
-    if own is None:
-        brought = None if problem is None or problem.rhs is None else problem.params
-        own = np.zeros(0) if brought is None else np.asarray(brought, float).reshape(-1)
-    elif own.ndim == 2 and len(own) != len(starts):
+    if own.ndim > 2:
+        raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
+    if own.ndim == 2 and len(own) != len(starts):
         raise ValueError(
             f"params has {len(own)} rows for {len(starts)} members; give one row for each member, or one for all."
         )
-    elif own.ndim > 2:
-        raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
     if own.ndim == 2 and any(item.args for item in as_invariants(options.get("invariants", ()))):
         raise ValueError(
             "ensemble: invariants must not have args if params differ between members: omit args; the functions "
@@ -614,22 +384,10 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any]) -> Chunk:
     return Chunk(0, starts, own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size)))
 
 
-def _takes_one_parameter(problem: Problem) -> bool:
-    return problem.params is not None and np.size(problem.params) == 1
-
-
 def _bare(fun: Any) -> Any:
-    """Return `fun`; if it is a problem with `rhs`, without its `fun` and `reference`, which may not be picklable."""
-    if not isinstance(fun, Problem) or fun.rhs is None:
-        return fun
-    return dataclasses.replace(fun, fun=_not_called, reference=None)
-
-
-def _not_called(t: float, y: np.ndarray) -> np.ndarray:
-    raise NotImplementedError(
-        "ensemble leaves out `fun` of a problem that has `rhs`, so that fun cannot be called here; call rhs(t, y, out, "
-        "params) instead."
-    )
+    """Return `fun`; if it is a problem with `rhs`, only with that, because its other functions may not be picklable."""
+    has_rhs = isinstance(fun, Problem) and fun.rhs is not None
+    return dataclasses.replace(fun, fun=fun.rhs, reference=None) if has_rhs else fun
 
 
 def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
@@ -638,29 +396,25 @@ def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
     At most `TRIED` of the members `everyone`, spread over all, are tried. A finding of the checks at the start applies
     to all members with the same parameters.
     """
-    first: Exception | None = None
-    starts, params = everyone.y0s, everyone.params
-    for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
+    errors: list[Exception] = []
+    y0s, params = everyone.y0s, everyone.params
+    for k in np.unique(np.linspace(0, len(y0s) - 1, TRIED).astype(int)):
         own = None if task.request.params is None else params[k].copy()
-        request = task.request._replace(y0=starts[k].copy(), params=own)
-        tried = dataclasses.replace(task, request=request)
+        tried = task._replace(request=task.request._replace(y0=y0s[k].copy(), params=own))
         try:
-            ready = tried.prepared(request.y0, own, check_start=True)
+            ready = tried.prepared(tried.request.y0, tried.request.params, check_start=True)
         except MemoryError:
             raise
         except Exception as error:
-            first = first or error
-        else:
-            if found := ready.trust.message:
-                ready.trust.doubts.clear()
-                tried = dataclasses.replace(tried, doubt=(params[k].copy(), found))
-            return _with_common_constraints(Plan(tried, ready), everyone)
-    assert first is not None
+            errors.append(error)
+            continue
+        if found := ready.trust.message:
+            ready.trust.doubts.clear()
+            tried = tried._replace(doubt=(params[k].copy(), found))
+        return _with_common_constraints(Plan(tried, ready), everyone)
     # A transposed y0s fails in the user's function, whose error may not explain that; jitted code explains nothing.
-    first.add_note(
-        f"ensemble: the rows of y0s are members; y0s has {len(starts)} rows of {starts.shape[1]} components."
-    )
-    raise first
+    errors[0].add_note(f"ensemble: the rows of y0s are members; y0s has {len(y0s)} rows of {y0s.shape[1]} components.")
+    raise errors[0]
 
 
 def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
@@ -668,29 +422,23 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
 
     If one of them does not hold for the parameters of some member, no member keeps any.
     """
-    task, found = plan.task, plan.ready.conserved
-    if found.found is None:
+    task, ready, conserved = plan.task, plan.ready, plan.ready.conserved
+    if conserved.found is None:
         return plan
-    C = found.linear.C
-    holds = len(C) > 0 and (task.request.params is None or _hold(plan, everyone))
-    projection = {**task.request.projection, "linear_invariants": (C, C.T) if holds else None}
-    task = dataclasses.replace(task, request=task.request._replace(projection=projection))
-    return Plan(task, None if len(C) and not holds else plan.ready)
-
-
-def _hold(plan: Plan, everyone: Chunk) -> bool:
-    """Return True if the linear invariants of the first member hold for the parameters of all members."""
-    ready, own = plan.ready, plan.ready.problem.parameters.copy()
+    C, parameters = conserved.linear.C, ready.problem.parameters
     first = np.unique(everyone.params, axis=0, return_index=True)[1]
-    if len(first) == 1 or ready.problem.variations is not None:
-        return len(first) == 1
-    y = everyone.y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size)))
-    f = np.full(y.shape, np.nan)
-    for k, member in enumerate(first):
-        ready.problem.parameters[:] = everyone.params[member]
-        f[k] = unless_error(ready.problem.derivative, plan.t0, y[k])
-    ready.problem.parameters[:] = own
-    return bool(confirmed(y, f, ready.conserved.linear).all())
+    holds = len(C) > 0 and (len(first) == 1 or ready.problem.variations is None)
+    if holds and len(first) > 1:
+        y = everyone.y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size)))
+        f, own = np.full(y.shape, np.nan), parameters.copy()
+        for k, member in enumerate(first):
+            parameters[:] = everyone.params[member]
+            f[k] = unless_error(ready.problem.derivative, plan.t0, y[k])
+        parameters[:] = own
+        holds = bool(confirmed(y, f, conserved.linear).all())
+    projection = {**task.request.projection, "linear_invariants": (C, C.T) if holds else None}
+    task = task._replace(request=task.request._replace(projection=projection))
+    return Plan(task, None if len(C) and not holds else ready)
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
@@ -701,12 +449,11 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
     """
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
     native = is_compiled(rhs) or isinstance(rhs, PointerFunction)
-    budget = CHUNK_STEPS if native and plan.task.request.compiled is not False else INTERPRETED_STEPS
-    steps = plan.n_steps or UNKNOWN_STEPS
-    by_work = budget * 4 / (steps * max(4, plan.size))
+    work = CHUNK_WORK if native and plan.task.request.compiled is not False else INTERPRETED_WORK
+    by_work = work / ((expected_steps(plan.ready.schedule) or UNKNOWN_STEPS) * max(4, plan.size))
     by_bytes = CHUNK_BYTES / (plan.size * plan.dtype.itemsize * (1 + plan.times.size))
     size = min(by_work, by_bytes, LARGEST_CHUNK, math.ceil(members / LEAST_CHUNKS))
-    return LANES * max(LEAST_OCTETS, math.ceil(size / LANES))
+    return LANES * max(LEAST_BATCHES, math.ceil(size / LANES))
 
 
 def _check_memory(plan: Plan, members: int, max_bytes: float | None) -> None:
@@ -721,30 +468,3 @@ def _check_memory(plan: Plan, members: int, max_bytes: float | None) -> None:
             f"{members} members of {plan.size} components need {members * each / 1e9:.3g} GB, the bound is "
             f"{bound / 1e9:.3g} GB. {advice}, or raise max_bytes."
         )
-
-
-def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
-    """Return the pool that runs the chunks."""
-    if executor is None or isinstance(executor, (int, np.integer)):
-        plan.compile(progress=progress)
-        threads = cores() if executor is None else count("executor", executor)
-        return thread_pool(plan, threads if plan.why_not is None else 1)
-    run = partial(run_elsewhere, plan.task, uuid.uuid4().hex)
-    if isinstance(executor, Executor):
-        return Pool(executor, run, partial(_workers, executor))
-    if executor == "dask" or type(executor).__module__.partition(".")[0] == "distributed":
-        if pointers := plan.ready.problem.pointers(plan.ready):
-            raise pointers[0].unpicklable()  # Dask's own message for it is very long
-        # Imported by name, because the integrations depend on this package and need further libraries.
-        found, workers, end = import_module("eip_scipy.integrations.dask").connected(executor)
-        return Pool(found, run, workers, end)
-    raise TypeError(
-        f"executor must be None, a number of threads, 'dask', a dask.distributed Client or an executor of "
-        f"concurrent.futures, got {executor!r}."
-    )
-
-
-def _workers(executor: Executor) -> int:
-    """Return the number of workers of an executor, of `mpi4py.futures` or of Python, or else the number of cores."""
-    found = (getattr(executor, name, None) for name in ("num_workers", "_max_workers"))
-    return next((number for number in found if isinstance(number, int) and number > 0), cores())

@@ -31,12 +31,13 @@ class Field(NamedTuple):
     `dims` are its dimensions in tables, () for a number or text that describes the whole run, None if tables leave it
     out. ``join(one, two)`` returns the field of a run and its continuation. Without it fields along t are concatenated,
     or computed when they are first requested, and others are those of the continuation. `table` is the name in tables,
-    if it is another one.
+    if it is another one, and `unset` the value for a member of an ensemble that did not run.
     """
 
     dims: tuple[str, ...] | None = None
     join: Callable[[Any, Any], Any] | None = None
     table: str = ""
+    unset: Any = None
 
 
 def _by_event(one: list[np.ndarray] | None, two: list[np.ndarray] | None) -> list[np.ndarray] | None:

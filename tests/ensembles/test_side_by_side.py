@@ -18,7 +18,7 @@ from eip_scipy import (
     ensemble,
     integrate,
 )  # fmt: skip
-from eip_scipy.ensembles import tasks
+from eip_scipy.ensembles import members as running
 from eip_scipy.problems import harmonic, kepler, solar_system
 from eip_scipy.problems.gravity.nbody import nbody
 
@@ -31,7 +31,7 @@ def spread_starts(y0, members, size=1e-3, seed=0):
 
 @pytest.fixture(autouse=True)
 def _small_ensembles_too(monkeypatch):
-    monkeypatch.setattr(tasks, "LEAST_WORK", 0)
+    monkeypatch.setattr(running, "LEAST_WORK", 0)
 
 
 def check_bits(problem, t_span, starts, *, params=None, members=None, **options):
@@ -180,7 +180,7 @@ def test_a_member_that_fails_disturbs_no_other():
 
 
 @njit(error_model="numpy")
-def all_that_octets_do(t, y, out):
+def all_that_lanes_do(t, y, out):
     a, b, total = y[0], y[1], 0.0
     for i in range(y.size):
         total += y[i]
@@ -197,10 +197,10 @@ def all_that_octets_do(t, y, out):
 
 @pytest.mark.slow
 @pytest.mark.needs_jit
-def test_octets_are_floats_lane_by_lane():
+def test_lanes_are_floats():
     """All operations of functions of batches give the floats of each lane."""
     starts = np.random.default_rng(11).normal(size=(8, 8))
-    run = check_bits(all_that_octets_do, (0, 0.5), starts, method=EIPRK4, h=0.1, in_place=True, invariants=())
+    run = check_bits(all_that_lanes_do, (0, 0.5), starts, method=EIPRK4, h=0.1, in_place=True, invariants=())
     assert run.side_by_side.all()
 
 
@@ -277,9 +277,9 @@ def test_multistep_members_tell_a_passage_at_whichever_step_it_comes():
 @pytest.mark.parametrize("together", [True, False], ids=["side by side", "one by one"])
 def test_evaluations_of_multistep_members_do_not_depend_on_how_fast_the_machine_is(monkeypatch, together):
     """Calls of the engine that end anywhere, within the last states too."""
-    monkeypatch.setattr(tasks, "FIRST_STEPS", 3)
-    monkeypatch.setattr(tasks, "SWEEP_SECONDS", 0.0)
+    monkeypatch.setattr(running, "FIRST_STEPS", 3)
+    monkeypatch.setattr(running, "CALL_SECONDS", 0.0)
     if not together:
-        monkeypatch.setattr(tasks, "why_one_by_one", lambda *_: "a test")
+        monkeypatch.setattr(running, "not_batched_because", lambda *_: "a test")
     run = check_bits(kepler(), (0, 3.01), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02)
     assert run.side_by_side.all() == together
