@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,9 +20,11 @@ from .gradients import NumericalGradient, difference_gradient, typical_sizes, un
 from .inputs import count, filled, flag, numbers, reals, require_arguments, shown
 from .invariant_checks import complaints, listed, reported, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
-from .linear import LinearInvariants
 from .pointers import GRADIENT, PointerFunction, by_pointer
 from .states import states
+
+if TYPE_CHECKING:
+    from .particles import LinearInvariants
 
 __all__ = ["Invariant", "InvariantSet", "as_invariants", "check_gradient", "copied", "with_args"]
 
@@ -318,7 +320,7 @@ class InvariantSet:
     the right-hand side of the system, for checks.
 
     The `target` of `balances` are the values that the run integrates. `kinds` are groups of components that have the
-    same unit, see `kinds_of`, or None. Masks (l,) of the values: the user gave the target of the `given`, and the
+    same unit, or None. Masks (l,) of the values: the user gave the target of the `given`, and the
     gradients of the `computed` are computed because none was given.
     """
 

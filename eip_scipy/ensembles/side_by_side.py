@@ -8,10 +8,9 @@ import numpy as np
 
 from ..core.jitted import NotCompilableError
 from ..core.native_functions import Native
-from ..core.options import Options
 from ..core.pointers import PointerFunction
 from ..core.stepping import UNBOUNDED
-from ..engine.data import AUTO, NEW, Multistep, Schedule
+from ..engine.data import AUTO, NEW, Multistep, Options, Schedule
 from ..engine.native import LibraryFunction, NativeFunctions, OctetFunctions
 
 __all__ = ["LANES", "need_compiling", "octet_functions", "why_one_by_one"]
