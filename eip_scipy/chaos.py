@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from .core.inputs import count as as_count
 from .core.inputs import is_number, reals, shown
 from .core.names import nearest
-from .core.options import ProjectionOptions
+from .core.projection import ProjectionOptions
 from .core.results import Diagnostics
 from .run.continuation import continued
 from .run.fields import rows

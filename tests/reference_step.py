@@ -129,7 +129,7 @@ class Step:
         self.remembered = scale, size, np.maximum(now, lasting)
         constant = (error == 0.0) & (norms(y_hat - y) == 0.0)
         errors = np.where(constant, now, size * inverse)
-        sigma = scale * (errors**self.tableau.kappa + FLOOR) if errors.any() else np.ones(len(scale))
+        sigma = scale * (errors**self.tableau.metric_exponent + FLOOR) if errors.any() else np.ones(len(scale))
         if len(blocks) < y.size:
             return spread(sigma), None, None
         return spread(sigma), spread(self.remembered[2] ** 2), spread(inverse**2)

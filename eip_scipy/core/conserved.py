@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from itertools import product
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dgeqp3
 
 from ..engine.native import LibraryFunction
-from ..methods.base import PROJECTION_ONLY, Method
+from ..methods.base import PROJECTION_ONLY
 from .gradients import time_of_motion, typical_sizes, unless_error
-from .invariant_set import InvariantSet
-from .linear import LinearInvariants, confirmed, found_invariants, undetermined
-from .options import ProjectionOptions
-from .particles import Particles, missing_particles
-from .tangent_vectors import TangentVectors
+from .particles import LinearInvariants, particle_invariants
 
-__all__ = ["Conserved", "Samples", "conserved"]
+if TYPE_CHECKING:
+    from .runs import Run
+
+__all__ = ["NEAR_DISTANCE", "NOTHING", "Conserved", "confirmed", "conserved", "reduced_rows"]
 
 # Largest state whose linear invariants are searched for: the time grows with the cube of the number of components.
 MOST_COMPONENTS = 300
@@ -26,9 +27,34 @@ MOST_COMPONENTS = 300
 NEAR, FAR = 3, 5
 # Distances of the points from the start, in units of the components' sizes.
 NEAR_DISTANCE, FAR_DISTANCE = 1e-2, 0.5
+# Diagonal entries of R below NULL times the largest are zero. If one is between NULL and CLEAR, nothing is found.
+NULL, CLEAR = 1e-12, 1e-10
+# Bound of the residual of rates of the form d y, where d y is an invariant, as for the centre of mass.
+NULL_RATE = 1e-9
+# Coefficients below this share of the largest one are 0; pivots are larger than LEAST_PIVOT. Others are rounded to BITS
+# bits, so that they do not depend on the points. A rate may differ from 0 by HOLDS times the sum of its terms.
+NEGLIGIBLE, LEAST_PIVOT, BITS, HOLDS = 1e-9, 1e-4, 32, 1e-8
+# A vector is a combination of others if its remainder is below this share of it.
+REMAINDER = 1e-7
+# The largest share of their terms that total forces and torques, and changes of a mass between states, may have.
+SMALL = 1e-9
 
 Array = np.ndarray
-Derivative = Callable[[float, Array], Array]
+
+
+class Particles(NamedTuple):
+    """Masses (N,) of particles with this number of coordinates, whose momentum or angular momentum no run keeps yet."""
+
+    masses: Array
+    dimension: int
+
+    def __str__(self) -> str:
+        given = "masses" if self.dimension == 3 else "masses, dimension=2"
+        return (
+            "momentum and angular momentum of the particles are conserved too, and the run does not keep all of them, "
+            "without which keeping the energy can make the motion less accurate. Write "
+            f"invariants=[H, *particle_invariants({given})], with the masses of the energy H"
+        )
 
 
 class Conserved(NamedTuple):
@@ -52,52 +78,107 @@ class Conserved(NamedTuple):
         return (text,) * bool(self.found) + (() if self.missing is None else (str(self.missing),))
 
 
-class Samples:
+NOTHING = Conserved()
+
+
+def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
+    """Return what the system of a run conserves; nothing if the run cannot keep it.
+
+    The run has evaluated its invariants at the start. `y` is the state there, without tangent vectors, and `f` its
+    derivative. Particles are looked for if `names`, but not in ready problems. A user's one-step method need not keep
+    linear invariants, and none are looked for.
+    """
+    invariants, method, n, half = run.invariants, run.tableau, y.size, y.size // 2
+    plain = y.dtype.kind == "f" and not invariants.balances.items and method is not PROJECTION_ONLY
+    if not plain or invariants.size == 0 or hasattr(invariants.items, "shift"):  # fields have their own projection
+        return NOTHING
+    known, is_searched = None, False
+    if run.projection.given_linear_invariants is None and (not method.in_python or method.drives):
+        is_searched = run.projection.linear_invariants is not None and n <= MOST_COMPONENTS
+        known = next((item.linear for item in invariants.items if item.linear is not None), None)
+        known = None if is_searched or known is None or known.C.shape[1] != n else known
+    names = (
+        names
+        and n >= 8 and n % 2 == 0 and np.array_equal(f[:half], y[half:])
+        and not (n > MOST_COMPONENTS and invariants.by_values.any())  # gradients by differences take long
+        and not all(isinstance(item.function, LibraryFunction) for item in invariants.items)
+    )  # fmt: skip
+    if not (is_searched or known or names):
+        return NOTHING
+    samples = _Samples(run, y, f, is_searched)
+    with np.errstate(all="ignore"):
+        found = unless_error(_found, samples, known, names)
+    run.problem.uncount(samples.calls)
+    return Conserved(calls=samples.calls) if found is None else found
+
+
+def _found(samples: _Samples, known: LinearInvariants | None, names: bool) -> Conserved:
+    """Return what is found among all linear invariants if the samples are wide, else among the `known` ones."""
+    found, count, missing = NOTHING.linear, None, None
+    if samples.is_wide:
+        found = found_invariants(*samples.points)
+        count = len(found.C)
+    elif known is not None:
+        found = known.only(confirmed(*samples.points, known))
+        count = len(found.C)
+    if count:
+        found = found.only(undetermined(found.C, samples.gradients, samples.sizes))
+    if names and (count or not samples.is_wide):  # momentum is among what a search finds
+        given = samples.run.projection.given_linear_invariants
+        C = found.C.reshape(-1, samples.y.size) if given is None else np.atleast_2d(given[0])
+        missing = _missing_particles(samples, C)
+    return Conserved(found, count, samples.calls, missing)
+
+
+class _Samples:
     """States around the start of a run and their derivatives. The states are the same in each run that starts there.
 
-    There are `near` points near the start, at its time, and `far` points at larger distances, at times up to the end.
-    `start` is a `Start`; of a state with `tangents` only the state itself is varied and returned. `calls` counts the
-    evaluations of ``rhs(t, y)``.
+    The first ones are near the start, at its time; if `is_wide`, there are others at larger distances, at times up to
+    the end. Of a state with tangent vectors only the state itself, `y` at the start, is varied. `calls` counts the
+    evaluations of the right-hand side.
     """
 
-    def __init__(self, rhs: Derivative, start: Any, invariants: InvariantSet, tangents: TangentVectors) -> None:
-        self._rhs, self._start, self.invariants, self._tangents = rhs, start, invariants, tangents
-        self.y0, self.f0, self.G0 = map(tangents.state, (start.y, start.f, invariants.start_gradients))
-        self.near, self.far, self.calls = NEAR, 0, 0
+    def __init__(self, run: Run, y: Array, f: Array, is_wide: bool) -> None:
+        self.run, self.y, self.f, self.is_wide, self.calls = run, y, f, is_wide, 0
 
     @cached_property
     def sizes(self) -> Array:
         """Return the sizes (n,) of the components."""
-        tau = min(self.invariants.tau, time_of_motion(self.y0, self.f0))
-        return np.abs(self.y0) + typical_sizes(self.y0, self.f0, tau)
+        tau = min(self.run.invariants.tau, time_of_motion(self.y, self.f))
+        return np.abs(self.y) + typical_sizes(self.y, self.f, tau)
 
     @cached_property
     def points(self) -> tuple[Array, Array]:
         """Return states (m, n) and derivatives, which are NaN where the function fails."""
-        t0, t_bound = self.invariants.t_span
-        ways = _directions(self.near, self.far, self.y0.size)
-        if not self.y0.all():  # a component that is 0 at the start may have to stay nonnegative, as a concentration
-            ways = np.where(self.y0 == 0, np.abs(ways), ways)
-        y = self.y0 + ways * self.sizes
-        f = np.empty_like(y)
+        near, far = (max(self.y.size, NEAR), FAR) if self.is_wide else (NEAR, 0)
+        ways = _directions(near, far, self.y.size)
+        if not self.y.all():  # a component that is 0 at the start may have to stay nonnegative, as a concentration
+            ways = np.where(self.y == 0, np.abs(ways), ways)
+        y = self.y + ways * self.sizes
+        f = np.full_like(y, np.nan)
+        t0, t_bound = self.run.invariants.t_span
         span = t_bound - t0 if np.isfinite(t_bound) else 0.0
-        times = [t0] * self.near + [t0 + span * k / (FAR - 1) for k in range(self.far)]
-        self.calls += len(times)
-        for k, t in enumerate(times):
-            found = unless_error(self._rhs, t, self._augmented(y[k]))
-            f[k] = np.nan if found is None else self._tangents.state(found)
+        self.calls += near + far
+        rhs = self.run.tangents.of_state(self.run.problem.derivative, self.run.begin.y)
+        for k, t in enumerate([t0] * near + [t0 + span * k / (FAR - 1) for k in range(far)]):
+            if (found := unless_error(rhs, t, y[k])) is not None:
+                f[k] = found
         return y, f
 
     @cached_property
     def gradients(self) -> Array:
         """Return the gradients (NEAR, l, n) of the invariants at the first points."""
         self.calls += NEAR
-        states = [(self._start.t, self._augmented(state)) for state in self.points[0][:NEAR]]
-        found = [self.invariants.gradients(*here, self._rhs(*here)) for here in states]
-        return self._tangents.state(np.array(found))
+        (t, start, *_), tangents = self.run.begin, self.run.tangents
+        states = [tangents.with_state(start, y) for y in self.points[0][:NEAR]]
+        return tangents.state(
+            np.array([self.run.invariants.gradients(t, y, self.run.problem.derivative(t, y)) for y in states])
+        )
 
-    def _augmented(self, y: Array) -> Array:
-        return self._tangents.with_state(self._start.y, y)
+    def states(self) -> Iterator[tuple[Array, Array, Array]]:
+        """Return the state, the derivative and the gradients (l, n) at the start, and then at the first points."""
+        yield self.y, self.f, self.run.tangents.state(self.run.invariants.start_gradients)
+        yield from zip(*self.points, self.gradients, strict=False)
 
 
 @lru_cache(maxsize=8)
@@ -107,32 +188,138 @@ def _directions(near: int, far: int, n: int) -> Array:
     return ways * np.repeat([NEAR_DISTANCE, FAR_DISTANCE], [near, far])[:, None]
 
 
-def conserved(samples: Samples, projection: ProjectionOptions, method: Method, names: bool) -> Conserved:
-    """Return what a system conserves; nothing if its runs cannot keep it.
+def found_invariants(y: Array, f: Array) -> LinearInvariants:
+    """Return the quantities c y with c f = 0, and those whose rates are such quantities.
 
-    Particles are looked for if `names`, but not in ready problems.
+    `f` (m, n) are the derivatives at the states `y` (m, n). The first n states are close to each other, and nothing is
+    found if a derivative there is not finite; the others are left out where theirs are not finite.
     """
-    invariants, n = samples.invariants, samples.y0.size
-    plain = invariants.dtype.kind == "f" and not invariants.balances.items
-    # Fields are projected by their own functions.
-    if not plain or invariants.size == 0 or method is PROJECTION_ONLY or hasattr(invariants.items, "shift"):
-        return Conserved()
-    given = projection.constraints
-    may_keep = given is None and (not method.in_python or method.drives)  # a user's step need not keep any
-    known = next((item.linear for item in invariants.items if item.linear is not None), None)
-    names = names and not all(isinstance(item.function, LibraryFunction) for item in invariants.items)
-    found, count, _, missing = Conserved()
-    with np.errstate(all="ignore"):
-        if may_keep and projection.is_searched and n <= MOST_COMPONENTS:
-            samples.near, samples.far = max(n, NEAR), FAR
-            found = found_invariants(*samples.points)
-            count = len(found.C)
-        elif may_keep and known is not None and known.C.shape[1] == n:
-            found = known.only(confirmed(*samples.points, known))
-            count = len(found.C)
-        if count:
-            found = found.only(undetermined(found.C, samples.gradients, samples.sizes))
-        # Momentum is among what a search finds. Gradients by differences take long.
-        if names and (count or not samples.far) and not (n > MOST_COMPONENTS and invariants.by_values.any()):
-            missing = missing_particles(samples, found.C.reshape(-1, n) if given is None else np.atleast_2d(given[0]))
-    return Conserved(found, count, samples.calls, missing)
+    n = y.shape[1]
+    none, good = LinearInvariants(np.zeros((0, n)), np.zeros((0, 0))), np.isfinite(f).all(axis=1)
+    if not good[:n].all():
+        return none
+    # Rows are in units of the largest rate at their state, and columns in those of the largest rate of a component.
+    size = np.abs(f[good]).max(axis=1, keepdims=True)
+    size[size == 0] = 1.0
+    F = f[good] / size
+    units = np.abs(F).max(axis=0)
+    units[units == 0] = 1.0
+    F /= units
+    left, order = dgeqp3(F)[:2]  # the QR decomposition with pivots
+    left = np.abs(left.diagonal())
+    rank = int(np.count_nonzero(left > NULL * left[0]))
+    if not 0 < rank < n or left[rank - 1] < CLEAR * left[0]:
+        return none
+    pivots, others = order[:rank] - 1, order[rank:] - 1
+    Q, R = np.linalg.qr(F[:, pivots])
+    momenta, inverse = np.eye(n)[others], np.linalg.inv(R)
+    momenta[:, pivots] = -(inverse @ (Q.T @ F[:, others])).T
+    momenta = _without_negligible(reduced_rows(momenta, LEAST_PIVOT)) / units
+    momenta = _rounded(momenta / np.abs(momenta).max(axis=1, keepdims=True))
+    rates = y[good] @ momenta.T / size
+    shares = Q.T @ rates
+    paired = np.linalg.norm(rates - Q @ shares, axis=0) <= NULL_RATE * np.linalg.norm(rates, axis=0)
+    centres = np.zeros((np.count_nonzero(paired), n))
+    centres[:, pivots] = (inverse @ shares[:, paired]).T
+    C = np.concatenate([_rounded(_without_negligible(centres) / units), momenta])
+    A = np.zeros((len(C), len(C)))
+    A[: len(centres), len(centres) :][:, paired] = np.eye(len(centres))
+    return LinearInvariants(C, A)
+
+
+def confirmed(y: Array, f: Array, given: LinearInvariants) -> Array:
+    """Return a mask (k,) of the rows of `given` whose rates agree with the derivatives f (m, n) at the states y."""
+    C, R = given.C.T, (given.A @ given.C).T
+    return (np.abs(f @ C - y @ R) <= HOLDS * (np.abs(f) @ np.abs(C) + np.abs(y) @ np.abs(R))).all(axis=0)
+
+
+def undetermined(C: Array, gradients: Array, sizes: Array) -> Array:
+    """Return a mask (k,) of the rows of C (k, n) that do not occur in a combination of the gradients.
+
+    `gradients` (m, l, n) are those of the invariants at m states, and `sizes` (n,) those of the components. If the rows
+    were kept whose combination is a combination of the gradients, no correction could change that combination of the
+    invariants, such as a momentum that is an invariant.
+    """
+    rows, free = (C * sizes).T, np.ones(len(C), bool)
+    rows /= np.linalg.norm(rows, axis=0)
+    for G in np.swapaxes(gradients * sizes, 1, 2):
+        slopes = G / np.maximum(np.linalg.norm(G, axis=0), np.finfo(float).tiny)
+        shares = np.linalg.lstsq(rows, slopes)[0]
+        _, left, combinations = np.linalg.svd(slopes - rows @ shares, full_matrices=False)
+        free &= (np.abs(shares @ combinations[left < REMAINDER].T) < REMAINDER).all(axis=1)
+    return free
+
+
+def reduced_rows(rows: Array, least: float) -> Array:
+    """Return the reduced row echelon form of independent rows; pivots are larger than `least`."""
+    rows, done = rows.copy(), 0
+    for column in range(rows.shape[1]):
+        if done == len(rows):
+            break
+        pivot = done + int(np.argmax(np.abs(rows[done:, column])))
+        if abs(rows[pivot, column]) < least:
+            continue
+        rows[[done, pivot]] = rows[[pivot, done]]
+        rows[done] /= rows[done, column]
+        others = np.arange(len(rows)) != done
+        rows[others] -= np.outer(rows[others, column], rows[done])
+        done += 1
+    return rows
+
+
+def _without_negligible(rows: Array) -> Array:
+    return np.where(np.abs(rows) < NEGLIGIBLE * np.abs(rows).max(axis=1, keepdims=True, initial=0.0), 0.0, rows)
+
+
+def _rounded(rows: Array) -> Array:
+    mantissa, exponent = np.frexp(rows)
+    return np.ldexp(np.round(np.ldexp(mantissa, BITS)), exponent - BITS)
+
+
+def _missing_particles(samples: _Samples, C: Array) -> Particles | None:
+    """Return the particles of a state (q, v) whose momentum and angular momentum the run does not keep; else None.
+
+    One of the invariants is the energy, whose gradient gives the masses, and `C` (k, n) are the linear invariants that
+    the corrections leave unchanged.
+    """
+    half = samples.y.size // 2
+    for d, row in product((3, 2), range(samples.run.invariants.size)):
+        if half % d or half < 2 * d or (masses := _masses(samples.states(), row, d)) is None:
+            continue
+        wanted = _momenta(masses, d, samples.points[0][0]).T
+        known = np.concatenate([samples.gradients[0], C]).T
+        known /= np.maximum(np.linalg.norm(known, axis=0), np.finfo(float).tiny)
+        rest = wanted - known @ np.linalg.lstsq(known, wanted, rcond=SMALL)[0]
+        if (np.linalg.norm(rest, axis=0) > REMAINDER * np.linalg.norm(wanted, axis=0)).any():
+            return Particles(masses, d)
+    return None
+
+
+def _masses(states: Iterator[tuple[Array, Array, Array]], row: int, d: int) -> Array | None:
+    """Return masses (N,) for which a row of the gradients has the momenta, and momentum and angular momentum are kept.
+
+    Return None if there are none. The mass of a particle at rest is unknown, and its state is not examined.
+    """
+    masses = None
+    for y, f, G in states:
+        v, p = (x.reshape(2, -1, d)[1] for x in (y, G[row]))
+        m: Array = (p * v).sum(axis=1) / (v * v).sum(axis=1)
+        if np.isnan(m).any():
+            continue
+        fits = (np.abs(p - m[:, None] * v) <= SMALL * np.abs(p).max(axis=1, keepdims=True)).all() and (m > 0).all()
+        if not fits or (masses is not None and (np.abs(m - masses) > SMALL * masses).any()):
+            return None
+        masses, rows = m, _momenta(m, d, y)
+        if not (np.abs(rows @ f) <= SMALL * (np.abs(rows) @ np.abs(f))).all():
+            return None
+    return masses
+
+
+def _momenta(masses: Array, d: int, y: Array) -> Array:
+    """Return the gradients of the momentum and the angular momentum of particles at the state y."""
+    (item,) = particle_invariants(masses, d)
+    assert item.linear is not None
+    assert item.gradient is not None
+    slope = np.empty((1 if d == 2 else 3, y.size))
+    item.gradient(0.0, y, slope)
+    return np.concatenate([item.linear.C[d:], slope])

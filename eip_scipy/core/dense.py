@@ -18,7 +18,7 @@ from ..engine.native import Call, Engine, PythonFunctions
 from ..methods.base import PROJECTION_ONLY, DenseForm
 from .bound_problem import BoundProblem
 from .inputs import reals, shown
-from .options import ProjectionOptions
+from .projection import ProjectionOptions
 from .runs import Run
 from .step_control import StepControl
 

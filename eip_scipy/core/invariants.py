@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .inputs import count, flag, reals, shown
-from .linear import LinearInvariants
 from .pointers import GRADIENT, PointerFunction, by_pointer
+
+if TYPE_CHECKING:
+    from .particles import LinearInvariants
 
 __all__ = ["Invariant", "as_invariants", "copied", "with_args"]
 

@@ -1,10 +1,9 @@
-"""Particles with states (q, v): their angular momentum, and whether a system keeps it together with the momentum."""
+"""Particles with states (q, v): their angular momentum as an invariant, with which runs keep linear invariants."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,15 +11,22 @@ import numpy as np
 from .inputs import real_array, shown
 from .invariants import Invariant, copied
 from .jitted import compilable, jitted
-from .linear import LinearInvariants
 
-__all__ = ["Particles", "compiled_items", "missing_particles", "particle_invariants"]
-
-# The largest share of their terms that total forces and torques, and changes of a mass between states, may have; and
-# the smallest share of a gradient that is not a combination of others.
-SMALL, REMAINDER = 1e-9, 1e-7
+__all__ = ["LinearInvariants", "compiled_items", "particle_invariants"]
 
 Array = np.ndarray
+
+
+class LinearInvariants(NamedTuple):
+    """Quantities C y, with C of shape (k, n), and their rates A C y, with A of shape (k, k)."""
+
+    C: Array
+    A: Array
+
+    def only(self, rows: Array) -> LinearInvariants:
+        """Return those of the `rows`, a mask (k,), whose rates are 0 or among them too."""
+        kept = rows & ~(self.A[:, ~rows] != 0).any(axis=1)
+        return LinearInvariants(self.C[kept], self.A[np.ix_(kept, kept)])
 
 
 def particle_invariants(masses: Any, dimension: int = 3, *, about: Any = None) -> list[Invariant]:
@@ -41,7 +47,7 @@ def particle_invariants(masses: Any, dimension: int = 3, *, about: Any = None) -
     list of Invariant
         The angular momentum L, the sum of m q x v, with its gradient: 3 values in three dimensions, one value in two,
         in the unit of mass times that of q times that of v. Runs with it leave momentum and centre of mass unchanged
-        by their corrections, as with the option `frame`, in those directions in which `fun` keeps them; see
+        by their corrections, as with the option `linear_invariants`, in those directions in which `fun` keeps them; see
         :doc:`/explanation/metric`. Together with the energy these are all ten integrals of free particles.
 
     Raises
@@ -104,79 +110,11 @@ def _functions(masses: tuple[float, ...], about: tuple[float, ...]) -> tuple[Cal
     return compilable(value), compilable(gradient)
 
 
-class Particles(NamedTuple):
-    """Masses (N,) of particles with this number of coordinates, whose momentum or angular momentum no run keeps yet."""
-
-    masses: Array
-    dimension: int
-
-    def __str__(self) -> str:
-        given = "masses" if self.dimension == 3 else "masses, dimension=2"
-        return (
-            "momentum and angular momentum of the particles are conserved too, and the run does not keep all of them, "
-            "without which keeping the energy can make the motion less accurate. Write "
-            f"invariants=[H, *particle_invariants({given})], with the masses of the energy H"
-        )
-
-
-def missing_particles(samples: Any, C: Array) -> Particles | None:
-    """Return the particles of a state (q, v) whose momentum and angular momentum the run does not keep; else None.
-
-    `samples` are the `Samples` around the start. One of the invariants is the energy, whose gradient gives the masses,
-    and `C` (k, n) are the linear invariants that the corrections leave unchanged.
-    """
-    y, half = samples.y0, samples.y0.size // 2
-    if y.size % 2 or not np.array_equal(samples.f0[:half], y[half:]):
-        return None
-    for d, row in product((3, 2), range(len(samples.G0))):
-        if half % d or half < 2 * d or _masses(y, samples.f0, samples.G0[row], d) is None:
-            continue
-        states = list(zip(*samples.points, samples.gradients, strict=False))
-        m, *others = (_masses(x, f, G[row], d) for x, f, G in states)
-        if m is None or not all(found is not None and (np.abs(found - m) <= SMALL * m).all() for found in others):
-            continue
-        if _lacks(particle_invariants(m, d)[0], states[0][0], np.concatenate([states[0][2], C])):
-            return Particles(m, d)
-    return None
-
-
-def _masses(y: Array, f: Array, slope: Array, d: int) -> Array | None:
-    """Return masses (N,) for which `slope` has the momenta, and total force and torque are 0; None if there are none.
-
-    The mass of a particle at rest is unknown, NaN, and then forces and torques are not examined.
-    """
-    (q, v), (_, a), (_, p) = (x.reshape(2, -1, d) for x in (y, f, slope))
-    m: Array = (p * v).sum(axis=1) / (v * v).sum(axis=1)
-    if (np.abs(p - m[:, None] * v) > SMALL * np.abs(p).max(axis=1, keepdims=True)).any() or (m <= 0).any():
-        return None
-    if np.isnan(m).any():
-        return m
-    force = m[:, None] * a
-    turns = q[:, :, None] * force[:, None, :]
-    torque, sizes = turns.sum(axis=0), np.abs(turns).sum(axis=0)
-    is_free = (np.abs(force.sum(axis=0)) <= SMALL * np.abs(force).sum(axis=0)).all()
-    return m if is_free and (np.abs(torque - torque.T) <= SMALL * (sizes + sizes.T)).all() else None
-
-
-def _lacks(item: Invariant, y: Array, known: Array) -> bool:
-    """Return True if momentum or angular momentum, `item`, at the state y do not follow from the gradients `known`."""
-    assert item.linear is not None
-    assert item.gradient is not None
-    d = len(item.linear.C) // 2
-    slope = np.empty((1 if d == 2 else 3, y.size))
-    item.gradient(0.0, y, slope)
-    wanted = np.concatenate([item.linear.C[d:], slope]).T
-    known = known.T / np.maximum(np.linalg.norm(known, axis=1), np.finfo(float).tiny)
-    rest = wanted - known @ np.linalg.lstsq(known, wanted, rcond=SMALL)[0]
-    return bool((np.linalg.norm(rest, axis=0) > REMAINDER * np.linalg.norm(wanted, axis=0)).any())
-
-
 def compiled_items(items: tuple[Invariant, ...]) -> tuple[Invariant, ...]:
     """Return the invariants, with those of particles jitted if Numba is installed."""
-    return tuple(item if item.linear is None else _compiled(item) for item in items)
-
-
-def _compiled(item: Invariant) -> Invariant:
-    new: Invariant = copied(item)
-    new.function, new.gradient = jitted(item.function), jitted(item.gradient)
-    return new
+    found = list(items)
+    for k, item in enumerate(items):
+        if item.linear is not None:
+            found[k] = new = copied(item)
+            new.function, new.gradient = jitted(item.function), jitted(item.gradient)
+    return tuple(found)

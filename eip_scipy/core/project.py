@@ -16,7 +16,7 @@ from .bound_problem import BoundProblem
 from .failures import projection_failure
 from .inputs import as_vector, count, is_number, reals, shown
 from .invariant_set import InvariantSet
-from .options import MOST_ITERATIONS, ProjectionOptions, weights
+from .projection import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
 from .runs import Run
 from .states import initial_state

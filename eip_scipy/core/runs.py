@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -27,15 +26,12 @@ from ..engine.native import BUILD, Call, Engine, Hooks, NativeFunctions, PythonF
 from ..engine.trust import Trust
 from ..methods.base import PROJECTION_ONLY, Method
 from .callers import users_level
-from .conserved import Conserved, Samples, conserved
+from .conserved import Conserved, confirmed, conserved
 from .examination import Derivative, Examiner, is_check_due, unresolved
 from .failures import projection_failure
-from .frame import frame_rows, spanned
-from .gradients import unless_error
 from .invariant_checks import Complaint, listed, reported
 from .invariant_set import TARGET_TOLERANCE, InvariantSet
-from .linear import confirmed
-from .options import ProjectionOptions
+from .projection import ProjectionOptions, are_combinations, linear_rows
 from .results import Diagnostics, slowness
 from .step_control import StepControl
 from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
@@ -46,10 +42,10 @@ if TYPE_CHECKING:
 __all__ = ["Run", "Start"]
 
 START_ITERATIONS = 50
-FRAME_DISTANCE = 1e-4
+COMBINATION_DISTANCE = 1e-4
 
 # What `restore` makes again, and what a copy does not need.
-RESTORED = ("tableau", "given", "invariants", "identity", "diagnostics", "examiner")
+RESTORED = ("tableau", "given", "invariants", "diagnostics", "examiner")
 
 Array = np.ndarray
 
@@ -71,7 +67,7 @@ class Run:
 
     After the start, `tableau` is the method for these equations, and `method` the form of it that the engine uses for
     the steps. The invariants were measured at `begin`; `start`, of the first step, may have been moved by
-    `project_initial`, and `moved` says how far. ``identity()`` returns the options that determine the bits of the run.
+    `project_initial`, and `moved` says how far.
     `looked` is the step at which the invariants were checked last. `depends_on_time` is True if an invariant depends on
     time; its scale then depends on the start. `conserved` is what the system conserves in addition to the invariants.
     Whoever makes the steps sets `schedule`.
@@ -83,7 +79,6 @@ class Run:
     options: Any
     work: Work
     invariants: InvariantSet
-    identity: Callable[[], dict[str, Any]]
     trust: Trust
     conserved: Conserved
     schedule: Schedule
@@ -109,6 +104,10 @@ class Run:
     def y0(self) -> Array:
         """Return the state at which the first step starts."""
         return self.start.y
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options that determine the bits of the run, by name."""
+        return self.projection.identity(self.options, self.invariants)
 
     @property
     def uses_jacobian(self) -> bool:
@@ -173,13 +172,10 @@ class Run:
         y, f = map(self.tangents.state, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
         self.depends_on_time = method is not PROJECTION_ONLY and invariants.add_rounding_of_time(start.y)
-        options, sigma, self.identity = projection.settled(method, self.stepping, y, f, invariants)
-        samples = Samples(rhs, start, invariants, self.tangents)
-        found = unless_error(conserved, samples, projection, method, tell and options.watched)
-        self.conserved = Conserved(calls=samples.calls) if found is None else found
-        self.problem.uncount(self.conserved.calls)
+        options, sigma = projection.validate(method, self.stepping, y, f, invariants)
+        self.conserved = conserved(self, y, f, tell and options.watched)
         if len(C := self.conserved.linear.C):
-            options = options._replace(frame=frame_rows((C, C.T), y.size, 1))
+            options = options._replace(frame=linear_rows((C, C.T), y.size, 1))
         self.options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)
         invariants.kinds = options.kinds
         self.method = method.for_engine(self.problem.sees_velocity)
@@ -225,12 +221,12 @@ class Run:
         errors. The gradients are examined at two states, because a gradient may be a combination of rows of C by
         chance.
         """
-        (t0, y0, f0, tau), frame, invariants, G = self.begin, self.options.frame, self.invariants, self.work.G
-        held = spanned(frame, G.view(float))
+        (t0, y0, f0, tau), linear, invariants, G = self.begin, self.options.frame, self.invariants, self.work.G
+        held = are_combinations(linear, G.view(float))
         if not np.count_nonzero(held):
             return self.options.scales
-        away = y0 + FRAME_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
-        held &= spanned(frame, invariants.gradients(t0, away, f0).view(float))
+        away = y0 + COMBINATION_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
+        held &= are_combinations(linear, invariants.gradients(t0, away, f0).view(float))
         return np.where(held, invariants.sizes_of_terms(y0, G, self.work.values) / EPS, self.options.scales)
 
     def _projected_start(self) -> Array:

@@ -31,7 +31,7 @@ from .failures import failure
 from .inputs import is_number
 from .invariants import as_invariants
 from .names import nearest
-from .options import ProjectionOptions, takes_projection_options
+from .projection import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
 from .runs import Run, Start
 from .states import initial_state
@@ -326,7 +326,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run, work = self._run, self._run.work
         run.examine(here.y, here.f, is_known=not new_function)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
-        fresh = run.projection.settled(run.tableau, run.stepping, run.y0, run.start.f, run.invariants)[0]
+        fresh = run.projection.validate(run.tableau, run.stepping, run.y0, run.start.f, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
         if self.TABLEAU.drives and not new_function:
             for name in (*CONTROL, "status"):

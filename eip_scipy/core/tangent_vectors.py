@@ -12,8 +12,8 @@ from scipy.integrate import OdeSolution
 
 from ..engine.data import EUCLIDEAN, GIVEN
 from ..engine.data import Columns as EngineVectors
-from .blocks import INDEX
 from .inputs import reals, shown
+from .projection import INDEX
 
 __all__ = ["NO_TANGENT_VECTORS", "StateSolution", "TangentVectors", "tangent_vectors"]
 

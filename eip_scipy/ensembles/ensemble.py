@@ -16,17 +16,16 @@ from numpy.typing import ArrayLike
 
 from ..checkpoint import require_place
 from ..core.arguments import extra_arguments, floats, parameter_values
-from ..core.conserved import NEAR_DISTANCE
+from ..core.conserved import NEAR_DISTANCE, confirmed
 from ..core.events import Events
 from ..core.gradients import unless_error
 from ..core.inputs import count, flag, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
-from ..core.linear import confirmed
 from ..core.names import nearest
-from ..core.options import ProjectionDetails
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem
+from ..core.projection import ProjectionDetails
 from ..core.solvers import EIPRK4, EIPSolver
 from ..core.states import states
 from ..engine.data import N_COUNTERS

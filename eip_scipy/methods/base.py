@@ -62,7 +62,7 @@ class Method:
         return not self.has_estimate
 
     @property
-    def kappa(self) -> float:
+    def metric_exponent(self) -> float:
         """Exponent of the error metric, (order + 1) / (order of the estimate + 1), or 1 without an estimate."""
         if self.error_estimator_order is None:
             return 1.0

@@ -122,7 +122,7 @@ class GaussJackson(Method):
         return f"<GaussJackson {self.name}: order {self.order}{corrected}>"
 
     @property
-    def kappa(self) -> float:
+    def metric_exponent(self) -> float:
         """Exponent of the error metric: (order + 2) / (order of the estimate + 2)."""
         return (self.order + 2) / (self.error_estimator_order + 2)
 

@@ -63,7 +63,7 @@ class ScipySolverAdapter(Method):
     # Exponent of the relative error estimates in the weights of the projection. On a chain with dampers the errors of
     # Radau are 0.03 of those without projection, and 0.09 with weights from the tolerances alone (exponent 0). The
     # errors of BDF are the same with both exponents there, and ten times larger with exponent 0 on a flyball governor.
-    kappa = 1.0
+    metric_exponent = 1.0
     exponent = 0.0
     multistep = None
     solver: type[OdeSolver]

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..core.blocks import blocks_of, kinds_of
 from ..core.gradients import random_directions, time_of_motion, unless_error
 from ..core.inputs import as_vector
+from ..core.projection import is_canonical
 from ..engine.data import EPS, NFEV, Work
 from ..engine.native import Hooks
 from .base import Method
@@ -160,7 +160,7 @@ class OneStep(Method):
         motion = tau if motion == np.inf else motion
         h, last = sign * min(SHORT * motion, tau), np.full_like(y, np.nan)
         is_real = y.dtype.kind == "f"
-        parts = 2 if is_real and 2 * kinds_of(blocks_of(None, y.size, 1), y, f).size == y.size else 1
+        parts = 2 if is_canonical(y, f) else 1
 
         def norms(x: Array) -> Array:
             return np.linalg.norm(x.reshape(parts, -1), axis=1)

@@ -547,8 +547,8 @@ class _MassAndEnergy(tuple[Invariant, ...]):
     """The invariants "mass" and "energy", or one of them, whose projection takes two passes over the field.
 
     The gradients 2 w psi and 2 w H psi = 2 w i f are never stored: their products and the energy are sums over psi and
-    f. Runs for which `core.options` allows it call `moments` and `shift`. All other runs, and steps whose gradients are
-    nearly parallel, call the values and gradients of the items.
+    f. Runs for which `core.projection` allows it call `moments` and `shift`. All other runs, and steps whose gradients
+    are nearly parallel, call the values and gradients of the items.
     """
 
     _gpe: GrossPitaevskii

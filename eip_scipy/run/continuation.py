@@ -10,7 +10,7 @@ from ..checkpoint import first_difference
 from ..core.events import ContinuedEvents, as_events
 from ..core.inputs import is_number, shown
 from ..core.names import nearest
-from ..core.options import ProjectionOptions
+from ..core.projection import ProjectionOptions
 from ..engine.data import START
 from .fields import joined
 from .integrate import integrate

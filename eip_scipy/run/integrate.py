@@ -18,9 +18,9 @@ from ..core.failures import failure
 from ..core.invariants import Invariant
 from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
-from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem
+from ..core.projection import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver

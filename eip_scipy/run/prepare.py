@@ -17,10 +17,10 @@ from ..core.events import Events, as_events, replaced
 from ..core.inputs import count, flag, real_array, shown
 from ..core.invariants import Invariant, as_invariants, with_args
 from ..core.jitted import is_compiled
-from ..core.options import ProjectionOptions
 from ..core.particles import compiled_items
 from ..core.pointers import GRADIENT, PointerFunction, by_pointer
 from ..core.problem import BROUGHT, Problem
+from ..core.projection import ProjectionOptions
 from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver, class_named, eip_method

@@ -17,10 +17,10 @@ from ..core.acceleration import AccelerationField
 from ..core.inputs import flag, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
-from ..core.options import Blocks, LinearConstraints, Metric
 from ..core.particles import particle_invariants
 from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
+from ..core.projection import Blocks, LinearConstraints, Metric
 from ..core.results import ProjectionWarning
 from ..core.solvers import EIPBDF, EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, EIPRadau
 from ..core.states import initial_state

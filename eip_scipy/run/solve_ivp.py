@@ -15,7 +15,7 @@ from ..core.arguments import are_same
 from ..core.events import Events, as_events, replaced
 from ..core.inputs import shown
 from ..core.invariants import as_invariants, with_args
-from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
+from ..core.projection import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
 from ..core.solvers import (
     EIPBDF,

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, EIPRK45, ensemble, integrate
-from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
+from eip_scipy.core.projection import ProjectionKeywords, ProjectionOptions
 from eip_scipy.ensembles.ensemble import EnsembleKeywords
 from eip_scipy.problems import kepler
 from eip_scipy.solvers import EIPSolver

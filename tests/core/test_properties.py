@@ -366,7 +366,9 @@ def test_error_metric_is_its_formula(given, blocks, method):
         scale = np.array(scale_of) + rtol * np.array(largest)
         r = np.array([np.sqrt(squares[b].sum()) for b in blocks]) / scale
         shares, sigma, shift, unit = r / r.max(), np.empty(4), flow(tableau, K), np.empty(4)
-        for b, weight, share, s in zip(blocks, scale * (shares**tableau.kappa + 1e-7), shares, scale, strict=True):
+        for b, weight, share, s in zip(
+            blocks, scale * (shares**tableau.metric_exponent + 1e-7), shares, scale, strict=True
+        ):
             sigma[b], unit[b] = weight, 1 / s**2
             shift[b] *= share**2
         G = np.array([item.grad(0, y) for item in (H, L)])

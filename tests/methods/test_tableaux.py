@@ -139,7 +139,7 @@ def test_attributes():
     assert [t.order for t in (RK1, RK2, RK3, RK4, RK5)] == [1, 2, 3, 4, 5]
     assert [t.fsal for t in (RK1, RK2, RK3, RK4, RK5)] == [False, False, False, True, False]
     assert [t.error_estimator_order for t in (RK1, RK2, RK3, RK4, RK5)] == [None, 1, 2, 3, 4]
-    assert [t.kappa for t in (RK1, RK2, RK4)] == [1.0, 1.5, 1.25]
+    assert [t.metric_exponent for t in (RK1, RK2, RK4)] == [1.0, 1.5, 1.25]
     assert all("section 2.1" in t.reference for t in (RK1, RK2, RK3, RK4))
     assert "RK4" in repr(RK4)
     assert "order 4" in repr(RK4)

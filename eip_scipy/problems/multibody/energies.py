@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ...core.balances import Balance
+from ...core.conserved import reduced_rows
 from ...core.gradients import difference_gradient
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like
-from ...core.linear import reduced_rows
 from .motion import plain
 from .parts import Energy, Parts
 from .start import Names, nearest_start
