@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..methods.base import Method
-from .inputs import is_number, shown
-from .states import initial_state
+from .inputs import initial_state, is_number, shown
 from .stepping import StepOptions, Stepping, fixed_steps
 
 __all__ = ["Settings", "checked_stepping", "checked_vector", "is_state", "kept_state", "settings_of"]

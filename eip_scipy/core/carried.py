@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import Call, Rates, call
-from .arguments import scalars
+from .functions import NotCompilableError, is_jitted, jit_is_off, scalars
 from .inputs import numbers, shown
-from .jitted import NotCompilableError, is_jitted, jit_is_off
 
 __all__ = ["Carried", "bound", "real_value", "time_shift"]
 

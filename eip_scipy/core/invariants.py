@@ -13,16 +13,13 @@ import numpy as np
 
 from ..engine.data import EPS, Grouping
 from ..engine.native import BUILD, Call, LibraryFunction, Rates, call
-from .arguments import names, scalars
 from .callers import users_level
 from .carried import Carried, bound, real_value, time_shift
+from .functions import GRADIENT, NotCompilableError, PointerFunction, by_pointer, is_jitted, jit_is_off, names, scalars
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
-from .inputs import count, filled, flag, numbers, reals, require_arguments, shown
+from .inputs import count, filled, flag, numbers, reals, require_arguments, shown, states
 from .invariant_checks import complaints, listed, reported, time_derivative
-from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .linear import LinearInvariants
-from .pointers import GRADIENT, PointerFunction, by_pointer
-from .states import states
 
 __all__ = ["Invariant", "InvariantSet", "as_invariants", "check_gradient", "copied", "with_args"]
 

@@ -12,7 +12,7 @@ from numba.extending import overload
 
 from .dual_arrays import for_duals, inside
 from .dual_numbers import Dual, put_slope, seed, slope, stack_array
-from .jitted import NotCompilableError
+from .functions import NotCompilableError
 
 __all__ = ["compiled_for", "dual_along", "gradient_by_duals", "new_state", "rate_by_duals"]
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .functions import compilable, jitted
 from .inputs import real_array, shown
 from .invariants import Invariant, copied
-from .jitted import compilable, jitted
 from .linear import LinearInvariants
 
 __all__ = ["Particles", "compiled_items", "missing_particles", "particle_invariants"]

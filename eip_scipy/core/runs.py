@@ -177,7 +177,7 @@ class Run:
         samples = Samples(rhs, start, invariants, self.tangents)
         found = unless_error(conserved, samples, projection, method, tell and options.watched)
         self.conserved = Conserved(calls=samples.calls) if found is None else found
-        self.problem.uncount(self.conserved.calls)
+        self.problem.count -= self.conserved.calls
         if len(C := self.conserved.linear.C):
             options = options._replace(frame=frame_rows((C, C.T), y.size, 1))
         self.options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)

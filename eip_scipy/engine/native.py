@@ -97,7 +97,7 @@ class PythonFunctions(NamedTuple):
 
 
 class NativeFunctions(NamedTuple):
-    """The addresses of the functions of a run, with the signatures in cpp/system.hpp; `owner` keeps them alive.
+    """The addresses of the functions of a run, with the signatures in cpp/system.hpp; `keepalive` keeps them alive.
 
     A function of the library is a `LibraryFunction` instead of an address. Each invariant, gradient and event is a
     pair: the address, and the number of floats that the function fills. If the address of a gradient is None, the
@@ -113,7 +113,7 @@ class NativeFunctions(NamedTuple):
     event: tuple[tuple[Any, int], ...]
     params: np.ndarray
     second_order: bool
-    owner: Any
+    keepalive: Any
     python: PythonFunctions | None = None
     jacobian: Any = None
     floors: np.ndarray | None = None
@@ -128,7 +128,7 @@ class OctetFunctions(NamedTuple):
     rhs: Any
     inv: tuple[tuple[Any, int], ...]
     grad: tuple[tuple[Any, int], ...]
-    owner: Any
+    keepalive: Any
     jacobian: Any = None
 
 

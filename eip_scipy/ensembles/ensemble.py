@@ -20,20 +20,17 @@ from numpy.typing import ArrayLike
 
 from ..checkpoint.locks import absolute
 from ..checkpoint.signals import sigterm_as_ctrl_c
-from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.conserved import NEAR_DISTANCE
 from ..core.events import Events
+from ..core.functions import PointerFunction, extra_arguments, floats, is_compiled, parameter_values
 from ..core.gradients import unless_error
-from ..core.inputs import count, flag, is_number, shown
+from ..core.inputs import count, flag, is_number, shown, states
 from ..core.invariants import as_invariants
-from ..core.jitted import is_compiled
 from ..core.linear import confirmed
 from ..core.names import nearest
 from ..core.options import ProjectionDetails, ProjectionOptions
-from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.solvers import EIPRK4, EIPSolver
-from ..core.states import states
 from ..core.tangent_vectors import TangentVectors
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning

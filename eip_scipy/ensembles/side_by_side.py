@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.jitted import NotCompilableError
-from ..core.native_functions import Native
+from ..core.functions import CompiledFunction, NotCompilableError, PointerFunction
 from ..core.options import Options
-from ..core.pointers import PointerFunction
 from ..core.stepping import UNBOUNDED
 from ..engine.data import AUTO, NEW, Multistep, Schedule
 from ..engine.native import LibraryFunction, NativeFunctions, OctetFunctions
@@ -38,7 +36,7 @@ def why_one_by_one(history: Multistep | None, options: Options, schedule: Schedu
 
 def octet_functions(functions: NativeFunctions) -> OctetFunctions:
     """Return the functions of a run for a batch of eight members; raise NotCompilableError if one has no version."""
-    rhs, inv, grad, jacobian = ([_of_eight(one) for one in functions.owner.get(name, [])] for name in NAMES)
+    rhs, inv, grad, jacobian = ([_of_eight(one) for one in functions.keepalive.get(name, [])] for name in NAMES)
     moved = jacobian[0][0] if jacobian else None
     return OctetFunctions(rhs[0][0], tuple(inv), tuple(grad), functions, moved)
 
@@ -48,11 +46,11 @@ def need_compiling(functions: NativeFunctions) -> bool:
     return any(
         not isinstance(native.function, (PointerFunction, LibraryFunction))
         for name in NAMES
-        for native in functions.owner.get(name, [])
+        for native in functions.keepalive.get(name, [])
     )
 
 
-def _of_eight(native: Native) -> tuple[Any, int]:
+def _of_eight(native: CompiledFunction) -> tuple[Any, int]:
     """Return the version of a function for eight members, and the number of floats that it fills for each member."""
     one = native.function
     if one is None:
@@ -63,7 +61,7 @@ def _of_eight(native: Native) -> tuple[Any, int]:
         return one, native.floats
     if isinstance(one, PointerFunction):
         raise NotCompilableError(f"{one.name} is a C function, which is called for one member at a time")
-    from ..core.numba_pointers import compiled  # both load Numba
+    from ..core.numba_bridge import compiled  # both load Numba
     from .octets.type import OCTET
 
     # An array of n floats becomes (n, 8) doubles. The function must not branch on values or create arrays.

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..core.failures import failure
-from ..core.jitted import NotCompilableError
+from ..core.functions import NotCompilableError
 from ..core.runs import Run
 from ..core.stepping import UNBOUNDED, saved_steps
 from ..engine import data

@@ -15,11 +15,10 @@ import numpy as np
 
 from ..core.examination import is_check_due, steps_to_check
 from ..core.failures import failure
+from ..core.functions import PointerFunction, is_compiled, is_jitted
 from ..core.invariants import Invariant
-from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
-from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.runs import Run

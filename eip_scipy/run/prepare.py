@@ -10,21 +10,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.acceleration import AccelerationField
-from ..core.arguments import are_same, extra_arguments, floats
 from ..core.bound_problem import FORMS, BoundProblem
 from ..core.events import Events, as_events, replaced
-from ..core.inputs import count, flag, real_array, shown
+from ..core.functions import (
+    GRADIENT,
+    AccelerationField,
+    PointerFunction,
+    are_same,
+    by_pointer,
+    extra_arguments,
+    floats,
+    is_compiled,
+)
+from ..core.inputs import count, flag, initial_state, real_array, shown
 from ..core.invariants import Invariant, as_invariants, with_args
-from ..core.jitted import is_compiled
 from ..core.options import ProjectionOptions
 from ..core.particles import compiled_items
-from ..core.pointers import GRADIENT, PointerFunction, by_pointer
-from ..core.problem import BROUGHT, Problem
+from ..core.problem import PROBLEM_DEFAULTS, Problem
 from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver, class_named, eip_method
-from ..core.states import initial_state
 from ..core.stepping import ATOL, StepOptions, interval
 from ..core.tangent_vectors import tangent_vectors
 from ..core.variations import First, Variations, augmented_rhs
@@ -95,23 +100,14 @@ class Request(NamedTuple):
         events = None if self.events is None else as_events(self.events)
         return self._replace(fun=fun, acceleration=acceleration, events=events, jacobian=jacobian)
 
-    @property
-    def adaptive(self) -> bool:
-        """Return True if an option of adaptive steps was given: `rtol`, `atol`, `first_step` or `max_step`."""
-        no_bound = isinstance(self.max_step, float) and self.max_step == np.inf
-        return not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
-
     def steps(self, own: Problem | None, method: Method) -> StepOptions:
         """Return the options of the step size: the step of the problem, or the defaults, for what was not given."""
-        fixed = own is not None and not self.adaptive and not method.drives
-        h = (own.h if fixed and own is not None else None) if self.h is DEFAULT else self.h
-        return StepOptions(
-            h=h,
-            first_step=self.first_step,
-            max_step=self.max_step,
-            rtol=1e-3 if self.rtol is DEFAULT else self.rtol,
-            atol=ATOL if self.atol is DEFAULT else self.atol,
-        )
+        h, no_bound = self.h, isinstance(self.max_step, float) and self.max_step == np.inf
+        if h is DEFAULT:
+            adaptive = not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
+            h = None if own is None or adaptive or method.drives else own.h
+        rtol, atol = 1e-3 if self.rtol is DEFAULT else self.rtol, ATOL if self.atol is DEFAULT else self.atol
+        return StepOptions(h, self.first_step, self.max_step, rtol, atol)
 
 
 def prepared(given: Request, *, check_start: bool = True) -> Run:
@@ -121,15 +117,21 @@ def prepared(given: Request, *, check_start: bool = True) -> Run:
     method = _method(solver)
     _check_choices(given)
     problem, projection = as_problem(given, method, solver)
-    t0, t_bound = _span(given, own, problem.events)
+    events, t_span = problem.events, _start(given, own)[0]
+    t0, t_bound = interval(t_span)
+    if math.isinf(t_bound) and not (events.terminal or (given.callback is not None and given.save_every is not None)):
+        raise ValueError(
+            f"t_span must be finite unless a terminal event ends the run, got {shown(t_span)}; a callback may "
+            "end it too, at the steps that save_every=... saves."
+        )
     n = problem.y0.size if problem.variations is None else problem.variations.tangents.n
     stepping = given.steps(own, method).checked(solver.__name__, method, t0, t_bound, n, stacklevel=4)
     run = Run(problem, solver.__name__, method, stepping, projection).start_at(problem.y0, check=check_start)
-    run.schedule = schedule = _schedule(stepping.span, run.start.tau, given, problem.events)
+    run.schedule = schedule = _schedule(stepping.span, run.start.tau, given, events)
     check_memory(saved_rows(schedule), run, given.max_bytes)
     # `attach` sets all attributes of a new record.
     run.attach(Diagnostics.__new__(Diagnostics) if given.diagnostics is None else given.diagnostics)
-    schedule.g[:] = problem.events.at_start(t0, run.y0, run.start.f, run.start.tau * schedule.span.sign)
+    schedule.g[:] = events.at_start(t0, run.y0, run.start.f, run.start.tau * schedule.span.sign)
     run.work.K[0] = run.start.f
     run.work.counters[NFEV] = problem.count
     return run
@@ -142,25 +144,27 @@ def as_problem(given: Request, method: Method, solver: Any) -> tuple[BoundProble
     """
     own = given.fun if isinstance(given.fun, Problem) else None
     fun, form = _function(given, own)
-    params = _parameters(given, own)
-    extra = extra_arguments(given.args, params)
-    y0 = _state(own.y0 if own is not None and given.y0 is None else given.y0)
+    extra = extra_arguments(given.args, given.params if own is None else _parameters(given, own))
+    y0 = initial_state(_start(given, own)[1])
+    if y0.size == 0:
+        raise ValueError("y0 is empty; integrate needs a state with at least one component.")
     events = as_events(own.events if own is not None and given.events is None else given.events)
-    jacobian = by_pointer(given.jacobian, "jacobian", GRADIENT, takes_f=True)
-    acc = None
+    jacobian, acc = by_pointer(given.jacobian, "jacobian", GRADIENT, takes_f=True), None
     if own is not None:
         jacobian = own.jacobian if jacobian is None else jacobian
         acc = own.acc if method.of_second_order else None
     if given.jac is not None and not method.drives:
         name = solver.__name__
         raise TypeError(f"jac is the Jacobian for EIPRadau and EIPBDF, but {name} does not use one. Omit jac.")
-    projection = _projection(given, own, fun, method, extra)
-    variations = _variations(given, own, fun, form, y0, extra, solver, projection)
-    if variations is not None:
+    projection, variations = _projection(given, own, fun, method, extra), None
+    if given.variations is not None:
+        variations = _variations(given, own, fun, form, y0, extra, solver, projection)
         fun, form, acc, jacobian = variations.rhs, FORMS[False, True], None, None
         y0 = variations.tangents.augmented(y0, floats(extra))
         events = replaced(events, map(variations.event, events))
         projection = replace(projection, invariants=variations.invariants)
+    elif given.jvp is not None or given.symplectic is not None:
+        raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
     return BoundProblem(
         fun, y0, form, extra, problem=own, events=Events(events, extra), acc=acc, jacobian=jacobian,
         jac=Jacobian(given.jac), variations=variations, explains=True,
@@ -191,10 +195,8 @@ def _function(given: Request, own: Problem | None) -> tuple[Any, str]:
     return fun, FORMS[name == "acceleration", in_place or isinstance(fun, PointerFunction)]
 
 
-def _parameters(given: Request, own: Problem | None) -> Any:
+def _parameters(given: Request, own: Problem) -> Any:
     """Return the option `params`, with values that a problem has or knows by name."""
-    if own is None:
-        return given.params
     if given.args is not None:
         raise TypeError("args: a Problem has params; pass params=..., or its functions instead of the Problem.")
     if isinstance(given.params, Mapping):
@@ -207,9 +209,9 @@ def _projection(given: Request, own: Problem | None, fun: Any, method: Method, e
 
     Invariants lose args that equal the last arguments of the run, which are passed to them anyway.
     """
-    options = dict(given.projection)
+    options, known = dict(given.projection), [extra]
     if own is not None:
-        brought = {name: getattr(own, name) for name in BROUGHT}
+        brought = {name: getattr(own, name) for name in PROBLEM_DEFAULTS}
         if brought["linear_invariants"] is None:
             del brought["linear_invariants"]  # they may be found
         elif isinstance(options.get("linear_invariants"), str):
@@ -217,14 +219,14 @@ def _projection(given: Request, own: Problem | None, fun: Any, method: Method, e
         if method.drives:
             brought["invariants"] = own.stiff_invariants
         options = brought | options
+        known += [] if own.params is None else [(own.params,)]
     items = as_invariants(options.get("invariants", ()))
-    if any(item.args for item in items):
-        known = [(own.params,), extra] if own is not None and own.params is not None else [extra]
-        items = tuple(_without_own(item, known) for item in items)
+    if any([item.args for item in items]):
+        items = tuple([_without_own(item, known) for item in items])
     if is_compiled(fun) or isinstance(fun, PointerFunction):
         items = compiled_items(items)
         if not isinstance(fun, LibraryFunction):  # problems have their own
-            options = {"linear_invariants": "auto"} | options
+            options.setdefault("linear_invariants", "auto")
     return ProjectionOptions(**options | {"invariants": items})
 
 
@@ -242,12 +244,8 @@ def _variations(
     extra: tuple,
     solver: Any,
     projection: ProjectionOptions,
-) -> Variations | None:
-    """Return the `Variations` for the option `variations`, or None if it was not given."""
-    if given.variations is None:
-        if given.jvp is not None or given.symplectic is not None:
-            raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
-        return None
+) -> Variations:
+    """Return the `Variations` for the option `variations`."""
     if given.symplectic is not None:
         flag("symplectic", given.symplectic)
     names = () if own is None else tuple(own.parameters)
@@ -270,18 +268,23 @@ def default_method(fun: Any) -> type[EIPSolver] | None:
     return eip_method(fun.method) if isinstance(fun, Problem) and fun.method is not None else None
 
 
-def _start(given: Request, own: Problem | None) -> tuple[Any, Any]:
+def _start(given: Request, own: Problem | None) -> list[Any]:
     """Return t_span and y0; those of the problem for what is not given."""
-    t_span, y0 = given.t_span, given.y0
-    if own is not None:
-        t_span, y0 = own.t_span if t_span is None else t_span, own.y0 if y0 is None else y0
-    return _required("t_span", t_span), _required("y0", y0)
+    found = []
+    for name in ("t_span", "y0"):
+        value = getattr(given, name)
+        if value is None and own is not None:
+            value = getattr(own, name)
+        if value is None:
+            raise TypeError(f"integrate: {name} is missing; it can be omitted only for a Problem that has its own.")
+        found.append(value)
+    return found
 
 
 def started_at(given: Request) -> tuple[float, np.ndarray]:
     """Return time and state at the start; those of the problem if none are given."""
     t_span, y0 = _start(given, given.fun if isinstance(given.fun, Problem) else None)
-    return interval(t_span)[0], _state(y0)
+    return interval(t_span)[0], initial_state(y0)
 
 
 def _method(method: Any) -> Any:
@@ -308,32 +311,6 @@ def _check_choices(request: Request) -> None:
     if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
         raise ValueError(f"compiled must be True, False or None (compile if possible), got {shown(compiled)}.")
     check_bytes(request.max_bytes)
-
-
-def _required(name: str, value: Any) -> Any:
-    if value is None:
-        raise TypeError(f"integrate: {name} is missing; it can be omitted only for a Problem that has its own.")
-    return value
-
-
-def _state(y0: Any) -> np.ndarray:
-    start = initial_state(_required("y0", y0))
-    if start.size == 0:
-        raise ValueError("y0 is empty; integrate needs a state with at least one component.")
-    return start
-
-
-def _span(given: Request, own: Problem | None, events: Events) -> tuple[float, float]:
-    """Return the interval; it may be infinite only if something can end the run."""
-    t_span = _start(given, own)[0]
-    t0, t_bound = interval(t_span)
-    ends = events.terminal or (given.callback is not None and given.save_every is not None)
-    if math.isinf(t_bound) and not ends:
-        raise ValueError(
-            f"t_span must be finite unless a terminal event ends the run, got {shown(t_span)}; a callback may "
-            "end it too, at the steps that save_every=... saves."
-        )
-    return t0, t_bound
 
 
 def _schedule(span: Span, tau: float, request: Request, events: Events) -> Schedule:

@@ -13,17 +13,15 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
-from ..core.acceleration import AccelerationField
-from ..core.inputs import flag, is_number, shown
+from ..core.functions import AccelerationField, PointerFunction, by_pointer
+from ..core.inputs import flag, initial_state, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
 from ..core.options import Blocks, LinearConstraints, Metric
 from ..core.particles import particle_invariants
-from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
 from ..core.results import ProjectionWarning
 from ..core.solvers import EIPBDF, EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, EIPRadau
-from ..core.states import initial_state
 from ..core.stepping import UNBOUNDED, interval
 from ..engine.data import EPS, NFEV
 from ..methods.nystrom import depends_on_velocity

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...core.balances import Balance
+from ...core.functions import compiled_like
 from ...core.gradients import difference_gradient
 from ...core.invariants import Invariant
-from ...core.jitted import compiled_like
 from ...core.linear import reduced_rows
 from .motion import plain
 from .parts import Energy, Parts
