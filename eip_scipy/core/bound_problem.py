@@ -15,16 +15,7 @@ from ..methods.gauss_jackson import jacobian_product
 from ..methods.implicit import Jacobian
 from ..methods.nystrom import check_halves
 from .events import Events
-from .functions import (
-    BY_NAME,
-    NotCompilableError,
-    PointerFunction,
-    compiled_call,
-    floats,
-    jit_is_off,
-    names,
-    native_functions,
-)
+from .functions import BY_NAME, NotCompilableError, PointerFunction, compiled_calls, floats, names, native_functions
 from .inputs import as_derivative, filled, numbers, require_arguments, shown
 from .problem import Problem, made
 
@@ -186,10 +177,10 @@ class BoundProblem:
             return self.in_python(run), "interpreted: compiled=False"
         try:
             functions, reason = native_functions(run)
-            if reason is None:
+            if not reason:
                 return functions, None
             if wanted:
-                raise reason
+                raise NotCompilableError(reason)
         except NotCompilableError as error:
             if wanted:
                 raise
@@ -217,8 +208,8 @@ class BoundProblem:
         if run.uses_jacobian:
             jacobian = call(self.jacobian, self.extra, (n // 2,), convert, in_place=True, takes_f=True)
         inv, grad = run.invariants.calls
-        if by_address and not jit_is_off():
-            rhs, *both = (compiled_call(known, n, dtype) for known in (rhs, *inv, *grad))
+        if by_address:
+            rhs, *both = compiled_calls((rhs, *inv, *grad), n, dtype)
             inv, grad = tuple(both[: len(inv)]), tuple(both[len(inv) :])
         rates = run.invariants.rates(run.options.adaptive)
         return PythonFunctions(rhs, inv, grad, self.events.calls, self.second_order, jacobian, rates)

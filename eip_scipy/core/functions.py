@@ -10,7 +10,8 @@ import ctypes
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BY_NAME", "GRADIENT", "AccelerationField", "ChangedShapeError", "CompiledFunction", "Kind", "NotCompilableError",
-    "PointerFunction", "are_same", "by_pointer", "compilable", "compiled_call", "compiled_like", "extra_arguments",
+    "PointerFunction", "are_same", "by_pointer", "compilable", "compiled_calls", "compiled_like", "extra_arguments",
     "floats", "is_compiled", "is_jitted", "is_pointer", "jit_is_off", "jitted", "jitted_call", "names",
     "native_functions", "own_values", "parameter_values", "reraise_user_exception", "scalars",
 ]  # fmt: skip
@@ -72,8 +73,7 @@ def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
 
 def are_same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
     """Return True if two tuples have the same length and their items are pairwise the same object, or equal numbers."""
-    pairs = zip(one, other, strict=False)
-    return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in pairs)
+    return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 def parameter_values(params: Any) -> np.ndarray:
@@ -105,7 +105,7 @@ def scalars(extra: tuple[Any, ...]) -> str | None:
 
 def floats(extra: tuple[Any, ...]) -> np.ndarray:
     """Return further arguments as an array of floats for native functions; it is empty if only Python can pass them."""
-    return np.asarray(extra[0]) if _is_array(extra) else np.array(extra if scalars(extra) else (), float)
+    return extra[0] if _is_array(extra) else np.array(extra if scalars(extra) else (), float)
 
 
 def names(extra: tuple[Any, ...]) -> tuple[str, ...]:
@@ -333,7 +333,7 @@ class _Compiler:
             raise NotCompilableError("args are neither numbers nor one array of floats")
         self._dtype, self._scalars, self._p = y0.dtype.char, types, parameters.size if extra else -1
         self._width, self._is_off = 1 if y0.dtype == float else 2, jit_is_off()
-        self.found: dict[str, list[CompiledFunction]] = {}
+        self.found, self.pairs = defaultdict[str, list[CompiledFunction]](list), defaultdict[str, list[Any]](list)
 
     def add(
         self, group: str, fun: Any, name: str, shape: tuple[int, ...], size: int, real: bool = False, **form: bool
@@ -352,15 +352,12 @@ class _Compiler:
             function = compiled(fun, Kind(shape, size, self._p, self._dtype, real, scalars=self._scalars, **form), name)
             entry = function.address
         count = math.prod(shape) * (1 if real else self._width)
-        self.found.setdefault(group, []).append(CompiledFunction(function, count, entry))
-
-    def entries(self, group: str) -> tuple[tuple[Any, int], ...]:
-        """Return the functions of a group as pairs of an entry and a number of floats."""
-        return tuple([(found.entry, found.floats) for found in self.found.get(group, ())])
+        self.found[group].append(CompiledFunction(function, count, entry))
+        self.pairs[group].append((entry, count))
 
 
-def native_functions(run: Run) -> tuple[NativeFunctions, NotCompilableError | None]:
-    """Return the addresses of the functions of a run, and the reason why those of its events are missing, if they are.
+def native_functions(run: Run) -> tuple[NativeFunctions, str]:
+    """Return the addresses of the functions of a run, and the reason why those of its events are missing, or "".
 
     The engine passes the array of parameters itself, not a copy. Raise NotCompilableError if a function other than an
     event is neither a function of the library, nor a C function by pointer, nor a Numba function of the documented
@@ -370,7 +367,7 @@ def native_functions(run: Run) -> tuple[NativeFunctions, NotCompilableError | No
     if tableau.in_python:
         raise NotCompilableError(f"{tableau.name} is a {'solver' if tableau.drives else 'one-step method'} in Python")
     compiler = _Compiler(run.y0, problem.extra, problem.parameters)
-    (fun, form), add = problem.native_form, compiler.add
+    (fun, form), add, pairs = problem.native_form, compiler.add, compiler.pairs
     second_order = form.startswith("acceleration")
     name, size = ("acceleration", n // 2) if second_order else ("fun", n)
     add("rhs", fun, name, (size,), size, in_place=form.endswith("place"))
@@ -381,26 +378,26 @@ def native_functions(run: Run) -> tuple[NativeFunctions, NotCompilableError | No
         add("rate", item.rate_function, name, _shape(invariants, k), n, real=True, takes_f=takes_f, gradient=True)
     if run.uses_jacobian:
         add("jacobian", problem.jacobian, "jacobian", (n // 2,), n // 2, takes_f=True, in_place=True, gradient=True)
-    entries, reason = compiler.entries, None
+    reason = ""
     try:
         for k, event in enumerate(problem.events.functions):
             alone = getattr(event, "unaugmented", None)
             event, size = (event, n) if alone is None else (alone.function, alone.n)
             add("event", event, f"event {k}", (), size, real=True)
     except NotCompilableError as error:
-        compiler.found["event"], reason = [], error
-    rates, jacobian = entries("rate"), entries("jacobian")
+        pairs["event"], compiler.found["event"], reason = [], [], str(error)
+    rates = [entry for entry, _ in pairs["rate"]]
     return NativeFunctions(
-        rhs=entries("rhs")[0][0],
-        inv=entries("inv"),
-        grad=entries("grad"),
-        event=entries("event"),
+        rhs=pairs["rhs"][0][0],
+        inv=pairs["inv"],
+        grad=pairs["grad"],
+        event=pairs["event"],
         params=problem.parameters,  # itself: an ensemble writes each member's there
         second_order=second_order,
-        jacobian=jacobian[0][0] if jacobian else None,
-        rates=invariants.rates(run.options.adaptive, [entry for entry, _ in rates]) if rates else Rates(),
-        by_parameters=entries("by_parameters"),
-        floors=invariants.floors if any([entry is None for entry, _ in entries("grad")]) else None,
+        jacobian=pairs["jacobian"][0][0] if run.uses_jacobian else None,
+        rates=invariants.rates(run.options.adaptive, rates) if rates else Rates(),
+        by_parameters=pairs["by_parameters"],
+        floors=invariants.floors if any([entry is None for entry, _ in pairs["grad"]]) else None,
         keepalive=compiler.found,
     ), reason
 
@@ -428,16 +425,17 @@ def _add_invariant(add: Callable[..., None], invariants: InvariantSet, k: int, n
         add("by_parameters", alone.by_parameters, f"derivatives by parameters of {name}", rows, n, real=True)
 
 
-def compiled_call(call: Call, n: int, dtype: np.dtype[Any]) -> Call:
-    """Return `call` with the C function made from a Numba function ``fun(t, y)`` of states (n,) of the type `dtype`.
+def compiled_calls(calls: Iterable[Call], n: int, dtype: np.dtype[Any]) -> list[Call]:
+    """Return calls with C functions for Numba functions ``fun(t, y)`` that compile for states (n,) of type `dtype`."""
+    found, is_off = [], jit_is_off()
+    for call in calls:
+        if is_jitted(call.fun) and not (is_off or call.args or call.takes_f or call.in_place):
+            from .numba_bridge import compiled_or_none
 
-    Return `call` itself if it has another function, or one that does not compile.
-    """
-    if not is_jitted(call.fun) or call.args or call.takes_f or call.in_place:
-        return call
-    from .numba_bridge import compiled_or_none
-
-    return call._replace(compiled=compiled_or_none(call.fun, Kind(call.shape, n, -1, dtype.char, call.real)))
+            kind = Kind(call.shape, n, -1, dtype.char, call.real)
+            call = call._replace(compiled=compiled_or_none(call.fun, kind))
+        found.append(call)
+    return found
 
 
 def reraise_user_exception(

@@ -108,9 +108,9 @@ class NativeFunctions(NamedTuple):
     """
 
     rhs: Any
-    inv: tuple[tuple[Any, int], ...]
-    grad: tuple[tuple[Any, int], ...]
-    event: tuple[tuple[Any, int], ...]
+    inv: Sequence[tuple[Any, int]]
+    grad: Sequence[tuple[Any, int]]
+    event: Sequence[tuple[Any, int]]
     params: np.ndarray
     second_order: bool
     keepalive: Any
@@ -118,7 +118,7 @@ class NativeFunctions(NamedTuple):
     jacobian: Any = None
     floors: np.ndarray | None = None
     rates: Rates = Rates()
-    by_parameters: tuple[tuple[Any, int], ...] = ()
+    by_parameters: Sequence[tuple[Any, int]] = ()
     native: bool = True
 
 
