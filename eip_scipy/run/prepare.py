@@ -23,7 +23,7 @@ from ..core.functions import (
     is_compiled,
 )
 from ..core.inputs import count, flag, initial_state, real_array, shown
-from ..core.invariants import Invariant, as_invariants, with_args
+from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionOptions
 from ..core.particles import compiled_items
 from ..core.problem import PROBLEM_DEFAULTS, Problem
@@ -212,7 +212,7 @@ def _projection(given: Request, own: Problem | None, fun: Any, method: Method, e
     options, known = dict(given.projection), [extra]
     if own is not None:
         brought = {name: getattr(own, name) for name in PROBLEM_DEFAULTS}
-        if brought["linear_invariants"] is None:
+        if own.linear_invariants is None:
             del brought["linear_invariants"]  # they may be found
         elif isinstance(options.get("linear_invariants"), str):
             del options["linear_invariants"]
@@ -222,17 +222,13 @@ def _projection(given: Request, own: Problem | None, fun: Any, method: Method, e
         known += [] if own.params is None else [(own.params,)]
     items = as_invariants(options.get("invariants", ()))
     if any([item.args for item in items]):
-        items = tuple([_without_own(item, known) for item in items])
+        known = [args for args in known if args]
+        items = tuple(with_args(x, ()) if any(are_same(x.args, args) for args in known) else x for x in items)
     if is_compiled(fun) or isinstance(fun, PointerFunction):
         items = compiled_items(items)
         if not isinstance(fun, LibraryFunction):  # problems have their own
             options.setdefault("linear_invariants", "auto")
     return ProjectionOptions(**options | {"invariants": items})
-
-
-def _without_own(item: Invariant, known: list[tuple]) -> Invariant:
-    """Return the invariant without args that equal one of the `known` ones, which the run passes on."""
-    return with_args(item, ()) if any(own and are_same(item.args, own) for own in known) else item
 
 
 def _variations(
@@ -257,8 +253,8 @@ def _variations(
         )
     first = First(interval(_start(given, own)[0])[0], y0, extra)
     items = projection.invariants
-    tangents = tangents.kept_symplectic(given.symplectic, own is not None and own.canonical, bool(items))
-    variational = None if own is None else own.variational
+    canonical, variational = (False, None) if own is None else (own.canonical, own.variational)
+    tangents = tangents.kept_symplectic(given.symplectic, canonical, bool(items))
     rhs, source = augmented_rhs(tangents, fun, form, first, given.jvp, variational)
     return Variations.of(tangents, rhs, source, first, items)
 
@@ -319,19 +315,12 @@ def _schedule(span: Span, tau: float, request: Request, events: Events) -> Sched
         if save_every is not None:
             raise ValueError("give save_every or t_eval, not both.")
         times = evaluation_times(t_eval, span.t0, span.t_bound)
-    n_events = len(events.functions)
+    every, n = 0 if save_every is None else count("save_every", save_every), len(events.functions)
     return Schedule(
-        span=span,
-        save_every=0 if save_every is None else count("save_every", save_every),
-        t_eval=times,
-        place=np.zeros(3, np.int64),
-        clock=np.array([span.t0, span.t0, 0.0, tau]),
-        g=np.zeros(n_events),
-        g_new=np.zeros(n_events),
-        rate=np.array([math.nan] * n_events),
-        rate_new=np.zeros(n_events),
-        g_direction=events.directions,
-    )
+        span=span, save_every=every, t_eval=times, place=np.zeros(3, np.int64),
+        clock=np.array([span.t0, span.t0, 0.0, tau]), g=np.zeros(n), g_new=np.zeros(n), rate=np.array([math.nan] * n),
+        rate_new=np.zeros(n), g_direction=events.directions,
+    )  # fmt: skip
 
 
 def evaluation_times(t_eval: Any, t0: float, t_bound: float) -> np.ndarray:
