@@ -16,7 +16,7 @@ from ..methods.implicit import Jacobian
 from ..methods.nystrom import check_halves
 from .events import Events
 from .functions import BY_NAME, NotCompilableError, PointerFunction, compiled_calls, floats, names, native_functions
-from .inputs import as_derivative, filled, numbers, require_arguments, shown
+from .inputs import as_vector, filled, numbers, require_arguments, shown
 from .problem import Problem, made
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ class BoundProblem:
         fun = _flat(self.fun, n) if self.vectorized else self.fun
 
         def convert(f: Any, t: float) -> Array:
-            return np.array(as_derivative(f, size, dtype, t, self.name), dtype, order="C")
+            return np.array(as_vector(f, size, dtype, f"{self.name} returned", t), dtype, order="C")
 
         rhs = call(fun, self.extra, (size,), convert, in_place=self._in_place)
         jacobian = None
@@ -248,7 +248,7 @@ def _checked(fun: Callable[..., Any], extra: tuple, y0: Array, name: str) -> Cal
         f = fun(t, y.copy(), *extra)
         if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
             return f
-        return np.array(as_derivative(f, n, dtype, t, name), dtype, order="C")
+        return np.array(as_vector(f, n, dtype, f"{name} returned", t), dtype, order="C")
 
     return evaluate
 
