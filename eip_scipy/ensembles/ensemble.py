@@ -37,7 +37,7 @@ from ..engine.trust import ProjectionWarning
 from ..run.fields import Field, component_names, distinct, time_name
 from ..run.figures import steps
 from ..run.memory import check_bytes, most_bytes
-from ..run.prepare import DEFAULT, Request, default_method
+from ..run.prepare import DEFAULT, RunArguments, default_method
 from ..run.results import Result
 from ..run.tables import dataset
 from .checkpoints import EnsembleFile
@@ -411,7 +411,7 @@ def ensemble(
     method = default_method(fun) or EIPRK4 if method is None else method
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
     common["acceleration"] = acceleration
-    request = Request.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
+    request = RunArguments.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
     request = request.with_pointers()
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
@@ -563,7 +563,7 @@ def _separate(result: EnsembleResult, tangents: TangentVectors) -> None:
 
 
 def _check_options(options: dict[str, Any]) -> None:
-    known = set(Request._fields) - ALONE | set(ProjectionOptions.names())
+    known = set(RunArguments._fields) - ALONE | set(ProjectionOptions.names())
     for name in options:
         if name not in known:
             raise TypeError(f"ensemble() has no option {name!r}{nearest(name, (*OWN, *known))}")

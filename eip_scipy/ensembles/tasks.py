@@ -26,7 +26,7 @@ from ..engine.native import BUILD
 from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
-from ..run.prepare import Request, prepared
+from ..run.prepare import RunArguments, prepared
 from .side_by_side import need_compiling, octet_functions, why_one_by_one
 
 __all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
@@ -51,7 +51,7 @@ class StoppedError(Exception):
 class Task:
     """The part of an ensemble that all members share, in a form that can be sent to other processes."""
 
-    request: Request  # arguments of `integrate` for one member with a valid start
+    request: RunArguments  # arguments of `integrate` for one member with a valid start
     members: int = 1  # total number of members
     reduce: Callable[[Any], Any] | None = None  # function of the result of a member, whose value replaces saved states
     doubt: tuple[np.ndarray, str] | None = None  # parameters for which the checks at the start found the given fault

@@ -14,7 +14,7 @@ from ..core.options import ProjectionOptions
 from ..engine.data import START
 from .fields import joined
 from .integrate import integrate
-from .prepare import Request
+from .prepare import RunArguments
 from .results import IntegrationResult, Origin, described
 
 __all__ = ["continue_to", "continued"]
@@ -36,7 +36,7 @@ def continue_to(result: IntegrationResult, t: float, options: dict[str, Any]) ->
     for name in options:
         if name in CHANGING:
             continue
-        known = {*Request._fields, *ProjectionOptions.names()} - {"projection"}
+        known = {*RunArguments._fields, *ProjectionOptions.names()} - {"projection"}
         if name not in known:
             raise TypeError(f"continue_to() has no option {name!r}{nearest(name, CHANGING)}")
         error = TypeError if name in DEFINING else ValueError
@@ -59,7 +59,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
         raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
     _require_same_functions(result, origin)
     request = origin.request
-    asked = {name: getattr(request, name) for name in Request._fields if name not in OWN}
+    asked = {name: getattr(request, name) for name in RunArguments._fields if name not in OWN}
     asked |= {**request.projection, "invariants": origin.kept(), "t_span": (origin.t, t), "y0": origin.y}
     if result.t_events is not None:
         asked["events"] = ContinuedEvents(as_events(asked["events"]), result.t_events)

@@ -41,7 +41,7 @@ from .driver import check_memory, saved_rows
 from .memory import check_bytes
 from .resume import plain, settings
 
-__all__ = ["DEFAULT", "Request", "as_problem", "default_method", "identity", "prepared", "started_at"]
+__all__ = ["DEFAULT", "RunArguments", "as_problem", "default_method", "identity", "prepared", "started_at"]
 
 
 class _Default:
@@ -55,7 +55,7 @@ class _Default:
 DEFAULT: Any = _Default()
 
 
-class Request(NamedTuple):
+class RunArguments(NamedTuple):
     """The arguments of `integrate` as given; `projection` contains only the projection options that were given."""
 
     fun: Any = None
@@ -88,12 +88,12 @@ class Request(NamedTuple):
     projection: Mapping[str, Any] = MappingProxyType({})
 
     @classmethod
-    def of(cls, **keywords: Any) -> Request:
+    def of(cls, **keywords: Any) -> RunArguments:
         """Return a request made from keywords, including projection options."""
         projection, others = ProjectionOptions.split(keywords)
         return cls(projection=projection, **others)
 
-    def with_pointers(self) -> Request:
+    def with_pointers(self) -> RunArguments:
         """Return the arguments with C functions wrapped, so that an error says why they cannot be pickled."""
         fun, acceleration = by_pointer(self.fun, "fun"), by_pointer(self.acceleration, "acceleration")
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
@@ -110,7 +110,7 @@ class Request(NamedTuple):
         return StepOptions(h, self.first_step, self.max_step, rtol, atol)
 
 
-def prepared(given: Request, *, check_start: bool = True) -> Run:
+def prepared(given: RunArguments, *, check_start: bool = True) -> Run:
     """Check the arguments of `integrate`, and return a run at its start; for `check_start` see `Run.start_at`."""
     own = given.fun if isinstance(given.fun, Problem) else None
     solver: Any = default_method(own) if given.method is None else given.method
@@ -137,7 +137,7 @@ def prepared(given: Request, *, check_start: bool = True) -> Run:
     return run
 
 
-def as_problem(given: Request, method: Method, solver: Any) -> tuple[BoundProblem, ProjectionOptions]:
+def as_problem(given: RunArguments, method: Method, solver: Any) -> tuple[BoundProblem, ProjectionOptions]:
     """Look at a user's functions, arguments, start and options, once for all interfaces, and return what a run needs.
 
     `method` is that of the class `solver`, for which implicit methods keep other invariants by default.
@@ -171,7 +171,7 @@ def as_problem(given: Request, method: Method, solver: Any) -> tuple[BoundProble
     ), projection  # fmt: skip
 
 
-def _function(given: Request, own: Problem | None) -> tuple[Any, str]:
+def _function(given: RunArguments, own: Problem | None) -> tuple[Any, str]:
     """Return the function that the engine calls, and its form in `FORMS`; C functions so that Python can call them."""
     fun: Any = given.fun
     in_place, name = flag("in_place", given.in_place), "fun"
@@ -195,7 +195,7 @@ def _function(given: Request, own: Problem | None) -> tuple[Any, str]:
     return fun, FORMS[name == "acceleration", in_place or isinstance(fun, PointerFunction)]
 
 
-def _parameters(given: Request, own: Problem) -> Any:
+def _parameters(given: RunArguments, own: Problem) -> Any:
     """Return the option `params`, with values that a problem has or knows by name."""
     if given.args is not None:
         raise TypeError("args: a Problem has params; pass params=..., or its functions instead of the Problem.")
@@ -204,7 +204,7 @@ def _parameters(given: Request, own: Problem) -> Any:
     return own.params if given.params is None and own.rhs is not None else given.params
 
 
-def _projection(given: Request, own: Problem | None, fun: Any, method: Method, extra: tuple) -> ProjectionOptions:
+def _projection(given: RunArguments, own: Problem | None, fun: Any, method: Method, extra: tuple) -> ProjectionOptions:
     """Return the options of the projection, completed by those of the problem and by defaults for compiled functions.
 
     Invariants lose args that equal the last arguments of the run, which are passed to them anyway.
@@ -232,7 +232,7 @@ def _projection(given: Request, own: Problem | None, fun: Any, method: Method, e
 
 
 def _variations(
-    given: Request,
+    given: RunArguments,
     own: Problem | None,
     fun: Any,
     form: str,
@@ -264,7 +264,7 @@ def default_method(fun: Any) -> type[EIPSolver] | None:
     return eip_method(fun.method) if isinstance(fun, Problem) and fun.method is not None else None
 
 
-def _start(given: Request, own: Problem | None) -> list[Any]:
+def _start(given: RunArguments, own: Problem | None) -> list[Any]:
     """Return t_span and y0; those of the problem for what is not given."""
     found = []
     for name in ("t_span", "y0"):
@@ -277,7 +277,7 @@ def _start(given: Request, own: Problem | None) -> list[Any]:
     return found
 
 
-def started_at(given: Request) -> tuple[float, np.ndarray]:
+def started_at(given: RunArguments) -> tuple[float, np.ndarray]:
     """Return time and state at the start; those of the problem if none are given."""
     t_span, y0 = _start(given, given.fun if isinstance(given.fun, Problem) else None)
     return interval(t_span)[0], initial_state(y0)
@@ -298,7 +298,7 @@ def _method(method: Any) -> Any:
     return method.TABLEAU
 
 
-def _check_choices(request: Request) -> None:
+def _check_choices(request: RunArguments) -> None:
     callback, compiled = request.callback, request.compiled
     if callback is not None and not callable(callback):
         raise TypeError(f"callback must be a function callback(t, y, residuals), got {shown(callback)}.")
@@ -309,7 +309,7 @@ def _check_choices(request: Request) -> None:
     check_bytes(request.max_bytes)
 
 
-def _schedule(span: Span, tau: float, request: Request, events: Events) -> Schedule:
+def _schedule(span: Span, tau: float, request: RunArguments, events: Events) -> Schedule:
     save_every, t_eval, times = request.save_every, request.t_eval, np.zeros(0)
     if t_eval is not None:
         if save_every is not None:

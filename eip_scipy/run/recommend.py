@@ -26,7 +26,7 @@ from ..core.stepping import UNBOUNDED, interval
 from ..engine.data import EPS, NFEV
 from ..methods.nystrom import depends_on_velocity
 from .integrate import Loop, integrate
-from .prepare import Request, evaluation_times, prepared
+from .prepare import RunArguments, evaluation_times, prepared
 from .results import IntegrationResult
 
 __all__ = ["Recommendation", "Trial", "recommend"]
@@ -289,7 +289,7 @@ class _Search:
         rtol = min(max(wanted, 1e-10), 1e-4)
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
         self.first = {**common, "method": EIPDOP853, "rtol": rtol, "atol": atol}
-        self.pilot = prepared(Request.of(fun=problem, **self.first))
+        self.pilot = prepared(RunArguments.of(fun=problem, **self.first))
         missing = self.pilot.conserved.missing
         if missing is not None:
             own = particle_invariants(missing.masses, missing.dimension)
@@ -382,7 +382,7 @@ class _Search:
 
     def _integrate(self, t: float, options: Mapping[str, Any], **further: Any) -> tuple[IntegrationResult, int]:
         """Run from the start to t; return the result and its evaluations, for Jacobians of implicit methods too."""
-        given = Request.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further})
+        given = RunArguments.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further})
         run, is_implicit = prepared(given), options["method"].TABLEAU.drives
         if is_implicit:
             calls, fun = count(int(run.work.counters[NFEV]) + run.method.start_calls), run.problem.fun

@@ -20,7 +20,7 @@ __all__ = ["Fields", "IntegrationResult", "Origin", "Result", "described"]
 class Origin(NamedTuple):
     """Origin of a result, from which its run can be continued."""
 
-    request: Any  # `Request`: the arguments of `integrate`
+    request: Any  # `RunArguments`: the arguments of `integrate`
     t: float  # time of the last state
     y: np.ndarray  # (n,): last state of the run, saved or not
     sign: float  # direction of time, 1 or -1
