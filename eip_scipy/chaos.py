@@ -17,7 +17,7 @@ from .core.results import Diagnostics
 from .run.continuation import continued
 from .run.fields import rows
 from .run.integrate import integrate
-from .run.prepare import Request, prepared
+from .run.prepare import RunArguments, prepared
 from .run.results import IntegrationResult
 
 __all__ = ["LyapunovSpectrum", "Megno", "lyapunov_spectrum", "megno"]
@@ -124,11 +124,11 @@ def _checked(function: str, arguments: dict[str, Any], every: Any, segments: int
     `arguments` are those of `integrate`. If `every` is None, this time is 1 / `segments` of the interval, rounded up to
     a whole number of steps if they are equal.
     """
-    known = {*Request._fields, *ProjectionOptions.names()} - {*OWN, "projection"}
+    known = {*RunArguments._fields, *ProjectionOptions.names()} - {*OWN, "projection"}
     for name in sorted(arguments.keys() - known):
         hint = "; it sets this option of integrate itself; omit it." if name in OWN else nearest(name, sorted(known))
         raise TypeError(f"{function}() has no option {name!r}{hint}")
-    start = prepared(Request.of(**{"method": None, **arguments}))
+    start = prepared(RunArguments.of(**{"method": None, **arguments}))
     span = start.schedule.span
     h, length = abs(span.h), abs(span.t_bound - span.t0)
     if not 0 < length < np.inf:

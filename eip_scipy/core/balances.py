@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from .functions import GRADIENT, by_pointer
 from .inputs import flag, reals, shown
 from .invariants import Invariant, OwnArguments
-from .pointers import GRADIENT, by_pointer
 
 __all__ = ["Balance"]
 

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..methods.base import Method
-from .inputs import is_number, shown
-from .states import initial_state
+from .inputs import initial_state, is_number, shown
 from .step_control import StepControl, fixed_steps
 
 __all__ = ["Settings", "changed_control", "checked_vector", "is_state", "kept_state", "settings_of"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,15 +14,10 @@ from ..methods.base import Method
 from ..methods.gauss_jackson import jacobian_product
 from ..methods.implicit import Jacobian
 from ..methods.nystrom import check_halves
-from .acceleration import BY_NAME
-from .arguments import Packed, floats, names, scalars
 from .events import Events
-from .inputs import filled, numbers, require_arguments, shown
-from .jitted import NotCompilableError, compiled_call
-from .native_functions import native_functions, with_events
-from .pointers import PointerFunction
+from .functions import BY_NAME, NotCompilableError, PointerFunction, compiled_calls, floats, names, native_functions
+from .inputs import as_vector, filled, numbers, require_arguments, shown
 from .problem import Problem, made
-from .states import as_derivative
 
 if TYPE_CHECKING:
     from .runs import Run
@@ -78,6 +72,8 @@ class BoundProblem:
         self.parameters = floats(extra)
         self.second_order, self._in_place = form.startswith("acceleration"), form.endswith("in place")
         self.name = "acceleration" if self.second_order else "fun"
+        # Accelerations may depend on velocities if they come from a function that is called with these.
+        self.sees_velocity = not self.second_order and (problem is None or problem.acc is None)
         self.count = 0  # of the calls of `derivative`
         self.bind(fun)
         if jacobian is not None and not callable(jacobian):
@@ -85,19 +81,23 @@ class BoundProblem:
 
     def bind(self, fun: Any) -> None:
         """Use `fun`, of the same form, from now on."""
-        self.fun = fun
-        make = _filled if self._in_place else _checked
-        called = _flat(fun, self.y0.size) if self.vectorized else fun
-        if not self.second_order:
-            self.evaluate = make(called, self.extra, self.y0, self.name)
-            return
-        check_halves(self.y0.size)
-        half = self.y0.size // 2
-        acc = make(called, self.extra, self.y0[:half], self.name)
-        self.evaluate = lambda t, y: np.concatenate([y[half:], acc(t, y[:half])])
+        self.fun, acc = fun, self.acc
+        self.native_form = fun, self.form  # what the engine calls: `acc` if it is in the same library as `fun`
+        own = isinstance(fun, LibraryFunction) and isinstance(acc, LibraryFunction)
+        if own and fun.__name__.partition(".")[0] == acc.__name__.partition(".")[0]:
+            self.native_form = acc, "acceleration"
+        self.is_second_order = self.native_form[1].startswith("acceleration")  # (v, a) by its construction
+        called, half = _flat(fun, self.y0.size) if self.vectorized else fun, 0
+        if self.second_order:
+            check_halves(self.y0.size)
+            half = self.y0.size // 2
+        evaluate = (_filled if self._in_place else _checked)(called, self.extra, self.y0[: half or None], self.name)
+        self.evaluate = evaluate
+        if self.second_order:
+            self.evaluate = lambda t, y: np.concatenate([y[half:], evaluate(t, y[:half])])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("evaluate", "native_form")}
+        return {name: value for name, value in vars(self).items() if name != "evaluate"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -117,20 +117,6 @@ class BoundProblem:
                 state, advice = ("q", CALLED_ACCELERATION) if self.second_order else ("y", CALLED)
                 require_arguments(self.fun, ("t", state, *third, *names(self.extra)), self.name, advice)
             raise
-
-    def uncount(self, calls: int) -> None:
-        """Take back the count of calls that are no part of ``nfev``."""
-        self.count -= calls
-
-    @property
-    def is_second_order(self) -> bool:
-        """True if the right-hand side is (v, a) by its construction."""
-        return self.second_order or self.native_form[1].startswith("acceleration")
-
-    @property
-    def sees_velocity(self) -> bool:
-        """True if accelerations come from a function that is called with velocities, on which they may depend."""
-        return not self.second_order and (self.problem is None or self.problem.acc is None)
 
     @property
     def left_out(self) -> str:
@@ -181,14 +167,6 @@ class BoundProblem:
         self.jacobian = made(self.jacobian)
         return None if self.jacobian is None else jacobian_product(self.jacobian, *self.extra)
 
-    @cached_property
-    def native_form(self) -> tuple[Any, str]:
-        """The function to compile and its form: `acc` if it comes from the same library as `fun`, else `fun`."""
-        own = isinstance(self.fun, LibraryFunction) and isinstance(self.acc, LibraryFunction)
-        if own and self.fun.__name__.partition(".")[0] == self.acc.__name__.partition(".")[0]:
-            return self.acc, "acceleration"
-        return self.fun, self.form
-
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
         """Return the functions that the loop calls, and None if all are called natively.
 
@@ -198,19 +176,16 @@ class BoundProblem:
         if wanted is False:
             return self.in_python(run), "interpreted: compiled=False"
         try:
-            functions, params = self._native(run)
-        except NotCompilableError as reason:
+            functions, reason = native_functions(run)
+            if not reason:
+                return functions, None
+            if wanted:
+                raise NotCompilableError(reason)
+        except NotCompilableError as error:
             if wanted:
                 raise
-            return self.in_python(run), f"interpreted: {reason}"
-        if not self.events.functions:
-            return functions, None
-        try:
-            return with_events(functions, self.events.functions, params, run.y0), None
-        except NotCompilableError as reason:
-            if wanted:
-                raise
-            return functions._replace(python=self.in_python(run)), f"events are called from Python: {reason}"
+            return self.in_python(run), f"interpreted: {error}"
+        return functions._replace(python=self.in_python(run)), f"events are called from Python: {reason}"
 
     def pointers(self, run: Run) -> list[PointerFunction]:
         """Return the C functions of a run that were given as pointers."""
@@ -219,17 +194,6 @@ class BoundProblem:
             functions += [item.function, item.gradient, item.rate_function]
         return [function for function in functions if isinstance(function, PointerFunction)]
 
-    def _native(self, run: Run) -> tuple[NativeFunctions, Packed | None]:
-        """Return the addresses of all functions but events, and the packed `extra`; else raise NotCompilableError."""
-        if run.tableau.in_python:
-            kind = "a solver" if run.tableau.drives else "a one-step method"
-            raise NotCompilableError(f"{run.tableau.name} is {kind} in Python")
-        if (types := scalars(self.extra)) is None:
-            raise NotCompilableError("args are neither numbers nor one array of floats")
-        params = Packed(self.parameters, types) if self.extra else None
-        jacobian = self.jacobian if run.uses_jacobian else None
-        return native_functions(*self.native_form, params, run, jacobian), params
-
     def in_python(self, run: Run, *, by_address: bool = False) -> PythonFunctions:
         """Return all functions as Python calls them, or `by_address` jitted ones that compile."""
         n, dtype = self.y0.size, self.y0.dtype
@@ -237,7 +201,7 @@ class BoundProblem:
         fun = _flat(self.fun, n) if self.vectorized else self.fun
 
         def convert(f: Any, t: float) -> Array:
-            return np.array(as_derivative(f, size, dtype, t, self.name), dtype, order="C")
+            return np.array(as_vector(f, size, dtype, f"{self.name} returned", t), dtype, order="C")
 
         rhs = call(fun, self.extra, (size,), convert, in_place=self._in_place)
         jacobian = None
@@ -245,7 +209,7 @@ class BoundProblem:
             jacobian = call(self.jacobian, self.extra, (n // 2,), convert, in_place=True, takes_f=True)
         inv, grad = run.invariants.calls
         if by_address:
-            rhs, *both = (compiled_call(known, n, dtype) for known in (rhs, *inv, *grad))
+            rhs, *both = compiled_calls((rhs, *inv, *grad), n, dtype)
             inv, grad = tuple(both[: len(inv)]), tuple(both[len(inv) :])
         rates = run.invariants.rates(run.options.adaptive)
         return PythonFunctions(rhs, inv, grad, self.events.calls, self.second_order, jacobian, rates)
@@ -256,23 +220,24 @@ class BoundProblem:
         def kind(fun: Any, in_python: bool) -> str:
             if in_python:
                 return "python"
+            if fun is None:
+                return "differences"
             if isinstance(fun, LibraryFunction):
                 return "native"
             return "pointer" if isinstance(fun, PointerFunction) else "jitted"
 
         in_python = isinstance(functions, PythonFunctions)
-        found = {self.name: kind(self.fun, in_python)}
+        events_in_python = isinstance(functions, PythonFunctions) or functions.python is not None
+        called = {self.name: self.fun}
         for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
             item = item if item.unaugmented is None else item.unaugmented.function
-            found[label] = kind(item.function, in_python)
-            differences = item.gradient is None and not in_python
-            found[f"gradient of {label}"] = "differences" if differences else kind(item.gradient, in_python)
+            called |= {label: item.function, f"gradient of {label}": item.gradient}
             if item.rate_function is not None:
-                found[f"rate of {label}"] = kind(item.rate_function, in_python)
+                called[f"rate of {label}"] = item.rate_function
         if run.uses_jacobian:
-            found["jacobian"] = kind(self.jacobian, in_python)
-        in_python = isinstance(functions, PythonFunctions) or functions.python is not None
-        return found | {f"event {k}": kind(event, in_python) for k, event in enumerate(self.events.functions)}
+            called["jacobian"] = self.jacobian
+        found = {name: kind(fun, in_python) for name, fun in called.items()}
+        return found | {f"event {k}": kind(event, events_in_python) for k, event in enumerate(self.events.functions)}
 
 
 def _checked(fun: Callable[..., Any], extra: tuple, y0: Array, name: str) -> Callable[[float, Array], Array]:
@@ -283,7 +248,7 @@ def _checked(fun: Callable[..., Any], extra: tuple, y0: Array, name: str) -> Cal
         f = fun(t, y.copy(), *extra)
         if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
             return f
-        return np.array(as_derivative(f, n, dtype, t, name), dtype, order="C")
+        return np.array(as_vector(f, n, dtype, f"{name} returned", t), dtype, order="C")
 
     return evaluate
 

@@ -108,7 +108,7 @@ def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
     samples = _Samples(run, y, f, is_searched)
     with np.errstate(all="ignore"):
         found = unless_error(_found, samples, known, names)
-    run.problem.uncount(samples.calls)
+    run.problem.count -= samples.calls
     return Conserved(calls=samples.calls) if found is None else found
 
 

@@ -17,7 +17,7 @@ from numba import njit, types
 from numba.extending import is_jitted, overload
 
 from .dual_numbers import Dual
-from .numba_pointers import refuse_addresses
+from .numba_bridge import refuse_addresses
 
 __all__ = ["for_duals", "inside"]
 

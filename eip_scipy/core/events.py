@@ -11,9 +11,8 @@ from scipy.integrate import DenseOutput
 
 from ..engine.data import EPS
 from ..engine.native import Call, call
-from .arguments import names
+from .functions import by_pointer, is_pointer, names
 from .inputs import is_number, reals, require_arguments, shown
-from .pointers import by_pointer, is_pointer
 
 __all__ = ["ContinuedEvents", "Events", "Start", "as_events", "replaced"]
 

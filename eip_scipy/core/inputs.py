@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from ..engine.native import BUILD
+
 __all__ = [
-    "as_vector", "converted_from_single", "count", "filled", "flag", "is_number", "numbers", "real_array", "reals",
-    "require_arguments", "shown",
+    "as_derivative", "as_vector", "converted_from_single", "count", "filled", "flag", "initial_state", "is_number",
+    "numbers", "real_array", "reals", "require_arguments", "shown", "states",
 ]  # fmt: skip
 
 PLAIN = frozenset((int, float, complex, str, bool, type(None), np.float64, np.complex128))
@@ -21,6 +23,7 @@ DATES = (datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
 NO_UNITS = ("", "dimensionless")
 SHOWN = 120
 SINGLE = ("float32", "complex64")
+READS = "reads its argument out, whose content is arbitrary, before filling it"
 LARGEST_COUNT = 2**63 - 1  # largest 64-bit integer
 # Names of the values of single precision that have been converted, while `converted_from_single` looks for them.
 _singles: ContextVar[list[str] | None] = ContextVar("_singles", default=None)
@@ -41,9 +44,10 @@ def numbers(name: str, value: Any) -> np.ndarray | None:
     Objects that Python can convert, such as numbers of SymPy and mpmath, are converted. A TypeError that contains the
     argument's `name` is raised for dates and for values with a unit, because NumPy would silently drop the unit.
     """
+    if type(value) is np.ndarray and value.dtype == float:
+        return np.array(value, order="C")
     _refuse_units(name, value)
-    singles = _singles.get()
-    if singles is not None and _is_single(value):
+    if (singles := _singles.get()) is not None and _is_single(value):
         singles.append(name)
     try:
         found = np.asarray(value)
@@ -79,11 +83,11 @@ def _converted(objects: np.ndarray) -> np.ndarray:
     if any(isinstance(item, str) for item in items):  # float would read the text
         raise TypeError
     try:
-        if not any(isinstance(item, np.complexfloating) for item in items):  # float would drop the imaginary part
-            return np.array([float(item) for item in items]).reshape(objects.shape)
+        is_complex = any(isinstance(item, np.complexfloating) for item in items)  # float would drop the imaginary part
+        found = list(map(complex if is_complex else float, items))
     except TypeError:  # not all are real
-        pass
-    return np.array([complex(item) for item in items]).reshape(objects.shape)
+        found = list(map(complex, items))
+    return np.array(found).reshape(objects.shape)
 
 
 def _refuse_units(name: str, value: Any, *, is_item: bool = False) -> None:
@@ -145,8 +149,6 @@ def is_number(value: Any, name: str = "") -> bool:
 
 def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
     """Return the option `name` as an int; raise ValueError unless `value` is an integer from 1 to `most`."""
-    if type(value) is int and 1 <= value <= most:
-        return value
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer >= 1, got {shown(value)}.")
     if value > most:
@@ -171,23 +173,22 @@ def require_arguments(fun: Callable[..., Any], given: Sequence[str], what: str, 
         signature = inspect.signature(fun)
     except (TypeError, ValueError):  # some functions in C have no signature
         return
+    if (error := _mismatch(signature, given)) is None:
+        return
+    names, first = ", ".join(given), next(iter(signature.parameters), "t")
+    is_time = given[0] != "t" or first.strip("_").startswith("t")
+    if not is_time and _mismatch(signature, given[1:]) is None:
+        advice = f"The first argument is always the time: write lambda {names}: ..., or def name({names})."
+    raise TypeError(f"{what} is called with ({names}): {error}. {advice}") from None
+
+
+def _mismatch(signature: inspect.Signature, given: Sequence[str]) -> TypeError | None:
+    """Return the error of a call with as many arguments as `given`, or None if the signature accepts them."""
     try:
         signature.bind(*given)
     except TypeError as error:
-        if _leaves_out_time(signature, given):
-            names = ", ".join(given)
-            advice = f"The first argument is always the time: write lambda {names}: ..., or def name({names})."
-        raise TypeError(f"{what} is called with ({', '.join(given)}): {error}. {advice}") from None
-
-
-def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool:
-    """Return True if a function accepts all given arguments except the time, and its first argument is not the time."""
-    try:
-        signature.bind(*given[1:])
-    except TypeError:
-        return False
-    first = next(iter(signature.parameters), "t")
-    return given[0] == "t" and not first.strip("_").startswith("t")
+        return error
+    return None
 
 
 def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
@@ -226,12 +227,36 @@ def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any
         return out
     other.fill(1.0)
     call(ones)
-    for places, does in (
-        (np.isnan(found) & (other == 1), "does not fill all of its argument out"),
-        (np.isnan(found) & ~np.isnan(other), "reads its argument out, whose content is arbitrary, before filling it"),
-    ):
-        if places.any():
-            *row, component = np.argwhere(places)[0].tolist()
-            where = ", ".join(map(str, (*row, component * shape[-1] // found.shape[-1])))
-            raise ValueError(f"{what} {does}, in component {where}, at t={t:.10g}.")
-    return out
+    unset = np.isnan(found) & (other == 1)
+    wrong = unset if unset.any() else np.isnan(found) & ~np.isnan(other)
+    if not wrong.any():
+        return out
+    *row, component = np.argwhere(wrong)[0].tolist()
+    where = ", ".join(map(str, (*row, component * shape[-1] // found.shape[-1])))
+    does = "does not fill all of its argument out" if wrong is unset else READS
+    raise ValueError(f"{what} {does}, in component {where}, at t={t:.10g}.")
+
+
+def as_derivative(value: Any, n: int, dtype: np.dtype, t: float, name: str = "fun") -> np.ndarray:
+    """Return the value of a user's right-hand side at t as an array (n,), or raise an error; see `as_vector`."""
+    return as_vector(value, n, dtype, f"{name} returned", t)
+
+
+def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
+    """Return y0 as a new float64 or complex128 array (n,), with SciPy's error messages."""
+    y = states(name, y0)
+    if y.ndim != 1:
+        raise ValueError(f"`{name}` must be 1-dimensional.")
+    if not BUILD.are_finite(y.view(float)):
+        raise ValueError(f"All components of the initial state `{name}` must be finite.")
+    return y
+
+
+def states(name: str, value: Any) -> np.ndarray:
+    """Return a state, or several states, as a new float64 or complex128 array of any shape, after checks."""
+    if np.ma.isMaskedArray(value) and np.ma.is_masked(value):
+        raise ValueError(f"masked values in {name}; fill or drop them first.")
+    found = numbers(name, value)
+    if found is None:
+        raise TypeError(f"`{name}` must hold numbers, got {shown(value)}.")
+    return found

@@ -15,15 +15,12 @@ import numpy as np
 
 from ..engine.data import EPS, Grouping
 from ..engine.native import BUILD, Call, LibraryFunction, Rates, call
-from .arguments import names, scalars
 from .callers import users_level
+from .functions import NotCompilableError, PointerFunction, is_jitted, jit_is_off, names, scalars
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
-from .inputs import filled, numbers, require_arguments, shown
+from .inputs import filled, numbers, require_arguments, shown, states
 from .invariant_checks import complaints, listed, reported, time_derivative
 from .invariants import Invariant, as_invariants, copied
-from .jitted import NotCompilableError, is_jitted, jit_is_off
-from .pointers import PointerFunction
-from .states import states
 
 __all__ = ["BalanceSet", "InvariantSet", "check_gradient", "with_duals"]
 

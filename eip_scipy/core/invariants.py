@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .functions import GRADIENT, PointerFunction, by_pointer
 from .inputs import count, flag, reals, shown
-from .pointers import GRADIENT, PointerFunction, by_pointer
 
 if TYPE_CHECKING:
     from .particles import LinearInvariants

@@ -12,7 +12,7 @@ from numba.extending import overload
 
 from .dual_arrays import for_duals, inside
 from .dual_numbers import Dual, put_slope, seed, slope, stack_array
-from .jitted import NotCompilableError
+from .functions import NotCompilableError
 
 __all__ = ["compiled_for", "dual_along", "gradient_by_duals", "new_state", "rate_by_duals"]
 
@@ -30,7 +30,7 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     """Return the gradient ``grad(t, y, out[, params])`` of a jitted invariant whose value has this `shape`.
 
     The gradient fills `out` (*shape, n), exact up to rounding. If `scalars` is not empty, it takes numbers of these
-    types instead of params, ``grad(t, y, out, *numbers)``; see `Packed`. Raise NotCompilableError if dual numbers
+    types instead of params, ``grad(t, y, out, *numbers)``; see `scalars`. Raise NotCompilableError if dual numbers
     cannot do what `fun` does.
     """
     dual = dual_along(n)
@@ -94,7 +94,7 @@ def compiled_for(function: Callable[..., Any], ndim: int, has_params: bool, scal
     """Compile ``function(t, y, a, args)`` as ``call(t, y, a, *args)``, for real y (n,) and a of `ndim` dimensions.
 
     `args` are the arguments that follow in a user's functions: params if `has_params`, or numbers of the types in
-    `scalars`, see `Packed`.
+    `scalars`, see `scalars`.
     """
     function = inside(function)
     floats, third = (types.Array(types.float64, dimensions, "C") for dimensions in (1, ndim))

@@ -26,7 +26,7 @@ def rhs_by_duals(
 
     Y consists of the state (n,), the parameters with the indices `parameters`, and `count` tangent vectors. The
     derivatives of `fun` are exact up to rounding. `form` is that of `fun`, see `native_functions`. If `scalars` is not
-    empty, `fun` takes numbers of these types instead of params, see `Packed`. Raise NotCompilableError if dual numbers
+    empty, `fun` takes numbers of these types instead of params, see `scalars`. Raise NotCompilableError if dual numbers
     cannot do what `fun` does.
     """
     dual, places = dual_along(count), np.array(parameters, np.int64)

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .functions import compilable, jitted
 from .inputs import real_array, shown
 from .invariants import Invariant, copied
-from .jitted import compilable, jitted
 
 __all__ = ["LinearInvariants", "compiled_items", "particle_invariants"]
 

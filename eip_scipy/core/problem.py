@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import library
+from .functions import by_pointer
 from .inputs import real_array, shown
 from .invariants import Invariant, as_invariants
 from .names import nearest
-from .pointers import by_pointer
 
 __all__ = [
-    "BROUGHT", "Deferred", "Problem", "bind", "component_names", "library_variational", "made", "native_invariant",
+    "PROBLEM_DEFAULTS", "Deferred", "Problem", "bind", "component_names", "library_variational", "made",
+    "native_invariant",
 ]  # fmt: skip
 
 # Options of the projection that a problem brings.
-BROUGHT = ("invariants", "metric", "blocks", "linear_invariants")
+PROBLEM_DEFAULTS = ("invariants", "metric", "blocks", "linear_invariants")
 MOST = 12  # components that are printed
 
 
@@ -189,7 +190,7 @@ class Problem:
             raise TypeError(f"{self.name}: the problem has no {missing}; pass {missing} to solve_ivp.")
         brought: dict[str, Any] = {"events": self.events}
         if hasattr(method, "TABLEAU"):  # an EIP method
-            brought |= {name: value for name in BROUGHT if (value := getattr(self, name)) is not None}
+            brought |= {name: value for name in PROBLEM_DEFAULTS if (value := getattr(self, name)) is not None}
             if method.TABLEAU.drives:
                 brought["invariants"] = self.stiff_invariants
             elif self.h is not None and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
@@ -263,7 +264,7 @@ class Problem:
             f"{self.name}: y = ({state}), {start}",
             f"  interval    {'; '.join(filter(None, (', '.join(interval) or 'none', self.units, zero)))}",
             f"  invariants  {kept or 'none'}",
-            f"  functions   {functions}; options {', '.join(having(BROUGHT[1:])) or 'none'}",
+            f"  functions   {functions}; options {', '.join(having(PROBLEM_DEFAULTS[1:])) or 'none'}",
             f"  source      {self.source or 'not given'}",
         ]
         return "\n".join(lines)

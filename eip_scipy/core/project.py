@@ -14,12 +14,11 @@ from ..engine.trust import ProjectionWarning
 from ..methods.base import PROJECTION_ONLY
 from .bound_problem import BoundProblem
 from .failures import projection_failure
-from .inputs import as_vector, count, is_number, reals, shown
+from .inputs import as_vector, count, initial_state, is_number, reals, shown
 from .invariant_set import InvariantSet
 from .projection import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
 from .runs import Run
-from .states import initial_state
 from .step_control import StepControl
 
 __all__ = ["project"]

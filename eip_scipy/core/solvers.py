@@ -28,13 +28,12 @@ from .callers import users_level
 from .dense import ExactEnds, Interpolants
 from .examination import is_check_due
 from .failures import failure
-from .inputs import is_number
+from .inputs import initial_state, is_number
 from .invariants import as_invariants
 from .names import nearest
 from .projection import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
 from .runs import Run, Start
-from .states import initial_state
 from .step_control import ATOL, StepControl, interval
 from .variations import Variations
 

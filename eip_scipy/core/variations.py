@@ -10,14 +10,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engine.native import BUILD, LibraryFunction
-from .arguments import scalars
+from .functions import (
+    GRADIENT,
+    NotCompilableError,
+    PointerFunction,
+    by_pointer,
+    compiled_like,
+    is_compiled,
+    is_jitted,
+    jit_is_off,
+    jitted_call,
+    scalars,
+)
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
-from .inputs import filled, require_arguments, shown
+from .inputs import as_derivative, filled, require_arguments, shown
 from .invariant_set import with_duals
 from .invariants import Invariant, copied
-from .jitted import NotCompilableError, compiled_like, is_compiled, is_jitted, jit_is_off, jitted_call
-from .pointers import GRADIENT, PointerFunction, by_pointer
-from .states import as_derivative
 from .tangent_vectors import TangentVectors
 
 __all__ = ["First", "Variations", "augmented_rhs"]

@@ -14,21 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 __all__ = [
-    "BUILD",
-    "Call",
-    "Engine",
-    "FailedCallError",
-    "Hooks",
-    "LibraryFunction",
-    "NativeFunctions",
-    "OctetFunctions",
-    "PythonFunctions",
-    "Rates",
-    "call",
-    "library",
-    "library_function",
-    "working_alone",
-]
+    "BUILD", "Call", "Engine", "FailedCallError", "Hooks", "LibraryFunction", "NativeFunctions", "OctetFunctions",
+    "PythonFunctions", "Rates", "call", "library", "library_function", "working_alone",
+]  # fmt: skip
 
 # Names one of the builds, _native or _native_v3, to use instead of the best one for the processor.
 VARIABLE = "EIP_SCIPY_ENGINE"
@@ -97,7 +85,7 @@ class PythonFunctions(NamedTuple):
 
 
 class NativeFunctions(NamedTuple):
-    """The addresses of the functions of a run, with the signatures in cpp/system.hpp; `owner` keeps them alive.
+    """The addresses of the functions of a run, with the signatures in cpp/system.hpp; `keepalive` keeps them alive.
 
     A function of the library is a `LibraryFunction` instead of an address. Each invariant, gradient and event is a
     pair: the address, and the number of floats that the function fills. If the address of a gradient is None, the
@@ -108,17 +96,17 @@ class NativeFunctions(NamedTuple):
     """
 
     rhs: Any
-    inv: tuple[tuple[Any, int], ...]
-    grad: tuple[tuple[Any, int], ...]
-    event: tuple[tuple[Any, int], ...]
+    inv: Sequence[tuple[Any, int]]
+    grad: Sequence[tuple[Any, int]]
+    event: Sequence[tuple[Any, int]]
     params: np.ndarray
     second_order: bool
-    owner: Any
+    keepalive: Any
     python: PythonFunctions | None = None
     jacobian: Any = None
     floors: np.ndarray | None = None
     rates: Rates = Rates()
-    by_parameters: tuple[tuple[Any, int], ...] = ()
+    by_parameters: Sequence[tuple[Any, int]] = ()
     native: bool = True
 
 
@@ -128,7 +116,7 @@ class OctetFunctions(NamedTuple):
     rhs: Any
     inv: tuple[tuple[Any, int], ...]
     grad: tuple[tuple[Any, int], ...]
-    owner: Any
+    keepalive: Any
     jacobian: Any = None
 
 
@@ -160,14 +148,6 @@ def _build(name: str) -> Any:
         ) from None
 
 
-def _best() -> Any:
-    """Return the build that the environment variable `VARIABLE` names, or else the best one for the processor."""
-    if name := os.environ.get(VARIABLE):
-        return _build(name)
-    plain = _build("_native")
-    return _build("_native_v3") if plain.HAS_V3 else plain
-
-
 def _require_current(build: Any) -> None:
     """Raise ImportError in a clone whose sources have changed since the engine was built."""
     folder = Path(__file__).parent / "cpp"
@@ -176,19 +156,16 @@ def _require_current(build: Any) -> None:
         raise ImportError(f"the sources in {folder} have changed since the engine was built. Build it again: {AGAIN}")
 
 
-def _is_worker() -> bool:
-    """Return True in a process started by `multiprocessing`: there are usually as many of these as processors."""
-    module = sys.modules.get("multiprocessing.process")
-    return module is not None and module.parent_process() is not None
-
-
 if TYPE_CHECKING:
     from . import _native as BUILD  # noqa: N812
 else:
-    BUILD = _best()
+    BUILD = _build(os.environ.get(VARIABLE) or "_native")
+    if BUILD.HAS_V3 and not os.environ.get(VARIABLE):  # the best one for the processor
+        BUILD = _build("_native_v3")
     _require_current(BUILD)
-if _is_worker() and "OMP_NUM_THREADS" not in os.environ:
-    BUILD.end_threads()
+_processes = sys.modules.get("multiprocessing.process")
+if _processes is not None and _processes.parent_process() is not None and "OMP_NUM_THREADS" not in os.environ:
+    BUILD.end_threads()  # in a worker of `multiprocessing`: there are usually as many of these as processors
 
 
 @contextmanager

@@ -15,24 +15,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checkpoint import require_place
-from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.conserved import NEAR_DISTANCE, confirmed
 from ..core.events import Events
+from ..core.functions import PointerFunction, extra_arguments, floats, is_compiled, parameter_values
 from ..core.gradients import unless_error
-from ..core.inputs import count, flag, shown
+from ..core.inputs import count, flag, shown, states
 from ..core.invariants import as_invariants
-from ..core.jitted import is_compiled
 from ..core.names import nearest
-from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.projection import ProjectionDetails
 from ..core.solvers import EIPRK4, EIPSolver
-from ..core.states import states
 from ..engine.data import N_COUNTERS
 from ..engine.trust import ProjectionWarning
 from ..run.driver import expected_steps
 from ..run.memory import check_bytes, most_bytes
-from ..run.prepare import DEFAULT, Request, default_method
+from ..run.prepare import DEFAULT, RunArguments, default_method
 from .checkpoints import opened
 from .executors import results
 from .members import LANES, Chunk, Plan, Task, placed
@@ -198,7 +195,7 @@ def ensemble(
         options["invariants"] = invariants
     everyone = _inputs(fun, y0s, params, options)
     members = len(everyone.y0s)
-    request = Request.of(
+    request = RunArguments.of(
         fun=_bare(fun), acceleration=acceleration, t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], h=h,
         method=default_method(fun) or EIPRK4 if method is None else method, save_every=save_every, t_eval=t_eval,
         **options,

@@ -16,10 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..core.functions import CompiledFunction, NotCompilableError, PointerFunction
 from ..core.inputs import shown
-from ..core.jitted import NotCompilableError
-from ..core.native_functions import Native
-from ..core.pointers import PointerFunction
 from ..core.runs import Run
 from ..core.step_control import UNBOUNDED, saved_steps
 from ..engine import data
@@ -27,7 +25,7 @@ from ..engine.native import BUILD, LibraryFunction, OctetFunctions
 from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, expected_steps
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop, assembled
-from ..run.prepare import Request, prepared
+from ..run.prepare import RunArguments, prepared
 from ..run.results import IntegrationResult
 from .result import COUNTERS, FAILED, FIELDS, NOT_RUN
 
@@ -55,7 +53,7 @@ class Chunk(NamedTuple):
 class Task(NamedTuple):
     """The part of an ensemble that all members share, in a form that can be sent to other processes."""
 
-    request: Request  # arguments of `integrate` for one member with a valid start
+    request: RunArguments  # arguments of `integrate` for one member with a valid start
     members: int  # total number of members
     reduce: Callable[[Any], Any] | None  # function of the result of a member, whose value replaces saved states
     doubt: tuple[np.ndarray, str] | None = None  # parameters for which the checks at the start found the given fault
@@ -449,10 +447,10 @@ def not_batched_because(driver: Driver, members: int) -> str:
     }
     if reason := next(filter(reasons.get, reasons), ""):
         return reason
-    little, owner = members * schedule.span.n_steps * run.y0.size < LEAST_WORK, driver.functions.owner
+    little, keepalive = members * schedule.span.n_steps * run.y0.size < LEAST_WORK, driver.functions.keepalive
     try:
         names = ("rhs", "inv", "grad", "jacobian")
-        rhs, inv, grad, jacobian = (tuple(_for_lanes(one, little) for one in owner.get(name, ())) for name in names)
+        rhs, inv, grad, jacobian = (tuple(_for_lanes(one, little) for one in keepalive.get(name, ())) for name in names)
     except NotCompilableError as error:
         return str(error)
     product = jacobian[0][0] if jacobian else None
@@ -460,7 +458,7 @@ def not_batched_because(driver: Driver, members: int) -> str:
     return ""
 
 
-def _for_lanes(native: Native, little: bool) -> tuple[Any, int]:
+def _for_lanes(native: CompiledFunction, little: bool) -> tuple[Any, int]:
     """Return the version of a function for eight members, and the number of floats that it fills for each member.
 
     If there is `little` work, no function is compiled. NotCompilableError is raised for a function without a version.
@@ -474,7 +472,7 @@ def _for_lanes(native: Native, little: bool) -> tuple[Any, int]:
         raise NotCompilableError(f"{one.name} is a C function, which is called for one member at a time")
     if little:
         raise NotCompilableError("compiling functions for eight members would take longer than the run")
-    from ..core.numba_pointers import compiled  # both load Numba
+    from ..core.numba_bridge import compiled  # both load Numba
     from .lanes8 import LANES8
 
     # An array of n floats becomes (n, 8) doubles. The function must not branch on values or create arrays.

@@ -120,7 +120,7 @@ class ScipySolverAdapter(Method):
             atol=run.stepping.atol, first_step=min(length, abs(span.t_bound - t)) or None, **jacobian._asdict(),
         )  # fmt: skip
         self.start_calls = calls[0]
-        run.problem.uncount(self.start_calls)
+        run.problem.count -= self.start_calls
         solver.nfev = 0
         self._counted = dict.fromkeys(COUNTERS, 0)
         lacking = [name for name in PRIVATE[self.solver] if not hasattr(solver, name)]

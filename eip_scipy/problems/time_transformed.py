@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ..core.functions import compilable, compiled_like, jitted, jitted_call, own_values
 from ..core.invariants import Invariant
-from ..core.jitted import compilable, compiled_like, jitted, jitted_call
 from ..core.problem import Problem, bind
-from ..core.states import own_values
 
 __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 

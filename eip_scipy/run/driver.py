@@ -11,8 +11,7 @@ import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..core.dense import Interpolants, ManifoldDenseOutput, solution
-from ..core.jitted import ChangedShapeError
-from ..core.native_functions import raise_again
+from ..core.functions import ChangedShapeError, reraise_user_exception
 from ..core.runs import Run
 from ..core.step_control import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
@@ -106,7 +105,7 @@ class Driver:
     def _raise_own(self, *failed: Any) -> NoReturn:
         """Raise the exception of the Numba or C function that failed; the arguments are those of `FailedCallError`."""
         try:
-            raise_again(self.functions, *failed)
+            reraise_user_exception(self.functions, *failed)
         except ChangedShapeError as changed:
             self.place(changed)
             raise

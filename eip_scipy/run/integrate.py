@@ -15,10 +15,9 @@ import numpy as np
 
 from ..core.examination import is_check_due, steps_to_check
 from ..core.failures import failure
+from ..core.functions import PointerFunction, is_compiled, is_jitted
 from ..core.invariants import Invariant
-from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
-from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.projection import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
@@ -31,7 +30,7 @@ from ..engine.native import PythonFunctions
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver
-from .prepare import DEFAULT, Request, identity, prepared, started_at
+from .prepare import DEFAULT, RunArguments, identity, prepared, started_at
 from .results import IntegrationResult, Origin, described
 
 __all__ = ["integrate"]
@@ -215,14 +214,14 @@ def integrate(
     >>> run.y.shape, bool((run.max_residual < 1e-11).all())
     ((4, 68), True)
     """
-    asked = locals()  # the fields of Request have the same names and defaults
+    asked = locals()  # the fields of RunArguments have the same names and defaults
     known = ProjectionOptions.names()
     for name in projection:
         if name not in known:
-            own = (name for name in Request._fields if name != "projection")
+            own = (name for name in RunArguments._fields if name != "projection")
             others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
-    request = Request(*map(asked.__getitem__, Request._fields))
+    request = RunArguments(*map(asked.__getitem__, RunArguments._fields))
     opened = _resume.opened(checkpoint, checkpoint_every, resume, dense_output)
     begin = time.perf_counter()
     with opened as keeper:
@@ -239,7 +238,7 @@ class Loop:
     An exception raised in `run` gets the result up to that point as its attribute `partial`.
     """
 
-    def __init__(self, run: Run, given: Request, keeper: _resume.Checkpointer | None = None) -> None:
+    def __init__(self, run: Run, given: RunArguments, keeper: _resume.Checkpointer | None = None) -> None:
         self.given, self.keeper, self.problem = given, keeper, run.problem
         self.method, self.events, self.diagnostics = run.name, run.problem.events, run.diagnostics
         self.callback, self.progress = given.callback, given.progress
@@ -551,7 +550,7 @@ def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
     return tqdm(total=length, initial=abs(float(schedule.clock[TIME]) - span.t0), unit="time", **shown)
 
 
-def _keep_start(error: BaseException, request: Request, seconds: float) -> None:
+def _keep_start(error: BaseException, request: RunArguments, seconds: float) -> None:
     """Attach a result with the initial state as `partial` to an exception that has no `partial`."""
     if hasattr(error, "partial"):
         return

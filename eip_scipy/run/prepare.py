@@ -10,21 +10,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.acceleration import AccelerationField
-from ..core.arguments import are_same, extra_arguments, floats
 from ..core.bound_problem import FORMS, BoundProblem
 from ..core.events import Events, as_events, replaced
-from ..core.inputs import count, flag, real_array, shown
-from ..core.invariants import Invariant, as_invariants, with_args
-from ..core.jitted import is_compiled
+from ..core.functions import (
+    GRADIENT,
+    AccelerationField,
+    PointerFunction,
+    are_same,
+    by_pointer,
+    extra_arguments,
+    floats,
+    is_compiled,
+)
+from ..core.inputs import count, flag, initial_state, real_array, shown
+from ..core.invariants import as_invariants, with_args
 from ..core.particles import compiled_items
-from ..core.pointers import GRADIENT, PointerFunction, by_pointer
-from ..core.problem import BROUGHT, Problem
+from ..core.problem import PROBLEM_DEFAULTS, Problem
 from ..core.projection import ProjectionOptions
 from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver, class_named, eip_method
-from ..core.states import initial_state
 from ..core.step_control import ATOL, StepControl, interval
 from ..core.tangent_vectors import tangent_vectors
 from ..core.variations import First, Variations, augmented_rhs
@@ -36,7 +41,7 @@ from .driver import check_memory, saved_rows
 from .memory import check_bytes
 from .resume import plain, settings
 
-__all__ = ["DEFAULT", "Request", "as_problem", "default_method", "identity", "prepared", "started_at"]
+__all__ = ["DEFAULT", "RunArguments", "as_problem", "default_method", "identity", "prepared", "started_at"]
 
 
 class _Default:
@@ -50,7 +55,7 @@ class _Default:
 DEFAULT: Any = _Default()
 
 
-class Request(NamedTuple):
+class RunArguments(NamedTuple):
     """The arguments of `integrate` as given; `projection` contains only the projection options that were given."""
 
     fun: Any = None
@@ -83,90 +88,91 @@ class Request(NamedTuple):
     projection: Mapping[str, Any] = MappingProxyType({})
 
     @classmethod
-    def of(cls, **keywords: Any) -> Request:
+    def of(cls, **keywords: Any) -> RunArguments:
         """Return a request made from keywords, including projection options."""
         projection, others = ProjectionOptions.split(keywords)
         return cls(projection=projection, **others)
 
-    def with_pointers(self) -> Request:
+    def with_pointers(self) -> RunArguments:
         """Return the arguments with C functions wrapped, so that an error says why they cannot be pickled."""
         fun, acceleration = by_pointer(self.fun, "fun"), by_pointer(self.acceleration, "acceleration")
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
         events = None if self.events is None else as_events(self.events)
         return self._replace(fun=fun, acceleration=acceleration, events=events, jacobian=jacobian)
 
-    @property
-    def adaptive(self) -> bool:
-        """Return True if an option of adaptive steps was given: `rtol`, `atol`, `first_step` or `max_step`."""
-        no_bound = isinstance(self.max_step, float) and self.max_step == np.inf
-        return not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
-
     def steps(self, own: Problem | None, method: Method) -> dict[str, Any]:
         """Return the options of the step size: the step of the problem, or the defaults, for what was not given."""
-        fixed = own is not None and not self.adaptive and not method.drives
-        return {
-            "h": (own.h if fixed and own is not None else None) if self.h is DEFAULT else self.h,
-            "first_step": self.first_step,
-            "max_step": self.max_step,
-            "rtol": 1e-3 if self.rtol is DEFAULT else self.rtol,
-            "atol": ATOL if self.atol is DEFAULT else self.atol,
-        }
+        h, no_bound = self.h, isinstance(self.max_step, float) and self.max_step == np.inf
+        if h is DEFAULT:
+            adaptive = not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
+            h = None if own is None or adaptive or method.drives else own.h
+        rtol, atol = 1e-3 if self.rtol is DEFAULT else self.rtol, ATOL if self.atol is DEFAULT else self.atol
+        control = {"first_step": self.first_step, "max_step": self.max_step}
+        return {"h": h, **control, "rtol": rtol, "atol": atol}
 
 
-def prepared(given: Request, *, check_start: bool = True) -> Run:
+def prepared(given: RunArguments, *, check_start: bool = True) -> Run:
     """Check the arguments of `integrate`, and return a run at its start; for `check_start` see `Run.start_at`."""
     own = given.fun if isinstance(given.fun, Problem) else None
     solver: Any = default_method(own) if given.method is None else given.method
     method = _method(solver)
     _check_choices(given)
     problem, projection = as_problem(given, method, solver)
-    ends = t0, _ = _span(given, own, problem.events)
+    events, t_span = problem.events, _start(given, own)[0]
+    ends = t0, t_bound = interval(t_span)
+    if math.isinf(t_bound) and not (events.terminal or (given.callback is not None and given.save_every is not None)):
+        raise ValueError(
+            f"t_span must be finite unless a terminal event ends the run, got {shown(t_span)}; a callback may "
+            "end it too, at the steps that save_every=... saves."
+        )
     n = problem.y0.size if problem.variations is None else problem.variations.tangents.n
     stepping = StepControl.of(solver.__name__, method, ends, n, **given.steps(own, method))
     run = Run(problem, solver.__name__, method, stepping, projection).start_at(problem.y0, check=check_start)
-    run.schedule = schedule = _schedule(stepping.span, run.start.tau, given, problem.events)
+    run.schedule = schedule = _schedule(stepping.span, run.start.tau, given, events)
     check_memory(saved_rows(schedule), run, given.max_bytes)
     # `attach` sets all attributes of a new record.
     run.attach(Diagnostics.__new__(Diagnostics) if given.diagnostics is None else given.diagnostics)
-    schedule.g[:] = problem.events.at_start(t0, run.y0, run.start.f, run.start.tau * schedule.span.sign)
+    schedule.g[:] = events.at_start(t0, run.y0, run.start.f, run.start.tau * schedule.span.sign)
     run.work.K[0] = run.start.f
     run.work.counters[NFEV] = problem.count
     return run
 
 
-def as_problem(given: Request, method: Method, solver: Any) -> tuple[BoundProblem, ProjectionOptions]:
+def as_problem(given: RunArguments, method: Method, solver: Any) -> tuple[BoundProblem, ProjectionOptions]:
     """Look at a user's functions, arguments, start and options, once for all interfaces, and return what a run needs.
 
     `method` is that of the class `solver`, for which implicit methods keep other invariants by default.
     """
     own = given.fun if isinstance(given.fun, Problem) else None
     fun, form = _function(given, own)
-    params = _parameters(given, own)
-    extra = extra_arguments(given.args, params)
-    y0 = _state(own.y0 if own is not None and given.y0 is None else given.y0)
+    extra = extra_arguments(given.args, given.params if own is None else _parameters(given, own))
+    y0 = initial_state(_start(given, own)[1])
+    if y0.size == 0:
+        raise ValueError("y0 is empty; integrate needs a state with at least one component.")
     events = as_events(own.events if own is not None and given.events is None else given.events)
-    jacobian = by_pointer(given.jacobian, "jacobian", GRADIENT, takes_f=True)
-    acc = None
+    jacobian, acc = by_pointer(given.jacobian, "jacobian", GRADIENT, takes_f=True), None
     if own is not None:
         jacobian = own.jacobian if jacobian is None else jacobian
         acc = own.acc if method.of_second_order else None
     if given.jac is not None and not method.drives:
         name = solver.__name__
         raise TypeError(f"jac is the Jacobian for EIPRadau and EIPBDF, but {name} does not use one. Omit jac.")
-    projection = _projection(given, own, fun, method, extra)
-    variations = _variations(given, own, fun, form, y0, extra, solver, projection)
-    if variations is not None:
+    projection, variations = _projection(given, own, fun, method, extra), None
+    if given.variations is not None:
+        variations = _variations(given, own, fun, form, y0, extra, solver, projection)
         fun, form, acc, jacobian = variations.rhs, FORMS[False, True], None, None
         y0 = variations.tangents.augmented(y0, floats(extra))
         events = replaced(events, map(variations.event, events))
         projection = replace(projection, invariants=variations.invariants)
+    elif given.jvp is not None or given.symplectic is not None:
+        raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
     return BoundProblem(
         fun, y0, form, extra, problem=own, events=Events(events, extra), acc=acc, jacobian=jacobian,
         jac=Jacobian(given.jac), variations=variations, explains=True,
     ), projection  # fmt: skip
 
 
-def _function(given: Request, own: Problem | None) -> tuple[Any, str]:
+def _function(given: RunArguments, own: Problem | None) -> tuple[Any, str]:
     """Return the function that the engine calls, and its form in `FORMS`; C functions so that Python can call them."""
     fun: Any = given.fun
     in_place, name = flag("in_place", given.in_place), "fun"
@@ -190,10 +196,8 @@ def _function(given: Request, own: Problem | None) -> tuple[Any, str]:
     return fun, FORMS[name == "acceleration", in_place or isinstance(fun, PointerFunction)]
 
 
-def _parameters(given: Request, own: Problem | None) -> Any:
+def _parameters(given: RunArguments, own: Problem) -> Any:
     """Return the option `params`, with values that a problem has or knows by name."""
-    if own is None:
-        return given.params
     if given.args is not None:
         raise TypeError("args: a Problem has params; pass params=..., or its functions instead of the Problem.")
     if isinstance(given.params, Mapping):
@@ -201,39 +205,35 @@ def _parameters(given: Request, own: Problem | None) -> Any:
     return own.params if given.params is None and own.rhs is not None else given.params
 
 
-def _projection(given: Request, own: Problem | None, fun: Any, method: Method, extra: tuple) -> ProjectionOptions:
+def _projection(given: RunArguments, own: Problem | None, fun: Any, method: Method, extra: tuple) -> ProjectionOptions:
     """Return the options of the projection, completed by those of the problem and by defaults for compiled functions.
 
     Invariants lose args that equal the last arguments of the run, which are passed to them anyway.
     """
-    options = dict(given.projection)
+    options, known = dict(given.projection), [extra]
     if own is not None:
-        brought = {name: getattr(own, name) for name in BROUGHT}
-        if brought["linear_invariants"] is None:
+        brought = {name: getattr(own, name) for name in PROBLEM_DEFAULTS}
+        if own.linear_invariants is None:
             del brought["linear_invariants"]  # they may be found
         elif isinstance(options.get("linear_invariants"), str):
             del options["linear_invariants"]
         if method.drives:
             brought["invariants"] = own.stiff_invariants
         options = brought | options
+        known += [] if own.params is None else [(own.params,)]
     items = as_invariants(options.get("invariants", ()))
-    if any(item.args for item in items):
-        known = [(own.params,), extra] if own is not None and own.params is not None else [extra]
-        items = tuple(_without_own(item, known) for item in items)
+    if any([item.args for item in items]):
+        known = [args for args in known if args]
+        items = tuple(with_args(x, ()) if any(are_same(x.args, args) for args in known) else x for x in items)
     if is_compiled(fun) or isinstance(fun, PointerFunction):
         items = compiled_items(items)
         if not isinstance(fun, LibraryFunction):  # problems have their own
-            options = {"linear_invariants": "auto"} | options
+            options.setdefault("linear_invariants", "auto")
     return ProjectionOptions(**options | {"invariants": items})
 
 
-def _without_own(item: Invariant, known: list[tuple]) -> Invariant:
-    """Return the invariant without args that equal one of the `known` ones, which the run passes on."""
-    return with_args(item, ()) if any(own and are_same(item.args, own) for own in known) else item
-
-
 def _variations(
-    given: Request,
+    given: RunArguments,
     own: Problem | None,
     fun: Any,
     form: str,
@@ -241,12 +241,8 @@ def _variations(
     extra: tuple,
     solver: Any,
     projection: ProjectionOptions,
-) -> Variations | None:
-    """Return the `Variations` for the option `variations`, or None if it was not given."""
-    if given.variations is None:
-        if given.jvp is not None or given.symplectic is not None:
-            raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
-        return None
+) -> Variations:
+    """Return the `Variations` for the option `variations`."""
     if given.symplectic is not None:
         flag("symplectic", given.symplectic)
     names = () if own is None else tuple(own.parameters)
@@ -258,8 +254,8 @@ def _variations(
         )
     first = First(interval(_start(given, own)[0])[0], y0, extra)
     items = projection.invariants
-    tangents = tangents.kept_symplectic(given.symplectic, own is not None and own.canonical, bool(items))
-    variational = None if own is None else own.variational
+    canonical, variational = (False, None) if own is None else (own.canonical, own.variational)
+    tangents = tangents.kept_symplectic(given.symplectic, canonical, bool(items))
     rhs, source = augmented_rhs(tangents, fun, form, first, given.jvp, variational)
     return Variations.of(tangents, rhs, source, first, items)
 
@@ -269,18 +265,23 @@ def default_method(fun: Any) -> type[EIPSolver] | None:
     return eip_method(fun.method) if isinstance(fun, Problem) and fun.method is not None else None
 
 
-def _start(given: Request, own: Problem | None) -> tuple[Any, Any]:
+def _start(given: RunArguments, own: Problem | None) -> list[Any]:
     """Return t_span and y0; those of the problem for what is not given."""
-    t_span, y0 = given.t_span, given.y0
-    if own is not None:
-        t_span, y0 = own.t_span if t_span is None else t_span, own.y0 if y0 is None else y0
-    return _required("t_span", t_span), _required("y0", y0)
+    found = []
+    for name in ("t_span", "y0"):
+        value = getattr(given, name)
+        if value is None and own is not None:
+            value = getattr(own, name)
+        if value is None:
+            raise TypeError(f"integrate: {name} is missing; it can be omitted only for a Problem that has its own.")
+        found.append(value)
+    return found
 
 
-def started_at(given: Request) -> tuple[float, np.ndarray]:
+def started_at(given: RunArguments) -> tuple[float, np.ndarray]:
     """Return time and state at the start; those of the problem if none are given."""
     t_span, y0 = _start(given, given.fun if isinstance(given.fun, Problem) else None)
-    return interval(t_span)[0], _state(y0)
+    return interval(t_span)[0], initial_state(y0)
 
 
 def _method(method: Any) -> Any:
@@ -298,7 +299,7 @@ def _method(method: Any) -> Any:
     return method.TABLEAU
 
 
-def _check_choices(request: Request) -> None:
+def _check_choices(request: RunArguments) -> None:
     callback, compiled = request.callback, request.compiled
     if callback is not None and not callable(callback):
         raise TypeError(f"callback must be a function callback(t, y, residuals), got {shown(callback)}.")
@@ -309,51 +310,18 @@ def _check_choices(request: Request) -> None:
     check_bytes(request.max_bytes)
 
 
-def _required(name: str, value: Any) -> Any:
-    if value is None:
-        raise TypeError(f"integrate: {name} is missing; it can be omitted only for a Problem that has its own.")
-    return value
-
-
-def _state(y0: Any) -> np.ndarray:
-    start = initial_state(_required("y0", y0))
-    if start.size == 0:
-        raise ValueError("y0 is empty; integrate needs a state with at least one component.")
-    return start
-
-
-def _span(given: Request, own: Problem | None, events: Events) -> tuple[float, float]:
-    """Return the interval; it may be infinite only if something can end the run."""
-    t_span = _start(given, own)[0]
-    t0, t_bound = interval(t_span)
-    ends = events.terminal or (given.callback is not None and given.save_every is not None)
-    if math.isinf(t_bound) and not ends:
-        raise ValueError(
-            f"t_span must be finite unless a terminal event ends the run, got {shown(t_span)}; a callback may "
-            "end it too, at the steps that save_every=... saves."
-        )
-    return t0, t_bound
-
-
-def _schedule(span: Span, tau: float, request: Request, events: Events) -> Schedule:
+def _schedule(span: Span, tau: float, request: RunArguments, events: Events) -> Schedule:
     save_every, t_eval, times = request.save_every, request.t_eval, np.zeros(0)
     if t_eval is not None:
         if save_every is not None:
             raise ValueError("give save_every or t_eval, not both.")
         times = evaluation_times(t_eval, span.t0, span.t_bound)
-    n_events = len(events.functions)
+    every, n = 0 if save_every is None else count("save_every", save_every), len(events.functions)
     return Schedule(
-        span=span,
-        save_every=0 if save_every is None else count("save_every", save_every),
-        t_eval=times,
-        place=np.zeros(3, np.int64),
-        clock=np.array([span.t0, span.t0, 0.0, tau]),
-        g=np.zeros(n_events),
-        g_new=np.zeros(n_events),
-        rate=np.array([math.nan] * n_events),
-        rate_new=np.zeros(n_events),
-        g_direction=events.directions,
-    )
+        span=span, save_every=every, t_eval=times, place=np.zeros(3, np.int64),
+        clock=np.array([span.t0, span.t0, 0.0, tau]), g=np.zeros(n), g_new=np.zeros(n), rate=np.array([math.nan] * n),
+        rate_new=np.zeros(n), g_direction=events.directions,
+    )  # fmt: skip
 
 
 def evaluation_times(t_eval: Any, t0: float, t_bound: float) -> np.ndarray:

@@ -13,22 +13,20 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
-from ..core.acceleration import AccelerationField
-from ..core.inputs import flag, is_number, shown
+from ..core.functions import AccelerationField, PointerFunction, by_pointer
+from ..core.inputs import flag, initial_state, is_number, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
 from ..core.particles import particle_invariants
-from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
 from ..core.projection import Blocks, LinearConstraints, Metric
 from ..core.results import ProjectionWarning
 from ..core.solvers import EIPBDF, EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, EIPRadau
-from ..core.states import initial_state
 from ..core.step_control import UNBOUNDED, interval
 from ..engine.data import EPS, NFEV
 from ..methods.nystrom import depends_on_velocity
 from .integrate import Loop, integrate
-from .prepare import Request, evaluation_times, prepared
+from .prepare import RunArguments, evaluation_times, prepared
 from .results import IntegrationResult
 
 __all__ = ["Recommendation", "Trial", "recommend"]
@@ -291,7 +289,7 @@ class _Search:
         rtol = min(max(wanted, 1e-10), 1e-4)
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
         self.first = {**common, "method": EIPDOP853, "rtol": rtol, "atol": atol}
-        self.pilot = prepared(Request.of(fun=problem, **self.first))
+        self.pilot = prepared(RunArguments.of(fun=problem, **self.first))
         missing = self.pilot.conserved.missing
         if missing is not None:
             own = particle_invariants(missing.masses, missing.dimension)
@@ -384,7 +382,7 @@ class _Search:
 
     def _integrate(self, t: float, options: Mapping[str, Any], **further: Any) -> tuple[IntegrationResult, int]:
         """Run from the start to t; return the result and its evaluations, for Jacobians of implicit methods too."""
-        given = Request.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further})
+        given = RunArguments.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further})
         run, is_implicit = prepared(given), options["method"].TABLEAU.drives
         if is_implicit:
             calls, fun = count(int(run.work.counters[NFEV]) + run.method.start_calls), run.problem.fun

@@ -10,10 +10,9 @@ import scipy.integrate
 from numpy.typing import ArrayLike
 from scipy.integrate import OdeSolution, OdeSolver
 
-from ..core.acceleration import AccelerationField
-from ..core.arguments import are_same
 from ..core.events import Events, as_events, replaced
-from ..core.inputs import shown
+from ..core.functions import AccelerationField, are_same
+from ..core.inputs import initial_state, shown
 from ..core.invariants import as_invariants, with_args
 from ..core.projection import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
@@ -28,7 +27,6 @@ from ..core.solvers import (
     class_named,
     eip_method,
 )  # fmt: skip
-from ..core.states import initial_state
 from ..core.step_control import interval
 from ..core.tangent_vectors import StateSolution, TangentVectors, tangent_vectors
 from ..core.variations import First, Variations, augmented_rhs

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import LowLevelCallable
 
 from eip_scipy import EIPGJ12, EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate
-from eip_scipy.core.jitted import jitted_call
+from eip_scipy.core.functions import jitted_call
 from eip_scipy.engine.native import BUILD, library
 from eip_scipy.problems import ForceConstants, kepler, nbody
 

@@ -17,7 +17,7 @@ from eip_scipy.core.dense import Interpolants
 from eip_scipy.engine import native
 from eip_scipy.engine.data import Work
 from eip_scipy.engine.native import BUILD, Engine
-from eip_scipy.run.prepare import Request, prepared
+from eip_scipy.run.prepare import RunArguments, prepared
 
 Y0 = pericentre(0.6)
 
@@ -27,7 +27,7 @@ def parts(method=EIPRK4, **options):
     fun, y0 = orbit, Y0
     if options.pop("dtype", None):
         fun, y0 = spin, SPIN_START
-    ready = prepared(Request.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
+    ready = prepared(RunArguments.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
     functions, _ = ready.problem.functions(ready, False)
     return {
         "method": ready.method,
@@ -85,7 +85,7 @@ def test_arrays_that_do_not_fit_are_refused(case):
     engine, refused = Engine(**given), 0
     records = [(given[part], part) for part in ("method", "options", "schedule")]
     if case in ("kepler", "adaptive"):
-        ready = prepared(Request.of(fun=orbit, t_span=(0, 1), y0=Y0, **{"method": EIPRK4, **CASES[case]}))
+        ready = prepared(RunArguments.of(fun=orbit, t_span=(0, 1), y0=Y0, **{"method": EIPRK4, **CASES[case]}))
         records += [(Interpolants(ready, engine).record, "dense output")]
     for record, part in records:
         for path in arrays(record):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from eip_scipy import EIPRK45, equations, hamiltonian, integrate
-from eip_scipy.core import jitted
+from eip_scipy.core import functions
 from eip_scipy.problems import symbolic
 from eip_scipy.problems.symbolic import system
 
@@ -16,7 +16,7 @@ def test_without_numba(monkeypatch):
     H = "(px**2 + py**2)/2 + log(x) + atan2(y, x) + sqrt(1 + y**2) + abs(y) + max(x, y) + cbrt(x) + y*cbrt(y)"
     y = np.array([1.2, -0.4, 0.3, 0.1])
     compiled = hamiltonian(H, name="one")
-    monkeypatch.setattr(jitted, "find_spec", lambda name: None)
+    monkeypatch.setattr(functions, "find_spec", lambda name: None)
     system._functions.cache_clear()
     plain = hamiltonian(H, name="one")
     system._functions.cache_clear()

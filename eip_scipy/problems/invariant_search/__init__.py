@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ...core.functions import compiled_like, is_jitted
 from ...core.inputs import count, is_number, reals, shown
 from ...core.invariants import Invariant
-from ...core.jitted import compiled_like, is_jitted
 from ...core.problem import Problem, component_names
 from .polynomials import Term, functions, written
 from .search import Search, Surroundings

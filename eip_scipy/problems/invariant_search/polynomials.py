@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.jitted import compiled_like, is_compiled
+from ...core.functions import compiled_like, is_compiled
 
 __all__ = ["LARGEST_DENOMINATOR", "Functions", "Monomial", "Polynomial", "Term", "functions", "product_of", "written"]
 

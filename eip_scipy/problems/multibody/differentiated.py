@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.functions import NotCompilableError, compilable, is_jitted, jit_is_off, jitted
 from ...core.gradients import (
     DIFFER,
     DIFFERENCE_WEIGHTS,
@@ -25,7 +26,6 @@ from ...core.gradients import (
     NumericalGradient,
     time_of_motion,
 )
-from ...core.jitted import NotCompilableError, compilable, is_jitted, jit_is_off, jitted
 from ...engine.data import EPS
 from .motion import new_floats, new_like
 from .parts import Energy, Given, Outputs, Parts, on_copies

@@ -10,9 +10,9 @@ import numpy as np
 
 from ...core.balances import Balance
 from ...core.conserved import reduced_rows
+from ...core.functions import compiled_like
 from ...core.gradients import difference_gradient
 from ...core.invariants import Invariant
-from ...core.jitted import compiled_like
 from .motion import plain
 from .parts import Energy, Parts
 from .start import Names, nearest_start

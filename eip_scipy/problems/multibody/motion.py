@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.jitted import compilable, compiled_like, is_jitted, jitted
+from ...core.functions import compilable, compiled_like, is_jitted, jitted
 from ...engine.native import BUILD
 
 __all__ = ["Motion", "Sizes", "changed", "motion", "new_floats", "new_like", "plain", "solve", "vector"]

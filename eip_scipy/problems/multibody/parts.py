@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...core.functions import compilable, jitted, own_values
 from ...core.inputs import shown
-from ...core.jitted import compilable, jitted
-from ...core.states import own_values
 from .motion import plain
 from .start import Names
 

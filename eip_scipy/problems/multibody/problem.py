@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ...core.functions import is_jitted
 from ...core.inputs import is_number, real_array, shown
 from ...core.invariants import Invariant
-from ...core.jitted import is_jitted
 from ...core.problem import Problem, bind
 from ...core.results import Multipliers
 from .energies import energy_of, momenta_of, norms_of, states_near, typical_speed

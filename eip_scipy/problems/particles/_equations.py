@@ -12,8 +12,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
+from ...core.functions import compiled_like, is_jitted
 from ...core.gradients import DIFFERENCE_WEIGHTS
-from ...core.jitted import compiled_like, is_jitted
 
 __all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
 

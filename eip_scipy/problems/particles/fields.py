@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.jitted import compilable, jitted
-from ...core.states import own_values
+from ...core.functions import compilable, jitted, own_values
 from ._equations import (
     FieldFunctions,
     at_any_time,

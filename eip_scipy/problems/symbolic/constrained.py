@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import sympy
 
-from ...core.jitted import compilable, compiled_like, is_jitted, jitted
+from ...core.functions import compilable, compiled_like, is_jitted, jitted
 from ..multibody.motion import new_floats, new_like
 from ..multibody.parts import Energy, Outputs, Parts
 from .brackets import slope

@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 from sympy.core.function import AppliedUndef
 from sympy.physics.mechanics import KanesMethod, Point, dynamicsymbols, msubs
 
+from ...core.functions import compiled_like, is_jitted
 from ...core.inputs import is_number, shown
-from ...core.jitted import compiled_like, is_jitted
 from ...core.names import nearest
 from ..multibody.motion import plain
 from ..multibody.parts import required_outputs

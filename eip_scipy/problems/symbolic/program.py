@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import sympy
 
-from ...core.jitted import compilable, is_jitted, jitted
+from ...core.functions import compilable, is_jitted, jitted
 from .parser import cbrt, with_powers_of_roots
 
 __all__ = ["Arguments", "function", "variational"]

@@ -14,9 +14,9 @@ import numpy as np
 import sympy
 
 from ...core.balances import Balance
+from ...core.functions import is_jitted
 from ...core.inputs import is_number, reals, shown
 from ...core.invariants import Invariant
-from ...core.jitted import is_jitted
 from ...core.problem import Deferred, Problem, bind
 from ..multibody.motion import vector
 from .brackets import Manifold, NotKeptError, how_kept, slope, vanishes

@@ -1,8 +1,9 @@
-"""Numba functions for the native engine: as C function pointers, compiled when a run begins."""
+"""The bridge to Numba: jitted functions as C functions of the engine, and the engine's functions for jitted ones."""
 
 from __future__ import annotations
 
-from functools import lru_cache
+import ctypes
+from functools import cache, lru_cache
 from itertools import count
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
@@ -15,16 +16,16 @@ from numba.core.errors import NumbaError, TypingError
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.np.arrayobj import populate_array
 
-from .jitted import ChangedShapeError, NotCompilableError
-from .native_functions import Kind
+from ..engine.native import LibraryFunction
+from .functions import ChangedShapeError, Kind, NotCompilableError
 
-__all__ = ["Compiled", "compiled", "compiled_or_none", "refuse_addresses"]
+__all__ = ["Compiled", "compiled", "compiled_or_none", "jitted_call", "refuse_addresses"]
 
 MOST_DIMENSIONS = 4  # of arrays whose addresses are refused
 
 # Counter for the names of C functions.
 _serial = count()
-# How the number of each type in `Packed` is read from params.
+# How a number of each type in `scalars` is read from params.
 SCALARS = {"d": "params[{}]", "q": "int(params[{}])", "?": "params[{}] != 0"}
 # Statements that write `value` to `out`, by the number of dimensions; "values" are those of invariants, also in a list.
 PUT = {
@@ -37,8 +38,13 @@ PUT = {
         "    for j in range(out.shape[1]): out[i, j] = value[i, j]",
     ],
 }
+# Of `call_by_handle` in library.cpp.
+FUNCTION = ctypes.CFUNCTYPE(
+    ctypes.c_double, ctypes.c_void_p, ctypes.c_double, *[ctypes.c_void_p] * 4, *[ctypes.c_int64] * 2
+)
 # Inlined, because only then the compiler sees that the arrays need no counting of references.
-_inlined = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_inlined = njit(forceinline=True)
+_inner = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class Compiled(NamedTuple):
@@ -84,7 +90,7 @@ def _compile(fun: Any, kind: Kind, number: Any) -> tuple[int, Any, bool]:
 
     Equal functions, `kind` and `number` are compiled once in a process.
     """
-    call = _with_all_arguments(fun, kind, _inlined)
+    call = _with_all_arguments(fun, kind, _inner)
 
     def array(scalar: Any, ndim: int) -> Any:
         return types.Array(number or scalar, ndim, "C", aligned=number is None)
@@ -178,3 +184,50 @@ def refuse_addresses(kind: Any, name: str) -> None:
 
             def generic_resolve(self, kind: Any, attribute: str) -> None:
                 raise TypingError(f"Cannot give C code the address of an array of {name}")
+
+
+@cache
+def jitted_call(function: LibraryFunction) -> Any:
+    """Return a jitted function with the arguments of `function`, for contiguous states and parameters.
+
+    Return `function` itself if its parameters are fixed, if the size of its value is not, or if it returns a value that
+    depends on f or on the size of the state.
+    """
+    returns = function.returns_numbers
+    if function.own or function.numbers < 0 or not (function.in_place or returns):
+        return function
+    call, handle, rows = FUNCTION(function.call_address), function.handle, function.numbers
+    wrong = f"{function.__name__} was called with a state or params of the wrong size"
+    no_memory = f"{function.__name__} could not get the memory that it needs"
+
+    def number(t, y, params):
+        state = y.ctypes.data
+        return call(handle, t, state, state, 0, params.ctypes.data, y.size, params.size)
+
+    def numbers(t, y, params):
+        out = np.empty(rows)
+        fill(t, y, y, out, params)
+        return out
+
+    def fill(t, y, f, out, params):
+        pointers = y.ctypes.data, f.ctypes.data, out.ctypes.data, params.ctypes.data
+        status = call(handle, t, *pointers, y.size, params.size)
+        if status > 0.0:
+            raise MemoryError(no_memory)
+        if status != 0.0:
+            raise ValueError(wrong)
+
+    def fill_rows(t, y, f, out, params):  # `out` may be a part of a larger array
+        found = np.empty((rows, y.size))
+        fill(t, y, f, found, params)
+        for i in range(rows):  # an assignment to a slice takes Numba seconds to compile
+            for j in range(y.size):
+                out[i, j] = found[i, j]
+
+    fill = _inlined(fill)
+    if returns:
+        return _inlined(number if rows == 1 else numbers)
+    filled = fill if rows == 1 else _inlined(fill_rows)
+    if function.takes_f:
+        return filled
+    return _inlined(lambda t, y, out, params: filled(t, y, y, out, params))

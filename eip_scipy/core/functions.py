@@ -1,0 +1,453 @@
+"""A user's functions: their last arguments, their form, and what the engine calls for them.
+
+Functions are plain Python, jitted by Numba, C functions by pointer, or functions of the engine's library. Numba is not
+imported here: before a user imports it, there are no jitted functions.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+
+import numpy as np
+
+from ..engine.native import Call, LibraryFunction, NativeFunctions, Rates
+from .inputs import as_vector, filled, is_number, real_array, reals, shown
+
+if TYPE_CHECKING:
+    from .invariant_set import InvariantSet
+    from .numba_bridge import Compiled
+    from .runs import Run
+
+__all__ = [
+    "BY_NAME", "GRADIENT", "AccelerationField", "ChangedShapeError", "CompiledFunction", "Kind", "NotCompilableError",
+    "PointerFunction", "are_same", "by_pointer", "compilable", "compiled_calls", "compiled_like", "extra_arguments",
+    "floats", "is_compiled", "is_jitted", "is_pointer", "jit_is_off", "jitted", "jitted_call", "names",
+    "native_functions", "own_values", "parameter_values", "reraise_user_exception", "scalars",
+]  # fmt: skip
+
+BY_NAME = (
+    "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...), or "
+    "eip_scipy.solve_ivp(acceleration=fun, t_span=..., y0=..., ...)"
+)
+EXACT = 2**53  # integers up to this one are exact as floats
+# Signatures of C functions.
+VALUE = "int (double t, const double *y, double *out, const double *params)"
+GRADIENT = "int (double t, const double *y, const double *f, double *out, const double *params)"
+# Modules of the classes of pointers that are not wrapped in a LowLevelCallable, and of the functions of numba.cfunc.
+NUMBA = "numba.core.ccallback"
+BARE = {"ctypes", "_ctypes", "_cffi_backend", NUMBA}
+NO_DUALS = "a gradient is compiled only for jitted functions of real states"
+_capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
+
+
+class ChangedShapeError(ValueError):
+    """A compiled function returned an array of another shape than at the start."""
+
+
+class NotCompilableError(TypeError):
+    """A run cannot be compiled; the message names the function and says why."""
+
+
+def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
+    """Return the last arguments of the functions of a run as a tuple: `args`, ``(params,)``, or () if both are None."""
+    if args is None:
+        return () if params is None else (parameter_values(params).reshape(-1),)
+    if params is not None:
+        raise TypeError("give args or params, not both: each of them defines the last arguments of the functions.")
+    try:
+        found = tuple(args)
+    except TypeError:
+        raise TypeError(f"args must be a tuple, got {shown(args)}; write args=(x,) for a single argument.") from None
+    return tuple(item.copy() for item in found) if _is_array(found) else found
+
+
+def are_same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    """Return True if two tuples have the same length and their items are pairwise the same object, or equal numbers."""
+    return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def parameter_values(params: Any) -> np.ndarray:
+    """Return `params` as a new array of floats; raise TypeError if they are not numbers, for instance a mapping."""
+    if isinstance(params, Mapping):
+        raise TypeError(
+            f"params must be an array of numbers, got {shown(params)}. Give the values in the order in which fun reads "
+            "them, params=[1.0, 2.0], or pass the mapping as args=(mapping,); fun is then called from Python. Problems "
+            "made by hamiltonian or equations accept a mapping from names to values."
+        )
+    return real_array("params", params, TypeError)
+
+
+def scalars(extra: tuple[Any, ...]) -> str | None:
+    """Return the types of further arguments that are numbers: "d" for a float, "q" for an integer, "?" for a bool.
+
+    Return "" for one array of floats or no argument, and None for arguments that only Python can pass.
+    """
+    types = ""
+    for item in () if _is_array(extra) else extra:
+        if isinstance(item, (bool, np.bool_)):
+            types += "?"
+        elif not is_number(item) or (isinstance(item, (int, np.integer)) and abs(int(item)) > EXACT):
+            return None
+        else:
+            types += "q" if isinstance(item, (int, np.integer)) else "d"
+    return types
+
+
+def floats(extra: tuple[Any, ...]) -> np.ndarray:
+    """Return further arguments as an array of floats for native functions; it is empty if only Python can pass them."""
+    return extra[0] if _is_array(extra) else np.array(extra if scalars(extra) else (), float)
+
+
+def names(extra: tuple[Any, ...]) -> tuple[str, ...]:
+    """Return the names of the further arguments in messages: "params" for one array, else "args[0]", "args[1]", ..."""
+    return ("params",) if _is_array(extra) else tuple(f"args[{k}]" for k in range(len(extra)))
+
+
+def _is_array(extra: tuple[Any, ...]) -> bool:
+    """Return True if the further arguments are one array of floats."""
+    return len(extra) == 1 and type(extra[0]) is np.ndarray and extra[0].ndim == 1 and extra[0].dtype == float
+
+
+class AccelerationField:
+    """First-order right-hand side ``f(t, y[, *args]) = (v, a)`` of y = (q, v), made from an acceleration.
+
+    This is ``acceleration(t, q, *args) -> (n/2,)``, or ``acceleration(t, q, out, *args)`` with `in_place`. `integrate`
+    and the functions built on it call the acceleration itself. The object can be pickled if the acceleration can.
+    """
+
+    def __init__(self, acceleration: Callable[..., Any], in_place: bool = False) -> None:
+        self.acceleration, self.in_place = acceleration, in_place
+
+    def __call__(self, t: float, y: np.ndarray, *args: Any) -> np.ndarray:
+        """Return the derivative at (t, y) as a new array."""
+        half, state = y.size // 2, np.asarray(y)
+        q, v = state[:half].copy(), state[half:]
+        if self.in_place:
+            a = filled(lambda out: self.acceleration(t, q, out, *args), q.shape, q.dtype, "acceleration", t)
+        else:
+            a = as_vector(self.acceleration(t, q, *args), half, q.dtype, "acceleration returned", t)
+        return np.concatenate([v, a])
+
+
+class PointerFunction:
+    """A C function in a form that Python can call: ``(t, y[, f], out[, params])``, with f for gradients that use it.
+
+    The `pointer`, a LowLevelCallable, is stored, so that its function lives as long as this object. `name` is its name
+    in messages, and `kind` the required signature. The engine always passes f to a gradient; without `takes_f` Python
+    passes NaN. If `shape` is given, there is no argument `out`: a new array of this shape is returned, or a float for
+    ``()``.
+    """
+
+    def __init__(
+        self, pointer: Any, name: str, kind: str = VALUE, *, takes_f: bool = False, shape: tuple[int, ...] | None = None
+    ) -> None:
+        given, wanted = (re.sub(r"\b(const|t|y|f|out|params)\b|\s", "", text) for text in (pointer.signature, kind))
+        if given != wanted:
+            raise TypeError(f"{name} is a C function of the signature {pointer.signature!r}, expected {kind}.")
+        if pointer.user_data is not None:
+            raise TypeError(f"{name} is a LowLevelCallable with user_data, which is not supported; pass it as params.")
+        self.pointer, self.name, self.kind = pointer, name, kind
+        self.takes_f, self.shape = takes_f, shape
+        # The first item of this tuple is the capsule of the pointer, whose name is the signature.
+        self.address = _capsule_pointer(tuple.__getitem__(pointer, 0), pointer.signature.encode())
+        # Calls release the GIL, as runs with native functions only do.
+        arrays = [ctypes.c_void_p] * kind.count("*")
+        self._function = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *arrays)(self.address)
+
+    def __call__(self, t: float, y: np.ndarray, *others: Any) -> Any:
+        """Call the function; return its value if `shape` is given, else None.
+
+        Entries of a returned value that the function does not fill are NaN. All entries of the value are NaN if the
+        status is above 0. If it is below 0, a RuntimeError is raised.
+        """
+        state = np.ascontiguousarray(y, complex if np.iscomplexobj(y) else float)
+        given = [state]
+        if self.kind == GRADIENT:
+            f, *others = others if self.takes_f else (np.full_like(state, np.nan), *others)  # type: ignore[assignment]
+            given.append(np.ascontiguousarray(f, state.dtype))
+        out, *extra = others if self.shape is None else (np.full(self.shape, np.nan), *others)
+        if len(extra) == 1:
+            params = reals("params", extra[0])
+        else:
+            params = None if scalars(tuple(extra)) is None else floats(tuple(extra))
+        if params is None:
+            raise TypeError(
+                f"{self.name} is a C function: its arguments after t and y are numbers or one array of floats, "
+                f"its params; it got {', '.join(map(shown, extra))}."
+            )
+        status = self._function(t, *(array.ctypes.data for array in (*given, out, params)))
+        if status < 0:
+            raise self.failure(t, status)
+        if status > 0:
+            out.fill(np.nan)
+        if self.shape is None:
+            return None
+        return out if self.shape else float(out)
+
+    def __reduce__(self) -> NoReturn:
+        raise self.unpicklable()
+
+    def unpicklable(self) -> TypeError:
+        """Return the error for an attempt to pickle this function."""
+        return TypeError(
+            f"{self.name} is a C function by pointer, which cannot be pickled, because its address is not valid in "
+            "another process. Use Python or Numba functions for ensembles on Dask or on processes."
+        )
+
+    def failure(self, t: float, status: int) -> RuntimeError:
+        """Return the error for a call at `t` that returned the negative `status`."""
+        return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; a status below 0 ends the run.")
+
+
+def is_pointer(fun: Any) -> bool:
+    """Return True if `fun` is a `scipy.LowLevelCallable`; without SciPy imported it cannot be one."""
+    return "scipy" in sys.modules and isinstance(fun, sys.modules["scipy"].LowLevelCallable)
+
+
+def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
+    """Return a `scipy.LowLevelCallable` as a `PointerFunction` with the keywords `form`; other functions unchanged.
+
+    Raise TypeError for a pointer of ctypes or cffi, or an object of ``numba.cfunc``: Python could call it, but not with
+    the arguments that it is made for.
+    """
+    if fun is None:
+        return None
+    if is_pointer(fun):
+        return PointerFunction(fun, name, kind, **form)
+    module = type(fun).__module__
+    if module in BARE:
+        given = f"{fun.__name__}.ctypes" if module == NUMBA else "pointer"
+        raise TypeError(f"{name} is a bare C function, {shown(fun)}; wrap it: scipy.LowLevelCallable({given}).")
+    return fun
+
+
+def is_jitted(fun: Any) -> bool:
+    """Return True if a function is a Numba function."""
+    # Not numba.extending.is_jitted, which imports the class in each of its calls.
+    return isinstance(fun, getattr(sys.modules.get("numba.core.dispatcher"), "Dispatcher", ()))
+
+
+def is_compiled(fun: Any) -> bool:
+    """Return True if the engine calls `fun` by its address: a Numba function, or a `LibraryFunction` of the engine."""
+    return is_jitted(fun) or isinstance(fun, LibraryFunction)
+
+
+def jit_is_off() -> bool:
+    """Return True if Numba's compilation is disabled (NUMBA_DISABLE_JIT)."""
+    return "numba" in sys.modules and bool(sys.modules["numba"].config.DISABLE_JIT)
+
+
+def compilable(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Mark a function of this package as one that `jitted` may compile, and return the function."""
+    fun.compilable = True  # type: ignore[attr-defined]
+    return fun
+
+
+@cache
+def jitted(fun: Any) -> Any:
+    """Return a `compilable` function jitted by Numba, if Numba is installed; return any other function unchanged."""
+    if not getattr(fun, "compilable", False) or is_jitted(fun) or find_spec("numba") is None:
+        return fun
+    from numba import njit
+
+    return njit(fun, error_model="numpy", forceinline=True)
+
+
+def compiled_like(fun: Callable[..., Any], *others: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `fun` jitted if all `others`, which `fun` calls, are Numba functions; else `fun`."""
+    return cast(Callable[..., Any], jitted(compilable(fun))) if all(map(is_jitted, others)) else fun
+
+
+def jitted_call(fun: Any) -> Any:
+    """Return a `LibraryFunction` in a form that Numba functions can call, if there is one; else `fun` itself."""
+    if not isinstance(fun, LibraryFunction) or find_spec("numba") is None or jit_is_off():
+        return fun
+    from . import numba_bridge
+
+    return numba_bridge.jitted_call(fun)
+
+
+def own_values(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a user's function with values that its later calls do not change; it may return one array again and again.
+
+    Numba functions, which cannot fill a global array, are returned unchanged.
+    """
+    if is_jitted(fun):
+        return fun
+
+    def own(*args: Any) -> Any:
+        value = fun(*args)
+        return np.array(value) if isinstance(value, np.ndarray | list) else value
+
+    return own
+
+
+class Kind(NamedTuple):
+    """Signature of a function.
+
+    Its value has the `shape`, () for a number, and is real, even if the state is complex, if `real`. It receives `size`
+    components of the state, of the type `dtype`, and an array params of length `p`, -1 for none, or numbers of the
+    types in `scalars`, see the function of this name. The user's function takes f, the derivative of the state, if
+    `takes_f`, and fills an argument `out` if `in_place`. If `gradient`, the engine calls it with the arguments of a
+    gradient, which include f.
+    """
+
+    shape: tuple[int, ...]
+    size: int
+    p: int
+    dtype: str
+    real: bool = False
+    takes_f: bool = False
+    in_place: bool = False
+    gradient: bool = False
+    scalars: str = ""
+
+
+class CompiledFunction(NamedTuple):
+    """A function that the engine calls: it fills `floats` floats, and `entry` is its address, or a `LibraryFunction`.
+
+    `function` keeps the address valid. It and `entry` are None for a gradient or rate that the engine computes.
+    """
+
+    function: PointerFunction | Compiled | LibraryFunction | None
+    floats: int
+    entry: Any
+
+
+class _Compiler:
+    """The functions of one run, whose states have the type of `y0`, in the groups of the engine."""
+
+    def __init__(self, y0: np.ndarray, extra: tuple, parameters: np.ndarray) -> None:
+        types = scalars(extra)
+        if types is None:
+            raise NotCompilableError("args are neither numbers nor one array of floats")
+        self._dtype, self._scalars, self._p = y0.dtype.char, types, parameters.size if extra else -1
+        self._width, self._is_off = 1 if y0.dtype == float else 2, jit_is_off()
+        self.found, self.pairs = defaultdict[str, list[CompiledFunction]](list), defaultdict[str, list[Any]](list)
+
+    def add(
+        self, group: str, fun: Any, name: str, shape: tuple[int, ...], size: int, real: bool = False, **form: bool
+    ) -> None:
+        """Add `fun` to the `group`; see `Kind` for the signature, and `name` is its name in messages."""
+        entry = function = fun
+        if isinstance(fun, PointerFunction):
+            entry = fun.address
+        elif fun is not None and not isinstance(fun, LibraryFunction):
+            if self._is_off:
+                raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
+            if not is_jitted(fun):
+                raise NotCompilableError(f"{name} is not a Numba function; decorate it with @numba.njit")
+            from .numba_bridge import compiled  # which loads Numba
+
+            function = compiled(fun, Kind(shape, size, self._p, self._dtype, real, scalars=self._scalars, **form), name)
+            entry = function.address
+        count = math.prod(shape) * (1 if real else self._width)
+        self.found[group].append(CompiledFunction(function, count, entry))
+        self.pairs[group].append((entry, count))
+
+
+def native_functions(run: Run) -> tuple[NativeFunctions, str]:
+    """Return the addresses of the functions of a run, and the reason why those of its events are missing, or "".
+
+    The engine passes the array of parameters itself, not a copy. Raise NotCompilableError if a function other than an
+    event is neither a function of the library, nor a C function by pointer, nor a Numba function of the documented
+    arguments, or if an invariant has `args`, or no gradient that can be compiled.
+    """
+    problem, invariants, n, tableau = run.problem, run.invariants, run.y0.size, run.tableau
+    if tableau.in_python:
+        raise NotCompilableError(f"{tableau.name} is a {'solver' if tableau.drives else 'one-step method'} in Python")
+    compiler = _Compiler(run.y0, problem.extra, problem.parameters)
+    (fun, form), add, pairs = problem.native_form, compiler.add, compiler.pairs
+    second_order = form.startswith("acceleration")
+    name, size = ("acceleration", n // 2) if second_order else ("fun", n)
+    add("rhs", fun, name, (size,), size, in_place=form.endswith("place"))
+    for k in range(len(invariants.items)):
+        _add_invariant(add, invariants, k, n)
+    for k, item in invariants.balances.items.items():
+        name, takes_f = f"rate of balance {invariants.labels[k]!r}", item.rate_uses_f
+        add("rate", item.rate_function, name, _shape(invariants, k), n, real=True, takes_f=takes_f, gradient=True)
+    if run.uses_jacobian:
+        add("jacobian", problem.jacobian, "jacobian", (n // 2,), n // 2, takes_f=True, in_place=True, gradient=True)
+    reason = ""
+    try:
+        for k, event in enumerate(problem.events.functions):
+            alone = getattr(event, "unaugmented", None)
+            event, size = (event, n) if alone is None else (alone.function, alone.n)
+            add("event", event, f"event {k}", (), size, real=True)
+    except NotCompilableError as error:
+        pairs["event"], compiler.found["event"], reason = [], [], str(error)
+    rates = [entry for entry, _ in pairs["rate"]]
+    return NativeFunctions(
+        rhs=pairs["rhs"][0][0],
+        inv=pairs["inv"],
+        grad=pairs["grad"],
+        event=pairs["event"],
+        params=problem.parameters,  # itself: an ensemble writes each member's there
+        second_order=second_order,
+        jacobian=pairs["jacobian"][0][0] if run.uses_jacobian else None,
+        rates=invariants.rates(run.options.adaptive, rates) if rates else Rates(),
+        by_parameters=pairs["by_parameters"],
+        floors=invariants.floors if any([entry is None for entry, _ in pairs["grad"]]) else None,
+        keepalive=compiler.found,
+    ), reason
+
+
+def _shape(invariants: InvariantSet, k: int) -> tuple[int, ...]:
+    """Return the shape of the value of invariant k."""
+    return () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
+
+
+def _add_invariant(add: Callable[..., None], invariants: InvariantSet, k: int, n: int) -> None:
+    """Add invariant k of a run: its value, its gradient, and derivatives by parameters of an augmented state."""
+    item, label, shape = invariants.items[k], invariants.labels[k], _shape(invariants, k)
+    name, alone = f"invariant {label!r}", item.unaugmented
+    if alone is not None:
+        item, n = alone.function, alone.n
+    if item.args:
+        raise NotCompilableError(f"{name} has args; pass its parameters through params")
+    add("inv", item.function, name, shape, n, real=True)
+    if item.gradient is None and not isinstance(item.function, PointerFunction):
+        raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
+    form = {"takes_f": item.uses_f, "in_place": item.in_place, "gradient": True}
+    add("grad", item.gradient, f"gradient of {name}", (*shape, n), n, **form)
+    if alone is not None and alone.by_parameters is not None:
+        rows = (*shape, alone.parameters)
+        add("by_parameters", alone.by_parameters, f"derivatives by parameters of {name}", rows, n, real=True)
+
+
+def compiled_calls(calls: Iterable[Call], n: int, dtype: np.dtype[Any]) -> list[Call]:
+    """Return calls with C functions for Numba functions ``fun(t, y)`` that compile for states (n,) of type `dtype`."""
+    found, is_off = [], jit_is_off()
+    for call in calls:
+        if is_jitted(call.fun) and not (is_off or call.args or call.takes_f or call.in_place):
+            from .numba_bridge import compiled_or_none
+
+            kind = Kind(call.shape, n, -1, dtype.char, call.real)
+            call = call._replace(compiled=compiled_or_none(call.fun, kind))
+        found.append(call)
+    return found
+
+
+def reraise_user_exception(
+    functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int
+) -> NoReturn:
+    """Raise the exception of a function whose call failed in the engine: of a Numba function its own, of any type.
+
+    The arguments after `functions` are those of the `FailedCallError` that the engine raised. The function is number
+    `k` of the list ``functions.keepalive[group]``. It was called with `t` and the arrays whose bytes are `y` and `f`,
+    and returned `status`.
+    """
+    function = functions.keepalive[group][k].function
+    if isinstance(function, PointerFunction):
+        raise function.failure(t, status)
+    raise function.failure(t, y, f, functions.params)
