@@ -238,7 +238,8 @@ class InvariantSet:
 
     def of_values(self, of_items: Sequence[Any], dtype: Any = bool) -> Array:
         """Return an array (l,) in which the flag or the number of each item is repeated as often as it has values."""
-        return np.repeat(np.array(of_items, dtype), np.diff(self.starts))
+        found = np.array(of_items, dtype)
+        return found if all(self.scalar) else np.repeat(found, np.diff(self.starts))
 
     def _names(self, k: int) -> Sequence[str]:
         """Return the names of the values of item k: its `value_names`, if any, else its label, with an index."""

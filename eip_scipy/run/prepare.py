@@ -220,7 +220,8 @@ def _projection(given: RunArguments, own: Problem | None, fun: Any, method: Meth
         if method.drives:
             brought["invariants"] = own.stiff_invariants
         options = brought | options
-        known += [] if own.params is None else [(own.params,)]
+        if own.params is not None:
+            known.insert(0, (own.params,))  # the same object as in the problem's own invariants
     items = as_invariants(options.get("invariants", ()))
     if any([item.args for item in items]):
         known = [args for args in known if args]
