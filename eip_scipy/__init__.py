@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .core.invariants import Invariant
     from .core.particles import particle_invariants
     from .core.project import project
-    from .core.results import Diagnostics, ProjectionWarning
+    from .core.results import Diagnostics
     from .core.solvers import (
         EIPBDF,
         EIPDOP853,
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         EIPRadau,
         eip_method,
     )
+    from .engine.trust import ProjectionWarning
     from .ensembles.ensemble import ensemble
     from .problems.invariant_search import find_invariants
     from .problems.symbolic import equations, hamiltonian
@@ -88,7 +89,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "Balance": "core.balances",
     "Diagnostics": "core.results",
     "Invariant": "core.invariants",
-    "ProjectionWarning": "core.results",
+    "ProjectionWarning": "engine.trust",
     "check_gradient": "core.invariant_set",
     "ensemble": "ensembles.ensemble",
     "equations": "problems.symbolic",

@@ -1,7 +1,8 @@
 """The projection of a run: its options, the metric, the blocks, and linear invariants that it leaves unchanged.
 
-A new option is a field of `ProjectionOptions`, a keyword, and, if the step needs it, a field of `Options` in
-engine/cpp/data.hpp.
+A new option is a field of `ProjectionOptions` with its text there, a keyword in `ProjectionDetails`, and a check in
+`validate`. If the step needs it, it is also a field of `Options` in engine/cpp/data.hpp, `is_plain` in system.hpp must
+know which value is neutral, and `not_batched_because` in ensembles/members.py whether eight members may run at once.
 """
 
 from __future__ import annotations
@@ -218,7 +219,7 @@ class ProjectionOptions:
             metric = weights("metric", self.metric, np.size(self.metric))
         # The given pair, because the rows in `options` come from LAPACK, whose last bits differ between machines.
         linear = self.given_linear_invariants
-        found = {
+        found: dict[str, Any] = {name: getattr(self, name) for name in self.names() if name != "check"} | {
             "rtol": options.rtol,
             "atol": options.atol,
             "invariants": [
@@ -226,14 +227,12 @@ class ProjectionOptions:
             ],
             "metric": metric,
             "blocks": (options.groups.start, options.groups.member),
-            "linear_invariants": self.linear_invariants
-            if linear is None
-            else [np.asarray(a, known.dtype) for a in linear],
-            "direction": self.direction,
             "every": "auto" if options.every == data.AUTO else options.every,
             "project_initial": bool(self.project_initial),
         }
         found |= {name: getattr(options, name) for name in ("iterations", "reuse_f", "uses_f", "compensated")}
+        if linear is not None:
+            found["linear_invariants"] = [np.asarray(a, known.dtype) for a in linear]
         if known.balances.items:
             found["balances"] = [known.labels[k] for k in known.balances.items]
         if options.balance_groups.value.size:

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engine import data
-from ..engine.trust import ProjectionWarning, Trust
+from ..engine.trust import Trust
 
-__all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning", "slowness"]
+__all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "slowness"]
 
 
 def _count(place: int, text: str) -> property:

@@ -85,6 +85,7 @@ def joined(one: Any, two: Any, but: Sequence[str] = ()) -> dict[str, Any]:
 
     The state where both meet is stored once.
     """
+    assert two.keys() <= FIELDS.keys()  # a field that is not declared would be that of the continuation alone
     meet = one["t"].size and two["t"].size and two["t"][0] == one["t"][-1]
     found: dict[str, Any] = {}
     for name, new in rows(two, slice(1 if meet else 0, None)).items():

@@ -139,7 +139,7 @@ def prepared(given: RunArguments, *, check_start: bool = True) -> Run:
 
 
 def as_problem(given: RunArguments, method: Method, solver: Any) -> tuple[BoundProblem, ProjectionOptions]:
-    """Look at a user's functions, arguments, start and options, once for all interfaces, and return what a run needs.
+    """Look at a user's functions, arguments, start and options, and return what a run needs.
 
     `method` is that of the class `solver`, for which implicit methods keep other invariants by default.
     """

@@ -20,10 +20,10 @@ from ..core.names import nearest
 from ..core.particles import particle_invariants
 from ..core.problem import Problem, bind
 from ..core.projection import Blocks, LinearConstraints, Metric
-from ..core.results import ProjectionWarning
 from ..core.solvers import EIPBDF, EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, EIPRadau
 from ..core.step_control import UNBOUNDED, interval
 from ..engine.data import EPS, NFEV
+from ..engine.trust import ProjectionWarning
 from ..methods.nystrom import depends_on_velocity
 from .integrate import Loop, integrate
 from .prepare import RunArguments, evaluation_times, prepared
