@@ -88,7 +88,7 @@ def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
     derivative. Particles are looked for if `names`, but not in ready problems. A user's one-step method need not keep
     linear invariants, and none are looked for.
     """
-    invariants, method, n, half = run.invariants, run.tableau, y.size, y.size // 2
+    invariants, method, n, half = run.invariants, run.method, y.size, y.size // 2
     plain = y.dtype.kind == "f" and not invariants.balances.items and method is not PROJECTION_ONLY
     if not plain or invariants.size == 0 or hasattr(invariants.items, "shift"):  # fields have their own projection
         return NOTHING

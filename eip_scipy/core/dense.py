@@ -63,7 +63,7 @@ class Interpolants(_Immutable):
         errors: Callable[[], AbstractContextManager[None]] = nullcontext,
         form: DenseForm | None = None,
     ) -> None:
-        self._form, self._method = form or run.tableau.dense_form(run.method), run.method
+        self._form, self._method = form or run.method.dense_form(run.stepper), run.stepper
         self.record = _record(run, self._form, events)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # all threads share one buffer
@@ -135,7 +135,7 @@ class Interpolants(_Immutable):
 def _record(run: Run, form: DenseForm, events: int) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
-    balances, stages = run.invariants.balances.places.size, run.method.b.size
+    balances, stages = run.invariants.balances.places.size, run.stepper.b.size
     options = run.options._replace(
         metric=data.GIVEN, direction=data.NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False,
         limit=math.inf, target=np.zeros(invariants),
@@ -175,10 +175,10 @@ def _without_functions(form: DenseForm, stages: int, history: Any, n: int, dtype
             corrected_count=0, levels=np.zeros((3, 0)), rates=np.zeros((rows, 0)), rate_sums=np.zeros((2, 0))
         )
     none, A = np.zeros(stages), np.zeros((stages, stages))
-    run.method = NO_METHOD._replace(A=A, b=none, b_low=none, b_v=none, b_v_low=none, c=none, multistep=history)
+    run.stepper = NO_METHOD._replace(A=A, b=none, b_low=none, b_v=none, b_v_low=none, c=none, multistep=history)
     run.work = Work(n, dtype, stages, 0, run.options.groups.start.size - 1)
     functions = PythonFunctions(Call(problem.fun, (), (n,), lambda value, t: value), (), (), (), second_order=False)
-    engine = Engine(run.method, run.options._replace(compensated=history is not None), run.work, functions)
+    engine = Engine(run.stepper, run.options._replace(compensated=history is not None), run.work, functions)
     return Interpolants(run, engine, form=form)
 
 

@@ -19,7 +19,7 @@ from ..engine.data import LEAST_CHANGE, Grouping, Method
 from ..engine.native import BUILD
 from ..methods.runge_kutta import DOP853, RK4
 from .gradients import random_directions, unless_error
-from .invariant_checks import complaints
+from .invariant_checks import findings
 from .invariant_set import InvariantSet
 
 __all__ = ["Examiner", "is_check_due", "steps_to_check", "unresolved"]
@@ -79,12 +79,12 @@ class Examiner:
     resolution: Callable[[Derivative, float, float, Array, float], str | None]
     largest: float = 0.0
 
-    def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
+    def finding(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return a sentence about an invariant or a gradient that is wrong at a state of the run, or None."""
         with np.errstate(all="ignore"):
             if not self.invariants.balances.items and unless_error(self._is_in_order, rhs, t, y) is not False:
                 return None
-            return unless_error(self._complaint, rhs, t, y)
+            return unless_error(self._finding, rhs, t, y)
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
         """Return a sentence about what is wrong in the step that the engine suspects, or None; clear its record."""
@@ -92,7 +92,7 @@ class Examiner:
         suspect[data.REASON] = data.NOTHING
         old, new = np.split(suspect[data.N_SUSPECT :].copy().view(self.invariants.dtype), 2)
         if reason == data.CHANGES_ALONG_FLOW:
-            return self.complaint(rhs, t_new, new)
+            return self.finding(rhs, t_new, new)
         with np.errstate(all="ignore"):
             if reason == data.LARGE_ERROR:
                 return unless_error(self.resolution, rhs, t_old, t_new - t_old, old, self.invariants.t_span[1])
@@ -107,14 +107,14 @@ class Examiner:
         of_run = known.target, known.scales, self.tau, known.t_span, directions
         return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
 
-    def _complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
-        """Return the text of the first of the `complaints` at a state, if f is finite there, and note rates."""
+    def _finding(self, rhs: Derivative, t: float, y: Array) -> str | None:
+        """Return the text of the first of the `findings` at a state, if f is finite there, and note rates."""
         f = rhs(t, y)
         if not BUILD.are_finite(f.view(float)):
             return None
         evaluated = self.invariants.gradients(t, y, f), self.invariants.values(t, y)
         self.invariants.note_rates(self.figures, t, y, f, *evaluated)
-        found = complaints(self.invariants, t, y, f, self.tau, rhs, evaluated)
+        found = findings(self.invariants, t, y, f, self.tau, rhs, evaluated)
         return found[0].text if found else None
 
     def _along_chord(
@@ -134,7 +134,7 @@ class Examiner:
         shares = np.arange(1, POINTS + 1) / POINTS
         chord = ((t_old + float(share) * (t_new - t_old), old + share * (new - old)) for share in shares)
         states = chain(chord, _before(self.invariants.t_span[0], rhs, t_old, old, t_new - t_old, waited))
-        return next(filter(None, (self._complaint(rhs, t, y) for t, y in states)), None)
+        return next(filter(None, (self._finding(rhs, t, y) for t, y in states)), None)
 
 
 def _before(begin: float, rhs: Derivative, t: float, y: Array, h: float, steps: int) -> Iterator[tuple[float, Array]]:

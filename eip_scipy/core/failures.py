@@ -40,7 +40,7 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
         return _not_finite(run, clock[data.TIME], clock[data.LENGTH])
     called = run.problem.name
     if status == data.TOO_SMALL:
-        at = run.method.not_finite_at if run.tableau.drives else None
+        at = run.stepper.not_finite_at if run.method.drives else None
         return OdeSolver.TOO_SMALL_STEP if at is None else f"{called} returned a non-finite value at t={at:.10g}"
     if status == data.UNSTABLE:
         return _unstable(run)
@@ -56,7 +56,7 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
 
 def _unstable(run: Run) -> str:
     """Return the message for a multistep method whose history has too large differences of the accelerations."""
-    history = run.method.multistep
+    history = run.stepper.multistep
     assert history is not None  # only multistep methods return this code
     t = history.t0 + int(history.place[data.NEWEST]) * history.h
     others = "EIPRKN12 if there are close encounters or forces that jump"
@@ -71,7 +71,7 @@ def _unstable(run: Run) -> str:
 
 def _not_finite(run: Run, t: float, h: float) -> str:
     """Return the message for a step in which a stage, the new state or the error estimate is not finite."""
-    work, method = run.work, run.method
+    work, method = run.work, run.stepper
     stages = [(work.K[i], t + method.c[i] * h) for i in range(method.b.size)]
     history = method.multistep
     if history is not None and history.place[data.HAVE_NODES]:

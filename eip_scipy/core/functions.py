@@ -363,7 +363,7 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     event is neither a function of the library, nor a C function by pointer, nor a Numba function of the documented
     arguments, or if an invariant has `args`, or no gradient that can be compiled.
     """
-    problem, invariants, n, tableau = run.problem, run.invariants, run.y0.size, run.tableau
+    problem, invariants, n, tableau = run.problem, run.invariants, run.y0.size, run.method
     if tableau.in_python:
         raise NotCompilableError(f"{tableau.name} is a {'solver' if tableau.drives else 'one-step method'} in Python")
     compiler = _Compiler(run.y0, problem.extra, problem.parameters)

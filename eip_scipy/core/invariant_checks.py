@@ -23,7 +23,7 @@ from .inputs import converted_from_single
 if TYPE_CHECKING:
     from .invariant_set import InvariantSet
 
-__all__ = ["Complaint", "complaints", "listed", "reported", "time_derivative"]
+__all__ = ["Finding", "findings", "listed", "reported", "time_derivative"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -62,7 +62,7 @@ WRONG = (
 CORRECT_GRAD = "Correct grad, or omit it to have it computed"
 
 
-class Complaint(NamedTuple):
+class Finding(NamedTuple):
     """Something that a check of the invariants has found to be wrong: the `text`, and the `advice` about it.
 
     The run must not start if it `is_error`; otherwise there is a warning of the class `category` at the start.
@@ -74,15 +74,15 @@ class Complaint(NamedTuple):
     category: type[Warning] = UserWarning
 
 
-def reported(found: Iterable[Complaint]) -> list[str]:
+def reported(found: Iterable[Finding]) -> list[str]:
     """Raise ValueError or warn about the findings of a check at the start; return the texts of the warnings."""
     texts = []
-    for complaint in found:
-        if complaint.is_error:
-            raise ValueError(f"{complaint.text}. {complaint.advice}, or pass check=False to skip this check.")
-        text = f"{complaint.text}. {complaint.advice}. (check=False skips this check.)"
-        warnings.warn(text, complaint.category, stacklevel=users_level())
-        texts.append(complaint.text)
+    for finding in found:
+        if finding.is_error:
+            raise ValueError(f"{finding.text}. {finding.advice}, or pass check=False to skip this check.")
+        text = f"{finding.text}. {finding.advice}. (check=False skips this check.)"
+        warnings.warn(text, finding.category, stacklevel=users_level())
+        texts.append(finding.text)
     return texts
 
 
@@ -108,7 +108,7 @@ class _State(NamedTuple):
     span: Array
 
 
-def complaints(
+def findings(
     known: InvariantSet,
     t: float,
     y: Array,
@@ -116,8 +116,8 @@ def complaints(
     tau: float,
     rhs: Derivative,
     evaluated: tuple[Array, Array] | None = None,
-) -> list[Complaint]:
-    """Return a `Complaint` for everything that is wrong with the invariants at a state (n,) with the derivative f.
+) -> list[Finding]:
+    """Return a `Finding` for everything that is wrong with the invariants at a state (n,) with the derivative f.
 
     The gradients are checked first, and if these are correct, the rates of change. `tau` is the length of a step.
     `evaluated` are the gradients (l, n) and the values (l,) at the state, if they are known.
@@ -146,8 +146,8 @@ def _rounding(at: _State, products: Callable[[Array], Array]) -> Array:
     return BLUR * np.max([np.abs(products(state) - here).sum(axis=-1) for state in states], axis=0)
 
 
-def _wrong_gradients(known: InvariantSet, at: _State, ways: Array) -> list[Complaint]:
-    """Return a `Complaint` for each gradient that is wrong in the first of the directions `ways` with a wrong one."""
+def _wrong_gradients(known: InvariantSet, at: _State, ways: Array) -> list[Finding]:
+    """Return a `Finding` for each gradient that is wrong in the first of the directions `ways` with a wrong one."""
     along, terms = (ways @ at.G.conj().T).real, np.abs(ways) @ np.abs(at.G).T
     # The terms inside an invariant may be larger than its value and than the products of gradient and state.
     inner = known.norm_products(at.G, at.span)
@@ -168,19 +168,19 @@ def _wrong_gradients(known: InvariantSet, at: _State, ways: Array) -> list[Compl
     wrong &= ~(known.computed & kink)
     if wrong.any() and (single := converted_from_single(lambda: known.values(at.t, at.y))):
         text = f"{single} numbers of single precision (float32), whose rounding exceeds what a projection corrects"
-        return [Complaint(True, text, DOUBLE)]
+        return [Finding(True, text, DOUBLE)]
     way = int(wrong.any(axis=1).argmax())
     places = np.flatnonzero(wrong[way]).tolist()
     return [_wrong_gradient(known, k, at.t, difference[way, k], along[way, k]) for k in places]
 
 
-def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, along: float) -> Complaint:
+def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, along: float) -> Finding:
     name = known.names[k]
     where = f"the derivative of the invariant along a test direction at t={t:.6g} is {difference:.6g}"
     if not known.computed[k]:
         text = f"gradient of invariant {name!r} is wrong: {where} by differences and {along:.6g} by grad"
-        return Complaint(True, text, CORRECT_GRAD)
-    return Complaint(
+        return Finding(True, text, CORRECT_GRAD)
+    return Finding(
         False,
         f"the gradient of invariant {name!r}, which is computed from its values, is not accurate: {where} by short "
         f"differences and {along:.6g} by the gradient. The function is not smooth there, or its values have few digits",
@@ -227,11 +227,11 @@ def _rates(known: InvariantSet, at: _State, rhs: Derivative) -> _Rates:
     return _Rates(unit, rate, terms, large, wrong, by_values)
 
 
-def _wrong_rates(known: InvariantSet, at: _State, rhs: Derivative) -> list[Complaint]:
-    """Return one `Complaint` about single precision, one about balances, and those about quantities that change."""
+def _wrong_rates(known: InvariantSet, at: _State, rhs: Derivative) -> list[Finding]:
+    """Return one `Finding` about single precision, one about balances, and those about quantities that change."""
     if 0 < np.abs(at.f).max() < np.finfo(float).tiny / EPS:  # the rates would have too few digits
         return []
-    complaints, found = [], _rates(known, at, rhs)
+    findings, found = [], _rates(known, at, rhs)
     wrong = found.wrong
     # Single precision does not explain large rates.
     small = found.large & (np.abs(found.rate) <= SINGLE_TOLERANCE * found.terms)
@@ -240,17 +240,17 @@ def _wrong_rates(known: InvariantSet, at: _State, rhs: Derivative) -> list[Compl
             f"{single} numbers of single precision (float32), which hides whether this system keeps "
             f"{_names(known, np.flatnonzero(small))}: rates of change below about 1e-7 of their terms are rounding"
         )
-        complaints.append(Complaint(False, text, DOUBLE))
+        findings.append(Finding(False, text, DOUBLE))
         wrong = wrong & ~small
     if (carried := wrong & known.balances.mask).any():
-        complaints.append(_wrong_rate_of_balance(known, at, found, carried))
+        findings.append(_wrong_rate_of_balance(known, at, found, carried))
         wrong = wrong & ~carried
     if not wrong.any():
-        return complaints
+        return findings
     if (nearest := _on_targets(known, at, rhs)) is not at:
         at, found = nearest, _rates(known, nearest, rhs)
         wrong = wrong & found.wrong
-    return complaints + _changing(known, at, found, wrong)
+    return findings + _changing(known, at, found, wrong)
 
 
 def _names(known: InvariantSet, places: Iterable[int]) -> str:
@@ -263,8 +263,8 @@ def _largest_first(found: _Rates, wrong: Array) -> list[int]:
     return [int(k) for k in order if wrong[k]]
 
 
-def _changing(known: InvariantSet, at: _State, found: _Rates, wrong: Array) -> list[Complaint]:
-    """Return one `Complaint` about each gradient that is slightly wrong, and one about the quantities that change.
+def _changing(known: InvariantSet, at: _State, found: _Rates, wrong: Array) -> list[Finding]:
+    """Return one `Finding` about each gradient that is slightly wrong, and one about the quantities that change.
 
     Small errors of a user's gradient, which `_wrong_gradients` allows, make rates that differences of values lack.
     """
@@ -272,14 +272,14 @@ def _changing(known: InvariantSet, at: _State, found: _Rates, wrong: Array) -> l
     rounding = VALUE_ROUNDINGS * EPS * known.sizes_of_terms(at.y, at.G, at.values) / (FLOW_SHARE * found.unit)
     shown = (np.abs(found.rate - found.by_values) > 0.5 * size) & (rounding < 0.1 * size * motion) & (motion < math.inf)
     misled = shown & ~known.computed
-    complaints = []
+    findings = []
     for k in _largest_first(found, wrong & misled):
         text = (
             f"gradient of invariant {known.names[k]!r} is wrong: at t={at.t:.6g} the invariant changes at the rate "
             f"{found.rate[k] * found.unit:.3g} by grad and {found.by_values[k] * found.unit:.3g} by differences of its "
             "values"
         )
-        complaints.append(Complaint(False, text, CORRECT_GRAD))
+        findings.append(Finding(False, text, CORRECT_GRAD))
     if changing := _largest_first(found, wrong & ~misled):
         k, *others = changing
         text = (
@@ -288,12 +288,12 @@ def _changing(known: InvariantSet, at: _State, found: _Rates, wrong: Array) -> l
             f"{found.terms[k] * found.unit:.3g}"
         )
         text += f"; the same holds for {_names(known, others)}" if others else ""
-        complaints.append(Complaint(False, text, WRONG))
-    return complaints
+        findings.append(Finding(False, text, WRONG))
+    return findings
 
 
-def _wrong_rate_of_balance(known: InvariantSet, at: _State, found: _Rates, wrong: Array) -> Complaint:
-    """Return one `Complaint` about the balances in the mask `wrong`, whose rates are wrong, with the worst first."""
+def _wrong_rate_of_balance(known: InvariantSet, at: _State, found: _Rates, wrong: Array) -> Finding:
+    """Return one `Finding` about the balances in the mask `wrong`, whose rates are wrong, with the worst first."""
     worst, *others = _largest_first(found, wrong)
     rate = known.balances.known(at.t, at.y, at.f)[worst]
     text = (
@@ -302,7 +302,7 @@ def _wrong_rate_of_balance(known: InvariantSet, at: _State, found: _Rates, wrong
         f"this sum add up to {found.terms[worst] * found.unit:.3g}"
     )
     text += f"; the same holds for {_names(known, others)}" if others else ""
-    return Complaint(False, text, "Correct rate, or omit it to have it computed", ProjectionWarning)
+    return Finding(False, text, "Correct rate, or omit it to have it computed", ProjectionWarning)
 
 
 def _on_targets(known: InvariantSet, at: _State, rhs: Derivative) -> _State:

@@ -19,7 +19,7 @@ from .callers import users_level
 from .functions import NotCompilableError, PointerFunction, is_jitted, jit_is_off, names, scalars
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
 from .inputs import filled, numbers, require_arguments, shown, states
-from .invariant_checks import complaints, listed, reported, time_derivative
+from .invariant_checks import findings, listed, reported, time_derivative
 from .invariants import Invariant, as_invariants, copied
 
 __all__ = ["BalanceSet", "InvariantSet", "check_gradient", "with_duals"]
@@ -478,7 +478,7 @@ class InvariantSet:
     ) -> list[str]:
         """Check the invariants at the start, with step `tau`: raise ValueError or warn; return the warnings' texts."""
         assert self.rhs is not None
-        return reported(complaints(self, t, y, f, tau, self.rhs, evaluated))
+        return reported(findings(self, t, y, f, tau, self.rhs, evaluated))
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:

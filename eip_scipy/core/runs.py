@@ -29,7 +29,7 @@ from .callers import users_level
 from .conserved import Conserved, confirmed, conserved
 from .examination import Derivative, Examiner, is_check_due, unresolved
 from .failures import projection_failure
-from .invariant_checks import Complaint, listed, reported
+from .invariant_checks import Finding, listed, reported
 from .invariant_set import TARGET_TOLERANCE, InvariantSet
 from .projection import ProjectionOptions, are_combinations, linear_rows
 from .results import Diagnostics, slowness
@@ -45,7 +45,7 @@ START_ITERATIONS = 50
 COMBINATION_DISTANCE = 1e-4
 
 # What `restore` makes again, and what a copy does not need.
-RESTORED = ("tableau", "given", "invariants", "diagnostics", "examiner")
+RESTORED = ("method", "invariants", "diagnostics", "examiner")
 
 Array = np.ndarray
 
@@ -62,20 +62,20 @@ class Start(NamedTuple):
 class Run:
     """A run of a `BoundProblem` by a method, as all interfaces use it; `start_at` makes its buffers and checks it.
 
-    `name` is the solver class, for messages, and `given` the method as it was given. With `level` a multistep method
-    returns the state at the newest end of its history; otherwise that in the middle.
+    `name` is the solver class, for messages. `projection` has the user's options, and `options` what the step makes of
+    them. With `level` a multistep method returns the state at the newest end of its history; otherwise that in the
+    middle.
 
-    After the start, `tableau` is the method for these equations, and `method` the form of it that the engine uses for
+    After the start, `method` is the method for these equations, and `stepper` the form of it that the engine uses for
     the steps. The invariants were measured at `begin`; `start`, of the first step, may have been moved by
-    `project_initial`, and `moved` says how far.
-    `looked` is the step at which the invariants were checked last. `depends_on_time` is True if an invariant depends on
-    time; its scale then depends on the start. `conserved` is what the system conserves in addition to the invariants.
-    Whoever makes the steps sets `schedule`.
+    `project_initial`, and `moved` says how far. `looked` is the step at which the invariants were checked last.
+    `depends_on_time` is True if an invariant depends on time; its scale then depends on the start. `conserved` is what
+    the system conserves in addition to the invariants. Whoever makes the steps sets `schedule`.
     """
 
     begin: Start
     start: Start
-    method: Any
+    stepper: Any
     options: Any
     work: Work
     invariants: InvariantSet
@@ -94,8 +94,8 @@ class Run:
         *,
         level: bool = False,
     ) -> None:
-        self.problem, self.name, self.given, self.stepping = problem, name, method, stepping
-        self.projection, self.level, self.tableau = projection, level, method
+        self.problem, self.name, self.method, self.stepping = problem, name, method, stepping
+        self.projection, self.level = projection, level
         known = problem.variations
         self.tangents: TangentVectors = NO_TANGENT_VECTORS if known is None else known.tangents
         self.looked, self.moved, self.depends_on_time, self._warned_of_balances = -1, "", False, False
@@ -112,7 +112,7 @@ class Run:
     @property
     def uses_jacobian(self) -> bool:
         """True if the method corrects accelerations by the Jacobian."""
-        history = self.method.multistep
+        history = self.stepper.multistep
         return history is not None and history.corrected_count > 0
 
     def start_at(
@@ -138,10 +138,10 @@ class Run:
         tau = self._first_step(y0, f0) if tau is None else tau
         self.begin = self.start = Start(self.stepping.span.t0, y0, f0, tau)
         self._make_buffers(check)
-        if self.tableau is PROJECTION_ONLY:
+        if self.method is PROJECTION_ONLY:
             return  # the state may be far from the targets
         self._check(check)
-        self.tableau.begin(self, self.start)
+        self.method.begin(self, self.start)
 
     def examine(self, y0: Array, f0: Array | None = None, *, is_known: bool = False) -> Array:
         """Return the derivative (n,) at y0 after a check of the equations by the method, unless they are known."""
@@ -149,23 +149,23 @@ class Run:
         try:
             f0 = self.problem.derivative(t0, y0) if f0 is None else f0
         except (ValueError, TypeError, IndexError) as error:
-            if self.given.of_second_order and not is_second_order:
+            if self.method.of_second_order and not is_second_order:
                 hint = self.problem.hint()
                 error.add_note(f"With {self.name} too, fun(t, y) returns the derivative of y = (q, v){hint}.")
             raise
         if not (is_known or is_second_order):
-            self.tableau = self.given.checked(self, Start(t0, y0, f0, 0.0))
+            self.method = self.method.checked(self, Start(t0, y0, f0, 0.0))
         return f0
 
     def _first_step(self, y0: Array, f0: Array) -> float:
         """Return the length of the first step, chosen from the state alone, without tangent vectors."""
         tangents = self.tangents
         derivative = tangents.of_state(self.problem.derivative, y0)
-        return self.stepping.first(derivative, tangents.state(y0), tangents.state(f0), self.tableau)
+        return self.stepping.first(derivative, tangents.state(y0), tangents.state(f0), self.method)
 
     def _make_buffers(self, tell: bool) -> None:
         """Evaluate the invariants at the start, and make the buffers for them; `tell`: see `InvariantSet`."""
-        start, method, projection, rhs = self.start, self.tableau, self.projection, self.problem.derivative
+        start, method, projection, rhs = self.start, self.method, self.projection, self.problem.derivative
         self.invariants = invariants = InvariantSet(
             projection.invariants, *start, self.problem.extra, tell=tell, t_bound=self.stepping.span.t_bound, rhs=rhs
         )
@@ -178,9 +178,9 @@ class Run:
             options = options._replace(frame=linear_rows((C, C.T), y.size, 1))
         self.options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)
         invariants.kinds = options.kinds
-        self.method = method.for_engine(self.problem.sees_velocity)
+        self.stepper = method.for_engine(self.problem.sees_velocity)
         carried, blocks = options.balances.place, options.groups.start.size - 1
-        size = self.method.b.size
+        size = self.stepper.b.size
         self.work = work = Work(start.y.size, start.y.dtype, size, invariants.size, blocks, carried.size)
         work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients
         del invariants.start_gradients  # which may be large
@@ -209,9 +209,9 @@ class Run:
             known = (self.work.G, self.work.values) if self.start is self.begin else None
             self.trust.doubts += self.invariants.check(*self.start[:3], self.invariants.tau, known)
         if self.projection.check and checks:
-            text = self.tableau.contradiction(self, self.start)
+            text = self.method.contradiction(self, self.start)
             if text is not None:
-                self.trust.doubts += reported([Complaint(False, text, "Make the method for the equation of this run")])
+                self.trust.doubts += reported([Finding(False, text, "Make the method for the equation of this run")])
 
     def _scales(self) -> Array:
         """Return the scales (l,) of the dead bands, within which errors of the invariants are not corrected.
@@ -245,17 +245,17 @@ class Run:
     def __getstate__(self) -> dict[str, Any]:
         """Return the values and arrays from which a copy continues with the same bits, after `restore`."""
         kept = {name: value for name, value in vars(self).items() if name not in RESTORED}
-        if self.tableau.in_python:
-            kept["method"] = self.method.state() if self.tableau.drives else None
-        of_copy = {"joint": self.options.joint is not None, "velocities": getattr(self.tableau, "velocities", None)}
+        if self.method.in_python:
+            kept["stepper"] = self.stepper.state() if self.method.drives else None
+        of_copy = {"joint": self.options.joint is not None, "velocities": getattr(self.method, "velocities", None)}
         return kept | {"options": self.options._replace(joint=None), "of_copy": of_copy | {"tau": self.invariants.tau}}
 
     def restore(self, given: Method) -> None:
         """Make again what a copy of a run by the method `given` lacks."""
         own = vars(self).pop("of_copy")
-        self.given = self.tableau = given
+        self.method = given
         if given.has_history:
-            self.tableau = replace(cast(Any, given), velocities=own["velocities"])
+            self.method = replace(cast(Any, given), velocities=own["velocities"])
         items, t_bound, extra = self.projection.invariants, self.stepping.span.t_bound, self.problem.extra
         rhs = self.problem.derivative
         self.invariants = found = InvariantSet(items, *self.begin, extra, tell=False, t_bound=t_bound, rhs=rhs)
@@ -264,17 +264,17 @@ class Run:
             self.options = self.options._replace(joint=found.items)
         self.trust.figures = self.work.trust
         if given.in_python:
-            state, self.method = self.method, given.for_engine()
+            state, self.stepper = self.stepper, given.for_engine()
             if given.drives:
                 given.begin(self, self.begin)
-                self.method.resume(state)
+                self.stepper.resume(state)
 
     def engine(self, functions: PythonFunctions | NativeFunctions, *, begins: bool = True) -> Engine:
         """Return the engine of the run, which it `begins` or continues; work.K[0] must hold the derivative there."""
         joint = None if functions.native else self.options.joint
-        hooks = self.tableau.hooks(self.method, self.work)._replace(joint=joint)
+        hooks = self.method.hooks(self.stepper, self.work)._replace(joint=joint)
         needed = hooks if hooks != Hooks() else None
-        engine, w = Engine(self.method, self.options, self.work, functions, self.schedule, needed), self.work
+        engine, w = Engine(self.stepper, self.options, self.work, functions, self.schedule, needed), self.work
         if self.options.watched and begins:
             t, f = self.schedule.span.t0, w.K[0]
             if self.start is not self.begin:  # the buffers have the values and gradients at `begin`
@@ -310,7 +310,7 @@ class Run:
     @property
     def shows(self) -> bool:
         """Return True if some steps may stay unprojected; the run then returns projected copies of their states."""
-        return self.invariants.size > 0 and (self.options.every != 1 or self.tableau.has_history)
+        return self.invariants.size > 0 and (self.options.every != 1 or self.method.has_history)
 
     def look(self, steps: int, ended: bool, t: float, y: Array) -> bool:
         """Examine a run after `steps` steps, or at its end (`ended`), and return True if it must be reported as faulty.
@@ -338,7 +338,7 @@ class Run:
         doubtful = not due and self._is_doubtful(ended)
         if found is None and (due or doubtful):
             self.looked = steps
-            found = self.examiner.complaint(rhs, t, y)
+            found = self.examiner.finding(rhs, t, y)
             doubtful = self._is_doubtful(ended)  # which depends on the rates that the examination has noted
         self.trust.doubts += [found] if found else []
         return found is not None or doubtful
@@ -380,12 +380,12 @@ class Run:
 
     def _is_doubtful(self, ended: bool) -> bool:
         """Return True if corrections or errors show that the run is faulty, before its end without hope of recovery."""
-        return self.trust.is_sick if ended else self.trust.beyond_doubt
+        return self.trust.exceeds_bounds if ended else self.trust.beyond_doubt
 
     @cached_property
     def examiner(self) -> Examiner:
         """Return the `Examiner` of the run's steps and states."""
-        resolution = partial(unresolved, self.method, self.options.groups)
+        resolution = partial(unresolved, self.stepper, self.options.groups)
         return Examiner(self.invariants, self.invariants.tau, self.work.trust, resolution)
 
 

@@ -248,7 +248,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             return
         run = self._run
         if self.TABLEAU.drives:
-            run.method.count(run.work)
+            run.stepper.count(run.work)
         run.work.K[0] = self.f
         run.schedule = bare_schedule(run.stepping.span, float(self.h_abs or 0.0))
         run.schedule.place[PENDING] = 1  # the solver shows the end of the last step
@@ -310,7 +310,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _restart(self, here: Start, new_function: bool) -> None:
         """Start a new run at `here`, a time and a state set by the user; counts and the largest residuals continue."""
         old = self._run
-        method = self.TABLEAU if new_function else old.tableau
+        method = self.TABLEAU if new_function else old.method
         new = Run(old.problem, old.name, method, old.stepping, old.projection, level=True)
         self._begin(new.start_at(*here[1:], check=False, is_known=not new_function))
         new.work.counters[:] = old.work.counters
@@ -325,13 +325,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run, work = self._run, self._run.work
         run.examine(here.y, here.f, is_known=not new_function)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
-        fresh = run.projection.validate(run.tableau, run.stepping, run.y0, run.start.f, run.invariants)[0]
+        fresh = run.projection.validate(run.method, run.stepping, run.y0, run.start.f, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
         if self.TABLEAU.drives and not new_function:
             for name in (*CONTROL, "status"):
-                setattr(run.method.scipy_solver, name, getattr(self, name))
+                setattr(run.stepper.scipy_solver, name, getattr(self, name))
         else:
-            run.tableau.begin(run, here)
+            run.method.begin(run, here)
         work.rates[0] = np.nan if new_function else work.rates[-1]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -471,7 +471,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             out: DenseOutput = ExactEnds(self._scipy.dense_output(), self.y_old, y)
             self.nfev = self._run.problem.count
         elif self.TABLEAU.drives and not self._run.invariants.size:
-            out = ExactEnds(self._run.method.scipy_solver.dense_output(), self.y_old, y)
+            out = ExactEnds(self._run.stepper.scipy_solver.dense_output(), self.y_old, y)
         else:
             ends = (self._raw_old, self._raw) if self._run.shows else (self.y_old, y)
             out = self._sampled().over(self.t_old, ends[0], t, ends[1])
@@ -712,7 +712,7 @@ class EIPBDF(_Implicit):
     @property
     def order(self) -> int:
         """Order of the next step, as in `scipy.integrate.BDF`."""
-        return int(self._run.method.scipy_solver.order)
+        return int(self._run.stepper.scipy_solver.order)
 
 
 def class_named(method: Any) -> str | None:

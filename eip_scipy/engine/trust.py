@@ -55,17 +55,17 @@ class Trust:
     @property
     def trusted(self) -> bool:
         """True if no step failed, no check found anything and the errors of the steps explain all corrections."""
-        return not (self.failed or self.doubts or self.is_sick)
+        return not (self.failed or self.doubts or self.exceeds_bounds)
 
     @property
-    def is_sick(self) -> bool:
+    def exceeds_bounds(self) -> bool:
         """Return True if the corrections or errors of an invariant do not occur in correct runs."""
-        return bool(sick(self.figures).any())
+        return bool(exceed_bounds(self.figures).any())
 
     @property
     def beyond_doubt(self) -> bool:
         """Return True if later projections cannot make the run reliable again."""
-        return self.is_sick and bool(_extreme(self.figures).any())
+        return self.exceeds_bounds and bool(_extreme(self.figures).any())
 
     @property
     def worst(self) -> tuple[str, float, float] | None:
@@ -106,7 +106,7 @@ class Trust:
 
         There is one for each of the worst three invariants, and one that counts the other invariants.
         """
-        found = np.flatnonzero(sick(self.figures))
+        found = np.flatnonzero(exceed_bounds(self.figures))
         if not found.size:
             return []
         rows = self.figures[found]
@@ -130,7 +130,7 @@ class Trust:
         return f"not to be trusted: {'; '.join(reasons)}.{cause} See {PAGE}"
 
 
-def sick(figures: np.ndarray) -> np.ndarray:
+def exceed_bounds(figures: np.ndarray) -> np.ndarray:
     """Return a mask of the rows of figures (..., N_FIGURES) that do not occur in correct runs."""
     large = (figures[..., data.NU] > BEYOND_DOUBT) | (figures[..., data.SUM] > TOGETHER * figures[..., data.EXPECTED])
     if not (np.count_nonzero(large) or np.count_nonzero(figures[..., SUSPICIOUS])):  # as in most runs

@@ -22,7 +22,7 @@ from ..core.runs import Run
 from ..core.step_control import UNBOUNDED, saved_steps
 from ..engine import data
 from ..engine.native import BUILD, LibraryFunction, OctetFunctions
-from ..engine.trust import Trust, sick, suspects
+from ..engine.trust import Trust, exceed_bounds, suspects
 from ..run.driver import Driver, expected_steps
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop, assembled
 from ..run.prepare import RunArguments, prepared
@@ -256,7 +256,7 @@ class BatchRunner:
             derivative = self._derivative(params[k])
             try:
                 f = derivative(span.t0, y0)
-                taus[k] = known or run.stepping.first(derivative, y0, f, run.tableau)
+                taus[k] = known or run.stepping.first(derivative, y0, f, run.method)
                 values[k] = events.at_start(span.t0, y0, f, span.sign * taus[k])
             except Exception:
                 taus[k] = np.nan
@@ -295,7 +295,7 @@ class BatchRunner:
         out["trusted"][arrived], out["message"][arrived] = True, ENDS[out["status"][arrived]]
         at_ends = run.options.watched
         suspected = suspects(each.figures, each.suspects) & at_ends
-        doubtful = np.asarray(sick(each.figures).any(axis=1) | suspected)
+        doubtful = np.asarray(exceed_bounds(each.figures).any(axis=1) | suspected)
         for k in arrived.tolist():
             if not (at_ends or doubtful[k]):
                 continue
@@ -307,7 +307,7 @@ class BatchRunner:
                 examiner = replace(run.examiner, tau=tau, figures=each.figures[k], largest=0.0)
                 found = [examiner.examine(each.suspects[k], derivative)] if suspected[k] else []
                 if at_ends:
-                    found.append(examiner.complaint(derivative, float(out["t"][k]), out["y"][k]))
+                    found.append(examiner.finding(derivative, float(out["t"][k]), out["y"][k]))
                     at_ends = found[-1] is not None
                 trust.doubts += list(filter(None, found))[:1]
             if not trust.trusted:
@@ -433,7 +433,7 @@ def _result(plan: Plan, members: dict[str, Any], k: int) -> IntegrationResult:
 def not_batched_because(driver: Driver, members: int) -> str:
     """Return the reason why `members` members cannot be vectorised; "" if they can, with their functions compiled."""
     run, options, schedule = driver.run, driver.run.options, driver.schedule
-    history = run.method.multistep
+    history = run.stepper.multistep
     reasons: dict[str, Any] = {
         "steps are adaptive": options.adaptive,
         "the interval is infinite": schedule.span.n_steps >= UNBOUNDED,

@@ -160,7 +160,7 @@ class GaussJackson(Method):
         corrected = slice(0, 0) if shorter else _System(self, run, start).corrected(check=run.options.limit < math.inf)
         # The engine takes balances with the room of a history, also in a run without steps.
         history = self._history(run, corrected, shorter_than_history=shorter and not balanced)
-        run.method = run.method._replace(multistep=history)
+        run.stepper = run.stepper._replace(multistep=history)
 
     def _history(self, run: Run, corrected: slice, *, shorter_than_history: bool) -> Multistep:
         """Return the record and the buffers of the history; `corrected` are the floats that the Jacobian corrects."""

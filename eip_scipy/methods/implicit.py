@@ -93,7 +93,7 @@ class ScipySolverAdapter(Method):
         return DenseForm(POLYNOMIAL, 1 + len(self.polynomials), np.pad(self.polynomials, ((0, 0), (1, 1))))
 
     def begin(self, run: Run, start: Start) -> None:
-        run.method._begin(run, start)
+        run.stepper._begin(run, start)
 
     def _begin(self, run: Run, start: Start) -> None:
         (t, y, f, length), rtol, span = start, run.stepping.rtol, run.stepping.span

@@ -22,6 +22,8 @@ __all__ = ["Driver", "check_memory", "saved_rows"]
 
 # Rows and bytes allocated at the start of a run whose number of steps is unknown; the buffers grow later.
 FIRST_ROWS, FIRST_BYTES = 1024, 2**24
+# Buffers that decide the remaining steps, or count.
+OF_WORK = ["carry", "err_sum", "sigma", "memory", "residual", "max_residual", "max_correction", "trust", "counters"]
 
 
 class Driver:
@@ -137,7 +139,7 @@ class Driver:
 
     def parts(self) -> dict[str, np.ndarray]:
         """Return the counters and the buffers, by name, that determine the remaining steps."""
-        w, schedule, history = self.run.work, self.schedule, self.run.method.multistep
+        w, schedule, history = self.run.work, self.schedule, self.run.stepper.multistep
         found = {"place": schedule.place, "clock": schedule.clock, "y": self.state, "slope": w.K[0], "g": schedule.g}
         if schedule.g.size:
             found["rate"] = schedule.rate
@@ -148,31 +150,18 @@ class Driver:
         if history is not None:
             found |= {"rates": history.rates, "rate_sums": history.rate_sums} if balanced else {}
             found |= {"nodes": history.nodes, "sums": history.sums, "node": history.place, "levels": history.levels}
-        kept = (
-            "carry",
-            "err_sum",
-            "sigma",
-            "memory",
-            "residual",
-            "max_residual",
-            "max_correction",
-            "trust",
-            "counters",
-        )
-        return found | {name: getattr(w, name) for name in kept}
+        return found | {name: getattr(w, name) for name in OF_WORK}
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return copies of the buffers of `parts` after the last accepted step, in which the loop may have paused."""
         copies = {name: part.copy() for name, part in self.parts().items()}
-        if self.schedule.place[PENDING] == 1:
+        work, schedule = self.run.work, self.schedule
+        if schedule.place[PENDING] == 1:
             copies["place"][PENDING] = 0
-            copies["clock"][TIME] = self.schedule.clock[TIME_NEW]
-            copies["y"], copies["slope"] = self.new.copy(), self.run.work.K[-1].copy()
-            if "balance_rate" in copies:
-                copies["balance_rate"] = self.run.work.rates[-1].copy()
-            copies["g"] = self.schedule.g_new.copy()
-            if self.schedule.g.size:
-                copies["rate"] = self.schedule.rate_new.copy()
+            copies["clock"][TIME] = schedule.clock[TIME_NEW]
+            new = {"y": self.new, "slope": work.K[-1], "g": schedule.g_new, "rate": schedule.rate_new}
+            new |= {"balance_rate": work.rates[-1]}
+            copies |= {name: new[name].copy() for name in copies.keys() & new.keys()}
         return copies
 
     def load(self, t: np.ndarray, y: np.ndarray) -> None:

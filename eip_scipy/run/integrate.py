@@ -242,9 +242,9 @@ class Loop:
         self.given, self.keeper, self.problem = given, keeper, run.problem
         self.method, self.events, self.diagnostics = run.name, run.problem.events, run.diagnostics
         self.callback, self.progress = given.callback, given.progress
-        if keeper is not None and run.tableau.drives:
+        if keeper is not None and run.method.drives:
             raise ValueError(
-                f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
+                f"checkpoint: a file cannot store the internal state of SciPy's {run.method.name}, which resuming "
                 "needs. Omit checkpoint, or save the last state of a run and start another run from it."
             )
         wanted, fun = given.compiled, run.problem.fun
@@ -378,7 +378,7 @@ class Loop:
         replaced by the number of all remaining steps, even if it is larger.
         """
         driver, schedule = self.driver, self.driver.schedule
-        history, left = driver.run.method.multistep, schedule.span.n_steps - driver.step
+        history, left = driver.run.stepper.multistep, schedule.span.n_steps - driver.step
         if history is not None and left - history.middle <= chunk:
             chunk = left  # each of the last states that is requested costs a step of the starting method
         chunk = min(chunk, steps_to_check(driver.step))

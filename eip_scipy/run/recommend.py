@@ -385,7 +385,7 @@ class _Search:
         given = RunArguments.of(fun=self.problem, t_span=(self.t0, t), **{**self.common, **options, **further})
         run, is_implicit = prepared(given), options["method"].TABLEAU.drives
         if is_implicit:
-            calls, fun = count(int(run.work.counters[NFEV]) + run.method.start_calls), run.problem.fun
+            calls, fun = count(int(run.work.counters[NFEV]) + run.stepper.start_calls), run.problem.fun
 
             def counted(*args: Any) -> Any:
                 if next(calls) > self.most:

@@ -56,10 +56,10 @@ def settings(
     """Return everything except functions that determines the bits of a run, with the names that users know."""
     span = run.stepping.span
     # A user-defined one-step method is identified by its name and orders; functions are identified by their values.
-    if run.tableau.in_python:
-        parts = [run.tableau.order, run.tableau.error_estimator_order]
+    if run.method.in_python:
+        parts = [run.method.order, run.method.error_estimator_order]
     else:
-        *parts, history = run.method
+        *parts, history = run.stepper
         parts += [] if history is None else [getattr(history, part) for part in Weights._fields]
     found = {
         "method": f"{method} {_digest(parts)[:8]}",

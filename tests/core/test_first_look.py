@@ -6,7 +6,7 @@ from systems import oscillator
 
 from eip_scipy import Invariant
 from eip_scipy.core.gradients import random_directions
-from eip_scipy.core.invariant_checks import complaints
+from eip_scipy.core.invariant_checks import findings
 from eip_scipy.core.invariant_set import InvariantSet
 
 SIZES = [0.0, *10.0 ** np.arange(-13.0, 0.5, 0.5)]
@@ -68,7 +68,7 @@ def test_what_is_found_in_order_passes_the_examination(case):
             at = t, y, f, known.gradients(t, y, f), known.values(t, y), TAU, known.t_span, random_directions(2, False)
             in_order.append(known.functions.is_in_order(*at))
             known.functions = Unsure(known.functions)
-            found.append(bool(complaints(known, t, y, f, TAU, fun)))
+            found.append(bool(findings(known, t, y, f, TAU, fun)))
     assert all(in_order[:3])
     assert not any(found[:3])
     assert any(found)

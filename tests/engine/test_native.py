@@ -30,7 +30,7 @@ def parts(method=EIPRK4, **options):
     ready = prepared(RunArguments.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
     functions, _ = ready.problem.functions(ready, False)
     return {
-        "method": ready.method,
+        "method": ready.stepper,
         "options": ready.options,
         "work": ready.work,
         "functions": functions,
