@@ -55,7 +55,6 @@ class EnsembleKeywords(ProjectionDetails, total=False):
     jacobian: Callable[..., Any] | None
     jac: Any
     events: Any
-    dense_output: bool
     compiled: bool | None
     rtol: ArrayLike
     atol: ArrayLike

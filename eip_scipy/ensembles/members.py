@@ -27,7 +27,7 @@ from ..run.driver import Driver, expected_steps
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop, assembled
 from ..run.prepare import RunArguments, prepared
 from ..run.results import IntegrationResult
-from .result import COUNTERS, FAILED, FIELDS, NOT_RUN
+from .result import COUNTERS, FAILED, MEMBER_FIELDS, NOT_RUN
 
 __all__ = ["LANES", "Chunk", "Plan", "Task", "placed", "run_chunk"]
 
@@ -109,13 +109,13 @@ class Plan:
         return self
 
     def not_run(self, m: int, rows: int) -> dict[str, Any]:
-        """Return the `FIELDS` of `m` members that did not run, with `rows` saved states, one after the other in memory.
+        """Return the fields of `m` members that did not run, with `rows` saved states, one after the other in memory.
 
         ``t_events`` and ``y_events`` have a list for each member, with an array for each event; without events they are
         empty.
         """
         sizes, found = {"component": self.size, "invariant": len(self.names), "time": rows}, dict[str, Any]()
-        for name, field in FIELDS.items():
+        for name, field in MEMBER_FIELDS.items():
             if field.dims:
                 kind = self.dtype if "component" in field.dims else object if isinstance(field.unset, str) else None
                 values = np.full([m, *(sizes[dim] for dim in field.dims[:0:-1])], field.unset, kind)

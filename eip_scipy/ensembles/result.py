@@ -10,7 +10,7 @@ from ..engine.data import NFEV, NJEV, NLU, REJECTED
 from ..run.fields import Field, component_names, dataset, distinct, time_name
 from ..run.results import Result, steps
 
-__all__ = ["COUNTERS", "FAILED", "FIELDS", "NOT_RUN", "EnsembleResult"]
+__all__ = ["COUNTERS", "FAILED", "MEMBER_FIELDS", "NOT_RUN", "EnsembleResult"]
 
 FAILED, NOT_RUN = -1, -2  # status; the others are those of `integrate`
 SHOWN = 5
@@ -22,7 +22,7 @@ def _each(*dims: str, unset: Any = np.nan, table: str = "") -> Field:
     return Field(("member", *dims), table=table, unset=unset)
 
 
-FIELDS = {
+MEMBER_FIELDS = {
     "y": _each("component"),
     "t": _each(table="t_end"),
     "status": _each(unset=NOT_RUN),
@@ -152,9 +152,9 @@ class EnsembleResult(Result):
             "invariant": distinct(self.names),
         }
         if self.trajectories is None:
-            data = dataset(self, FIELDS | {"invariants": FIELDS["end_invariants"]}, coordinates)
+            data = dataset(self, MEMBER_FIELDS | {"invariants": MEMBER_FIELDS["end_invariants"]}, coordinates)
         else:
-            data = dataset(self, FIELDS, coordinates | {"time": self.times})
+            data = dataset(self, MEMBER_FIELDS, coordinates | {"time": self.times})
         if (time := time_name(components)) != "t":
             data = data.rename({"t_end": f"{time}_end", **({"time": time} if "time" in data.dims else {})})
         return data
