@@ -125,7 +125,7 @@ class BoundProblem:
             n = self.variations.tangents.n
             return (
                 f"components from {n} on are derivatives, which overflow in long chaotic runs: shorten the "
-                " interval, or use megno or lyapunov_spectrum, which rescale them"
+                "interval, or use megno or lyapunov_spectrum, which rescale them"
             )
         if isinstance(self.fun, PointerFunction):
             return "components are NaN if the C function does not fill them, and all are if its status is above 0"

@@ -375,7 +375,7 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
         _add_invariant(add, invariants, k, n)
     for k, item in invariants.balances.items.items():
         name, takes_f = f"rate of balance {invariants.labels[k]!r}", item.rate_uses_f
-        add("rate", item.rate_function, name, _shape(invariants, k), n, real=True, takes_f=takes_f, gradient=True)
+        add("rate", item.rate_function, name, invariants.shapes[k], n, real=True, takes_f=takes_f, gradient=True)
     if run.uses_jacobian:
         add("jacobian", problem.jacobian, "jacobian", (n // 2,), n // 2, takes_f=True, in_place=True, gradient=True)
     reason = ""
@@ -402,14 +402,9 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     ), reason
 
 
-def _shape(invariants: InvariantSet, k: int) -> tuple[int, ...]:
-    """Return the shape of the value of invariant k."""
-    return () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
-
-
 def _add_invariant(add: Callable[..., None], invariants: InvariantSet, k: int, n: int) -> None:
     """Add invariant k of a run: its value, its gradient, and derivatives by parameters of an augmented state."""
-    item, label, shape = invariants.items[k], invariants.labels[k], _shape(invariants, k)
+    item, label, shape = invariants.items[k], invariants.labels[k], invariants.shapes[k]
     name, alone = f"invariant {label!r}", item.unaugmented
     if alone is not None:
         item, n = alone.function, alone.n

@@ -13,6 +13,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from ..core.callers import users_level
 from ..core.examination import is_check_due, steps_to_check
 from ..core.failures import failure
 from ..core.functions import PointerFunction, is_compiled, is_jitted
@@ -258,7 +259,7 @@ class Loop:
         self.wall_time = 0.0 if keeper is None else keeper.seconds
         self.chunk = FIRST_CHUNK
         self._seconds = 0.0
-        self.told = self._doubtful = self._event_ended = False
+        self.is_unreliable = self._doubtful = self._event_ended = False
 
     def run(self) -> IntegrationResult:
         driver = self.driver
@@ -281,21 +282,21 @@ class Loop:
         if status < 0:
             driver.save_now()
         result = self._result(status, message)
-        if self.told:
+        if self.is_unreliable:
             try:
-                warnings.warn(f"{self.method}: {driver.run.trust.message}", ProjectionWarning, stacklevel=3)
+                warnings.warn(f"{self.method}: {driver.run.trust.message}", ProjectionWarning, stacklevel=users_level())
             except ProjectionWarning as error:
                 error.partial = result  # type: ignore[attr-defined]
                 raise
         return result
 
     def steps(self, bar: Any) -> tuple[int, str]:
-        """Run until something ends the run; return status and message, and set `told` if it is not reliable."""
+        """Run until something ends the run; return status and message, and set `is_unreliable`."""
         self._doubtful = False
         status, message = self._steps(bar)
         self.driver.run.trust.failed = status < 0
         self._look(ended=True)
-        self.told = self._doubtful and status >= 0
+        self.is_unreliable = self._doubtful and status >= 0
         return status, message
 
     def _look(self, *, ended: bool = False) -> None:
@@ -317,7 +318,7 @@ class Loop:
             code = driver.advance(k + steps)
             seconds = time.perf_counter() - begin
             driver.warn()
-            self._tell_why_slow(seconds)
+            self._warn_if_slow(seconds)
             ended = self._ended(code)
             if schedule.span.h != 0.0:
                 bar.update(driver.step - k)
@@ -340,7 +341,7 @@ class Loop:
                 longer = max(self.chunk, 8 * steps)
                 self.chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
 
-    def _tell_why_slow(self, seconds: float) -> None:
+    def _warn_if_slow(self, seconds: float) -> None:
         """Warn once if only the invariants prevent a slow run from being compiled; `seconds` is the time of a chunk."""
         self._seconds += seconds
         if self._slowed and self._seconds > SLOW_SECONDS:
@@ -349,7 +350,7 @@ class Loop:
                 f"{self.method}: fun is jitted, and the run could be many times faster, but it is {self.why_not}. "
                 "Compile the functions of the invariants with numba.njit, or pass compiled=False if this is intended.",
                 UserWarning,
-                stacklevel=5,
+                stacklevel=users_level(),
             )
 
     def _ended(self, code: int) -> bool:
