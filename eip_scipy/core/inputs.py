@@ -14,7 +14,7 @@ import numpy as np
 from ..engine.native import BUILD
 
 __all__ = [
-    "as_derivative", "as_vector", "converted_from_single", "count", "filled", "flag", "initial_state", "is_number",
+    "as_vector", "converted_from_single", "count", "filled", "flag", "initial_state", "is_number",
     "numbers", "real_array", "reals", "require_arguments", "shown", "states",
 ]  # fmt: skip
 
@@ -235,11 +235,6 @@ def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any
     where = ", ".join(map(str, (*row, component * shape[-1] // found.shape[-1])))
     does = "does not fill all of its argument out" if wrong is unset else READS
     raise ValueError(f"{what} {does}, in component {where}, at t={t:.10g}.")
-
-
-def as_derivative(value: Any, n: int, dtype: np.dtype, t: float, name: str = "fun") -> np.ndarray:
-    """Return the value of a user's right-hand side at t as an array (n,), or raise an error; see `as_vector`."""
-    return as_vector(value, n, dtype, f"{name} returned", t)
 
 
 def initial_state(y0: Any, name: str = "y0") -> np.ndarray:

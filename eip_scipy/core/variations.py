@@ -23,7 +23,7 @@ from .functions import (
     scalars,
 )
 from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
-from .inputs import as_derivative, filled, require_arguments, shown
+from .inputs import as_vector, filled, require_arguments, shown
 from .invariant_set import with_duals
 from .invariants import Invariant, copied
 from .tangent_vectors import TangentVectors
@@ -209,10 +209,10 @@ class _Products:
             raise TypeError(f"jvp must be a function jvp(t, y, dy, ...) -> (n,), got {shown(jvp)}.")
 
         def fun(t: float, y: Array, *extra: Any) -> Array:
-            return as_derivative(self.derivative(t, y, extra), self.n, y.dtype, t)
+            return as_vector(self.derivative(t, y, extra), self.n, y.dtype, "fun returned", t)
 
         def product(t: float, y: Array, dy: Array, *extra: Any) -> Array:
-            return as_derivative(jvp(t, y.copy(), dy.copy(), *extra), self.n, y.dtype, t, "jvp")
+            return as_vector(jvp(t, y.copy(), dy.copy(), *extra), self.n, y.dtype, "jvp returned", t)
 
         rhs = _by_products.__wrapped__(fun, "value", product, self.n, self.tangents.count)
         try:
@@ -232,7 +232,7 @@ class _Products:
     def by_numbers(self) -> tuple[Any, str]:
         """Return the right-hand side by dual numbers, or else by complex steps, and which of them, if it is right."""
         t, y, extra = self.first
-        as_derivative(self.derivative(t, y, extra), self.n, y.dtype, t)
+        as_vector(self.derivative(t, y, extra), self.n, y.dtype, "fun returned", t)
         numbers, reason = scalars(extra), "it is not compiled by Numba"
         if is_jitted(self.fun) and not jit_is_off() and numbers is not None:
             from .jitted_tangents import rhs_by_duals
@@ -281,7 +281,7 @@ class _Products:
         rows, found = (a.reshape(-1, self.tangents.size) for a in (Y, out))
         y, M = rows[0, : self.n], rows[1:]
         found[:, self.n :] = 0.0
-        found[0, : self.n] = as_derivative(self.derivative(t, y, extra), self.n, Y.dtype, t)
+        found[0, : self.n] = as_vector(self.derivative(t, y, extra), self.n, Y.dtype, "fun returned", t)
         # Rows of a size below 2, because complex steps have to be small. Powers of two change them without rounding.
         sizes = 2.0 ** (np.frexp(np.abs(M).max(axis=1, keepdims=True))[1] - 1)
         vectors = M / sizes
