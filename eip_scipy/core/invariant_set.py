@@ -184,10 +184,10 @@ class InvariantSet:
     the right-hand side of the system, for checks.
 
     Item k has the values with the indices from `starts[k]` to `starts[k + 1]`, of the shape `shapes[k]`. The `target`
-    of `balances` are the values that the run integrates. `kinds` are groups of components that have the same unit, see
-    `kinds_of`, or None. `why_not` has, by label, the reasons why jitted invariants have no compiled gradient. Masks
-    (l,) of the values: the user gave the target of the `given`, and the gradients of the `computed` are computed
-    because none was given.
+    of `balances` are the values that the run integrates. `kinds` are groups of components that have the same unit, or
+    None. `why_not` has, by label, the reasons why jitted invariants have no compiled gradient. Masks (l,) of the
+    values: the user gave the target of the `given`, and the gradients of the `computed` are computed because none was
+    given.
     """
 
     def __init__(

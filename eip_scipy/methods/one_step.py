@@ -160,7 +160,7 @@ class OneStep(Method):
         motion = tau if motion == np.inf else motion
         h, last = sign * min(SHORT * motion, tau), np.full_like(y, np.nan)
         is_real = y.dtype.kind == "f"
-        parts = 2 if is_canonical(y, f) else 1
+        parts = 2 if is_canonical(y, f) or (is_real and y.size == 2) else 1
 
         def norms(x: Array) -> Array:
             return np.linalg.norm(x.reshape(parts, -1), axis=1)

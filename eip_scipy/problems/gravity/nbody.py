@@ -103,7 +103,7 @@ def nbody(
     Problem
         State (q_1, ..., q_N, v_1, ..., v_N), each with 3 components. Invariants: "H", the energy times G, and "L", the
         angular momentum times G (for `forces` see Notes; with `balances`, these replace "H" and "L"). Momentum and
-        centre of mass are linear constraints in `frame`; `blocks` are the bodies' positions and velocities.
+        centre of mass are `linear_invariants`; `blocks` are the bodies' positions and velocities.
 
     Raises
     ------
@@ -248,7 +248,7 @@ def _check_speeds(ratio: np.ndarray) -> None:
 
 
 def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the `frame` (C, S) of centre of mass and momentum, with shifts of bodies proportional to their masses.
+    """Return (C, S) of centre of mass and momentum, with shifts of bodies proportional to their masses.
 
     C (6, 6 N) maps a state to position and velocity of the centre of mass, and the columns of S (6 N, 6) are the shifts
     that restore it. The recoil from the correction of a planet then goes to its star.
@@ -261,6 +261,6 @@ def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the `frame` (C, S) of centre of mass and momentum, whose shifts move all bodies by the same distance."""
+    """Return (C, S) of centre of mass and momentum, whose shifts move all bodies by the same distance."""
     C, _ = recoil(gm)
     return C, np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), np.eye(3)))

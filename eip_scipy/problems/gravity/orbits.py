@@ -109,8 +109,8 @@ def balances_of_orbits(
 ) -> tuple[Balance, ...]:
     """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged.
 
-    That moves all other bodies in the opposite direction. If the `frame` of a run restores the centre of mass by a
-    common shift, which changes no orbit, only the body on an orbit about the heaviest body needs to move.
+    That moves all other bodies in the opposite direction. If the linear invariants of a run restore the centre of mass
+    by a common shift, which changes no orbit, only the body on an orbit about the heaviest body needs to move.
     """
     masses, state = real_array("gm", gm), real_array("y0", y0)
     newton = flag("newton", newton)
